@@ -1,0 +1,40 @@
+# Each target alone takes a fresh clone on a fresh Debian 12 (root or sudo) to a finished run.
+# PYTEST_ARGS="-k friction -x" goes to pytest; DEMO=name chooses a demo; see scripts/ for the rest.
+.PHONY: help setup test lint demo test-debian13 test-sid clean distclean
+SHELL := /bin/bash
+MAKEFLAGS += --no-print-directory
+DEMO ?= two_blocks
+export PYTEST_ARGS
+
+help:
+	@echo 'make test           lint, all tests in serial, the parallel ones on 2 ranks'
+	@echo 'make demo           demos/$(DEMO).py on 2 ranks, output in out/$(DEMO) (DEMO=name for another)'
+	@echo 'make lint           ruff and mypy'
+	@echo 'make test-debian13  the tests on Debian 13 in a chroot (made once, some minutes)'
+	@echo 'make test-sid       the same on Debian sid'
+	@echo 'make clean          remove .venv, caches and out/; the chroots stay (make distclean)'
+
+setup:
+	@scripts/setup.sh
+
+test: setup
+	@scripts/test.sh
+
+demo: setup
+	@scripts/demo.sh $(DEMO)
+
+lint: setup
+	@scripts/lint.sh
+
+test-debian13:
+	@scripts/chroot.sh trixie
+
+test-sid:
+	@scripts/chroot.sh sid
+
+clean:
+	rm -rf .venv .venv-lint .pytest_cache .ruff_cache .mypy_cache build out *.egg-info
+	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
+
+distclean: clean
+	@scripts/chroot.sh --remove

@@ -1,0 +1,34 @@
+"""Dynamic, large-deformation node-to-surface contact for FEniCSx, with integrators that conserve what physics conserves."""
+
+from importlib.metadata import version
+
+from dolfinx_nts.contact import ContactPair
+from dolfinx_nts.continuum import Body, Continuum, Dirichlet, Traction
+from dolfinx_nts.integrators import EnergyMomentum, Midpoint
+from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
+from dolfinx_nts.newton import Newton, StepFailedError
+from dolfinx_nts.simulate import Solution, Stepper, simulate
+from dolfinx_nts.surfaces import Surface
+from dolfinx_nts.system import State, System
+
+__version__ = version("dolfinx_nts")
+__all__ = [
+    "Body",
+    "ContactPair",
+    "Continuum",
+    "Dirichlet",
+    "EnergyMomentum",
+    "Midpoint",
+    "MooneyRivlin",
+    "NeoHookean",
+    "Newton",
+    "Solution",
+    "StVenantKirchhoff",
+    "State",
+    "StepFailedError",
+    "Stepper",
+    "Surface",
+    "System",
+    "Traction",
+    "simulate",
+]

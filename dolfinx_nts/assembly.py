@@ -1,0 +1,182 @@
+"""The only file that creates the PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> AIJ.
+
+Fields of the step problem are the bodies, then (with the energy-momentum scheme) the augmented unknowns (d, f), then the
+multipliers. A rank's unknowns are contiguous: its part of body 1, body 2, .., (d, f), multipliers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.integer[Any]]
+
+
+class Layout:
+    """Where the fields' unknowns stand in the system vector.
+
+    Args:
+        comm: MPI communicator.
+        sizes: Unknowns of each field on this rank.
+    """
+
+    def __init__(self, comm: Any, sizes: Sequence[int]) -> None:
+        counts = np.asarray(comm.allgather(list(sizes)), dtype=np.int64)
+        zero = np.zeros((1, counts.shape[1]), np.int64)
+        self.comm, self.counts, self._rank = comm, counts, comm.rank
+        self._field_start = np.concatenate([zero, counts.cumsum(axis=0)])
+        self._rank_start = np.concatenate([[0], counts.sum(axis=1).cumsum()])
+        self._offset = counts.cumsum(axis=1) - counts
+
+    @property
+    def num_owned(self) -> int:
+        """Unknowns on this rank."""
+        return int(self.counts[self._rank].sum())
+
+    @property
+    def first_owned(self) -> int:
+        """Number of this rank's first unknown in the system vector."""
+        return int(self._rank_start[self._rank])
+
+    def owned(self, field: int) -> slice:
+        """Where a field stands among this rank's unknowns."""
+        start = int(self._offset[self._rank, field])
+        return slice(start, start + int(self.counts[self._rank, field]))
+
+    def start(self, field: int) -> int:
+        """First number of this rank's unknowns within a field."""
+        return int(self._field_start[self._rank, field])
+
+    def to_system(self, field: int, index: IntArray) -> IntArray:
+        """Numbers within a field -> numbers in the system vector."""
+        start = self._field_start[:, field]
+        rank = np.searchsorted(start, index, side="right") - 1
+        system: IntArray = self._rank_start[rank] + self._offset[rank, field] + index - start[rank]
+        return system
+
+
+class ElementBlocks(NamedTuple):
+    """Unknowns of a batch of elements: for each part a field, its columns in the element, and numbers in the field.
+
+    Attributes:
+        fields: Field of each part.
+        columns: Slice of each part in the element's unknowns.
+        numbers: Numbers in the field, shape (n, columns); negative ones are left out.
+        pattern: Which entries of an element's tangent can be non-zero, shape (r, r).
+    """
+
+    fields: tuple[int, ...]
+    columns: tuple[slice, ...]
+    numbers: tuple[IntArray, ...]
+    pattern: npt.NDArray[np.bool_]
+
+
+class StepMatrix:
+    """Nested Jacobian of the step problem and the AIJ matrix the solvers see.
+
+    Args:
+        layout: Fields of the problem.
+        bodies: PETSc matrices of the body fields; contact adds to them in place.
+        elements: Unknowns of each batch of contact elements.
+    """
+
+    def __init__(self, layout: Layout, bodies: Sequence[Any], elements: Sequence[ElementBlocks]) -> None:
+        self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
+        self._sources: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+        for e, element in enumerate(elements):
+            for i, row in enumerate(element.fields):
+                for j, col in enumerate(element.fields):
+                    self._sources.setdefault((row, col), []).append((e, i, j))
+        fields = range(layout.counts.shape[1])
+        self._blocks = {
+            key: self._new_block(*key) for key in self._sources if key[0] != key[1] or key[0] >= len(bodies)
+        }
+        grid = [[self._block(i, j) for j in fields] for i in fields]
+        self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
+        self.aij: Any = None
+
+    def _block(self, i: int, j: int) -> Any:
+        if i == j and i < len(self._bodies):
+            return self._bodies[i]
+        return self._blocks.get((i, j))
+
+    def _entries(self, source: tuple[int, int, int]) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """Element rows and columns of a block, and their numbers in the fields (n, entries)."""
+        e, i, j = source
+        element = self._elements[e]
+        rows, cols = np.nonzero(element.pattern[element.columns[i], element.columns[j]])
+        return rows, cols, element.numbers[i][:, rows], element.numbers[j][:, cols]
+
+    def _new_block(self, row: int, col: int) -> Any:
+        parts = [self._entries(s)[2:] for s in self._sources[row, col]]
+        rows = np.concatenate([p[0].ravel() for p in parts])
+        cols = np.concatenate([p[1].ravel() for p in parts])
+        local = self._layout.counts[self._layout.comm.rank]
+        a = PETSc.Mat().create(self._layout.comm)
+        a.setSizes(((int(local[row]), None), (int(local[col]), None)))
+        a.setType("aij")
+        compat.set_preallocation_coo(a, rows, cols)
+        return a
+
+    def assemble(self, tangents: Sequence[FloatArray]) -> None:
+        """Add the contact tangents (n, r, r) to freshly assembled bodies and refresh nest and AIJ."""
+        for key, sources in self._sources.items():
+            if key in self._blocks:
+                values = [self._values(s, tangents) for s in sources]
+                compat.set_values_coo(self._blocks[key], np.concatenate([v.ravel() for v in values]))
+            else:
+                self._add_to_body(self._bodies[key[0]], sources, tangents)
+        self.nest.assemble()
+        if self.aij is None:
+            self.aij = self.nest.convert("aij", out=PETSc.Mat())  # without `out` the nest itself is converted
+        else:
+            self.nest.convert("aij", out=self.aij)
+
+    def _values(self, source: tuple[int, int, int], tangents: Sequence[FloatArray]) -> FloatArray:
+        e, i, j = source
+        rows, cols, _, _ = self._entries(source)
+        columns = self._elements[e].columns
+        values: FloatArray = tangents[e][:, columns[i], columns[j]][:, rows, cols]
+        return values
+
+    def _add_to_body(self, a: Any, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]) -> None:
+        a.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+        for e, i, j in sources:
+            element = self._elements[e]
+            rows, cols = element.numbers[i], element.numbers[j]
+            (n, num_rows), num_cols = rows.shape, cols.shape[1]
+            pointer = np.arange(n * num_rows + 1, dtype=PETSc.IntType) * num_cols
+            index = np.repeat(cols, num_rows, axis=0).ravel().astype(PETSc.IntType)
+            values = np.ascontiguousarray(tangents[e][:, element.columns[i], element.columns[j]])
+            a.setValuesIJV(
+                pointer,
+                index,
+                values.ravel(),
+                addv=PETSc.InsertMode.ADD_VALUES,
+                rowmap=rows.ravel().astype(PETSc.IntType),
+            )
+        a.assemble()
+
+    def field_sets(self, num_bodies: int) -> tuple[tuple[str, Any], tuple[str, Any]]:
+        """Index sets "bodies" and "contact" of the system vector for a field split."""
+        parts = []
+        fields = range(self._layout.counts.shape[1])
+        for chosen in ([f for f in fields if f < num_bodies], [f for f in fields if f >= num_bodies]):
+            local = [np.arange(*self._layout.owned(f).indices(self._layout.num_owned)) for f in chosen]
+            start = self._layout.first_owned
+            index = (np.concatenate(local) + start).astype(PETSc.IntType)
+            parts.append(PETSc.IS().createGeneral(index, comm=self._layout.comm))
+        return ("bodies", parts[0]), ("contact", parts[1])
+
+    def destroy(self) -> None:
+        """Free the PETSc objects; the bodies' matrices stay theirs."""
+        for a in (self.nest, self.aij, *self._blocks.values()):
+            if a is not None:
+                a.destroy()

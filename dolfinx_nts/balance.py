@@ -1,0 +1,114 @@
+"""The ledger: momenta, energy and its changes as pure functions of states and steps (theory section 7)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from dolfinx_nts.newton import Evaluation, StepProblem
+from dolfinx_nts.system import State, System
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Columns of the balance table; momenta have three components.
+COLUMNS = (
+    "time",
+    "kinetic",
+    "potential",
+    "energy",
+    "external_work",
+    "friction_dissipation",
+    "contact_defect",
+    "ledger_residual",
+    "linear_momentum",
+    "angular_momentum",
+    "active",
+    "stick",
+    "slip",
+    "min_gap",
+    "newton_iterations",
+)
+
+
+def measure(system: System, state: State) -> dict[str, Any]:
+    """Energies [J] and momenta [kg m/s, kg m^2/s] of a state, the same on all ranks.
+
+    Returns:
+        kinetic, potential, linear_momentum (3,), angular_momentum (3,).
+    """
+    local = np.zeros(8)
+    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+        momentum = body.inertia(v)
+        local[0] += 0.5 * float(v @ momentum)
+        local[1] += body.potential(u)
+        local[2:5] += body.linear_momentum(momentum)
+        local[5:8] += body.angular_momentum(u, momentum)
+    total = np.empty_like(local)
+    system.comm.Allreduce(local, total, op=MPI.SUM)
+    return {
+        "kinetic": float(total[0]),
+        "potential": float(total[1]),
+        "linear_momentum": total[2:5],
+        "angular_momentum": total[5:],
+    }
+
+
+def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, float]:
+    """Works and counts of an accepted step, the same on all ranks.
+
+    The contact defect is -sum lambda_N g_0: what activation loses and what a change of facet gains or loses.
+
+    Returns:
+        external_work [J], contact_defect [J], active, min_gap [m] (infinite without candidates).
+    """
+    scale = 2.0 / dt**2
+    work = defect = active = 0.0
+    for body, terms in zip(problem.system.bodies, step.bodies, strict=True):
+        work += scale * float(terms.external @ terms.du)
+        work += scale * float(terms.residual[body.fixed] @ terms.du[body.fixed])
+    smallest = np.inf
+    for contact, part, multiplier in zip(problem.contacts, step.contacts, step.multipliers, strict=True):
+        defect -= scale * float(multiplier[:, 0] @ contact.candidates.gap)
+        active += int(part.active.sum())
+        smallest = min(smallest, float(part.gap.min(initial=np.inf)))
+    comm = problem.system.comm
+    total = np.empty(3)
+    comm.Allreduce(np.array([work, defect, active]), total, op=MPI.SUM)
+    return {
+        "external_work": float(total[0]),
+        "contact_defect": float(total[1]),
+        "active": float(total[2]),
+        "min_gap": float(comm.allreduce(smallest, op=MPI.MIN)),
+    }
+
+
+def first_row(system: System, state: State) -> dict[str, Any]:
+    """Balance table row of the state a run starts from."""
+    row: dict[str, Any] = dict.fromkeys(COLUMNS, 0.0)
+    row |= measure(system, state)
+    row |= {"time": state.time, "energy": row["kinetic"] + row["potential"], "min_gap": np.inf}
+    return row
+
+
+def next_row(
+    first: dict[str, Any], last: dict[str, Any], measured: dict[str, Any], terms: dict[str, float]
+) -> dict[str, Any]:
+    """Row of an accepted step; external work, dissipation, defect and ledger residual are cumulative.
+
+    Args:
+        first: Row the ledger is opened with.
+        last: Row before the step.
+        measured: `measure` of the new state.
+        terms: `step_terms` of the step.
+    """
+    row = {**last, **measured, **terms}
+    for name in ("external_work", "contact_defect"):
+        row[name] = last[name] + terms[name]
+    row["energy"] = row["kinetic"] + row["potential"]
+    row["ledger_residual"] = (
+        row["energy"] - first["energy"] - row["external_work"] + row["friction_dissipation"] + row["contact_defect"]
+    )
+    return row

@@ -1,0 +1,257 @@
+"""Contact between two surfaces: which slave nodes may touch which facet in a step, and what they contribute.
+
+A `ContactPair` is part of the scene and holds no history; a `ContactStep` lives for one step. Both integrators share it: the
+midpoint rule has one unknown per candidate (lambda_N), the energy-momentum scheme eleven (d, f and six multipliers).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts import facets, nts, search
+from dolfinx_nts.surfaces import Surface
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.integer[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Part of a facet's size by which a slave may penetrate at the start of a run.
+INITIAL_PENETRATION = 0.01
+#: A node may project this far (in convective coordinates) beyond an edge that the master surface ends at ...
+_OVERHANG = 0.05
+#: ... and this far beyond an edge shared with another facet: between the normal cones of a convex edge.
+_WEDGE = 0.5
+#: Candidates are sought this part of a facet beyond the reach of the step's motion.
+_MARGIN = 0.5
+
+
+class Candidates(NamedTuple):
+    """Slave nodes that may touch in a step, one facet each; axis 0 = pair.
+
+    Attributes:
+        node: Positions in the slave surface's `owned`, shape (n,).
+        facet: Facets of the master surface, shape (n,).
+        xi: Orthogonal projection at t_n, shape (n, 2).
+        normal: Outward unit normal of the master there, shape (n, 3).
+        gap: g_0 [m], shape (n,).
+        length: Size of the facet [m], shape (n,).
+    """
+
+    node: IntArray
+    facet: IntArray
+    xi: FloatArray
+    normal: FloatArray
+    gap: FloatArray
+    length: FloatArray
+
+
+class ContactPair:
+    """Slave nodes of one surface must not penetrate the facets of another (19)-(21).
+
+    Args:
+        slave: Surface whose nodes are kept outside.
+        master: Surface whose facets keep them outside.
+
+    Raises:
+        TypeError: An argument is not a Surface.
+        ValueError: The surfaces share nodes.
+    """
+
+    def __init__(self, slave: Surface, master: Surface) -> None:
+        for name, value in (("slave", slave), ("master", master)):
+            if not isinstance(value, Surface):
+                raise TypeError(f"{name}={value!r}: pass a Surface, e.g. body.surface(marker)")
+        if slave.body is master.body and np.intersect1d(slave.points, master.points).size:
+            raise ValueError(f"slave, master: both surfaces of {slave.body.name!r} share nodes; choose disjoint markers")
+        self.slave, self.master = slave, master
+        self._free_edges = master.boundary_edges
+
+    @property
+    def name(self) -> str:
+        """Slave and master body, for messages and files."""
+        return f"{self.slave.body.name}-{self.master.body.name}"
+
+    def find(self, slave_u: FloatArray, master_u: FloatArray, current: IntArray, reach: float) -> Candidates:
+        """Search for this rank's candidates; every rank must call it.
+
+        Args:
+            slave_u: Owned displacements of the slave body [m].
+            master_u: Owned displacements of the master body [m].
+            current: Facet of each owned slave node in the last step or -1.
+            reach: Bound on the relative motion of slave and master in the step [m].
+        """
+        corners = self.master.positions(master_u)[self.master.facets]
+        x = self.slave.positions(slave_u)[self.slave.owned]
+        size = facets.size(corners)
+        radius = reach + _MARGIN * float(size.max())
+        closest = search.closest_facets(x, corners, reach=radius, current=current)
+        node = np.flatnonzero(closest.facet >= 0)
+        facet = closest.facet[node]
+        pair = corners[facet]
+        xi, converged = facets.project(x[node], pair, closest.xi[node])
+        foot, _, normal = facets.frame(pair, xi)
+        gap = np.einsum("ni,ni->n", normal, x[node] - foot)
+        length = size[facet]
+        legal = converged & self._over_facet(facet, xi) & self._movable(node, facet)
+        legal &= (gap > -_MARGIN * length) & (gap < reach + _MARGIN * length)
+        return Candidates(*(a[legal] for a in (node, facet, xi, normal, gap, length)))
+
+    def _over_facet(self, facet: IntArray, xi: FloatArray) -> BoolArray:
+        beyond = _beyond_edges(xi, self.master.facets.shape[1])
+        limit = np.where(self._free_edges[facet], _OVERHANG, _WEDGE)
+        inside: BoolArray = (beyond <= limit).all(axis=1)
+        return inside
+
+    def _movable(self, node: IntArray, facet: IntArray) -> BoolArray:
+        """Whether any coordinate of a pair is free; a pair that cannot move has nothing to solve for."""
+        slave = self.slave.fixed[self.slave.owned[node]].all(axis=1)
+        master = self.master.fixed[self.master.facets[facet]].all(axis=(1, 2))
+        return ~(slave & master)
+
+
+def _beyond_edges(xi: FloatArray, nc: int) -> FloatArray:
+    """How far xi lies beyond edge k (corner k to k + 1) of the reference facet, negative inside, shape (n, nc)."""
+    a, b = xi.T
+    if nc == 4:
+        return np.column_stack([-1 - b, a - 1, b - 1, -1 - a])
+    return 2 * np.column_stack([-b, a + b - 1, -a])
+
+
+class Contribution(NamedTuple):
+    """Step equations of the pairs at an iterate, scaled to [kg m] (coordinates, d, f) and [m] (constraints).
+
+    Attributes:
+        residual: Shape (n, r), r = 3 (nc + 1) + augmented + multipliers.
+        tangent: Shape (n, r, r).
+        gap: g_N at t_{n+1} [m], shape (n,).
+        active: Active set of the iterate, shape (n,).
+    """
+
+    residual: FloatArray
+    tangent: FloatArray
+    gap: FloatArray
+    active: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class ContactStep:
+    """The candidates of one pair of surfaces in one step, with the rule of the integrator.
+
+    Attributes:
+        pair: Its surfaces.
+        candidates: This rank's slave nodes and their facets.
+        rule: "direct" for the midpoint rule, else the discrete gradient.
+        x0: Slave and corners at t_n [m], shape (n, nc + 1, 3).
+        mass: Nodal mass of the slaves [kg], shape (n,); the scale of the active set.
+    """
+
+    pair: ContactPair
+    candidates: Candidates
+    rule: str
+    x0: FloatArray
+    mass: FloatArray
+
+    @property
+    def num_pairs(self) -> int:
+        """Candidates on this rank."""
+        return len(self.candidates.node)
+
+    @property
+    def num_corners(self) -> int:
+        """Corners of a master facet."""
+        return self.pair.master.facets.shape[1]
+
+    @property
+    def num_augmented(self) -> int:
+        """Unknowns d and f per pair."""
+        return 0 if self.rule == "direct" else nts.NUM_AUGMENTED
+
+    @property
+    def num_multipliers(self) -> int:
+        """Multipliers per pair."""
+        return 1 if self.rule == "direct" else nts.NUM_CONSTRAINTS
+
+    def dofs(self) -> tuple[IntArray, IntArray]:
+        """Global coordinates of the slaves (n, 3) and of the facets (n, 3 nc) in their bodies; -1 where prescribed."""
+        c, slave, master = self.candidates, self.pair.slave, self.pair.master
+        points, corners = slave.owned[c.node], master.facets[c.facet]
+        s = np.where(slave.fixed, -1, slave.dofs)[points]
+        m = np.where(master.fixed, -1, master.dofs)[corners].reshape(-1, 3 * self.num_corners)
+        return s, m
+
+    def points(self) -> tuple[IntArray, IntArray]:
+        """Global coordinates as in `dofs`, prescribed ones included."""
+        c, slave, master = self.candidates, self.pair.slave, self.pair.master
+        corners = master.facets[c.facet]
+        return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(-1, 3 * self.num_corners)
+
+    def initial_guess(self, x: FloatArray) -> FloatArray:
+        """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
+        if not self.num_augmented:
+            return np.empty((self.num_pairs, 0))
+        xi, converged = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
+        xi = np.where(converged[:, None], xi, self.candidates.xi)
+        _, _, normal = facets.frame(x[:, 1:], xi)
+        return np.column_stack([normal, xi]) * self.candidates.length[:, None]
+
+    def evaluate(self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray) -> Contribution:
+        """Residual and tangent of the pairs; pure.
+
+        Args:
+            x: Slave and corners at t_{n+1} [m], shape (n, nc + 1, 3).
+            augmented: Facet size times (d, f) [m], shape (n, 5) or (n, 0).
+            multiplier: h^2/2 lambda of the scaled constraints [kg m], shape (n, 6) or (n, 1).
+        """
+        if self.rule == "direct":
+            return self._direct(x, multiplier)
+        return self._invariants(x, augmented, multiplier)
+
+    def _direct(self, x: FloatArray, multiplier: FloatArray) -> Contribution:
+        middle, end = (self._gap(p) for p in (0.5 * (self.x0 + x), x))
+        n, size = self.num_pairs, 3 * (self.num_corners + 1)
+        gradient = middle.gradient.reshape(n, size)
+        residual = np.concatenate([multiplier * gradient, end.value[:, None]], axis=1)
+        tangent = np.zeros((n, size + 1, size + 1))
+        tangent[:, :size, :size] = 0.5 * multiplier[:, :, None] * middle.hessian
+        tangent[:, :size, size] = gradient
+        tangent[:, size, :size] = end.gradient.reshape(n, size)
+        return self._complementarity(residual, tangent, end.value, multiplier[:, 0], size)
+
+    def _gap(self, x: FloatArray) -> nts.Gap:
+        xi, _ = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
+        return nts.gap(x, xi)
+
+    def _invariants(self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray) -> Contribution:
+        c, n, nc = self.candidates, self.num_pairs, self.num_corners
+        length = c.length[:, None]
+        z0 = np.concatenate([self.x0.reshape(n, -1), c.normal, c.xi], axis=1)
+        z1 = np.concatenate([x.reshape(n, -1), augmented / length], axis=1)
+        # One length per pair makes every unknown a length or a force, so blocks compare across units and scales.
+        row, one = 1.0 / length, np.ones_like(length)
+        scale_z = np.concatenate([np.ones((n, 3 * (nc + 1))), np.tile(row, 5)], axis=1)
+        scale_g = np.concatenate([one, one, one, length, row, row], axis=1)
+        e = nts.element(z0, z1, multiplier * scale_g, self.rule)
+        size = z1.shape[1]
+        residual = np.concatenate([e.force * scale_z, e.constraint * scale_g], axis=1)
+        tangent = np.zeros((n, size + 6, size + 6))
+        tangent[:, :size, :size] = e.stiffness * scale_z[:, :, None] * scale_z[:, None]
+        mixed = scale_g[:, :, None] * scale_z[:, None]
+        tangent[:, :size, size:] = (e.force_gradient * mixed).transpose(0, 2, 1)
+        tangent[:, size:, :size] = e.constraint_gradient * mixed
+        return self._complementarity(residual, tangent, e.constraint[:, 0], multiplier[:, 0], size)
+
+    def _complementarity(
+        self, residual: FloatArray, tangent: FloatArray, gap: FloatArray, force: FloatArray, row: int
+    ) -> Contribution:
+        """Semi-smooth active set (theory section 9): g_N = 0 where active, lambda_N = 0 where not."""
+        gap = gap.copy()
+        active = -force - self.mass * gap > 0
+        off = ~active
+        residual[off, row] = force[off] / self.mass[off]
+        tangent[off, row] = 0.0
+        tangent[off, row, row] = 1.0 / self.mass[off]
+        return Contribution(residual, tangent, gap, active)

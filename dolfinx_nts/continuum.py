@@ -1,0 +1,413 @@
+"""Flexible bodies: hexahedral or tetrahedral DOLFINx meshes with a strain energy in UFL.
+
+`Body` is the protocol a System accepts; `Continuum` is the flexible body. All arrays cover the coordinates this rank owns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dolfinx_mesh
+from mpi4py import MPI
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.surfaces import Surface, locate_facets
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.integer[Any]]
+Vector = Sequence[float] | FloatArray
+VectorInTime = Vector | Callable[[float], Vector]
+
+
+class Body(Protocol):
+    """What a System asks of a body with coordinates q = X + u and a constant mass matrix (39).
+
+    Attributes:
+        name: Unique in a system.
+        comm: MPI communicator.
+        num_owned: Coordinates this rank owns; the global numbering is contiguous by rank.
+        reference: X [m], shape (num_owned,).
+        initial_velocity: v at the start [m/s], shape (num_owned,).
+        nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
+        fixed: Positions of the prescribed coordinates among the owned ones.
+    """
+
+    name: str
+    comm: Any
+    num_owned: int
+    reference: FloatArray
+    initial_velocity: FloatArray
+    nodal_mass: FloatArray
+    fixed: IntArray
+
+    def begin_step(self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float) -> None:
+        """Fix what a step from `time` over `dt` does not change."""
+
+    def inertia(self, v: FloatArray) -> FloatArray:
+        """M v."""
+
+    def internal(self, u1: FloatArray) -> FloatArray:
+        """Discrete gradient of the potential between t_n and t_{n+1} [N]."""
+
+    def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
+        """External forces of the step [N]; their work is f . (u_1 - u_0)."""
+
+    def tangent(self, u1: FloatArray) -> Any:
+        """PETSc matrix M + h^2/2 d(internal - external)/du_1; `fixed` rows and columns hold only a diagonal."""
+
+    def prescribed(self, time: float) -> FloatArray:
+        """Displacement of the `fixed` coordinates [m]."""
+
+    def potential(self, u: FloatArray) -> float:
+        """Stored energy on this rank [J]."""
+
+    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
+        """This rank's part of sum x cross p about the origin [kg m^2/s], shape (3,)."""
+
+    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
+        """This rank's part of the linear momentum [kg m/s], shape (3,)."""
+
+    def accept(self, u: FloatArray, v: FloatArray) -> None:
+        """Make u and v the body's current state."""
+
+
+@dataclass(frozen=True)
+class Dirichlet:
+    """Prescribed displacement on a part of the boundary.
+
+    Attributes:
+        where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
+        value: Displacement [m]: a vector, or a function of time; its work is external work.
+        components: Which of x, y, z are prescribed.
+
+    Raises:
+        ValueError: Unknown component.
+    """
+
+    where: Any
+    value: VectorInTime = (0.0, 0.0, 0.0)
+    components: tuple[int, ...] = (0, 1, 2)
+
+    def __post_init__(self) -> None:
+        if not self.components or not set(self.components) <= {0, 1, 2}:
+            raise ValueError(f"components={self.components!r}: choose from 0, 1, 2")
+
+
+@dataclass(frozen=True)
+class Traction:
+    """Dead traction on a part of the boundary.
+
+    Attributes:
+        where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
+        value: Force per reference area [Pa]: a vector, or a function of time.
+    """
+
+    where: Any
+    value: VectorInTime
+
+
+def _at(value: VectorInTime, time: float) -> FloatArray:
+    vector: FloatArray = np.asarray(value(time) if callable(value) else value, dtype=np.float64)
+    return vector
+
+
+def _facets(mesh: Any, where: Any, what: str) -> IntArray:
+    marker, tag = where if isinstance(where, tuple) else (where, None)
+    return locate_facets(mesh, marker, tag, what)
+
+
+class Continuum:
+    """A flexible body on a DOLFINx mesh (theory section 2).
+
+    Args:
+        mesh: 3D hexahedral or tetrahedral mesh.
+        material: Strain energy W(C) [J/m^3]: a material of this package or any callable C -> UFL scalar.
+        density: Reference density [kg/m^3], > 0.
+        velocity: Initial velocity [m/s]: a vector, or a callable x (3, n) -> (3, n) as in DOLFINx's interpolate.
+        bcs: `Dirichlet` conditions, fixed or moving in time.
+        name: Name in messages and files.
+        degree: Polynomial degree; contact surfaces need 1.
+        body_force: Force per reference volume [N/m^3], a vector or a function of time.
+        traction: `Traction` loads.
+        quadrature_degree: For energy, stress and mass alike; default 2 x 2 x 2 Gauss points on trilinear hexahedra.
+        extra_form: Further virtual work as UFL, a callable (u_m, v_m, w) -> form of the midpoint displacement,
+            velocity and test function; it is added to the internal virtual work and its work counts as external.
+
+    Attributes:
+        u: Displacement [m], dolfinx Function of the last accepted state.
+        v: Velocity [m/s], dolfinx Function.
+        space: Their function space.
+
+    Raises:
+        TypeError: `material` or a condition is not of the right kind.
+        ValueError: An argument is out of range, or the mesh is not a valid 3D mesh.
+    """
+
+    def __init__(
+        self,
+        mesh: Any,
+        material: Callable[[Any], Any],
+        *,
+        density: float,
+        velocity: Any = (0.0, 0.0, 0.0),
+        bcs: Sequence[Dirichlet] = (),
+        name: str = "body",
+        degree: int = 1,
+        body_force: VectorInTime = (0.0, 0.0, 0.0),
+        traction: Sequence[Traction] = (),
+        quadrature_degree: int | None = None,
+        extra_form: Callable[[Any, Any, Any], Any] | None = None,
+    ) -> None:
+        if not callable(material):
+            raise TypeError(f"material={material!r}: pass a callable C -> W(C), e.g. NeoHookean(young=.., poisson=..)")
+        if not (math.isfinite(density) and density > 0):
+            raise ValueError(f"density={density!r}: must be positive and finite [kg/m^3]")
+        _check_mesh(mesh, name)
+        self.name, self.mesh, self.comm, self.material, self.density = name, mesh, mesh.comm, material, density
+        self.degree = degree
+        self.space = compat.vector_space(mesh, degree)
+        self.u, self.v = (fem.Function(self.space, name=f"{name}_{s}") for s in "uv")
+        self.num_owned = 3 * self.space.dofmap.index_map.size_local
+        self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
+        self.body_force, self._traction, self._extra_form = body_force, tuple(traction), extra_form
+        self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree or 2 * degree})
+        self._ds = self._boundary_measure(quadrature_degree or 2 * degree)
+        self._set_conditions(bcs)
+        self._set_velocity(velocity)
+        self._build_constant_forms()
+        self._compiled: dict[Any, tuple[Any, Any, Any]] = {}
+
+    def surface(self, marker: Any, tag: int | None = None) -> Surface:
+        """A part of the boundary for contact.
+
+        Args:
+            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet meshtags.
+            tag: Value in the meshtags.
+
+        Raises:
+            ValueError: Degree above 1, no facet, or interior facets.
+        """
+        if self.degree != 1:
+            raise ValueError(f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1")
+        return Surface(self, locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}"))
+
+    # ---- set-up
+    def _boundary_measure(self, degree: int) -> Any:
+        indices = [_facets(self.mesh, load.where, "Traction.where") for load in self._traction]
+        tags = [np.full(len(i), k, np.int32) for k, i in enumerate(indices)]
+        empty = np.empty(0, np.int32)
+        index, tag = np.concatenate([empty, *indices]).astype(np.int32), np.concatenate([empty, *tags])
+        if len(np.unique(index)) < len(index):
+            raise ValueError("traction: two loads share a facet; add their values up in one Traction")
+        order = np.argsort(index)
+        data = dolfinx_mesh.meshtags(self.mesh, 2, index[order], tag[order])
+        return ufl.Measure("ds", self.mesh, subdomain_data=data, metadata={"quadrature_degree": degree})
+
+    def _set_conditions(self, bcs: Sequence[Dirichlet]) -> None:
+        self._bcs: list[Any] = []
+        self._conditions: list[tuple[IntArray, int, VectorInTime]] = []
+        owned = []
+        for bc in bcs:
+            if not isinstance(bc, Dirichlet):
+                raise TypeError(f"bcs: {bc!r} is not a Dirichlet(where, value, components)")
+            facets = _facets(self.mesh, bc.where, "Dirichlet.where")
+            blocks = np.asarray(fem.locate_dofs_topological(self.space, 2, facets))
+            for component in bc.components:
+                self._bcs.append(compat.subspace_component_bc(self.space, component, blocks))
+                dofs = np.sort(blocks * 3 + component)
+                dofs = dofs[dofs < self.num_owned]
+                self._conditions.append((dofs, component, bc.value))
+                owned.append(dofs)
+        self.fixed = np.unique(np.concatenate([np.empty(0, np.int64), *owned]).astype(np.int64))
+
+    def _set_velocity(self, velocity: Any) -> None:
+        if callable(velocity):
+            self.v.interpolate(velocity)
+        else:
+            vector = np.asarray(velocity, dtype=np.float64)
+            if vector.shape != (3,):
+                raise ValueError(f"velocity={velocity!r}: pass three components or a callable x (3, n) -> (3, n)")
+            self.v.x.array[:] = np.tile(vector, len(self.v.x.array) // 3)
+        wrong = not np.isfinite(self.v.x.array).all()
+        if self.comm.allreduce(wrong, op=MPI.LOR):
+            raise ValueError(f"velocity of {self.name!r}: not finite at some node; check the function for NaN")
+        values = self.v.x.array
+        for dofs, _, value in self._conditions:
+            if not callable(value):
+                values[dofs] = 0.0
+        self.v.x.scatter_forward()
+        self.initial_velocity = values[: self.num_owned].copy()
+
+    def _build_constant_forms(self) -> None:
+        v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+        mesh = self.mesh
+        self._loads = [fem.Constant(mesh, np.zeros(3)) for _ in range(1 + len(self._traction))]
+        load = ufl.inner(self._loads[0], w) * self._dx
+        for k, value in enumerate(self._loads[1:]):
+            load += ufl.inner(value, w) * self._ds(k)
+        f = ufl.Identity(3) + ufl.grad(self.u)
+        energy = self.material(f.T * f)
+        if ufl.as_ufl(energy).ufl_shape != ():
+            raise TypeError(f"material of {self.name!r}: W(C) must be a UFL scalar")
+        mass, self._load_form, self._energy_form = compat.compile_forms(
+            [self.density * ufl.inner(v, w) * self._dx, load, energy * self._dx]
+        )
+        self._mass = compat.create_matrix(mass)
+        compat.assemble_matrix(self._mass, mass, (), 0.0)
+        self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
+        self.nodal_mass = self.inertia(np.ones(self.num_owned))
+        total = self.comm.allreduce(np.array([self.nodal_mass.sum(), self.num_owned]))
+        self._diagonal = float(total[0] / total[1])
+
+    def _compile(self, integrator: Any) -> tuple[Any, Any, Any]:
+        """Compiled internal virtual work, tangent and extra virtual work of an integrator."""
+        if integrator not in self._compiled:
+            if not self._compiled:
+                self._u0, self._u1, self._v0 = (fem.Function(self.space) for _ in range(3))
+                self._h = fem.Constant(self.mesh, 1.0)
+            du, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+            f0, f1 = (ufl.Identity(3) + ufl.grad(u) for u in (self._u0, self._u1))
+            work = ufl.inner(integrator.piola(self.material, f0, f1), ufl.grad(w)) * self._dx
+            virtual, extra = work, None
+            if self._extra_form is not None:
+                um, vm = (self._u0 + self._u1) / 2, (self._u1 - self._u0) / self._h
+                extra = self._extra_form(um, vm, w)
+                virtual = work + extra
+            stiffness = self._h**2 / 2 * ufl.derivative(virtual, self._u1, du)
+            tangent = self.density * ufl.inner(du, w) * self._dx + stiffness
+            forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
+            self._compiled[integrator] = (forms[0], forms[1], forms[2] if extra is not None else None)
+            if not hasattr(self, "_matrix"):
+                self._matrix = compat.create_matrix(forms[1])
+        return self._compiled[integrator]
+
+    # ---- Body protocol
+    def begin_step(self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float) -> None:
+        """Set the state at t_n, the step and the loads at the midpoint."""
+        self._forms = self._compile(integrator)
+        self._fill(self._u0, u0)
+        self._h.value = dt
+        middle = time + 0.5 * dt
+        self._loads[0].value[:] = _at(self.body_force, middle)
+        for constant, traction in zip(self._loads[1:], self._traction, strict=True):
+            constant.value[:] = _at(traction.value, middle)
+        self._load = self._assemble(self._load_form)
+
+    def inertia(self, v: FloatArray) -> FloatArray:
+        """M v [kg m/s for a velocity]."""
+        self._in.array_w[:] = v
+        self._mass.mult(self._in, self._out)
+        return self._out.array_r.copy()
+
+    def internal(self, u1: FloatArray) -> FloatArray:
+        """Internal forces of the step [N]."""
+        self._fill(self._u1, u1)
+        return self._assemble(self._forms[0])
+
+    def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
+        """Body force, traction and gravity at the midpoint in time, less the extra virtual work [N]."""
+        force = self._load + self.nodal_mass * np.tile(gravity, self.num_owned // 3)
+        if self._forms[2] is not None:
+            self._fill(self._u1, u1)
+            force -= self._assemble(self._forms[2])
+        return force
+
+    def tangent(self, u1: FloatArray) -> Any:
+        """M + h^2/2 K; contact may add to it before the next call."""
+        self._fill(self._u1, u1)
+        compat.assemble_matrix(self._matrix, self._forms[1], self._bcs, self._diagonal)
+        return self._matrix
+
+    def prescribed(self, time: float) -> FloatArray:
+        """Prescribed displacements at a time, in the order of `fixed` [m]."""
+        values = np.zeros(self.num_owned)
+        for dofs, component, value in self._conditions:
+            values[dofs] = _at(value, time)[component]
+        return values[self.fixed]
+
+    def potential(self, u: FloatArray) -> float:
+        """Strain energy on this rank [J]."""
+        kept = self.u.x.array.copy()
+        self._fill(self.u, u)
+        energy = float(fem.assemble_scalar(self._energy_form))
+        self.u.x.array[:] = kept
+        return energy
+
+    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
+        """This rank's part of sum p [kg m/s]."""
+        total: FloatArray = momentum.reshape(-1, 3).sum(axis=0)
+        return total
+
+    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
+        """This rank's part of sum x cross p about the origin [kg m^2/s]."""
+        x = (self.reference + u).reshape(-1, 3)
+        total: FloatArray = np.cross(x, momentum.reshape(-1, 3)).sum(axis=0)
+        return total
+
+    def accept(self, u: FloatArray, v: FloatArray) -> None:
+        """Write the accepted state into the dolfinx Functions u and v."""
+        self._fill(self.u, u)
+        self._fill(self.v, v)
+
+    def _fill(self, function: Any, owned: FloatArray) -> None:
+        function.x.array[: self.num_owned] = owned
+        function.x.scatter_forward()
+
+    def _assemble(self, form: Any) -> FloatArray:
+        compat.assemble_vector(self._out, form)
+        return self._out.array_r.copy()
+
+
+#: Corner -> its three edge neighbours in DOLFINx vertex order.
+_NEIGHBOURS = np.array([[c ^ 1, c ^ 2, c ^ 4] for c in range(8)])
+#: The triple product flips sign at every second corner.
+_PARITY = np.array([1 - 2 * (bin(c).count("1") % 2) for c in range(8)])
+
+
+def _check_mesh(mesh: Any, name: str) -> None:
+    """Raise on every rank unless the mesh is a valid 3D hexahedral or tetrahedral mesh of degree 1."""
+    kind = compat.cell_name(mesh)
+    if kind not in ("hexahedron", "tetrahedron") or mesh.geometry.dim != 3:
+        raise ValueError(f"mesh of {name!r}: {kind} in {mesh.geometry.dim}D; pass 3D hexahedra or tetrahedra")
+    cells = compat.geometry_dofmap(mesh)
+    if cells.shape[1] not in (0, {"hexahedron": 8, "tetrahedron": 4}[kind]):
+        raise ValueError(f"mesh of {name!r}: geometry of degree above 1; pass a mesh of degree 1")
+    cells = cells[: mesh.topology.index_map(3).size_local]
+    finite = bool(np.isfinite(mesh.geometry.x).all())
+    if not mesh.comm.allreduce(finite, op=MPI.LAND):
+        raise ValueError(f"mesh of {name!r}: a node is not finite; check the coordinates for NaN")
+    x = mesh.geometry.x[cells] if len(cells) else np.empty((0, 8 if kind == "hexahedron" else 4, 3))
+    if kind == "hexahedron":
+        edges = x[:, _NEIGHBOURS] - x[:, :, None]
+        det = np.linalg.det(edges) * _PARITY
+    else:
+        edges = (x[:, 1:] - x[:, :1])[:, None]
+        det = np.linalg.det(edges)
+    size = np.linalg.norm(edges, axis=-1).prod(axis=-1)
+    degenerate = (np.abs(det) <= 1e-12 * size).any(axis=1)
+    bad = int(np.count_nonzero(degenerate | (np.abs(np.sign(det).sum(axis=1)) < det.shape[1])))
+    volume = np.abs(det.mean(axis=1)).sum() / (1 if kind == "hexahedron" else 6)
+    bad, volume, enclosed = mesh.comm.allreduce(np.array([bad, volume, _enclosed_volume(mesh)]))
+    if bad or (kind == "tetrahedron" and abs(volume - enclosed) > 1e-9 * volume):
+        raise ValueError(
+            f"mesh of {name!r}: {int(bad)} inverted or degenerate cells (cell volumes add up to {volume:.6g}, the "
+            f"boundary encloses {enclosed:.6g}); repair the mesh"
+        )
+
+
+def _enclosed_volume(mesh: Any) -> float:
+    """This rank's part of the volume inside the boundary, by the divergence theorem; triangles only."""
+    from dolfinx_nts.surfaces import _oriented_nodes
+
+    nodes = _oriented_nodes(mesh, compat.exterior_facets(mesh))
+    if nodes.shape[1] != 3:
+        return 0.0
+    a, b, c = mesh.geometry.x[nodes].transpose(1, 0, 2)
+    return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6)

@@ -1,0 +1,234 @@
+"""Everything that differs between DOLFINx 0.5.2, 0.9 and 0.11 (and their PETSc), and nothing else."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+from collections.abc import Sequence
+from typing import Any
+
+import dolfinx
+import dolfinx.fem.petsc as fem_petsc
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import cpp, fem, mesh
+from petsc4py import PETSc
+
+VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
+#: UFL-owned elements, AdjacencyList dofmaps.
+_OLD = VERSION < (0, 8)
+_SHARED = mesh.GhostMode.shared_facet
+
+IntArray = npt.NDArray[np.integer[Any]]
+FloatArray = npt.NDArray[np.float64]
+
+
+# ---- meshes
+def _partitioner() -> Any:
+    if VERSION < (0, 11):
+        return mesh.create_cell_partitioner(*(() if _OLD else (_SHARED,)))
+    return mesh.create_cell_partitioner(_SHARED, 2)
+
+
+def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Any:
+    """Degree-1 mesh with shared-facet ghosts.
+
+    Args:
+        comm: MPI communicator.
+        cells: This rank's part of the cells in DOLFINx vertex order, shape (m, corners).
+        x: This rank's part of the points [m], shape (n, 3).
+        cell_type: "hexahedron" or "tetrahedron".
+    """
+    cells, x = np.ascontiguousarray(cells, np.int64), np.ascontiguousarray(x, np.float64)
+    part = _partitioner()
+    if _OLD:
+        cell = ufl.Cell(cell_type, geometric_dimension=x.shape[1])
+        domain = ufl.Mesh(ufl.VectorElement("Lagrange", cell, 1))
+        return mesh.create_mesh(comm, cells, x, domain, _SHARED, part)
+    basix_ufl = importlib.import_module("basix.ufl")
+    e = basix_ufl.element("Lagrange", cell_type, 1, shape=(x.shape[1],))
+    args = (x, e) if VERSION < (0, 10) else (e, x)
+    return mesh.create_mesh(comm, cells, *args, partitioner=part)
+
+
+def model_to_mesh(model: Any, comm: Any, rank: int = 0) -> tuple[Any, Any, Any]:
+    """Gmsh model -> (mesh, cell tags, facet tags), with shared-facet ghosts in every version."""
+    if _OLD:
+        gmshio = importlib.import_module("dolfinx.io.gmshio")
+        m, ct, ft = gmshio.model_to_mesh(model, comm, rank, 3)
+        return m, ct, ft
+    io = importlib.import_module("dolfinx.io.gmshio" if VERSION < (0, 10) else "dolfinx.io.gmsh")
+    m, ct, ft = tuple(io.model_to_mesh(model, comm, rank, 3, partitioner=_partitioner()))[:3]
+    return m, ct, ft
+
+
+def _table(a: Any) -> IntArray:
+    if isinstance(a, np.ndarray):
+        return a
+    if not a.num_nodes:
+        return np.empty((0, 0), np.int32)
+    table: IntArray = np.asarray(a.array).reshape(a.num_nodes, -1)
+    return table
+
+
+def geometry_dofmap(msh: Any) -> IntArray:
+    """Geometry nodes of the cells, shape (cells, nodes)."""
+    g = msh.geometry
+    return _table(g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap)
+
+
+def cell_dofs(space: Any) -> IntArray:
+    """Blocked dofs of the cells, shape (cells, dofs)."""
+    return _table(space.dofmap.list)
+
+
+def entities_to_geometry(msh: Any, dim: int, entities: npt.ArrayLike) -> IntArray:
+    """Geometry nodes of the vertices of entities, shape (entities, vertices), tensor-ordered."""
+    entities, t = np.asarray(entities, dtype=np.int32), msh.topology
+    t.create_connectivity(dim, t.dim)
+    t.create_connectivity(t.dim, dim)
+    t.create_connectivity(dim, 0)
+    if not entities.size:  # 0.9 raises SIGFPE on an empty list
+        kind = cpp.mesh.cell_entity_type(t.cell_type, dim, 0)
+        return np.empty((0, cpp.mesh.cell_num_vertices(kind)), np.int32)
+    if _OLD:
+        nodes: IntArray = cpp.mesh.entities_to_geometry(_cpp_mesh(msh), dim, entities, False)
+    else:
+        nodes = mesh.entities_to_geometry(msh, dim, entities)
+    return nodes
+
+
+def _cpp_mesh(msh: Any) -> Any:
+    return getattr(msh, "_mesh", msh)
+
+
+def exterior_facets(msh: Any) -> IntArray:
+    """Owned exterior facets, sorted."""
+    t = msh.topology
+    t.create_connectivity(t.dim - 1, t.dim)
+    return np.sort(mesh.exterior_facet_indices(t))
+
+
+def cell_name(msh: Any) -> str:
+    """Name of the mesh's cell type, e.g. "hexahedron"."""
+    name = str(msh.topology.cell_type)
+    return name.rsplit(".", maxsplit=1)[-1]
+
+
+def create_submesh(msh: Any, dim: int, entities: npt.ArrayLike) -> tuple[Any, IntArray, IntArray]:
+    """Submesh and two int32 arrays: sub entity -> parent entity, sub node -> parent node."""
+    s, e, _, g = mesh.create_submesh(msh, dim, np.asarray(entities, dtype=np.int32))
+    if hasattr(e, "sub_topology_to_topology"):
+        im = s.topology.index_map(dim)
+        every = np.arange(im.size_local + im.num_ghosts, dtype=np.int32)
+        e = e.sub_topology_to_topology(every, False)
+    return s, np.asarray(e), np.asarray(g)
+
+
+# ---- spaces and functions
+def vector_space(msh: Any, degree: int) -> Any:
+    """Continuous Lagrange space of 3-vectors."""
+    if _OLD:
+        return fem.VectorFunctionSpace(msh, ("Lagrange", degree), dim=3)
+    return fem.functionspace(msh, ("Lagrange", degree, (3,)))
+
+
+def scalar_space(msh: Any, family: str, degree: int) -> Any:
+    """Scalar space of the family ("Lagrange" or "DG")."""
+    if _OLD:
+        return fem.FunctionSpace(msh, (family, degree))
+    return fem.functionspace(msh, (family, degree))
+
+
+def interpolation_points(space: Any) -> FloatArray:
+    """Reference interpolation points of a space, shape (n, 3)."""
+    p = space.element.interpolation_points
+    points: FloatArray = p() if callable(p) else p
+    return points
+
+
+def subspace_component_bc(space: Any, component: int, blocked_dofs: IntArray) -> Any:
+    """Homogeneous DirichletBC on one component of blocked dofs; it only masks rows and columns."""
+    dofs = np.sort(np.asarray(blocked_dofs, np.int32) * 3 + component)
+    return fem.dirichletbc(PETSc.ScalarType(0.0), dofs, space.sub(component))
+
+
+# ---- forms and assembly
+def compile_forms(forms: Sequence[Any]) -> list[Any]:
+    """Compile forms; all signatures come first because 0.5.2's depend on what was compiled before."""
+    for f in forms:
+        f.signature()
+    options = {"cffi_extra_compile_args": ["-O2"], "timeout": 600}
+    if _OLD:
+        return [fem.form(f, form_compiler_params={}, jit_params=options) for f in forms]
+    return [fem.form(f, jit_options=options) for f in forms]
+
+
+def create_vector(space: Any) -> Any:
+    """New zero ghosted PETSc vector in the layout of the space."""
+    f = fem.Function(space)  # a temporary would be freed under its petsc_vec in 0.9 and later
+    b = (f.x.petsc_vec if hasattr(f.x, "petsc_vec") else f.vector).duplicate()
+    b.set(0.0)
+    return b
+
+
+def assemble_vector(b: Any, form: Any) -> None:
+    """Assemble into a ghosted vector, ghosts added to their owners."""
+    with b.localForm() as loc:
+        loc.set(0.0)
+    fem_petsc.assemble_vector(b, form)
+    b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+
+
+def create_matrix(form: Any) -> Any:
+    """New PETSc matrix with the sparsity of a bilinear form."""
+    return fem_petsc.create_matrix(form)
+
+
+def assemble_matrix(a: Any, form: Any, bcs: Sequence[Any], diagonal: float) -> None:
+    """Assemble a bilinear form; rows and columns of bcs hold only the given diagonal."""
+    a.zeroEntries()
+    fem_petsc.assemble_matrix(a, form, list(bcs), diagonal)
+    a.assemble()
+
+
+# ---- MatSetPreallocationCOO / MatSetValuesCOO, which petsc4py 3.18 and 3.22 do not bind
+_lib: Any = None
+
+
+def _petsc_library() -> Any:
+    """The PETSc library this process already has loaded."""
+    global _lib  # noqa: PLW0603
+    if _lib is None:
+        with open("/proc/self/maps", encoding="utf-8") as maps:
+            names = (x.split()[-1] for x in maps if "libpetsc_" in x or "libpetsc." in x)
+            path = next(names)
+        _lib = ctypes.CDLL(path)
+        count, pointer = ctypes.c_ssize_t, ctypes.c_void_p
+        _lib.MatSetPreallocationCOO.argtypes = (pointer, count, pointer, pointer)
+        _lib.MatSetValuesCOO.argtypes = (pointer, pointer, ctypes.c_int)
+    return _lib
+
+
+def set_preallocation_coo(a: Any, rows: npt.ArrayLike, cols: npt.ArrayLike) -> None:
+    """Declare the triplets of a matrix; negative indices are ignored, duplicates summed."""
+    rows = np.array(rows, dtype=PETSc.IntType)  # copies: PETSc may permute them
+    cols = np.array(cols, dtype=PETSc.IntType)
+    if hasattr(a, "setPreallocationCOO"):
+        a.setPreallocationCOO(rows, cols)
+        return
+    i, j = rows.ctypes.data, cols.ctypes.data
+    if error := _petsc_library().MatSetPreallocationCOO(a.handle, rows.size, i, j):
+        raise PETSc.Error(error)
+
+
+def set_values_coo(a: Any, values: npt.ArrayLike) -> None:
+    """Replace the values of a matrix whose triplets were declared."""
+    values = np.ascontiguousarray(values, dtype=PETSc.ScalarType)
+    if hasattr(a, "setValuesCOO"):
+        a.setValuesCOO(values, PETSc.InsertMode.INSERT_VALUES)
+        return
+    mode = int(PETSc.InsertMode.INSERT_VALUES)
+    if error := _petsc_library().MatSetValuesCOO(a.handle, values.ctypes.data, mode):
+        raise PETSc.Error(error)

@@ -1,0 +1,106 @@
+"""Strain energies W(C) per reference volume, in UFL; any callable C -> UFL scalar serves as well."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import ufl
+
+
+def _require(condition: bool, name: str, value: float, remedy: str) -> None:
+    if not condition:
+        raise ValueError(f"{name}={value!r}: {remedy}")
+
+
+def _lame(young: float, poisson: float) -> tuple[float, float]:
+    """Lame's mu and lambda [Pa]."""
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+def _check_elastic(young: float, poisson: float) -> None:
+    _require(math.isfinite(young) and young > 0, "young", young, "must be positive and finite [Pa]")
+    _require(-1 < poisson < 0.5, "poisson", poisson, "must lie in (-1, 0.5); use e.g. 0.49 for rubber")
+
+
+@dataclass(frozen=True)
+class StVenantKirchhoff:
+    """W = lam/2 (tr E)^2 + mu E : E with E = (C - 1)/2; for moderate strains only.
+
+    Attributes:
+        young: Young's modulus [Pa], > 0.
+        poisson: Poisson's ratio [-], in (-1, 0.5).
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+
+    young: float
+    poisson: float
+
+    def __post_init__(self) -> None:
+        _check_elastic(self.young, self.poisson)
+
+    def __call__(self, c: Any) -> Any:
+        """W(C) [J/m^3]."""
+        mu, lam = _lame(self.young, self.poisson)
+        e = 0.5 * (c - ufl.Identity(3))
+        return lam / 2 * ufl.tr(e) ** 2 + mu * ufl.inner(e, e)
+
+
+@dataclass(frozen=True)
+class NeoHookean:
+    """W = mu/2 (tr C - 3 - ln det C) + lam/8 (ln det C)^2.
+
+    Attributes:
+        young: Young's modulus at small strain [Pa], > 0.
+        poisson: Poisson's ratio at small strain [-], in (-1, 0.5).
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+
+    young: float
+    poisson: float
+
+    def __post_init__(self) -> None:
+        _check_elastic(self.young, self.poisson)
+
+    def __call__(self, c: Any) -> Any:
+        """W(C) [J/m^3]."""
+        mu, lam = _lame(self.young, self.poisson)
+        log = ufl.ln(ufl.det(c))
+        return mu / 2 * (ufl.tr(c) - 3 - log) + lam / 8 * log**2
+
+
+@dataclass(frozen=True)
+class MooneyRivlin:
+    """W = a (tr C - 3) + b (tr cof C - 3) + c/2 (J - 1)^2 - d ln J with d = 2 (a + 2 b), stress-free at rest.
+
+    Attributes:
+        a: Coefficient of the first invariant [Pa], a + b > 0.
+        b: Coefficient of the second invariant [Pa].
+        c: Volumetric stiffness [Pa], > 0.
+
+    Raises:
+        ValueError: An argument is out of range.
+
+    Source: Simo and Tarnow (1992), the flying L-block.
+    """
+
+    a: float
+    b: float
+    c: float
+
+    def __post_init__(self) -> None:
+        _require(math.isfinite(self.a + self.b), "a, b", self.a + self.b, "must be finite [Pa]")
+        _require(self.a + self.b > 0, "a + b", self.a + self.b, "must be positive [Pa]: half the shear modulus")
+        _require(math.isfinite(self.c) and self.c > 0, "c", self.c, "must be positive and finite [Pa]")
+
+    def __call__(self, c: Any) -> Any:
+        """W(C) [J/m^3]."""
+        j2 = ufl.det(c)
+        second = (ufl.tr(c) ** 2 - ufl.tr(c * c)) / 2
+        volumetric = self.c / 2 * (ufl.sqrt(j2) - 1) ** 2 - (self.a + 2 * self.b) * ufl.ln(j2)
+        return self.a * (ufl.tr(c) - 3) + self.b * (second - 3) + volumetric

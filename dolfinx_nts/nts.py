@@ -1,0 +1,274 @@
+"""Batched node-to-surface element: gap, invariants, constraints, gradients and exact tangents.
+
+Axis 0 of every array is the pair (one slave node, one master facet with nc corners). Two descriptions of the same
+element: the direct one (projection and normal eliminated, for the midpoint rule, theory section 4) and the one in
+invariants (normal d and convective coordinates f as unknowns, for the energy-momentum scheme, sections 3 and 5).
+Nothing here knows about MPI, PETSc or bodies.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts import discrete_gradient, facets
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Constraints per pair: the gap and five augmented ones (43).
+NUM_CONSTRAINTS = 6
+#: Augmented unknowns per pair: d in R^3 and f in R^2.
+NUM_AUGMENTED = 5
+
+
+class Gap(NamedTuple):
+    """Direct description of the gap (16), (35).
+
+    Attributes:
+        value: g_N [m], shape (n,).
+        gradient: dg/dx [-], shape (n, nc + 1, 3); node 0 is the slave.
+        hessian: d2g/dx2 [1/m], shape (n, 3 (nc + 1), 3 (nc + 1)).
+    """
+
+    value: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class Element(NamedTuple):
+    """Contribution of the pairs to the step equations (63)-(66).
+
+    Attributes:
+        force: gradient of the constraints times the multipliers, shape (n, z).
+        constraint: g at t_{n+1}, shape (n, 6).
+        stiffness: d force / d z_1, shape (n, z, z).
+        force_gradient: d force / d lambda transposed, shape (n, 6, z).
+        constraint_gradient: d constraint / d z_1, shape (n, 6, z).
+    """
+
+    force: FloatArray
+    constraint: FloatArray
+    stiffness: FloatArray
+    force_gradient: FloatArray
+    constraint_gradient: FloatArray
+
+
+def gap(x: FloatArray, xi: FloatArray) -> Gap:
+    """Normal gap with its exact first and second derivative at the orthogonal projection.
+
+    Args:
+        x: Slave node and facet corners [m], shape (n, nc + 1, 3).
+        xi: Orthogonal projection of the slave onto the facet, shape (n, 2); must be converged.
+
+    Returns:
+        The gap, positive outside the master (35), with the projection and the normal linearised.
+    """
+    nc = x.shape[1] - 1
+    shape, dshape, ddshape = facets.shape(xi, nc)
+    zero = np.zeros((len(x), 1))
+    weight = np.concatenate([zero + 1.0, -shape], axis=1)
+    dshape = np.concatenate([zero[:, :, None] + np.zeros(2), dshape], axis=1)
+    _, tangents, normal = facets.frame(x[:, 1:], xi)
+    value = np.einsum("nk,nki,ni->n", weight, x, normal)
+    curvature = np.einsum("nkab,nki,ni->nab", ddshape, x[:, 1:], normal)
+    metric = np.einsum("nai,nbi->nab", tangents, tangents)
+
+    rhs = np.einsum("nk,nai->naki", weight, tangents)
+    slope = np.einsum("ni,nka->naki", normal, dshape)
+    rhs += value[:, None, None, None] * slope
+    dxi = _solve2(metric - value[:, None, None] * curvature, rhs)
+    tilt = slope + np.einsum("nab,nbki->naki", curvature, dxi)
+    dnormal = -np.einsum("naj,naki->njki", tangents, _solve2(metric, tilt))
+    hessian = np.einsum("nk,nilj->nkilj", weight, dnormal)
+    hessian -= np.einsum("ni,nka,nalj->nkilj", normal, dshape, dxi)
+    size = 3 * (nc + 1)
+    return Gap(value, np.einsum("nk,ni->nki", weight, normal), hessian.reshape(-1, size, size))
+
+
+def _solve2(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Solve the 2x2 systems a (n, 2, 2) for b (n, 2, ...)."""
+    return np.linalg.solve(a, b.reshape(len(b), 2, b[0].size // 2 if len(b) else 1)).reshape(b.shape)
+
+
+@lru_cache
+def _invariant_maps(nc: int) -> tuple[FloatArray, FloatArray, npt.NDArray[np.intp]]:
+    """Constant D^2 pi (p, z, z), the linear part of D pi (p, z), and the pairs I <= J (2, .)."""
+    pairs = np.array(np.triu_indices(nc))
+    num_z, num_yy = 3 * (nc + 2) + 2, pairs.shape[1]
+    second = np.zeros((num_yy + nc + 3, num_z, num_z))
+    y = np.zeros((nc, 3, num_z))
+    d = np.zeros((3, num_z))
+    for i in range(3):
+        d[i, 3 * (nc + 1) + i] = 1.0
+        y[:, i, i] = -1.0
+        for corner in range(nc):
+            y[corner, i, 3 * (corner + 1) + i] = 1.0
+    products = [(y[i], y[j]) for i, j in pairs.T] + [(yi, d) for yi in y] + [(d, d)]
+    for p, (a, b) in enumerate(products):
+        second[p] = a.T @ b + b.T @ a
+    linear = np.zeros((len(second), num_z))
+    linear[-2, -2] = linear[-1, -1] = 1.0
+    return second, linear, pairs
+
+
+def invariant_gradient(z: FloatArray, nc: int) -> FloatArray:
+    """D pi(z), shape (n, p, z); linear in z because pi is quadratic (45)."""
+    second, linear, _ = _invariant_maps(nc)
+    p, size, _ = second.shape
+    return (z @ second.reshape(p * size, size).T).reshape(-1, p, size) + linear
+
+
+def invariants(z: FloatArray, nc: int, gradient: FloatArray | None = None) -> FloatArray:
+    """The invariants pi(z) of theory section 3: 17 for a quadrilateral, 12 for a triangle.
+
+    Args:
+        z: (x_s, x_1 .. x_nc, d, f), shape (n, 3 (nc + 2) + 2).
+        nc: Corners of a facet, 3 or 4.
+        gradient: D pi(z) where it is known already.
+
+    Returns:
+        [y_I . y_J (I <= J), y_I . d, d . d, f], shape (n, p).
+    """
+    gradient = invariant_gradient(z, nc) if gradient is None else gradient
+    linear = _invariant_maps(nc)[1]
+    return 0.5 * np.matmul(gradient + linear, z[:, :, None])[:, :, 0]
+
+
+def constraints(pi: FloatArray, nc: int) -> FloatArray:
+    """The six constraints (43) from the invariants: gap, two tangent, unit normal, two projection.
+
+    Args:
+        pi: Invariants, shape (n, p).
+        nc: Corners of a facet.
+
+    Returns:
+        Shape (n, 6), units (m, m, m, -, m^2, m^2).
+    """
+    shape, dshape, _ = facets.shape(pi[:, -2:], nc)
+    yy, yd, dd = _split(pi, nc)
+    tangent = np.einsum("nia,ni->na", dshape, yd)
+    projection = np.einsum("ni,nij,nja->na", shape, yy, dshape)
+    normal = np.einsum("ni,ni->n", shape, yd)
+    return np.column_stack([-normal, tangent, 0.5 * (dd - 1.0), -projection])
+
+
+def _split(pi: FloatArray, nc: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """y_I . y_J as a full symmetric matrix, y_I . d and d . d."""
+    pairs = _invariant_maps(nc)[2]
+    yy = np.empty((len(pi), nc, nc))
+    yy[:, pairs[0], pairs[1]] = yy[:, pairs[1], pairs[0]] = pi[:, : pairs.shape[1]]
+    return yy, pi[:, pairs.shape[1] : -3], pi[:, -3]
+
+
+def constraint_gradient(pi: FloatArray, nc: int) -> FloatArray:
+    """dg/dpi of the six constraints, shape (n, 6, p)."""
+    shape, dshape, ddshape = facets.shape(pi[:, -2:], nc)
+    yy, yd, _ = _split(pi, nc)
+    pairs = _invariant_maps(nc)[2]
+    i, j, num = pairs[0], pairs[1], pairs.shape[1]
+    out = np.zeros((len(pi), NUM_CONSTRAINTS, pi.shape[1]))
+    out[:, 0, num:-3] = -shape
+    out[:, 1:3, num:-3] = dshape.transpose(0, 2, 1)
+    out[:, 3, -3] = 0.5
+    symmetric = shape[:, i, None] * dshape[:, j] + shape[:, j, None] * dshape[:, i]
+    out[:, 4:, :num] = -(symmetric * np.where(i == j, 0.5, 1.0)[:, None]).transpose(0, 2, 1)
+    yn, ydn = np.matmul(yy, shape[:, :, None])[:, :, 0], np.matmul(yy, dshape)
+    out[:, 0, -2:] = -np.einsum("nia,ni->na", dshape, yd)
+    out[:, 1:3, -2:] = np.einsum("niab,ni->nab", ddshape, yd)
+    out[:, 4:, -2:] = -np.einsum("nib,nia->nab", dshape, ydn)
+    out[:, 4:, -2:] -= np.einsum("ni,niab->nab", yn, ddshape)
+    return out
+
+
+def constraint_curvature(pi: FloatArray, multiplier: FloatArray, nc: int) -> FloatArray:
+    """Columns of d2(lambda . g)/dpi2 that belong to f, shape (n, p, 2); all others vanish.
+
+    The constraints are linear in the invariants of x and d once f is held, so the second derivative is these columns,
+    their transpose, and nothing else. Third derivatives of the shape functions vanish for both facets.
+    """
+    shape, dshape, ddshape = facets.shape(pi[:, -2:], nc)
+    yy, yd, _ = _split(pi, nc)
+    pairs = _invariant_maps(nc)[2]
+    i, j, num = pairs[0], pairs[1], pairs.shape[1]
+    normal, tangent, projection = multiplier[:, 0], multiplier[:, 1:3], multiplier[:, 4:]
+    bent = np.einsum("niab,na->nib", ddshape, projection)
+    slope = np.einsum("nia,na->ni", dshape, projection)
+    out = np.zeros((len(pi), pi.shape[1], 2))
+    out[:, num:-3] = -normal[:, None, None] * dshape + np.einsum("niab,na->nib", ddshape, tangent)
+    full = dshape[:, i] * slope[:, j, None] + shape[:, i, None] * bent[:, j]
+    full += dshape[:, j] * slope[:, i, None] + shape[:, j, None] * bent[:, i]
+    out[:, :num] = -full * np.where(i == j, 0.5, 1.0)[:, None]
+    ff = -np.einsum("n,nibc,ni->nbc", normal, ddshape, yd)
+    ff -= np.einsum("nibc,ni->nbc", ddshape, np.matmul(yy, slope[:, :, None])[:, :, 0])
+    mixed = np.matmul(dshape.transpose(0, 2, 1), np.matmul(yy, bent))
+    out[:, -2:] = ff - mixed - mixed.transpose(0, 2, 1)
+    return out
+
+
+def element(z0: FloatArray, z1: FloatArray, multiplier: FloatArray, rule: str) -> Element:
+    """Energy-momentum element in invariants with its exact tangent (63)-(66).
+
+    Args:
+        z0: (x_s, x_I, d, f) at t_n, shape (n, 3 (nc + 2) + 2).
+        z1: The same at t_{n+1}.
+        multiplier: lambda, shape (n, 6).
+        rule: Discrete gradient in pi, "mean-value" or "gonzalez".
+
+    Returns:
+        Forces, constraints and tangents in z.
+    """
+    nc = (z0.shape[1] - 2) // 3 - 2
+    second = _invariant_maps(nc)[0]
+    d0, d1 = invariant_gradient(z0, nc), invariant_gradient(z1, nc)
+    pi0, pi1 = invariants(z0, nc, d0), invariants(z1, nc, d1)
+    dm = 0.5 * (d0 + d1)
+    gradient1 = constraint_gradient(pi1, nc)
+    if rule == "mean-value":
+        gradient, curvature = discrete_gradient.mean_value(
+            pi0,
+            pi1,
+            lambda pi: constraint_gradient(pi, nc),
+            lambda pi: constraint_curvature(pi, multiplier, nc),
+        )
+        stiffness = _curvature_stiffness(dm, curvature, d1)
+    else:
+        gradient, rest = discrete_gradient.gonzalez(
+            pi0,
+            pi1,
+            multiplier,
+            lambda pi: constraints(pi, nc),
+            lambda pi: constraint_gradient(pi, nc),
+            lambda pi: _full_curvature(constraint_curvature(pi, multiplier, nc)),
+        )
+        stiffness = np.matmul(dm.transpose(0, 2, 1), np.matmul(rest, d1))
+    work = np.matmul(multiplier[:, None], gradient)[:, 0]
+    stiffness += 0.5 * (work @ second.reshape(len(second), -1)).reshape(stiffness.shape)
+    force = np.matmul(work[:, None], dm)[:, 0]
+    return Element(
+        force,
+        constraints(pi1, nc),
+        stiffness,
+        np.matmul(gradient, dm),
+        np.matmul(gradient1, d1),
+    )
+
+
+def _curvature_stiffness(dm: FloatArray, curvature: FloatArray, d1: FloatArray) -> FloatArray:
+    """D pi(z_m)^T H D pi(z_1) for an H given by its f columns; D pi is the identity on f."""
+    out = np.zeros((len(dm), dm.shape[2], dm.shape[2]))
+    out[:, :, -2:] = np.matmul(dm.transpose(0, 2, 1), curvature)
+    out[:, -2:] += np.matmul(curvature.transpose(0, 2, 1), d1)
+    out[:, -2:, -2:] -= curvature[:, -2:]
+    return out
+
+
+def _full_curvature(columns: FloatArray) -> FloatArray:
+    """The symmetric matrix whose f columns are given."""
+    n, p, _ = columns.shape
+    out = np.zeros((n, p, p))
+    out[:, -2:] = columns.transpose(0, 2, 1)
+    out[:, :, -2:] = columns
+    return out

@@ -1,0 +1,220 @@
+"""The time loop: `simulate` for a whole run, `Stepper` for those who keep the loop."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts import balance
+from dolfinx_nts.newton import Evaluation, Newton, StepFailedError, StepProblem
+from dolfinx_nts.system import State, System
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class Solution:
+    """What a run computed, complete up to where it ended.
+
+    Attributes:
+        system: The scene; its bodies hold the last accepted state.
+        status: "completed", or why the run stopped and what to do.
+        rows: Balance table, one row for the start and one per accepted step.
+        retries: How often a step was dropped and halved.
+    """
+
+    system: System
+    status: str = "running"
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    retries: int = 0
+
+    @property
+    def balance(self) -> dict[str, npt.NDArray[np.float64]]:
+        """Columns of the balance table, shape (rows,) or (rows, 3), identical on all ranks."""
+        return {name: np.array([row[name] for row in self.rows]) for name in balance.COLUMNS}
+
+    def plot(self, path: str) -> None:
+        """Write a picture of energies, ledger and momenta over time.
+
+        Args:
+            path: Picture file; its ending chooses the format.
+        """
+        from dolfinx_nts import output
+
+        if self.system.comm.rank == 0:
+            output.plot_balance(self.balance, path)
+
+
+class Stepper:
+    """Advances a system step by step.
+
+    Args:
+        system: The scene.
+        integrator: `Midpoint()` or `EnergyMomentum()`.
+        newton: Tolerances and retries.
+        petsc_options: PETSc options of the step's SNES, without prefix.
+
+    Attributes:
+        state: Last accepted state.
+        solution: Balance table so far.
+        problem: The step problem, for those who want its parts.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        integrator: Any,
+        *,
+        newton: Newton | None = None,
+        petsc_options: Mapping[str, Any] | None = None,
+    ) -> None:
+        if not (hasattr(integrator, "piola") and hasattr(integrator, "contact_gradient")):
+            raise TypeError(f"integrator={integrator!r}: pass Midpoint() or EnergyMomentum()")
+        self.newton = newton or Newton()
+        self.problem = StepProblem(system, integrator, self.newton, petsc_options)
+        self.system, self.state = system, system.initial_state()
+        self.solution = Solution(system, rows=[balance.first_row(system, self.state)])
+
+    def advance(self, dt: float) -> State:
+        """Advance by dt; a step that is not solved is dropped and halved, up to `newton.max_retries` times.
+
+        Args:
+            dt: Time to advance [s], > 0.
+
+        Returns:
+            The accepted state at the end.
+
+        Raises:
+            ValueError: dt is not positive.
+            StepFailedError: Not solved even with the smallest step; everything accepted so far is kept.
+        """
+        _positive("dt", dt)
+        end, part, retries = self.state.time + dt, 1, 0
+        done = 0
+        while done < part:
+            target = end - dt * (part - done - 1) / part
+            try:
+                self._step(target - self.state.time, target)
+            except StepFailedError as failure:
+                if retries == self.newton.max_retries:
+                    raise
+                retries += 1
+                self.solution.retries += 1
+                part, done = 2 * part, 2 * done
+                logger.info("%s; retrying with dt=%.3g", failure, dt / part)
+            else:
+                done += 1
+        return self.state
+
+    def _step(self, dt: float, time: float) -> None:
+        self.problem.begin(self.state, dt)
+        step = self.problem.solve()
+        state = self._accepted(step, dt, time)
+        rows = self.solution.rows
+        terms = balance.step_terms(self.problem, step, dt)
+        terms |= {"time": time, "newton_iterations": step.iterations}
+        rows.append(balance.next_row(rows[0], rows[-1], balance.measure(self.system, state), terms))
+        for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
+            body.accept(u, v)
+        self.state = state
+
+    def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
+        """State at t_{n+1}, with v_1 = 2 (u_1 - u_0)/h - v_0."""
+        old, facets, force, gap = self.state, [], [], []
+        for k, contact in enumerate(self.problem.contacts):
+            node = contact.candidates.node
+            facets.append(np.full_like(old.facets[k], -1))
+            facets[-1][node] = contact.candidates.facet
+            force.append(np.zeros_like(old.force[k]))
+            force[-1][node] = -2.0 / dt**2 * step.multipliers[k][:, 0]
+            gap.append(np.full_like(old.gap[k], np.inf))
+            gap[-1][node] = step.contacts[k].gap
+        return State(
+            time=time,
+            u=tuple(b.u1.copy() for b in step.bodies),
+            v=tuple(2.0 / dt * b.du - v for b, v in zip(step.bodies, old.v, strict=True)),
+            facets=tuple(facets),
+            force=tuple(force),
+            gap=tuple(gap),
+        )
+
+    def close(self) -> None:
+        """Free the PETSc objects of the last step."""
+        self.problem.destroy()
+
+
+def _positive(name: str, value: float) -> None:
+    if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+        raise ValueError(f"{name}={value!r}: must be positive and finite [s]")
+
+
+def simulate(
+    system: System,
+    integrator: Any,
+    *,
+    dt: float,
+    t_end: float,
+    newton: Newton | None = None,
+    petsc_options: Mapping[str, Any] | None = None,
+    output: Sequence[Any] = (),
+    progress: bool = False,
+) -> Solution:
+    """Run a system from t = 0 to t_end.
+
+    Args:
+        system: The scene.
+        integrator: `Midpoint()` or `EnergyMomentum()`.
+        dt: Step [s], > 0; the last step is shortened to end at t_end.
+        t_end: End of the run [s], > 0.
+        newton: Tolerances and retries.
+        petsc_options: PETSc options of the step's SNES, without prefix, e.g. {"pc_type": "fieldsplit"}.
+        output: Writers of `dolfinx_nts.output`; each is called after every accepted step that its cadence asks for.
+        progress: Show a progress line on rank 0.
+
+    Returns:
+        The Solution. A run that fails says so in `status` and keeps everything computed until then.
+
+    Raises:
+        ValueError: An argument is out of range; before any work.
+    """
+    _positive("dt", dt)
+    _positive("t_end", t_end)
+    stepper = Stepper(system, integrator, newton=newton, petsc_options=petsc_options)
+    steps = max(1, math.ceil(t_end / dt * (1 - 1e-12)))
+    bar = _progress_bar(steps, progress and system.comm.rank == 0)
+    try:
+        for writer in output:
+            writer.start(stepper)
+        for k in range(steps):
+            stepper.advance(min((k + 1) * dt, t_end) - stepper.state.time)
+            for writer in output:
+                writer.write(stepper, last=k == steps - 1)
+            if bar is not None:
+                row = stepper.solution.rows[-1]
+                bar.set_postfix(active=int(row["active"]), newton=row["newton_iterations"], refresh=False)
+                bar.update()
+        stepper.solution.status = "completed"
+    except StepFailedError as failure:
+        stepper.solution.status = f"{failure}. Try a smaller dt, a softer start, or inspect the nodes named here"
+        logger.warning("%s", stepper.solution.status)
+    finally:
+        for writer in output:
+            writer.close(stepper)
+        stepper.close()
+        if bar is not None:
+            bar.close()
+    return stepper.solution
+
+
+def _progress_bar(steps: int, wanted: bool) -> Any:
+    if not wanted:
+        return None
+    from tqdm import tqdm
+
+    return tqdm(total=steps, unit="step")

@@ -1,0 +1,156 @@
+"""Contact surfaces: oriented facets and their corner points, known on every rank.
+
+Every point of a body is linear in its coordinates, x = X + B u; on a continuum of nodes B only selects, so a surface keeps
+the node numbers of its corner points. Topology is gathered once; positions are gathered when a search needs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import facets as facet_math
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.integer[Any]]
+Marker = Callable[[FloatArray], npt.NDArray[np.bool_]]
+
+_CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
+
+
+def gather_rows(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Rows of all ranks in rank order, on every rank."""
+    return np.concatenate(comm.allgather(rows))
+
+
+def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArray:
+    """This rank's owned exterior facets selected by a marker function or by a tag.
+
+    Args:
+        mesh: dolfinx mesh.
+        marker: Callable x (3, n) -> bool (n,) that must hold at all corners of a facet, or dolfinx meshtags.
+        tag: Value to look for when `marker` is meshtags.
+        what: Name of the argument for messages.
+
+    Raises:
+        TypeError: `marker` is neither callable nor meshtags with a tag.
+        ValueError: The tags are not facet tags, or no exterior facet is selected, or an interior facet is.
+    """
+    exterior = compat.exterior_facets(mesh)
+    if tag is None:
+        if not callable(marker):
+            raise TypeError(f"{what}={marker!r}: pass a function of x with shape (3, n), or meshtags and a tag")
+        nodes = compat.entities_to_geometry(mesh, 2, exterior)
+        x = mesh.geometry.x
+        inside = np.asarray(marker(x[np.unique(nodes)].T), dtype=bool)
+        chosen = np.zeros(len(x), dtype=bool)
+        chosen[np.unique(nodes)] = inside
+        found = exterior[chosen[nodes].all(axis=1)]
+        wrong = 0
+    else:
+        if not hasattr(marker, "find") or marker.dim != 2:
+            raise ValueError(f"{what}={marker!r}: pass facet meshtags (dimension 2), not cell or edge tags")
+        tagged = marker.find(tag)
+        found = np.intersect1d(tagged, exterior).astype(np.int32)
+        owned = tagged < mesh.topology.index_map(2).size_local
+        wrong = int(np.count_nonzero(owned) - len(found))
+    total, wrong = (int(n) for n in np.sum(mesh.comm.allgather((len(found), wrong)), axis=0))
+    name = what if tag is None else f"{what} (tag {tag})"
+    if wrong:
+        raise ValueError(f"{name}: {wrong} interior facets selected; a contact surface must lie on the boundary")
+    if not total:
+        raise ValueError(f"{name}: selects no exterior facet; check the marker's tolerance or the tag")
+    return found
+
+
+class Surface:
+    """Oriented facets of a body's boundary. Create with `Continuum.surface`.
+
+    Attributes:
+        body: The body it belongs to.
+        points: Global node numbers of the corner points, sorted, shape (p,).
+        facets: Corner points of the facets as positions in `points`, cyclic and counter-clockwise seen from outside,
+            shape (m, nc); the order does not depend on the partition.
+        original: Input numbers of the points, the same for every number of ranks, shape (p,).
+        reference: Reference positions [m], shape (p, 3).
+        area: Tributary area of each point [m^2], shape (p,).
+        owned: Positions in `points` of the nodes this rank owns.
+        rows: Their coordinates among the body's owned ones, shape (owned, 3).
+        fixed: Which coordinates of the points are prescribed, shape (p, 3).
+    """
+
+    def __init__(self, body: Any, local_facets: IntArray) -> None:
+        mesh, space = body.mesh, body.space
+        self.body = body
+        nodes = _oriented_nodes(mesh, local_facets)
+        node_to_dof = np.full(len(mesh.geometry.x), -1, dtype=np.int64)
+        geometry = compat.geometry_dofmap(mesh)
+        cells = len(geometry)
+        node_to_dof[geometry] = compat.cell_dofs(space)[:cells, : geometry.shape[1]]
+        local = node_to_dof[nodes]
+        index_map = space.dofmap.index_map
+        corners = index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
+        ids = np.asarray(mesh.geometry.input_global_indices)[nodes]
+        table = np.stack([corners, ids], axis=-1)
+        table = gather_rows(mesh.comm, table)
+        x = gather_rows(mesh.comm, mesh.geometry.x[nodes])
+        first = table[..., 1].argmin(axis=1)
+        roll = (first[:, None] + np.arange(table.shape[1])) % table.shape[1]
+        table = np.take_along_axis(table, roll[..., None], axis=1)
+        x = np.take_along_axis(x, roll[..., None], axis=1)
+        order = np.lexsort(np.sort(table[..., 1], axis=1).T[::-1])
+        table, x = table[order], x[order]
+
+        self.points, at, inverse = np.unique(table[..., 0], return_index=True, return_inverse=True)
+        self.facets = inverse.reshape(table.shape[:2])
+        self.original = table[..., 1].ravel()[at]
+        self.reference = x.reshape(-1, 3)[at]
+        self.area = facet_math.tributary_areas(self.facets, x, len(self.points))
+        low, high = index_map.local_range
+        self.owned = np.flatnonzero((self.points >= low) & (self.points < high))
+        self.rows = 3 * (self.points[self.owned] - low)[:, None] + np.arange(3)
+        prescribed = np.zeros(body.num_owned, dtype=bool)
+        prescribed[body.fixed] = True
+        self.fixed = self.gather(prescribed)
+
+    @property
+    def dofs(self) -> IntArray:
+        """Global coordinate numbers of the points in the body, shape (p, 3)."""
+        dofs: IntArray = 3 * self.points[:, None] + np.arange(3)
+        return dofs
+
+    @property
+    def boundary_edges(self) -> npt.NDArray[np.bool_]:
+        """Whether edge k (corner k to k + 1) of a facet belongs to no other facet, shape (m, nc)."""
+        edges = np.stack([self.facets, np.roll(self.facets, -1, axis=1)], axis=-1)
+        key = np.sort(edges.reshape(-1, 2), axis=1)
+        _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+        free: npt.NDArray[np.bool_] = (count[inverse.ravel()] == 1).reshape(self.facets.shape)
+        return free
+
+    def gather(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values at all points, shape (p, 3), from this rank's owned body coordinates."""
+        return gather_rows(self.body.comm, values[self.rows])
+
+    def positions(self, u: FloatArray) -> FloatArray:
+        """Current positions of all points [m], shape (p, 3), from this rank's owned displacements."""
+        x: FloatArray = self.reference + self.gather(u)
+        return x
+
+
+def _oriented_nodes(mesh: Any, local_facets: IntArray) -> IntArray:
+    """Geometry nodes of facets in cyclic order, counter-clockwise seen from outside the adjacent cell."""
+    nodes = compat.entities_to_geometry(mesh, 2, local_facets)
+    nodes = nodes[:, _CYCLIC[nodes.shape[1]]]
+    to_cell = mesh.topology.connectivity(2, 3)
+    cells = np.array([to_cell.links(f)[0] for f in local_facets], dtype=np.int32)
+    x, centre = mesh.geometry.x, mesh.geometry.x[compat.geometry_dofmap(mesh)[cells]].mean(axis=1)
+    corner = x[nodes]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, -1] - corner[:, 0])
+    inward = np.einsum("ni,ni->n", normal, corner.mean(axis=1) - centre) < 0
+    nodes[inward] = nodes[inward][:, ::-1]
+    return nodes

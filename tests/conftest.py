@@ -1,0 +1,108 @@
+"""One pytest session on all ranks: rank 0 reports, and no rank is left waiting for another.
+
+Under mpirun every rank runs the same tests. After each test the ranks exchange who failed:
+
+- a test that failed on another rank is reported as an error here too, so every rank knows and the
+  run fails on every rank;
+- if a rank failed while another hangs in a collective call that will never complete, the failing
+  rank waits `PATIENCE` seconds, prints what it knows and aborts the whole run.
+"""
+
+import io
+import os
+import sys
+import tempfile
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+PATIENCE = 20.0
+"""Time [s] that a failing rank waits for the others before it aborts the run."""
+
+COMM = MPI.COMM_WORLD.Dup()
+FAILURES = pytest.StashKey[list[str]]()
+NOT_COLLECTED: list[str] = []
+
+
+def _failing_ranks(config, place: str, failures: list[str]) -> list[int]:
+    """Exchange at `place` which ranks failed; abort if a failing rank is left alone there."""
+    mine = np.array([zlib.crc32(place.encode()), bool(failures)], dtype=np.int64)
+    everyones = np.empty((COMM.size, 2), dtype=np.int64)
+    request = COMM.Iallgather(mine, everyones)
+    deadline = time.monotonic() + PATIENCE
+    while not request.Test():
+        time.sleep(2e-4)
+        if failures and time.monotonic() > deadline:
+            _abort(config, f"the other ranks do not reach the end of {place}", failures)
+    if np.any(everyones[:, 0] != mine[0]):
+        _abort(config, f"the ranks run different tests; this one: {place}", failures)
+    return np.flatnonzero(everyones[:, 1]).tolist()
+
+
+def _abort(config, reason: str, failures: list[str]) -> None:
+    # Ranks > 0 have printed their failures already; rank 0 would have in its summary.
+    _say(config, *(failures if COMM.rank == 0 else ()), f"run aborted: {reason}")
+    COMM.Abort(1)
+
+
+def _say(config, *parts: str) -> None:
+    """Print past pytest's capturing, each line under this rank's number."""
+    text = "".join(f"[rank {COMM.rank}] {line}\n" for part in parts for line in part.splitlines())
+    with config.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled():
+        print(text, end="", file=sys.stderr, flush=True)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config):
+    if COMM.rank > 0:
+        config.get_terminal_writer()._file = io.StringIO()
+        # A place for tmp_path of its own: pytest's cleaning up of old ones knows nothing of ranks.
+        place = Path(tempfile.gettempdir()) / f"pytest-of-{os.getuid()}-rank-{COMM.rank}"
+        place.mkdir(mode=0o700, exist_ok=True)
+        os.environ["PYTEST_DEBUG_TEMPROOT"] = str(place)
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item, call):
+    report = (yield).get_result()
+    if COMM.size == 1:
+        return
+    failures = item.stash.setdefault(FAILURES, [])
+    if report.failed:
+        failures.append(f"FAILED {item.nodeid} ({report.when})\n{report.longreprtext}")
+    if report.when != "teardown":
+        return
+    if COMM.rank > 0 and failures:
+        _say(item.config, *failures)
+    ranks = _failing_ranks(item.config, item.nodeid, failures)
+    if ranks and not failures:
+        report.outcome = "failed"
+        report.longrepr = f"{item.nodeid} failed on rank(s) {ranks}: their report is further up"
+
+
+def pytest_collectreport(report):
+    if report.failed:
+        NOT_COLLECTED.append(f"NOT COLLECTED {report.nodeid}\n{report.longreprtext}")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session, exitstatus):
+    if COMM.size == 1:
+        return
+    known = (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.NO_TESTS_COLLECTED)
+    failures = list(NOT_COLLECTED)
+    if exitstatus not in known:
+        failures.append(f"pytest ended early, exit status {int(exitstatus)}")
+    if COMM.rank > 0 and failures:
+        _say(session.config, *failures)
+    _failing_ranks(session.config, "the session", failures)
+
+
+@pytest.fixture
+def mpi_tmp_path(tmp_path):
+    """Rank 0's tmp_path, on every rank: for files that the ranks write together."""
+    return Path(COMM.bcast(str(tmp_path)))

@@ -1,0 +1,166 @@
+"""The layers of the package: imports only go down, and importing does nothing else."""
+
+import ast
+import importlib.metadata
+import logging
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "dolfinx_nts"
+
+LEVELS = [
+    {"discrete_gradient", "nts", "friction", "facets", "dolfinx_compat"},
+    {
+        "continuum",
+        "rigid",
+        "joints",
+        "contact",
+        "search",
+        "surfaces",
+        "materials",
+        "integrators",
+    },
+    {"system", "balance"},
+    {"newton", "assembly"},
+    {"simulate", "output", "tradeoff"},
+    {"__init__"},
+]
+LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}
+
+PRESENT = sorted(path.stem for path in PACKAGE.glob("*.py"))
+OPTIONAL = {"matplotlib", "h5py", "tqdm", "gmsh", "pyvista"}
+
+
+def source(module):
+    return (PACKAGE / f"{module}.py").read_text()
+
+
+def imported(module, tree=None):
+    """Yield the absolute dotted names that a module imports, at its top or inside functions."""
+    for node in ast.walk(tree or ast.parse(source(module))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level <= 1, f"{module}: the package has no parent"
+            base = ".".join(filter(None, ["dolfinx_nts" if node.level else "", node.module or ""]))
+            yield base
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def for_type_checking(node):
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
+def siblings(module):
+    """Return the package's modules that a module imports (types alone do not count)."""
+    tree = ast.parse(source(module))
+    tree.body = [node for node in tree.body if not for_type_checking(node)]
+    parts = [name.split(".") for name in imported(module, tree)]
+    return {p[1] for p in parts if p[0] == "dolfinx_nts" and len(p) > 1 and p[1] in LEVEL}
+
+
+def code_without_text(module):
+    """Return the source without comments, docstrings and other bare strings."""
+    tree = ast.parse(source(module))
+    for node in ast.walk(tree):
+        for field in ("body", "orelse", "finalbody"):
+            body = getattr(node, field, None)
+            if isinstance(body, list):
+                kept = [n for n in body if not is_bare_string(n)]
+                setattr(node, field, kept or ([ast.Pass()] if body else []))
+    return ast.unparse(ast.fix_missing_locations(tree))
+
+
+def is_bare_string(node):
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+def test_every_module_is_known():
+    unknown = set(PRESENT) - set(LEVEL)
+    assert not unknown, f"give these a level in LEVELS: {sorted(unknown)}"
+    folders = [p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"]
+    assert not folders, "the package is flat"
+
+
+@pytest.mark.parametrize("module", PRESENT)
+def test_imports_only_go_down(module):
+    up = {name for name in siblings(module) if LEVEL[name] > LEVEL.get(module, 0)}
+    assert not up, f"{module} (level {LEVEL[module]}) imports {sorted(up)} from above"
+
+
+@pytest.mark.parametrize("module", PRESENT)
+def test_no_module_imports_the_whole_package(module):
+    names = {alias for alias in imported(module) if module != "__init__"}
+    attributes = {n.split(".")[1] for n in names if n.startswith("dolfinx_nts.")} - set(LEVEL)
+    assert not attributes, f"import from the module that defines {sorted(attributes)}"
+
+
+@pytest.mark.parametrize("module", sorted((LEVELS[0] - {"dolfinx_compat"}) & set(PRESENT)))
+def test_level_0_knows_neither_mpi_nor_petsc(module):
+    top = {name.split(".")[0] for name in imported(module)}
+    assert not top & {"mpi4py", "petsc4py", "dolfinx"}
+    assert "dolfinx_compat" not in siblings(module)
+
+
+@pytest.mark.parametrize("module", sorted(set(PRESENT) - {"assembly", "dolfinx_compat"}))
+def test_only_assembly_creates_petsc_matrices(module):
+    makes = re.findall(r"\bMat\(\)|\.createAIJ\(|\.createNest\(", code_without_text(module))
+    assert not makes, f"{module} makes a PETSc matrix: {makes}"
+
+
+@pytest.mark.parametrize("module", sorted(set(PRESENT) - {"dolfinx_compat"}))
+def test_only_compat_knows_dolfinx_versions(module):
+    code = code_without_text(module)
+    asks = re.findall(r"dolfinx\.__version__|version\(['\"](?:fenics-)?dolfinx['\"]\)", code)
+    asks += re.findall(r"DOLFINX_VERSION|(?:hasattr|getattr)\((?:_?dolfinx|fem|mesh)\b", code)
+    assert not asks, f"{module} asks for the DOLFINx version: {asks}; dolfinx_compat does that"
+
+
+def in_fresh_python(code):
+    """Run code in a new interpreter that does not believe to be an MPI rank of this one."""
+    mpi = ("OMPI_", "PMIX_", "PRTE_", "ORTE_")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(mpi)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd="/", text=True, capture_output=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def test_importing_is_cheap():
+    loaded = in_fresh_python("import sys, dolfinx_nts; print(*sys.modules)")
+    ours = {name for name in loaded if name.split(".")[0] in OPTIONAL}
+    # What DOLFINx itself loads is not ours to avoid.
+    theirs = set(in_fresh_python("import sys, dolfinx, dolfinx.fem.petsc; print(*sys.modules)"))
+    assert not ours - theirs
+
+
+def test_importing_sets_up_no_logging():
+    state = "print(len(logging.root.handlers), logging.root.level)"
+    theirs = in_fresh_python(f"import logging, dolfinx, dolfinx.fem.petsc; {state}")
+    ours = in_fresh_python(f"import logging, dolfinx_nts; {state}")
+    assert ours in (theirs, ["0", str(logging.WARNING)])  # DOLFINx 0.5 itself adds a handler
+    own = "print(logger.handlers, logger.level)"
+    code = f"import logging, dolfinx_nts; logger = logging.getLogger('dolfinx_nts'); {own}"
+    assert in_fresh_python(code) == ["[]", "0"]
+
+
+def test_version_is_stated_once():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert importlib.metadata.version("dolfinx_nts") == version
+    assert "\nversion:" not in (ROOT / "CITATION.cff").read_text()
+    for module in PRESENT:
+        assert f'"{version}"' not in source(module), f"{module} states the version again"
+    if "__init__" in PRESENT:
+        assert in_fresh_python("import dolfinx_nts; print(dolfinx_nts.__version__)") == [version]
