@@ -1,7 +1,8 @@
 """The only file that creates the PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> AIJ.
 
-Fields of the step problem are the bodies, then (with the energy-momentum scheme) the augmented unknowns (d, f), then the
-multipliers. A rank's unknowns are contiguous: its part of body 1, body 2, .., (d, f), multipliers.
+Fields of the step problem are the bodies, then (with the energy-momentum scheme) the augmented
+unknowns (d, f), then the multipliers. A rank's unknowns are contiguous: its part of body 1, body 2,
+.., (d, f), multipliers.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from petsc4py import PETSc
 from dolfinx_nts import dolfinx_compat as compat
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.integer[Any]]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 class Layout:
@@ -87,7 +88,9 @@ class StepMatrix:
         elements: Unknowns of each batch of contact elements.
     """
 
-    def __init__(self, layout: Layout, bodies: Sequence[Any], elements: Sequence[ElementBlocks]) -> None:
+    def __init__(
+        self, layout: Layout, bodies: Sequence[Any], elements: Sequence[ElementBlocks]
+    ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
         self._sources: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
         for e, element in enumerate(elements):
@@ -96,7 +99,9 @@ class StepMatrix:
                     self._sources.setdefault((row, col), []).append((e, i, j))
         fields = range(layout.counts.shape[1])
         self._blocks = {
-            key: self._new_block(*key) for key in self._sources if key[0] != key[1] or key[0] >= len(bodies)
+            key: self._new_block(*key)
+            for key in self._sources
+            if key[0] != key[1] or key[0] >= len(bodies)
         }
         grid = [[self._block(i, j) for j in fields] for i in fields]
         self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
@@ -107,7 +112,9 @@ class StepMatrix:
             return self._bodies[i]
         return self._blocks.get((i, j))
 
-    def _entries(self, source: tuple[int, int, int]) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    def _entries(
+        self, source: tuple[int, int, int]
+    ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
         """Element rows and columns of a block, and their numbers in the fields (n, entries)."""
         e, i, j = source
         element = self._elements[e]
@@ -130,12 +137,16 @@ class StepMatrix:
         for key, sources in self._sources.items():
             if key in self._blocks:
                 values = [self._values(s, tangents) for s in sources]
-                compat.set_values_coo(self._blocks[key], np.concatenate([v.ravel() for v in values]))
+                compat.set_values_coo(
+                    self._blocks[key], np.concatenate([v.ravel() for v in values])
+                )
             else:
                 self._add_to_body(self._bodies[key[0]], sources, tangents)
         self.nest.assemble()
         if self.aij is None:
-            self.aij = self.nest.convert("aij", out=PETSc.Mat())  # without `out` the nest itself is converted
+            self.aij = self.nest.convert(
+                "aij", out=PETSc.Mat()
+            )  # without `out` the nest itself is converted
         else:
             self.nest.convert("aij", out=self.aij)
 
@@ -146,7 +157,9 @@ class StepMatrix:
         values: FloatArray = tangents[e][:, columns[i], columns[j]][:, rows, cols]
         return values
 
-    def _add_to_body(self, a: Any, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]) -> None:
+    def _add_to_body(
+        self, a: Any, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]
+    ) -> None:
         a.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         for e, i, j in sources:
             element = self._elements[e]
@@ -168,8 +181,13 @@ class StepMatrix:
         """Index sets "bodies" and "contact" of the system vector for a field split."""
         parts = []
         fields = range(self._layout.counts.shape[1])
-        for chosen in ([f for f in fields if f < num_bodies], [f for f in fields if f >= num_bodies]):
-            local = [np.arange(*self._layout.owned(f).indices(self._layout.num_owned)) for f in chosen]
+        for chosen in (
+            [f for f in fields if f < num_bodies],
+            [f for f in fields if f >= num_bodies],
+        ):
+            local = [
+                np.arange(*self._layout.owned(f).indices(self._layout.num_owned)) for f in chosen
+            ]
             start = self._layout.first_owned
             index = (np.concatenate(local) + start).astype(PETSc.IntType)
             parts.append(PETSc.IS().createGeneral(index, comm=self._layout.comm))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.newton import Evaluation, StepProblem
 from dolfinx_nts.system import State, System
+
+if TYPE_CHECKING:
+    from dolfinx_nts.newton import Evaluation, StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -59,7 +61,8 @@ def measure(system: System, state: State) -> dict[str, Any]:
 def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, float]:
     """Works and counts of an accepted step, the same on all ranks.
 
-    The contact defect is -sum lambda_N g_0: what activation loses and what a change of facet gains or loses.
+    The contact defect is -sum lambda_N g_0: what activation loses and what a change of facet gains
+    or loses.
 
     Returns:
         external_work [J], contact_defect [J], active, min_gap [m] (infinite without candidates).
@@ -70,7 +73,9 @@ def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, f
         work += scale * float(terms.external @ terms.du)
         work += scale * float(terms.residual[body.fixed] @ terms.du[body.fixed])
     smallest = np.inf
-    for contact, part, multiplier in zip(problem.contacts, step.contacts, step.multipliers, strict=True):
+    for contact, part, multiplier in zip(
+        problem.contacts, step.contacts, step.multipliers, strict=True
+    ):
         defect -= scale * float(multiplier[:, 0] @ contact.candidates.gap)
         active += int(part.active.sum())
         smallest = min(smallest, float(part.gap.min(initial=np.inf)))
@@ -109,6 +114,10 @@ def next_row(
         row[name] = last[name] + terms[name]
     row["energy"] = row["kinetic"] + row["potential"]
     row["ledger_residual"] = (
-        row["energy"] - first["energy"] - row["external_work"] + row["friction_dissipation"] + row["contact_defect"]
+        row["energy"]
+        - first["energy"]
+        - row["external_work"]
+        + row["friction_dissipation"]
+        + row["contact_defect"]
     )
     return row

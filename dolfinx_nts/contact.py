@@ -1,7 +1,8 @@
 """Contact between two surfaces: which slave nodes may touch which facet in a step, and what they contribute.
 
-A `ContactPair` is part of the scene and holds no history; a `ContactStep` lives for one step. Both integrators share it: the
-midpoint rule has one unknown per candidate (lambda_N), the energy-momentum scheme eleven (d, f and six multipliers).
+A `ContactPair` is part of the scene and holds no history; a `ContactStep` lives for one step. Both
+integrators share it: the midpoint rule has one unknown per candidate (lambda_N), the
+energy-momentum scheme eleven (d, f and six multipliers).
 """
 
 from __future__ import annotations
@@ -16,14 +17,16 @@ from dolfinx_nts import facets, nts, search
 from dolfinx_nts.surfaces import Surface
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.integer[Any]]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Part of a facet's size by which a slave may penetrate at the start of a run.
 INITIAL_PENETRATION = 0.01
-#: A node may project this far (in convective coordinates) beyond an edge that the master surface ends at ...
+#: A node may project this far (in convective coordinates) beyond an edge that the master surface
+# ends at ...
 _OVERHANG = 0.05
-#: ... and this far beyond an edge shared with another facet: between the normal cones of a convex edge.
+#: ... and this far beyond an edge shared with another facet: between the normal cones of a convex
+# edge.
 _WEDGE = 0.5
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 _MARGIN = 0.5
@@ -66,7 +69,9 @@ class ContactPair:
             if not isinstance(value, Surface):
                 raise TypeError(f"{name}={value!r}: pass a Surface, e.g. body.surface(marker)")
         if slave.body is master.body and np.intersect1d(slave.points, master.points).size:
-            raise ValueError(f"slave, master: both surfaces of {slave.body.name!r} share nodes; choose disjoint markers")
+            raise ValueError(
+                f"slave, master: both surfaces of {slave.body.name!r} share nodes; choose disjoint markers"
+            )
         self.slave, self.master = slave, master
         self._free_edges = master.boundary_edges
 
@@ -75,7 +80,9 @@ class ContactPair:
         """Slave and master body, for messages and files."""
         return f"{self.slave.body.name}-{self.master.body.name}"
 
-    def find(self, slave_u: FloatArray, master_u: FloatArray, current: IntArray, reach: float) -> Candidates:
+    def find(
+        self, slave_u: FloatArray, master_u: FloatArray, current: IntArray, reach: float
+    ) -> Candidates:
         """Search for this rank's candidates; every rank must call it.
 
         Args:
@@ -187,7 +194,9 @@ class ContactStep:
         """Global coordinates as in `dofs`, prescribed ones included."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
         corners = master.facets[c.facet]
-        return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(-1, 3 * self.num_corners)
+        return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(
+            -1, 3 * self.num_corners
+        )
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
@@ -198,7 +207,9 @@ class ContactStep:
         _, _, normal = facets.frame(x[:, 1:], xi)
         return np.column_stack([normal, xi]) * self.candidates.length[:, None]
 
-    def evaluate(self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray) -> Contribution:
+    def evaluate(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> Contribution:
         """Residual and tangent of the pairs; pure.
 
         Args:
@@ -225,12 +236,16 @@ class ContactStep:
         xi, _ = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
         return nts.gap(x, xi)
 
-    def _invariants(self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray) -> Contribution:
+    def _invariants(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> Contribution:
         c, n, nc = self.candidates, self.num_pairs, self.num_corners
         length = c.length[:, None]
-        z0 = np.concatenate([self.x0.reshape(n, -1), c.normal, c.xi], axis=1)
-        z1 = np.concatenate([x.reshape(n, -1), augmented / length], axis=1)
-        # One length per pair makes every unknown a length or a force, so blocks compare across units and scales.
+        positions = (n, 3 * (nc + 1))
+        z0 = np.concatenate([self.x0.reshape(positions), c.normal, c.xi], axis=1)
+        z1 = np.concatenate([x.reshape(positions), augmented / length], axis=1)
+        # One length per pair makes every unknown a length or a force, so blocks compare across
+        # units and scales.
         row, one = 1.0 / length, np.ones_like(length)
         scale_z = np.concatenate([np.ones((n, 3 * (nc + 1))), np.tile(row, 5)], axis=1)
         scale_g = np.concatenate([one, one, one, length, row, row], axis=1)
@@ -245,7 +260,12 @@ class ContactStep:
         return self._complementarity(residual, tangent, e.constraint[:, 0], multiplier[:, 0], size)
 
     def _complementarity(
-        self, residual: FloatArray, tangent: FloatArray, gap: FloatArray, force: FloatArray, row: int
+        self,
+        residual: FloatArray,
+        tangent: FloatArray,
+        gap: FloatArray,
+        force: FloatArray,
+        row: int,
     ) -> Contribution:
         """Semi-smooth active set (theory section 9): g_N = 0 where active, lambda_N = 0 where not."""
         gap = gap.copy()

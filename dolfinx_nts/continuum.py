@@ -1,6 +1,7 @@
 """Flexible bodies: hexahedral or tetrahedral DOLFINx meshes with a strain energy in UFL.
 
-`Body` is the protocol a System accepts; `Continuum` is the flexible body. All arrays cover the coordinates this rank owns.
+`Body` is the protocol a System accepts; `Continuum` is the flexible body. All arrays cover the
+coordinates this rank owns.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.surfaces import Surface, locate_facets
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.integer[Any]]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 VectorInTime = Vector | Callable[[float], Vector]
 
@@ -47,7 +48,9 @@ class Body(Protocol):
     nodal_mass: FloatArray
     fixed: IntArray
 
-    def begin_step(self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float) -> None:
+    def begin_step(
+        self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float
+    ) -> None:
         """Fix what a step from `time` over `dt` does not change."""
 
     def inertia(self, v: FloatArray) -> FloatArray:
@@ -128,17 +131,21 @@ class Continuum:
 
     Args:
         mesh: 3D hexahedral or tetrahedral mesh.
-        material: Strain energy W(C) [J/m^3]: a material of this package or any callable C -> UFL scalar.
+        material: Strain energy W(C) [J/m^3]: a material of this package or any callable C -> UFL
+            scalar.
         density: Reference density [kg/m^3], > 0.
-        velocity: Initial velocity [m/s]: a vector, or a callable x (3, n) -> (3, n) as in DOLFINx's interpolate.
+        velocity: Initial velocity [m/s]: a vector, or a callable x (3, n) -> (3, n) as in DOLFINx's
+            interpolate.
         bcs: `Dirichlet` conditions, fixed or moving in time.
         name: Name in messages and files.
         degree: Polynomial degree; contact surfaces need 1.
         body_force: Force per reference volume [N/m^3], a vector or a function of time.
         traction: `Traction` loads.
-        quadrature_degree: For energy, stress and mass alike; default 2 x 2 x 2 Gauss points on trilinear hexahedra.
-        extra_form: Further virtual work as UFL, a callable (u_m, v_m, w) -> form of the midpoint displacement,
-            velocity and test function; it is added to the internal virtual work and its work counts as external.
+        quadrature_degree: For energy, stress and mass alike; default 2 x 2 x 2 Gauss points on
+            trilinear hexahedra.
+        extra_form: Further virtual work as UFL, a callable (u_m, v_m, w) -> form of the midpoint
+            displacement, velocity and test function; it is added to the internal virtual work and
+            its work counts as external.
 
     Attributes:
         u: Displacement [m], dolfinx Function of the last accepted state.
@@ -166,18 +173,28 @@ class Continuum:
         extra_form: Callable[[Any, Any, Any], Any] | None = None,
     ) -> None:
         if not callable(material):
-            raise TypeError(f"material={material!r}: pass a callable C -> W(C), e.g. NeoHookean(young=.., poisson=..)")
+            raise TypeError(
+                f"material={material!r}: pass a callable C -> W(C), e.g. NeoHookean(young=.., poisson=..)"
+            )
         if not (math.isfinite(density) and density > 0):
             raise ValueError(f"density={density!r}: must be positive and finite [kg/m^3]")
         _check_mesh(mesh, name)
-        self.name, self.mesh, self.comm, self.material, self.density = name, mesh, mesh.comm, material, density
+        self.name, self.mesh, self.comm, self.material, self.density = (
+            name,
+            mesh,
+            mesh.comm,
+            material,
+            density,
+        )
         self.degree = degree
         self.space = compat.vector_space(mesh, degree)
         self.u, self.v = (fem.Function(self.space, name=f"{name}_{s}") for s in "uv")
         self.num_owned = 3 * self.space.dofmap.index_map.size_local
         self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
         self.body_force, self._traction, self._extra_form = body_force, tuple(traction), extra_form
-        self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree or 2 * degree})
+        self._dx = ufl.Measure(
+            "dx", mesh, metadata={"quadrature_degree": quadrature_degree or 2 * degree}
+        )
         self._ds = self._boundary_measure(quadrature_degree or 2 * degree)
         self._set_conditions(bcs)
         self._set_velocity(velocity)
@@ -188,27 +205,39 @@ class Continuum:
         """A part of the boundary for contact.
 
         Args:
-            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet meshtags.
+            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
+                meshtags.
             tag: Value in the meshtags.
 
         Raises:
             ValueError: Degree above 1, no facet, or interior facets.
         """
         if self.degree != 1:
-            raise ValueError(f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1")
-        return Surface(self, locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}"))
+            raise ValueError(
+                f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"
+            )
+        return Surface(
+            self, locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
+        )
 
     # ---- set-up
     def _boundary_measure(self, degree: int) -> Any:
         indices = [_facets(self.mesh, load.where, "Traction.where") for load in self._traction]
         tags = [np.full(len(i), k, np.int32) for k, i in enumerate(indices)]
         empty = np.empty(0, np.int32)
-        index, tag = np.concatenate([empty, *indices]).astype(np.int32), np.concatenate([empty, *tags])
+        index, tag = (
+            np.concatenate([empty, *indices]).astype(np.int32),
+            np.concatenate([empty, *tags]),
+        )
         if len(np.unique(index)) < len(index):
-            raise ValueError("traction: two loads share a facet; add their values up in one Traction")
+            raise ValueError(
+                "traction: two loads share a facet; add their values up in one Traction"
+            )
         order = np.argsort(index)
         data = dolfinx_mesh.meshtags(self.mesh, 2, index[order], tag[order])
-        return ufl.Measure("ds", self.mesh, subdomain_data=data, metadata={"quadrature_degree": degree})
+        return ufl.Measure(
+            "ds", self.mesh, subdomain_data=data, metadata={"quadrature_degree": degree}
+        )
 
     def _set_conditions(self, bcs: Sequence[Dirichlet]) -> None:
         self._bcs: list[Any] = []
@@ -233,11 +262,15 @@ class Continuum:
         else:
             vector = np.asarray(velocity, dtype=np.float64)
             if vector.shape != (3,):
-                raise ValueError(f"velocity={velocity!r}: pass three components or a callable x (3, n) -> (3, n)")
+                raise ValueError(
+                    f"velocity={velocity!r}: pass three components or a callable x (3, n) -> (3, n)"
+                )
             self.v.x.array[:] = np.tile(vector, len(self.v.x.array) // 3)
         wrong = not np.isfinite(self.v.x.array).all()
         if self.comm.allreduce(wrong, op=MPI.LOR):
-            raise ValueError(f"velocity of {self.name!r}: not finite at some node; check the function for NaN")
+            raise ValueError(
+                f"velocity of {self.name!r}: not finite at some node; check the function for NaN"
+            )
         values = self.v.x.array
         for dofs, _, value in self._conditions:
             if not callable(value):
@@ -283,13 +316,19 @@ class Continuum:
             stiffness = self._h**2 / 2 * ufl.derivative(virtual, self._u1, du)
             tangent = self.density * ufl.inner(du, w) * self._dx + stiffness
             forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
-            self._compiled[integrator] = (forms[0], forms[1], forms[2] if extra is not None else None)
+            self._compiled[integrator] = (
+                forms[0],
+                forms[1],
+                forms[2] if extra is not None else None,
+            )
             if not hasattr(self, "_matrix"):
                 self._matrix = compat.create_matrix(forms[1])
         return self._compiled[integrator]
 
     # ---- Body protocol
-    def begin_step(self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float) -> None:
+    def begin_step(
+        self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float
+    ) -> None:
         """Set the state at t_n, the step and the loads at the midpoint."""
         self._forms = self._compile(integrator)
         self._fill(self._u0, u0)
@@ -375,7 +414,9 @@ def _check_mesh(mesh: Any, name: str) -> None:
     """Raise on every rank unless the mesh is a valid 3D hexahedral or tetrahedral mesh of degree 1."""
     kind = compat.cell_name(mesh)
     if kind not in ("hexahedron", "tetrahedron") or mesh.geometry.dim != 3:
-        raise ValueError(f"mesh of {name!r}: {kind} in {mesh.geometry.dim}D; pass 3D hexahedra or tetrahedra")
+        raise ValueError(
+            f"mesh of {name!r}: {kind} in {mesh.geometry.dim}D; pass 3D hexahedra or tetrahedra"
+        )
     cells = compat.geometry_dofmap(mesh)
     if cells.shape[1] not in (0, {"hexahedron": 8, "tetrahedron": 4}[kind]):
         raise ValueError(f"mesh of {name!r}: geometry of degree above 1; pass a mesh of degree 1")

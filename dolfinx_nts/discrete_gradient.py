@@ -16,11 +16,17 @@ import ufl
 FloatArray = npt.NDArray[np.float64]
 
 #: Gauss points and weights on [0, 1].
-_GAUSS = {n: tuple(0.5 * (x + s) for x, s in zip(np.polynomial.legendre.leggauss(n), (1.0, 0.0), strict=True)) for n in range(1, 8)}
+_GAUSS = {
+    n: tuple(
+        0.5 * (x + s) for x, s in zip(np.polynomial.legendre.leggauss(n), (1.0, 0.0), strict=True)
+    )
+    for n in range(1, 8)
+}
 #: Exact for constraints of degree <= 4 in pi, whose gradient has degree 3.
 _CONTACT_POINTS = 2
-#: Relative strain increment below which W(C_1) - W(C_0) is taken from quadrature: there the three-point rule is exact
-#: to rounding (error ~ x^7), while the plain difference would leave rounding noise ~ eps / x in the stress.
+#: Relative strain increment below which W(C_1) - W(C_0) is taken from quadrature: there the
+#: three-point rule is exact to rounding (error ~ x^7), while the plain difference would leave
+# rounding noise ~ eps / x in the stress.
 _SMALL_STRAIN = 1e-2
 
 
@@ -33,7 +39,10 @@ def strain_derivative(energy: Callable[[Any], Any], strain: Any) -> Any:
 def mean_value_stress(energy: Callable[[Any], Any], c0: Any, c1: Any, points: int) -> Any:
     """S = 2 int_0^1 dW(C_0 + tau (C_1 - C_0)) dtau by Gauss points (UFL)."""
     tau, weight = _GAUSS[points]
-    stress = [w * strain_derivative(energy, c0 + t * (c1 - c0)) for t, w in zip(tau.tolist(), weight.tolist(), strict=True)]
+    stress = [
+        w * strain_derivative(energy, c0 + t * (c1 - c0))
+        for t, w in zip(tau.tolist(), weight.tolist(), strict=True)
+    ]
     return 2 * sum(stress[1:], start=stress[0])
 
 
@@ -41,7 +50,8 @@ def gonzalez_stress(energy: Callable[[Any], Any], c0: Any, c1: Any) -> Any:
     """Discrete derivative of W between C_0 and C_1 after Gonzalez (2000) (UFL).
 
     S = 2 dW(Cm) + 2 [W(C_1) - W(C_0) - dW(Cm) : DC] / (DC : DC) DC. The bracket is O(DC^3); for small DC it is taken from
-    quadrature, which is as exact and free of the cancellation that makes the plain form 0/0 at rest.
+    quadrature, which is as exact and free of the cancellation that makes the plain form 0/0 at
+    rest.
     """
     cm, dc = 0.5 * (c0 + c1), c1 - c0
     middle = strain_derivative(energy, cm)
@@ -51,7 +61,8 @@ def gonzalez_stress(energy: Callable[[Any], Any], c0: Any, c1: Any) -> Any:
     by_difference = energy(c1) - energy(c0) - ufl.inner(middle, dc)
     size, scale = ufl.inner(dc, dc), ufl.inner(cm, cm)
     bracket = ufl.conditional(ufl.lt(size, _SMALL_STRAIN**2 * scale), by_quadrature, by_difference)
-    # The addend is far below any increment that rounding lets exist; it only keeps 0/0 away at rest.
+    # The addend is far below any increment that rounding lets exist; it only keeps 0/0 away at
+    # rest.
     return 2 * (middle + bracket / (size + 1e-60 * scale) * dc)
 
 
@@ -91,7 +102,8 @@ def gonzalez(
 ) -> tuple[FloatArray, FloatArray]:
     """Gonzalez's discrete gradient (67) with the sign corrected, row by row, and its tangent.
 
-    Mixes the units of the invariants and is 0/0 at rest, which is why the mean value is the default.
+    Mixes the units of the invariants and is 0/0 at rest, which is why the mean value is the
+    default.
 
     Args:
         pi0: Invariants at t_n, shape (n, p).

@@ -20,7 +20,7 @@ VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
 _OLD = VERSION < (0, 8)
 _SHARED = mesh.GhostMode.shared_facet
 
-IntArray = npt.NDArray[np.integer[Any]]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 FloatArray = npt.NDArray[np.float64]
 
 

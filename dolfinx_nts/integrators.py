@@ -20,7 +20,8 @@ def _choose(name: str, value: str, known: tuple[str, ...]) -> None:
 class Midpoint:
     """Midpoint rule (58)-(60): keeps linear and angular momentum, not the energy."""
 
-    #: Contact is described directly: the projection is eliminated, the gap multiplier is the only unknown.
+    #: Contact is described directly: the projection is eliminated, the gap multiplier is the only
+    # unknown.
     contact_gradient: ClassVar[str] = "direct"
 
     def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:
@@ -34,10 +35,10 @@ class EnergyMomentum:
     """Energy-momentum scheme (61)-(66): keeps linear and angular momentum and closes the energy ledger.
 
     Attributes:
-        stress: Discrete derivative of the strain energy, "gonzalez" (exact for every W) or "mean-value" (Gauss points
-            in time: exact for polynomial W such as StVenantKirchhoff, to quadrature error otherwise).
-        contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit independent) or
-            "gonzalez" (the paper's (67), for comparison).
+        stress: Discrete derivative of the strain energy, "gonzalez" (exact for every W) or
+            "mean-value" (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to quadrature error otherwise).
+        contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit
+            independent) or "gonzalez" (the paper's (67), for comparison).
         quadrature_points: Gauss points in time of the mean-value stress, 1 to 7.
 
     Raises:

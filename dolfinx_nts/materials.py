@@ -21,7 +21,9 @@ def _lame(young: float, poisson: float) -> tuple[float, float]:
 
 def _check_elastic(young: float, poisson: float) -> None:
     _require(math.isfinite(young) and young > 0, "young", young, "must be positive and finite [Pa]")
-    _require(-1 < poisson < 0.5, "poisson", poisson, "must lie in (-1, 0.5); use e.g. 0.49 for rubber")
+    _require(
+        -1 < poisson < 0.5, "poisson", poisson, "must lie in (-1, 0.5); use e.g. 0.49 for rubber"
+    )
 
 
 @dataclass(frozen=True)
@@ -95,8 +97,15 @@ class MooneyRivlin:
 
     def __post_init__(self) -> None:
         _require(math.isfinite(self.a + self.b), "a, b", self.a + self.b, "must be finite [Pa]")
-        _require(self.a + self.b > 0, "a + b", self.a + self.b, "must be positive [Pa]: half the shear modulus")
-        _require(math.isfinite(self.c) and self.c > 0, "c", self.c, "must be positive and finite [Pa]")
+        _require(
+            self.a + self.b > 0,
+            "a + b",
+            self.a + self.b,
+            "must be positive [Pa]: half the shear modulus",
+        )
+        _require(
+            math.isfinite(self.c) and self.c > 0, "c", self.c, "must be positive and finite [Pa]"
+        )
 
     def __call__(self, c: Any) -> Any:
         """W(C) [J/m^3]."""

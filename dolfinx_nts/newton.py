@@ -1,7 +1,7 @@
 """The problem of one step as PETSc SNES callbacks: residual, nested Jacobian, convergence per block, diagnosis.
 
-The momentum equation is multiplied by h/2 and the multipliers are h^2/2 lambda (theory section 8), which makes the
-condition number independent of h. Nothing here changes a State.
+The momentum equation is multiplied by h/2 and the multipliers are h^2/2 lambda (theory section 8),
+which makes the condition number independent of h. Nothing here changes a State.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from dolfinx_nts.system import State, System
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Direct solve of the converted AIJ; symmetric indefinite pivoting needs more workspace than MUMPS's own guess.
+#: Direct solve of the converted AIJ; symmetric indefinite pivoting needs more workspace than
+# MUMPS's own guess.
 DEFAULT_PETSC_OPTIONS: Mapping[str, Any] = {
     "snes_linesearch_type": "basic",
     "ksp_type": "preonly",
@@ -74,7 +75,8 @@ class BodyTerms:
         internal: h^2/2 internal forces.
         external: h^2/2 external forces.
         contact: h^2/2 contact forces G^T lambda.
-        residual: Complete equation, also at prescribed coordinates, where it is h^2/2 times the reaction.
+        residual: Complete equation, also at prescribed coordinates, where it is h^2/2 times the
+            reaction.
     """
 
     u1: FloatArray
@@ -144,7 +146,11 @@ class StepProblem:
     """
 
     def __init__(
-        self, system: System, integrator: Any, newton: Newton, petsc_options: Mapping[str, Any] | None
+        self,
+        system: System,
+        integrator: Any,
+        newton: Newton,
+        petsc_options: Mapping[str, Any] | None,
     ) -> None:
         self.system, self.integrator, self.newton = system, integrator, newton
         self._options = {**DEFAULT_PETSC_OPTIONS, **(petsc_options or {})}
@@ -166,10 +172,12 @@ class StepProblem:
         self._first = [u + dt * v for u, v in zip(state.u, state.v, strict=True)]
         for body, u1 in zip(system.bodies, self._first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
-        local = np.array([
-            [np.abs(u1 - u).max(initial=0.0), np.abs(b.reference + u1).max(initial=0.0)]
-            for b, u1, u in zip(system.bodies, self._first, state.u, strict=True)
-        ])
+        local = np.array(
+            [
+                [np.abs(u1 - u).max(initial=0.0), np.abs(b.reference + u1).max(initial=0.0)]
+                for b, u1, u in zip(system.bodies, self._first, state.u, strict=True)
+            ]
+        )
         self._motion, self._extent = _global_max(system.comm, local).T
         self._spread = np.zeros(len(system.bodies))
         self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
@@ -205,22 +213,30 @@ class StepProblem:
         multipliers = sum(c.num_pairs * c.num_multipliers for c in contacts)
         any_contact = system.comm.allreduce(multipliers) > 0
         has_augmented = any_contact and any(c.num_augmented for c in contacts)
-        self._fields = ([nb] if has_augmented else []) + ([nb + has_augmented] if any_contact else [])
-        layout = Layout(system.comm, sizes + [augmented] * has_augmented + [multipliers] * any_contact)
+        self._fields = ([nb] if has_augmented else []) + (
+            [nb + has_augmented] if any_contact else []
+        )
+        layout = Layout(
+            system.comm, sizes + [augmented] * has_augmented + [multipliers] * any_contact
+        )
         x = PETSc.Vec().createMPI((layout.num_owned, None), comm=system.comm)
         index = [np.empty((0,), np.int64)]
         for c in contacts:
             slave, master = (system.body_index(s.body) for s in (c.pair.slave, c.pair.master))
             s, m = c.points()
-            index.append(np.concatenate([layout.to_system(slave, s), layout.to_system(master, m)], axis=1).ravel())
+            index.append(
+                np.concatenate(
+                    [layout.to_system(slave, s), layout.to_system(master, m)], axis=1
+                ).ravel()
+            )
         needed = np.concatenate(index)
         local = PETSc.Vec().createSeq(len(needed), comm=PETSc.COMM_SELF)
         source = PETSc.IS().createGeneral(needed.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
         scatter = PETSc.Scatter().create(x, source, local, None)
         source.destroy()
         work = _Workspace(
-            layout, numbers, self._element_blocks(layout), x, x.duplicate(), x.duplicate(), local, scatter,
-            PETSc.SNES().create(system.comm),
+            layout, numbers, self._element_blocks(layout), x, x.duplicate(), x.duplicate(), local,
+            scatter, PETSc.SNES().create(system.comm),
         )  # fmt: skip
         return work
 
@@ -232,17 +248,25 @@ class StepProblem:
         offset = [layout.start(f) for f in self._fields]
         for c in self.contacts:
             slave, master = (self.system.body_index(s.body) for s in (c.pair.slave, c.pair.master))
-            widths = [3, 3 * c.num_corners] + [c.num_augmented] * (len(self._fields) - 1) + [c.num_multipliers]
+            widths = (
+                [3, 3 * c.num_corners]
+                + [c.num_augmented] * (len(self._fields) - 1)
+                + [c.num_multipliers]
+            )
             stops = np.cumsum(widths)
             numbers = list(c.dofs())
             for k, width in enumerate(widths[2:]):
-                numbers.append(offset[k] + np.arange(c.num_pairs * width).reshape(c.num_pairs, width))
+                numbers.append(
+                    offset[k] + np.arange(c.num_pairs * width).reshape(c.num_pairs, width)
+                )
                 offset[k] += c.num_pairs * width
             pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
             pattern[stops[-2] :, stops[-2] :] = False
             pattern[stops[-2], stops[-2]] = True
             columns = tuple(slice(int(b - w), int(b)) for w, b in zip(widths, stops, strict=True))
-            blocks.append(ElementBlocks((slave, master, *self._fields), columns, tuple(numbers), pattern))
+            blocks.append(
+                ElementBlocks((slave, master, *self._fields), columns, tuple(numbers), pattern)
+            )
         return blocks
 
     # ---- iterates
@@ -255,7 +279,9 @@ class StepProblem:
         values = x[self._work.layout.owned(self._fields[which])]
         stops = np.cumsum([c.num_pairs * w for c, w in zip(self.contacts, widths, strict=True)])
         parts = np.split(values, stops[:-1])
-        return [p.reshape(c.num_pairs, w) for p, c, w in zip(parts, self.contacts, widths, strict=True)]
+        return [
+            p.reshape(c.num_pairs, w) for p, c, w in zip(parts, self.contacts, widths, strict=True)
+        ]
 
     def _start(self) -> None:
         """First guess: free flight, no contact force, d and f that fit it."""
@@ -267,7 +293,9 @@ class StepProblem:
                 x[work.layout.owned(k)] = u1
         positions = self._positions(work.x)
         if len(self._fields) == 2:
-            guess = [c.initial_guess(p).ravel() for c, p in zip(self.contacts, positions, strict=True)]
+            guess = [
+                c.initial_guess(p).ravel() for c, p in zip(self.contacts, positions, strict=True)
+            ]
             with work.x as x:
                 x[work.layout.owned(self._fields[0])] = np.concatenate(guess)
 
@@ -282,7 +310,11 @@ class StepProblem:
             size = c.num_pairs * 3 * (c.num_corners + 1)
             s, m = c.pair.slave, c.pair.master
             reference = np.concatenate(
-                [s.reference[s.owned[c.candidates.node]][:, None], m.reference[m.facets[c.candidates.facet]]], axis=1
+                [
+                    s.reference[s.owned[c.candidates.node]][:, None],
+                    m.reference[m.facets[c.candidates.facet]],
+                ],
+                axis=1,
             )
             out.append(reference + u[start : start + size].reshape(reference.shape))
             start += size
@@ -302,14 +334,24 @@ class StepProblem:
         contacts = tuple(
             c.evaluate(p, a, m)
             for c, p, a, m in zip(
-                self.contacts, positions, self._parts(values, "num_augmented", 0), multipliers, strict=True
+                self.contacts,
+                positions,
+                self._parts(values, "num_augmented", 0),
+                multipliers,
+                strict=True,
             )
         )
-        forces = [k.residual[:, : 3 * (c.num_corners + 1)] for c, k in zip(self.contacts, contacts, strict=True)]
+        forces = [
+            k.residual[:, : 3 * (c.num_corners + 1)]
+            for c, k in zip(self.contacts, contacts, strict=True)
+        ]
         work.local.array_w[:] = np.concatenate([np.empty(0), *(f.ravel() for f in forces)])
         work.forces.set(0.0)
         work.scatter.scatter(
-            work.local, work.forces, addv=PETSc.InsertMode.ADD_VALUES, mode=PETSc.ScatterMode.REVERSE
+            work.local,
+            work.forces,
+            addv=PETSc.InsertMode.ADD_VALUES,
+            mode=PETSc.ScatterMode.REVERSE,
         )
         force = work.forces.array_r
         bodies = []
@@ -333,13 +375,20 @@ class StepProblem:
             r = terms.residual.copy()
             r[body.fixed] = 0.0
             out[work.layout.owned(k)] = r
-        for which, name in enumerate(("augmented", "multipliers")[-len(self._fields) :] if self._fields else ()):
-            rows = [_rows(c, k, name).ravel() for c, k in zip(self.contacts, e.contacts, strict=True)]
+        for which, name in enumerate(
+            ("augmented", "multipliers")[-len(self._fields) :] if self._fields else ()
+        ):
+            rows = [
+                _rows(c, k, name).ravel() for c, k in zip(self.contacts, e.contacts, strict=True)
+            ]
             out[work.layout.owned(self._fields[which])] = np.concatenate(rows)
         return out
 
     def _ratios(
-        self, bodies: list[BodyTerms], contacts: tuple[Contribution, ...], multipliers: list[FloatArray]
+        self,
+        bodies: list[BodyTerms],
+        contacts: tuple[Contribution, ...],
+        multipliers: list[FloatArray],
     ) -> dict[str, float]:
         """Residual of each block over what counts as converged there."""
         squares = []
@@ -359,12 +408,17 @@ class StepProblem:
         return ratio
 
     def _contact_ratios(
-        self, bodies: list[BodyTerms], contacts: tuple[Contribution, ...], multipliers: list[FloatArray]
+        self,
+        bodies: list[BodyTerms],
+        contacts: tuple[Contribution, ...],
+        multipliers: list[FloatArray],
     ) -> dict[str, float]:
         moved = max(float(np.abs(b.du).max(initial=0.0)) for b in bodies)
         local = [moved, float(np.isnan([c.residual.sum() for c in contacts]).any())]
         for c, k, m in zip(self.contacts, contacts, multipliers, strict=True):
-            rows = [np.abs(_rows(c, k, name)).max(initial=0.0) for name in ("augmented", "multipliers")]
+            rows = [
+                np.abs(_rows(c, k, name)).max(initial=0.0) for name in ("augmented", "multipliers")
+            ]
             local += [*rows, np.abs(m).max(initial=0.0), c.mass.max(initial=0.0)]
         top = _global_max(self.system.comm, np.array(local))
         if top[1]:
@@ -374,7 +428,9 @@ class StepProblem:
         ratio = {}
         for c, (a, m, force, mass) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
             if c.num_augmented:
-                ratio[f"{c.pair.name} (d, f)"] = _over(a, self.newton.rtol * max(force, mass * motion))
+                ratio[f"{c.pair.name} (d, f)"] = _over(
+                    a, self.newton.rtol * max(force, mass * motion)
+                )
             ratio[f"{c.pair.name} constraints"] = _over(m, length)
         return ratio
 
@@ -383,7 +439,8 @@ class StepProblem:
         """Solve the step that `begin` fixed.
 
         Raises:
-            StepFailedError: Not converged; names the worst block, its node or facet, and active-set flips.
+            StepFailedError: Not converged; names the worst block, its node or facet, and active-set
+                flips.
         """
         work = self._work
         assert work is not None
@@ -395,7 +452,9 @@ class StepProblem:
         last = self._at(work.x)
         if reason <= 0:
             raise StepFailedError(self._diagnosis(last, reason, iterations))
-        return Evaluation(last.x, last.bodies, last.contacts, last.multipliers, last.ratio, iterations)
+        return Evaluation(
+            last.x, last.bodies, last.contacts, last.multipliers, last.ratio, iterations
+        )
 
     def _at(self, x: Any) -> Evaluation:
         """Evaluation at an iterate, reused while SNES asks for the same one."""
@@ -412,7 +471,9 @@ class StepProblem:
     def _jacobian_blocks(self, work: _Workspace) -> None:
         bodies = [b.tangent(u1) for b, u1 in zip(self.system.bodies, self._first, strict=True)]
         work.matrix = StepMatrix(work.layout, bodies, work.elements)
-        work.matrix.assemble([self._zero_tangent(c) for c in self.contacts] if work.elements else [])
+        work.matrix.assemble(
+            [self._zero_tangent(c) for c in self.contacts] if work.elements else []
+        )
 
     @staticmethod
     def _zero_tangent(c: ContactStep) -> FloatArray:
@@ -472,7 +533,8 @@ class StepProblem:
                 i = int(np.nanargmax(size)) if not np.isnan(size).all() else 0
                 node = int(c.pair.slave.original[c.pair.slave.owned[c.candidates.node[i]]])
                 notes.append(
-                    (float(size[i]), f"contact {c.pair.name!r}: node {node} on facet {int(c.candidates.facet[i])}, "
+                    (float(size[i]), f"contact {c.pair.name!r}: node {node} on facet
+                    {int(c.candidates.facet[i])}, "
                      f"{int(flips[i])} active-set flips")
                 )  # fmt: skip
         for body, terms in zip(self.system.bodies, e.bodies, strict=True):
@@ -481,12 +543,18 @@ class StepProblem:
                 r[body.fixed] = 0.0
                 i = int(np.argmax(np.where(np.isnan(r), np.inf, r))) // 3
                 x = body.reference.reshape(-1, 3)[i]
-                notes.append((0.0, f"body {body.name!r}: largest residual at X = ({x[0]:.4g}, {x[1]:.4g}, {x[2]:.4g})"))
+                notes.append(
+                    (
+                        0.0,
+                        f"body {body.name!r}: largest residual at X = ({x[0]:.4g}, {x[1]:.4g}, {x[2]:.4g})",
+                    )
+                )
         gathered = [n for part in self.system.comm.allgather(notes) for n in part]
         top = [text for _, text in sorted(gathered, key=lambda n: -n[0])[:4]]
         return (
             f"step from t={self._state.time:.6g} with dt={self._dt:.3g} not solved after {iterations} iterations (SNES "
-            f"reason {reason}); worst block {worst!r} at {e.ratio[worst]:.3g} times its tolerance; " + "; ".join(top)
+            f"reason {reason}); worst block {worst!r} at {e.ratio[worst]:.3g} times its tolerance; "
+            + "; ".join(top)
         )
 
     def destroy(self) -> None:

@@ -1,9 +1,11 @@
 """Batched node-to-surface element: gap, invariants, constraints, gradients and exact tangents.
 
-Axis 0 of every array is the pair (one slave node, one master facet with nc corners). Two descriptions of the same
-element: the direct one (projection and normal eliminated, for the midpoint rule, theory section 4) and the one in
-invariants (normal d and convective coordinates f as unknowns, for the energy-momentum scheme, sections 3 and 5).
-Nothing here knows about MPI, PETSc or bodies.
+Axis 0 of every array is the pair (one slave node, one master facet with nc corners). Two
+descriptions of the same
+element: the direct one (projection and normal eliminated, for the midpoint rule, theory section 4)
+    and the one in
+invariants (normal d and convective coordinates f as unknowns, for the energy-momentum scheme,
+sections 3 and 5). Nothing here knows about MPI, PETSc or bodies.
 """
 
 from __future__ import annotations
@@ -85,12 +87,13 @@ def gap(x: FloatArray, xi: FloatArray) -> Gap:
     hessian = np.einsum("nk,nilj->nkilj", weight, dnormal)
     hessian -= np.einsum("ni,nka,nalj->nkilj", normal, dshape, dxi)
     size = 3 * (nc + 1)
-    return Gap(value, np.einsum("nk,ni->nki", weight, normal), hessian.reshape(-1, size, size))
+    return Gap(value, np.einsum("nk,ni->nki", weight, normal), hessian.reshape(len(x), size, size))
 
 
 def _solve2(a: FloatArray, b: FloatArray) -> FloatArray:
     """Solve the 2x2 systems a (n, 2, 2) for b (n, 2, ...)."""
-    return np.linalg.solve(a, b.reshape(len(b), 2, b[0].size // 2 if len(b) else 1)).reshape(b.shape)
+    columns = int(np.prod(b.shape[2:]))
+    return np.linalg.solve(a, b.reshape(len(b), 2, columns)).reshape(b.shape)
 
 
 @lru_cache
@@ -118,7 +121,7 @@ def invariant_gradient(z: FloatArray, nc: int) -> FloatArray:
     """D pi(z), shape (n, p, z); linear in z because pi is quadratic (45)."""
     second, linear, _ = _invariant_maps(nc)
     p, size, _ = second.shape
-    return (z @ second.reshape(p * size, size).T).reshape(-1, p, size) + linear
+    return (z @ second.reshape(p * size, size).T).reshape(len(z), p, size) + linear
 
 
 def invariants(z: FloatArray, nc: int, gradient: FloatArray | None = None) -> FloatArray:
@@ -186,8 +189,9 @@ def constraint_gradient(pi: FloatArray, nc: int) -> FloatArray:
 def constraint_curvature(pi: FloatArray, multiplier: FloatArray, nc: int) -> FloatArray:
     """Columns of d2(lambda . g)/dpi2 that belong to f, shape (n, p, 2); all others vanish.
 
-    The constraints are linear in the invariants of x and d once f is held, so the second derivative is these columns,
-    their transpose, and nothing else. Third derivatives of the shape functions vanish for both facets.
+    The constraints are linear in the invariants of x and d once f is held, so the second derivative
+    is these columns, their transpose, and nothing else. Third derivatives of the shape functions
+    vanish for both facets.
     """
     shape, dshape, ddshape = facets.shape(pi[:, -2:], nc)
     yy, yd, _ = _split(pi, nc)

@@ -92,7 +92,8 @@ class Stepper:
 
         Raises:
             ValueError: dt is not positive.
-            StepFailedError: Not solved even with the smallest step; everything accepted so far is kept.
+            StepFailedError: Not solved even with the smallest step; everything accepted so far is
+                kept.
         """
         _positive("dt", dt)
         end, part, retries = self.state.time + dt, 1, 0
@@ -173,8 +174,10 @@ def simulate(
         dt: Step [s], > 0; the last step is shortened to end at t_end.
         t_end: End of the run [s], > 0.
         newton: Tolerances and retries.
-        petsc_options: PETSc options of the step's SNES, without prefix, e.g. {"pc_type": "fieldsplit"}.
-        output: Writers of `dolfinx_nts.output`; each is called after every accepted step that its cadence asks for.
+        petsc_options: PETSc options of the step's SNES, without prefix, e.g. {"pc_type":
+            "fieldsplit"}.
+        output: Writers of `dolfinx_nts.output`; each is called after every accepted step that its
+            cadence asks for.
         progress: Show a progress line on rank 0.
 
     Returns:
@@ -197,11 +200,15 @@ def simulate(
                 writer.write(stepper, last=k == steps - 1)
             if bar is not None:
                 row = stepper.solution.rows[-1]
-                bar.set_postfix(active=int(row["active"]), newton=row["newton_iterations"], refresh=False)
+                bar.set_postfix(
+                    active=int(row["active"]), newton=row["newton_iterations"], refresh=False
+                )
                 bar.update()
         stepper.solution.status = "completed"
     except StepFailedError as failure:
-        stepper.solution.status = f"{failure}. Try a smaller dt, a softer start, or inspect the nodes named here"
+        stepper.solution.status = (
+            f"{failure}. Try a smaller dt, a softer start, or inspect the nodes named here"
+        )
         logger.warning("%s", stepper.solution.status)
     finally:
         for writer in output:

@@ -1,7 +1,8 @@
 """Contact surfaces: oriented facets and their corner points, known on every rank.
 
 Every point of a body is linear in its coordinates, x = X + B u; on a continuum of nodes B only selects, so a surface keeps
-the node numbers of its corner points. Topology is gathered once; positions are gathered when a search needs them.
+the node numbers of its corner points. Topology is gathered once; positions are gathered when a
+search needs them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import facets as facet_math
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.integer[Any]]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 Marker = Callable[[FloatArray], npt.NDArray[np.bool_]]
 
 _CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
@@ -32,18 +33,22 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
 
     Args:
         mesh: dolfinx mesh.
-        marker: Callable x (3, n) -> bool (n,) that must hold at all corners of a facet, or dolfinx meshtags.
+        marker: Callable x (3, n) -> bool (n,) that must hold at all corners of a facet, or dolfinx
+            meshtags.
         tag: Value to look for when `marker` is meshtags.
         what: Name of the argument for messages.
 
     Raises:
         TypeError: `marker` is neither callable nor meshtags with a tag.
-        ValueError: The tags are not facet tags, or no exterior facet is selected, or an interior facet is.
+        ValueError: The tags are not facet tags, or no exterior facet is selected, or an interior
+            facet is.
     """
     exterior = compat.exterior_facets(mesh)
     if tag is None:
         if not callable(marker):
-            raise TypeError(f"{what}={marker!r}: pass a function of x with shape (3, n), or meshtags and a tag")
+            raise TypeError(
+                f"{what}={marker!r}: pass a function of x with shape (3, n), or meshtags and a tag"
+            )
         nodes = compat.entities_to_geometry(mesh, 2, exterior)
         x = mesh.geometry.x
         inside = np.asarray(marker(x[np.unique(nodes)].T), dtype=bool)
@@ -53,7 +58,9 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
         wrong = 0
     else:
         if not hasattr(marker, "find") or marker.dim != 2:
-            raise ValueError(f"{what}={marker!r}: pass facet meshtags (dimension 2), not cell or edge tags")
+            raise ValueError(
+                f"{what}={marker!r}: pass facet meshtags (dimension 2), not cell or edge tags"
+            )
         tagged = marker.find(tag)
         found = np.intersect1d(tagged, exterior).astype(np.int32)
         owned = tagged < mesh.topology.index_map(2).size_local
@@ -61,9 +68,13 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
     total, wrong = (int(n) for n in np.sum(mesh.comm.allgather((len(found), wrong)), axis=0))
     name = what if tag is None else f"{what} (tag {tag})"
     if wrong:
-        raise ValueError(f"{name}: {wrong} interior facets selected; a contact surface must lie on the boundary")
+        raise ValueError(
+            f"{name}: {wrong} interior facets selected; a contact surface must lie on the boundary"
+        )
     if not total:
-        raise ValueError(f"{name}: selects no exterior facet; check the marker's tolerance or the tag")
+        raise ValueError(
+            f"{name}: selects no exterior facet; check the marker's tolerance or the tag"
+        )
     return found
 
 
@@ -73,8 +84,8 @@ class Surface:
     Attributes:
         body: The body it belongs to.
         points: Global node numbers of the corner points, sorted, shape (p,).
-        facets: Corner points of the facets as positions in `points`, cyclic and counter-clockwise seen from outside,
-            shape (m, nc); the order does not depend on the partition.
+        facets: Corner points of the facets as positions in `points`, cyclic and counter-clockwise
+            seen from outside, shape (m, nc); the order does not depend on the partition.
         original: Input numbers of the points, the same for every number of ranks, shape (p,).
         reference: Reference positions [m], shape (p, 3).
         area: Tributary area of each point [m^2], shape (p,).

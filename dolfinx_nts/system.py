@@ -13,7 +13,7 @@ from dolfinx_nts.contact import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.continuum import Body
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.integer[Any]]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +47,8 @@ class System:
 
     Raises:
         TypeError: `gravity` is not three numbers.
-        ValueError: No body, equal names, a contact of a body that is not in the system, or initial penetration beyond
-            one part in a hundred of the facet size.
+        ValueError: No body, equal names, a contact of a body that is not in the system, or initial
+            penetration beyond one part in a hundred of the facet size.
     """
 
     def __init__(
@@ -71,7 +71,9 @@ class System:
         for pair in self.contacts:
             for role, surface in (("slave", pair.slave), ("master", pair.master)):
                 if not any(surface.body is b for b in self.bodies):
-                    raise ValueError(f"contacts: the {role} body {surface.body.name!r} is not among bodies={names}")
+                    raise ValueError(
+                        f"contacts: the {role} body {surface.body.name!r} is not among bodies={names}"
+                    )
         self._check_penetration()
 
     def body_index(self, body: Any) -> int:
