@@ -21,6 +21,7 @@ from dolfinx_nts.contact import ContactStep, Contribution
 from dolfinx_nts.system import State, System
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Direct solve of the converted AIJ; symmetric indefinite pivoting needs more workspace than
 # MUMPS's own guess.
@@ -525,36 +526,23 @@ class StepProblem:
 
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:
         """One sentence that names what failed and where; every rank must call it."""
-        worst = max(e.ratio, key=lambda name: np.inf if np.isnan(e.ratio[name]) else e.ratio[name])
-        notes = []
-        for c, k, flips in zip(self.contacts, e.contacts, self._flips, strict=True):
-            if len(flips):
-                size = np.abs(k.residual[:, 3 * (c.num_corners + 1) :]).max(axis=1) * (1 + flips)
-                i = int(np.nanargmax(size)) if not np.isnan(size).all() else 0
-                node = int(c.pair.slave.original[c.pair.slave.owned[c.candidates.node[i]]])
-                notes.append(
-                    (float(size[i]), f"contact {c.pair.name!r}: node {node} on facet
-                    {int(c.candidates.facet[i])}, "
-                     f"{int(flips[i])} active-set flips")
-                )  # fmt: skip
-        for body, terms in zip(self.system.bodies, e.bodies, strict=True):
-            if body.num_owned:
-                r = np.abs(terms.residual)
-                r[body.fixed] = 0.0
-                i = int(np.argmax(np.where(np.isnan(r), np.inf, r))) // 3
-                x = body.reference.reshape(-1, 3)[i]
-                notes.append(
-                    (
-                        0.0,
-                        f"body {body.name!r}: largest residual at X = ({x[0]:.4g}, {x[1]:.4g}, {x[2]:.4g})",
-                    )
-                )
+        worst = max(e.ratio, key=lambda name: np.nan_to_num(e.ratio[name], nan=np.inf))
+        notes = [
+            _contact_note(c, k, flips)
+            for c, k, flips in zip(self.contacts, e.contacts, self._flips, strict=True)
+            if c.num_pairs
+        ]
+        notes += [
+            _body_note(body, terms)
+            for body, terms in zip(self.system.bodies, e.bodies, strict=True)
+            if body.num_owned
+        ]
         gathered = [n for part in self.system.comm.allgather(notes) for n in part]
         top = [text for _, text in sorted(gathered, key=lambda n: -n[0])[:4]]
         return (
-            f"step from t={self._state.time:.6g} with dt={self._dt:.3g} not solved after {iterations} iterations (SNES "
-            f"reason {reason}); worst block {worst!r} at {e.ratio[worst]:.3g} times its tolerance; "
-            + "; ".join(top)
+            f"step from t={self._state.time:.6g} with dt={self._dt:.3g} not solved after "
+            f"{iterations} iterations (SNES reason {reason}); worst block {worst!r} at "
+            f"{e.ratio[worst]:.3g} times its tolerance; {'; '.join(top)}"
         )
 
     def destroy(self) -> None:
@@ -562,6 +550,25 @@ class StepProblem:
         if self._work is not None:
             self._work.destroy()
             self._work = None
+
+
+def _contact_note(c: ContactStep, k: Contribution, flips: IntArray) -> tuple[float, str]:
+    """The pair that flipped most or is worst solved, with its rank among all notes."""
+    rows = np.abs(k.residual[:, 3 * (c.num_corners + 1) :]).max(axis=1)
+    weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips)
+    i = int(np.argmax(weight))
+    node = int(c.pair.slave.original[c.pair.slave.owned[c.candidates.node[i]]])
+    facet, count = int(c.candidates.facet[i]), int(flips[i])
+    text = f"contact {c.pair.name!r}: node {node} on facet {facet}, {count} active-set flips"
+    return float(weight[i]), text
+
+
+def _body_note(body: Any, terms: BodyTerms) -> tuple[float, str]:
+    """Where the body's equation is worst solved; ranked below contact."""
+    r = np.nan_to_num(np.abs(terms.residual), nan=np.inf)
+    r[body.fixed] = 0.0
+    x = ", ".join(f"{c:.4g}" for c in body.reference.reshape(-1, 3)[int(np.argmax(r)) // 3])
+    return 0.0, f"body {body.name!r}: largest residual at X = ({x})"
 
 
 def _global_max(comm: Any, values: FloatArray) -> FloatArray:
