@@ -128,6 +128,12 @@ def _beyond_edges(xi: FloatArray, nc: int) -> FloatArray:
     return 2 * np.column_stack([-b, a + b - 1, -a])
 
 
+def _solve(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Solve a (n, k, k) y = b (n, k)."""
+    y: FloatArray = np.linalg.solve(a, b[:, :, None])[:, :, 0]
+    return y
+
+
 class Contribution(NamedTuple):
     """Step equations of the pairs at an iterate, scaled to [kg m] (coordinates, d, f) and [m] (constraints).
 
@@ -152,6 +158,7 @@ class ContactStep:
         pair: Its surfaces.
         candidates: This rank's slave nodes and their facets.
         rule: "direct" for the midpoint rule, else the discrete gradient.
+        condense: Whether (d, f) and their multipliers are eliminated pair by pair.
         x0: Slave and corners at t_n [m], shape (n, nc + 1, 3).
         mass: Nodal mass of the slaves [kg], shape (n,); the scale of the active set.
     """
@@ -159,6 +166,7 @@ class ContactStep:
     pair: ContactPair
     candidates: Candidates
     rule: str
+    condense: bool
     x0: FloatArray
     mass: FloatArray
 
@@ -173,14 +181,18 @@ class ContactStep:
         return self.pair.master.facets.shape[1]
 
     @property
+    def _only_normal(self) -> bool:
+        return self.condense or self.rule == "direct"
+
+    @property
     def num_augmented(self) -> int:
         """Unknowns d and f per pair."""
-        return 0 if self.rule == "direct" else nts.NUM_AUGMENTED
+        return 0 if self._only_normal else nts.NUM_AUGMENTED
 
     @property
     def num_multipliers(self) -> int:
         """Multipliers per pair."""
-        return 1 if self.rule == "direct" else nts.NUM_CONSTRAINTS
+        return 1 if self._only_normal else nts.NUM_CONSTRAINTS
 
     def dofs(self) -> tuple[IntArray, IntArray]:
         """Global coordinates of the slaves (n, 3) and of the facets (n, 3 nc) in their bodies; -1 where prescribed."""
@@ -200,8 +212,9 @@ class ContactStep:
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
-        if not self.num_augmented:
-            return np.empty((self.num_pairs, 0))
+        return self._augmented(x) if self.num_augmented else np.empty((self.num_pairs, 0))
+
+    def _augmented(self, x: FloatArray) -> FloatArray:
         xi, converged = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
         xi = np.where(converged[:, None], xi, self.candidates.xi)
         _, _, normal = facets.frame(x[:, 1:], xi)
@@ -219,7 +232,11 @@ class ContactStep:
         """
         if self.rule == "direct":
             return self._direct(x, multiplier)
-        return self._invariants(x, augmented, multiplier)
+        if self.condense:
+            return self._condensed(x, multiplier)
+        residual, tangent, gap = self._invariants(x, augmented, multiplier)
+        row = residual.shape[1] - nts.NUM_CONSTRAINTS
+        return self._complementarity(residual, tangent, gap, multiplier[:, 0], row)
 
     def _direct(self, x: FloatArray, multiplier: FloatArray) -> Contribution:
         middle, end = (self._gap(p) for p in (0.5 * (self.x0 + x), x))
@@ -238,7 +255,8 @@ class ContactStep:
 
     def _invariants(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
-    ) -> Contribution:
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Scaled residual and tangent of (x, d, f, multipliers), and the gap."""
         c, n, nc = self.candidates, self.num_pairs, self.num_corners
         length = c.length[:, None]
         positions = (n, 3 * (nc + 1))
@@ -247,17 +265,40 @@ class ContactStep:
         # One length per pair makes every unknown a length or a force, so blocks compare across
         # units and scales.
         row, one = 1.0 / length, np.ones_like(length)
-        scale_z = np.concatenate([np.ones((n, 3 * (nc + 1))), np.tile(row, 5)], axis=1)
+        scale_z = np.concatenate([np.ones(positions), np.tile(row, nts.NUM_AUGMENTED)], axis=1)
         scale_g = np.concatenate([one, one, one, length, row, row], axis=1)
         e = nts.element(z0, z1, multiplier * scale_g, self.rule)
         size = z1.shape[1]
+        total = size + nts.NUM_CONSTRAINTS
         residual = np.concatenate([e.force * scale_z, e.constraint * scale_g], axis=1)
-        tangent = np.zeros((n, size + 6, size + 6))
+        tangent = np.zeros((n, total, total))
         tangent[:, :size, :size] = e.stiffness * scale_z[:, :, None] * scale_z[:, None]
         mixed = scale_g[:, :, None] * scale_z[:, None]
         tangent[:, :size, size:] = (e.force_gradient * mixed).transpose(0, 2, 1)
         tangent[:, size:, :size] = e.constraint_gradient * mixed
-        return self._complementarity(residual, tangent, e.constraint[:, 0], multiplier[:, 0], size)
+        return residual, tangent, e.constraint[:, 0]
+
+    def _condensed(self, x: FloatArray, multiplier: FloatArray) -> Contribution:
+        """The element in (x, lambda_N) alone: five constraints fix d and f, whose rows fix the rest.
+
+        At the projection of t_{n+1} the augmented constraints hold, and the rows of d and f are
+        linear in their multipliers; the Schur complement is then the exact tangent.
+        """
+        n, size = self.num_pairs, 3 * (self.num_corners + 1)
+        normal = size + nts.NUM_AUGMENTED
+        augmented = self._augmented(x)
+        full = np.zeros((n, nts.NUM_CONSTRAINTS))
+        full[:, :1] = multiplier
+        rows, columns = slice(size, normal), slice(normal + 1, None)
+        residual, tangent, _ = self._invariants(x, augmented, full)
+        full[:, 1:] = -_solve(tangent[:, rows, columns], residual[:, rows])
+        residual, tangent, gap = self._invariants(x, augmented, full)
+        outer = np.r_[:size, normal]
+        inner = np.setdiff1d(np.arange(tangent.shape[1]), outer)
+        left = tangent[:, outer[:, None], inner]
+        inside = np.linalg.solve(tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer])
+        reduced = tangent[:, outer[:, None], outer] - np.matmul(left, inside)
+        return self._complementarity(residual[:, outer], reduced, gap, multiplier[:, 0], size)
 
     def _complementarity(
         self,

@@ -279,6 +279,8 @@ class Continuum:
         self.initial_velocity = values[: self.num_owned].copy()
 
     def _build_constant_forms(self) -> None:
+        # A Constant, not a number: bodies of any density share one compiled form.
+        self._rho = fem.Constant(self.mesh, float(self.density))
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         mesh = self.mesh
         self._loads = [fem.Constant(mesh, np.zeros(3)) for _ in range(1 + len(self._traction))]
@@ -290,7 +292,7 @@ class Continuum:
         if ufl.as_ufl(energy).ufl_shape != ():
             raise TypeError(f"material of {self.name!r}: W(C) must be a UFL scalar")
         mass, self._load_form, self._energy_form = compat.compile_forms(
-            [self.density * ufl.inner(v, w) * self._dx, load, energy * self._dx]
+            [self._rho * ufl.inner(v, w) * self._dx, load, energy * self._dx]
         )
         self._mass = compat.create_matrix(mass)
         compat.assemble_matrix(self._mass, mass, (), 0.0)
@@ -314,7 +316,7 @@ class Continuum:
                 extra = self._extra_form(um, vm, w)
                 virtual = work + extra
             stiffness = self._h**2 / 2 * ufl.derivative(virtual, self._u1, du)
-            tangent = self.density * ufl.inner(du, w) * self._dx + stiffness
+            tangent = self._rho * ufl.inner(du, w) * self._dx + stiffness
             forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
             self._compiled[integrator] = (
                 forms[0],

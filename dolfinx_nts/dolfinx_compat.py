@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import importlib
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import dolfinx
@@ -155,13 +157,25 @@ def subspace_component_bc(space: Any, component: int, blocked_dofs: IntArray) ->
 
 
 # ---- forms and assembly
+@contextmanager
+def _quiet_compiler() -> Iterator[None]:
+    """0.5.2 sends the C compiler's progress to the root logger, whose level it raises itself."""
+    before = logging.root.manager.disable
+    logging.disable(logging.INFO)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
 def compile_forms(forms: Sequence[Any]) -> list[Any]:
     """Compile forms; all signatures come first because 0.5.2's depend on what was compiled before."""
     for f in forms:
         f.signature()
     options = {"cffi_extra_compile_args": ["-O2"], "timeout": 600}
     if _OLD:
-        return [fem.form(f, form_compiler_params={}, jit_params=options) for f in forms]
+        with _quiet_compiler():
+            return [fem.form(f, form_compiler_params={}, jit_params=options) for f in forms]
     return [fem.form(f, jit_options=options) for f in forms]
 
 

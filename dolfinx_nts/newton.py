@@ -44,6 +44,8 @@ class Newton:
         rtol: Largest residual of a block relative to the forces (or motions) of the step, > 0.
         max_iterations: Newton iterations before a step is dropped.
         max_retries: How often a dropped step may be halved before the run stops.
+        condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies and
+            lambda_N reach the linear solver; the same solution with a smaller factorisation.
 
     Raises:
         ValueError: An argument is out of range.
@@ -52,6 +54,7 @@ class Newton:
     rtol: float = 1e-12
     max_iterations: int = 25
     max_retries: int = 8
+    condense: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.rtol < 1:
@@ -195,7 +198,9 @@ class StepProblem:
         x = pair.slave.positions(state.u[slave])[pair.slave.owned[found.node]]
         mass = pair.slave.body.nodal_mass[pair.slave.rows[found.node, 0]]
         x0 = np.concatenate([x[:, None], corners], axis=1)
-        return ContactStep(pair, found, self.integrator.contact_gradient, x0, mass)
+        return ContactStep(
+            pair, found, self.integrator.contact_gradient, self.newton.condense, x0, mass
+        )
 
     def _prepare(self) -> None:
         """Layout, scatter and solver of this step; kept from the last one if no rank's candidates changed."""

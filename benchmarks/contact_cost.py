@@ -1,0 +1,81 @@
+"""What contact costs: a Newton iteration with about 300 active pairs against the same bodies without contact.
+
+Two elastic blocks of about 50k coordinates collide face to face. The same steps are run with and without the contact pair;
+printed are seconds per Newton iteration and their ratio. Run it on 1 and 2 ranks for the speed-up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+
+def _spinning(speed: float) -> Any:
+    """Translation along x with a spin about y, so that bodies work without contact too."""
+    return lambda x: np.array([speed + 0.5 * x[2], 0 * x[0], -0.5 * x[0]])
+
+
+def blocks(comm: MPI.Comm, cells: int, *, contact: bool) -> nts.System:
+    """Two blocks, the first moving towards the second; `cells` scales the mesh."""
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    box = dict(cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
+    left_cells, right_cells = [cells + 5, cells, cells], [cells + 3] * 3
+    left = nts.Continuum(
+        create_box(comm, [[0, 0, 0], [1, 1, 1]], left_cells, **box),
+        rubber, density=1e3, velocity=_spinning(2.0), name="left",
+    )  # fmt: skip
+    right = nts.Continuum(
+        create_box(comm, [[1.001, -0.1, -0.1], [2.201, 1.1, 1.1]], right_cells, **box),
+        rubber, density=1e3, velocity=_spinning(0.0), name="right",
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        slave=left.surface(lambda x: x[0] > 1 - 1e-9),
+        master=right.surface(lambda x: x[0] < 1.001 + 1e-9),
+    )
+    return nts.System([left, right], contacts=[pair] if contact else [])
+
+
+def seconds_per_iteration(system: nts.System, steps: int, dt: float) -> tuple[float, float, int]:
+    """Seconds per Newton iteration and per step, and active pairs, after the first two steps."""
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    for _ in range(2):
+        stepper.advance(dt)
+    rows, begin = len(stepper.solution.rows), time.perf_counter()
+    for _ in range(steps):
+        stepper.advance(dt)
+    elapsed = time.perf_counter() - begin
+    new = stepper.solution.rows[rows:]
+    iterations = int(np.sum([r["newton_iterations"] for r in new]))
+    stepper.close()
+    return elapsed / iterations, elapsed / steps, int(new[-1]["active"])
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cells", type=int, default=17, help="cells across the first block")
+    parser.add_argument("--steps", type=int, default=3)
+    options = parser.parse_args()
+    comm = MPI.COMM_WORLD
+    result = {}
+    for contact in (False, True):
+        system = blocks(comm, options.cells, contact=contact)
+        result[contact] = seconds_per_iteration(system, options.steps, 5e-4)
+    if comm.rank == 0:
+        size = sum(b.space.dofmap.index_map.size_global * 3 for b in system.bodies)
+        print(f"{size} coordinates, {comm.size} ranks, {result[True][2]} active pairs")
+        for contact, (iteration, step, _) in result.items():
+            name = "with contact" if contact else "no contact"
+            print(f"{name:>13}: {iteration:.3f} s per Newton iteration, {step:.3f} s per step")
+        print(f"ratio per iteration {result[True][0] / result[False][0]:.3f}")
+
+
+if __name__ == "__main__":
+    main()

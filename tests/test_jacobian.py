@@ -1,0 +1,277 @@
+"""The Jacobian of a step against differences of its residual, and the convergence it gives."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+CELLS = {"hex": CellType.hexahedron, "tet": CellType.tetrahedron}
+RULES = {
+    "midpoint": nts.Midpoint(),
+    "energy-momentum": nts.EnergyMomentum(),
+    "mean-value stress": nts.EnergyMomentum(stress="mean-value"),
+    "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
+}
+ACTIVE = ("none", "all", "mixed")
+#: Exact for polynomials up to degree 4.
+STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
+
+
+def box(low, high, n, cell):
+    return create_box(COMM, [low, high], [n, n, n], cell, ghost_mode=GhostMode.shared_facet)
+
+
+def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), comm=COMM):
+    """A small block above a larger one; its lower face is the slave."""
+    rubber = nts.NeoHookean(1e3, 0.3)
+    upper = nts.Continuum(
+        box([0.07, 0.12, 1 + gap], [0.87, 0.92, 1.8 + gap], 2, CELLS[cell]),
+        rubber,
+        density=1.0,
+        velocity=(0, 0, -speed),
+        name="upper",
+    )
+    lower = nts.Continuum(
+        box([0, 0, 0], [1, 1, 1], 2, CELLS[cell]), rubber, density=1.5, name="lower", bcs=bcs
+    )
+    pair = nts.ContactPair(
+        slave=upper.surface(lambda x: x[2] < 1 + gap + 1e-9),
+        master=lower.surface(lambda x: x[2] > 1 - 1e-9),
+    )
+    return nts.System([upper, lower], contacts=[pair])
+
+
+def smooth_motion(x, amplitude, phase):
+    """A displacement that does not depend on how the mesh is distributed."""
+    k = np.array([[1.1, 0.7, -0.4], [-0.6, 1.3, 0.8], [0.5, -0.9, 1.2]])
+    return amplitude * np.sin(x @ k.T + phase)
+
+
+def rotation(angle):
+    axis = np.array([1.0, 2.0, 3.0]) / np.sqrt(14)
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
+def rotated_state(system, angle=0.8, fixed=False):
+    """Both blocks turned in space, deformed, spinning and moving towards each other."""
+    turn, u, v = rotation(angle), [], []
+    for k, body in enumerate(system.bodies):
+        x = body.reference.reshape(-1, 3)
+        now = (x + smooth_motion(x, 0.03, k)) @ turn.T + [0.3, -0.2, 0.1]
+        velocity = np.cross([0.5, -0.8, 1.1], now) + smooth_motion(x, 0.4, 2.0 + k)
+        velocity += (0.5 - k) * -2.0 * turn[:, 2]
+        u.append((now - x).ravel())
+        v.append(velocity.ravel())
+        if fixed:
+            u[-1][body.fixed] = v[-1][body.fixed] = 0.0
+    start = system.initial_state()
+    return nts.State(0.0, tuple(u), tuple(v), start.facets, start.force, start.gap)
+
+
+class Linearised:
+    """A step problem at an iterate away from its solution."""
+
+    def __init__(self, system, rule, active, state, dt=0.02):
+        self.stepper = nts.Stepper(system, RULES[rule])
+        self.problem = problem = self.stepper.problem
+        problem.begin(state, dt)
+        self.work = work = problem._work
+        rng = np.random.default_rng(COMM.rank)
+        layout = work.layout
+        with work.x as x:
+            for k, body in enumerate(system.bodies):
+                here = layout.owned(k)
+                push = smooth_motion(body.reference.reshape(-1, 3), 0.02, 5.0 + k).ravel()
+                push[body.fixed] = 0.0
+                x[here] += push
+            if len(problem._fields) == 2:
+                here = layout.owned(problem._fields[0])
+                x[here] += 0.03 * rng.uniform(-1, 1, here.stop - here.start)
+        contact = problem.contacts[0]
+        gap = problem._at(work.x).contacts[0].gap
+        on = {
+            "none": np.zeros(len(gap), bool),
+            "all": np.ones(len(gap), bool),
+            "mixed": rng.uniform(size=len(gap)) < 0.5,
+        }[active]
+        margin = np.where(on, -1, 1) * rng.uniform(0.2, 0.4, len(gap))
+        force = 0.05 * rng.uniform(-1, 1, (len(gap), contact.num_multipliers))
+        force[:, 0] = contact.mass * (margin - gap)
+        with work.x as x:
+            x[layout.owned(problem._fields[-1])] = force.ravel()
+        evaluation = problem._at(work.x)
+        assert np.array_equal(evaluation.contacts[0].active, on)
+        self.candidates, self.active = len(gap), on
+        problem._jacobian_blocks(work)
+        problem._snes_jacobian(None, work.x, None, None)
+
+    def residual(self, x):
+        other = self.work.x.duplicate()
+        other.array_w[:] = x
+        r = self.problem._residual(self.problem.evaluate(other))
+        other.destroy()
+        return r
+
+    def close(self):
+        self.stepper.close()
+
+    def blocks(self):
+        fields = range(self.work.layout.counts.shape[1])
+        return [self.work.layout.owned(f) for f in fields]
+
+
+def dense(a):
+    rows, cols = (np.arange(n, dtype=np.int32) for n in a.getSize())
+    return a.getValues(rows, cols)
+
+
+def block_errors(found, expected, blocks):
+    """Largest difference of each block over its largest entry; of all entries where it is zero."""
+    errors = {}
+    for i, rows in enumerate(blocks):
+        for j, cols in enumerate(blocks):
+            e, f = expected[rows, cols], found[rows, cols]
+            scale = np.abs(f if f.any() else found).max(initial=0.0)
+            errors[i, j] = np.abs(f - e).max(initial=0.0) / scale
+    return errors
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+@pytest.mark.parametrize("active", ACTIVE)
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("cell", CELLS)
+def test_jacobian_is_the_derivative_of_the_residual(cell, rule, active):
+    system = two_blocks(cell)
+    at = Linearised(system, rule, active, rotated_state(system))
+    assert at.candidates == 9
+    x, step = at.work.x.array_r.copy(), 1e-4
+    expected = np.zeros((len(x), len(x)))
+    for j in range(len(x)):
+        for k, weight in STENCIL:
+            other = x.copy()
+            other[j] += k * step
+            expected[:, j] += weight / step * at.residual(other)
+    errors = block_errors(dense(at.work.matrix.aij), expected, at.blocks())
+    at.close()
+    assert max(errors.values()) < 1e-8, errors
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+@pytest.mark.parametrize("rule", RULES)
+def test_prescribed_coordinates_hold_only_a_diagonal(rule):
+    bcs = [nts.Dirichlet(lambda x: x[0] > 1 - 1e-9, components=(0, 2))]
+    system = two_blocks("hex", bcs=bcs)
+    at = Linearised(system, rule, "mixed", rotated_state(system, 0.1, fixed=True))
+    offset = at.work.layout.owned(1).start
+    fixed = offset + system.bodies[1].fixed
+    assert len(fixed) == 18
+    matrix, x, step = dense(at.work.matrix.aij), at.work.x.array_r.copy(), 1e-4
+    off = matrix.copy()
+    off[fixed, fixed] = 0.0
+    assert (matrix[fixed, fixed] > 0).all()
+    assert not off[fixed].any() and not off[:, fixed].any()
+    assert not at.residual(x)[fixed].any()
+    free = np.setdiff1d(np.arange(len(x)), fixed)
+    expected = np.zeros_like(matrix)
+    for j in free:
+        for k, weight in STENCIL:
+            other = x.copy()
+            other[j] += k * step
+            expected[:, j] += weight / step * at.residual(other)
+    expected[fixed, fixed] = matrix[fixed, fixed]
+    errors = block_errors(matrix, expected, at.blocks())
+    at.close()
+    assert max(errors.values()) < 1e-8, errors
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+@pytest.mark.parametrize("rule", RULES)
+def test_nest_and_aij_are_the_same_matrix(rule):
+    system = two_blocks("hex")
+    at = Linearised(system, rule, "mixed", rotated_state(system))
+    for _ in range(2):
+        nest, whole, blocks = at.work.matrix.nest, dense(at.work.matrix.aij), at.blocks()
+        for i, rows in enumerate(blocks):
+            for j, cols in enumerate(blocks):
+                part = nest.getNestSubMatrix(i, j)
+                values = dense(part) if part else np.zeros_like(whole[rows, cols])
+                assert np.array_equal(values, whole[rows, cols])
+        # Reassembled elsewhere, with the same pattern.
+        with at.work.x as x:
+            x[:] *= 1.01
+        at.problem._snes_jacobian(None, at.work.x, None, None)
+        assert not np.array_equal(dense(at.work.matrix.aij), whole)
+    at.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("active", ACTIVE)
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("cell", CELLS)
+def test_jacobian_along_directions(cell, rule, active):
+    """As above on any number of ranks: matrix times direction, through AIJ and nest."""
+    system = two_blocks(cell)
+    at = Linearised(system, rule, active, rotated_state(system))
+    assert COMM.allreduce(at.candidates) == 9
+    x, step = at.work.x.array_r.copy(), 1e-5
+    rng = np.random.default_rng(100 + COMM.rank)
+    direction, product = at.work.x.duplicate(), at.work.x.duplicate()
+    for which in range(len(at.blocks())):
+        p = np.zeros(len(x))
+        here = at.blocks()[which]
+        p[here] = rng.uniform(-1, 1, here.stop - here.start)
+        direction.array_w[:] = p
+        expected = sum(w / step * at.residual(x + k * step * p) for k, w in STENCIL)
+        for matrix in (at.work.matrix.aij, at.work.matrix.nest):
+            matrix.mult(direction, product)
+            for rows in at.blocks():
+                error = np.abs(product.array_r[rows] - expected[rows]).max(initial=0.0)
+                top = COMM.allreduce(np.abs(product.array_r[rows]).max(initial=0.0), op=MPI.MAX)
+                # Where nothing depends on p, the differences leave rounding errors.
+                assert error <= 1e-8 * (top or 1e-2)
+    direction.destroy()
+    product.destroy()
+    at.close()
+
+
+def convergence(system, rule, state, dt):
+    """Residual norm and active set of every iterate of a step."""
+    stepper = nts.Stepper(system, RULES[rule])
+    problem = stepper.problem
+    problem.begin(state, dt)
+    problem._jacobian_blocks(problem._work)
+    problem._configure(problem._work)
+    norms, sets = [], []
+
+    def record(snes, iteration, norm):
+        norms.append(norm)
+        sets.append([c.active.copy() for c in problem._last.contacts])
+
+    problem._work.snes.setMonitor(record)
+    problem.solve()
+    stepper.close()
+    return np.array(norms), sets
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("cell", CELLS)
+def test_newton_converges_quadratically(cell, rule, turned):
+    """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""
+    system = two_blocks(cell, gap=0.02, speed=6.0)
+    state = rotated_state(system) if turned else system.initial_state()
+    norms, sets = convergence(system, rule, state, 0.02)
+    assert COMM.allreduce(int(sum(s.sum() for s in sets[-1]))) >= 3
+    last = 0
+    for k, (a, b) in enumerate(zip(sets[:-1], sets[1:], strict=True), start=1):
+        changed = any(not np.array_equal(*pair) for pair in zip(a, b, strict=True))
+        last = k if COMM.allreduce(changed, op=MPI.LOR) else last
+    r = norms[last:] / norms.max()
+    near = np.flatnonzero((r[:-1] < 0.1) & (r[:-1] > 1e-14))
+    assert len(near) >= 3
+    assert (r[near + 1] < 5 * r[near] ** 2 + 1e-14).all(), r
