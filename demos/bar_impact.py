@@ -13,8 +13,8 @@ most 3.3333e-3 and leaves with +1e-2, undeformed.
 
 With `--gravity` the bar is dropped instead (acceleration 1e-2, v0 = 0). Contact is from 1 to 5/3 at
 a pressure that rises from 0.3 to 0.5, and from 11/3 to 13/3 at one that falls from 0.5 to 0.3,
-because the bar vibrates in the flight between; impulse 0.266667 each; at 16/3 it is at rest where it
-started.
+because the bar vibrates in the flight between; impulse 0.266667 each; at 16/3 it is at rest where
+it started.
 
 What to see. The end of the bar follows the exact solution. The pressure oscillates about it from
 step to step, as contact enforced at t_{n+1} on nodes that have mass must; the mean of two steps is
@@ -51,9 +51,7 @@ def scene(comm, elements, gravity):
     """Bar along x in front of a wall whose face is x = 0."""
     ghosts = GhostMode.shared_facet
     bar_box = [[GAP, 0, 0], [GAP + LENGTH, 1, 1]]
-    bar_mesh = create_box(
-        comm, bar_box, [elements, 1, 1], CellType.hexahedron, ghost_mode=ghosts
-    )
+    bar_mesh = create_box(comm, bar_box, [elements, 1, 1], CellType.hexahedron, ghost_mode=ghosts)
     wall_mesh = create_box(
         comm, [[-1, -0.5, -0.5], [0, 1.5, 1.5]], [1, 2, 2], CellType.hexahedron, ghost_mode=ghosts
     )
@@ -99,9 +97,11 @@ class Recorder:
     """A writer that keeps what happens at both ends of the bar, the same on all ranks."""
 
     def start(self, stepper):
+        """Begin anew."""
         self.rows = []
 
-    def write(self, stepper, last):
+    def write(self, stepper, *, last=False):
+        """Add the accepted state."""
         pair, state = stepper.system.contacts[0], stepper.state
         bar = stepper.system.bodies[0]
         x = bar.reference[0::3] + state.u[0][0::3]
@@ -111,6 +111,7 @@ class Recorder:
         self.rows.append((state.time, near, force / AREA, LENGTH - (far - near)))
 
     def close(self, stepper):
+        """Make columns of the rows."""
         self.time, self.gap, self.pressure, self.shortening = np.array(self.rows).T
 
 

@@ -67,7 +67,9 @@ def scene(
     left = nts.Continuum(
         box([0, 0, 0], 1.0, 0.0, cells[0]), material, density=density, velocity=spin, name="left"
     )
-    right = nts.Continuum(box([1.05, 0, 0], 1.2, -0.1, cells[1]), material, density=density, name="right")
+    right = nts.Continuum(
+        box([1.05, 0, 0], 1.2, -0.1, cells[1]), material, density=density, name="right"
+    )
     tolerance = 1e-9 * metre
     pair = nts.ContactPair(
         slave=left.surface(lambda x: x[0] > metre - tolerance),

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from dolfinx_nts.system import State, System
 
 if TYPE_CHECKING:
-    from dolfinx_nts.newton import Evaluation, StepProblem
+    from dolfinx_nts.step import Evaluation, StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -181,6 +181,11 @@ class ContactStep:
         return self.pair.master.facets.shape[1]
 
     @property
+    def num_coordinates(self) -> int:
+        """Coordinates of the slave and the corners of a pair."""
+        return 3 * (self.num_corners + 1)
+
+    @property
     def _only_normal(self) -> bool:
         return self.condense or self.rule == "direct"
 
@@ -209,6 +214,18 @@ class ContactStep:
         return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(
             -1, 3 * self.num_corners
         )
+
+    def reference(self) -> FloatArray:
+        """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
+        c, slave, master = self.candidates, self.pair.slave, self.pair.master
+        nodes = slave.reference[slave.owned[c.node]]
+        return np.concatenate([nodes[:, None], master.reference[master.facets[c.facet]]], axis=1)
+
+    def rows(self, k: Contribution, name: str) -> FloatArray:
+        """The residual's rows of the "augmented" unknowns or the "multipliers", shape (n, width)."""
+        start = self.num_coordinates
+        middle = start + self.num_augmented
+        return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
@@ -240,7 +257,7 @@ class ContactStep:
 
     def _direct(self, x: FloatArray, multiplier: FloatArray) -> Contribution:
         middle, end = (self._gap(p) for p in (0.5 * (self.x0 + x), x))
-        n, size = self.num_pairs, 3 * (self.num_corners + 1)
+        n, size = self.num_pairs, self.num_coordinates
         gradient = middle.gradient.reshape(n, size)
         residual = np.concatenate([multiplier * gradient, end.value[:, None]], axis=1)
         tangent = np.zeros((n, size + 1, size + 1))
@@ -257,9 +274,9 @@ class ContactStep:
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Scaled residual and tangent of (x, d, f, multipliers), and the gap."""
-        c, n, nc = self.candidates, self.num_pairs, self.num_corners
+        c, n = self.candidates, self.num_pairs
         length = c.length[:, None]
-        positions = (n, 3 * (nc + 1))
+        positions = (n, self.num_coordinates)
         z0 = np.concatenate([self.x0.reshape(positions), c.normal, c.xi], axis=1)
         z1 = np.concatenate([x.reshape(positions), augmented / length], axis=1)
         # One length per pair makes every unknown a length or a force, so blocks compare across
@@ -284,7 +301,7 @@ class ContactStep:
         At the projection of t_{n+1} the augmented constraints hold, and the rows of d and f are
         linear in their multipliers; the Schur complement is then the exact tangent.
         """
-        n, size = self.num_pairs, 3 * (self.num_corners + 1)
+        n, size = self.num_pairs, self.num_coordinates
         normal = size + nts.NUM_AUGMENTED
         augmented = self._augmented(x)
         full = np.zeros((n, nts.NUM_CONSTRAINTS))
@@ -296,7 +313,9 @@ class ContactStep:
         outer = np.r_[:size, normal]
         inner = np.setdiff1d(np.arange(tangent.shape[1]), outer)
         left = tangent[:, outer[:, None], inner]
-        inside = np.linalg.solve(tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer])
+        inside = np.linalg.solve(
+            tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer]
+        )
         reduced = tangent[:, outer[:, None], outer] - np.matmul(left, inside)
         return self._complementarity(residual[:, outer], reduced, gap, multiplier[:, 0], size)
 

@@ -646,7 +646,7 @@ def _colour_scale(drawn: Sequence[_Drawn], colour: str, limits: Any) -> Any:
 
 
 def _painted(drawn: Sequence[_Drawn], scale: Any) -> Any:
-    """What faces the viewer, from back to front, as a matplotlib collection."""
+    """What faces the viewer, from back to front."""
     from matplotlib.collections import PolyCollection
 
     corners, values = (np.concatenate([d[k] for d in drawn]) for k in (1, 2))
@@ -692,6 +692,8 @@ def _furnish(
     named: Sequence[_Drawn],
 ) -> None:
     """Colour bar, axes' directions, scale bar and names."""
+    from matplotlib.transforms import Affine2D
+
     total, box = figure.get_size_inches(), axes.get_position()
     height = min(box.height, max(0.8 * box.height, 2.0 / total[1]))
     place = (box.x1 + 0.2 / total[0], box.y0 + (box.height - height) / 2, 0.14 / total[0], height)
@@ -701,15 +703,23 @@ def _furnish(
     bar.formatter.set_powerlimits((-2, 4))
     bar.outline.set_visible(False)
 
-    inch = figure.dpi_scale_trans
+    # Not figure.dpi_scale_trans, which bbox_inches="tight" leaves behind.
+    inch = Affine2D().scale(*1 / total) + figure.transFigure
 
     def line(start: tuple[float, float], end: tuple[float, float], **look: Any) -> None:
         axes.annotate("", end, start, inch, inch, annotation_clip=False, arrowprops=look)
 
     for name, (x, y) in zip("xyz", 0.32 * _axes_of(*view)[:2].T, strict=True):
         line((0.5, 0.35), (0.5 + x, 0.35 + y), arrowstyle="->", lw=0.8, shrinkA=0, shrinkB=0)
-        place = (0.5 + 1.35 * x, 0.35 + 1.35 * y)
-        axes.text(*place, name, fontsize=8, ha="center", va="center", transform=inch)
+        axes.text(
+            0.5 + 1.35 * x,
+            0.35 + 1.35 * y,
+            name,
+            fontsize=8,
+            ha="center",
+            va="center",
+            transform=inch,
+        )
     metre = box.width * total[0] / float(np.diff(axes.get_xlim())[0])
     power = 10.0 ** math.floor(math.log10(1.5 / metre))
     length = max(k * power for k in (1, 2, 5) if k * power * metre <= 1.5)

@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import balance
-from dolfinx_nts.newton import Evaluation, Newton, StepFailedError, StepProblem
+from dolfinx_nts.newton import Newton, StepFailedError, StepSolver
+from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.system import State, System
 
 logger = logging.getLogger(__name__)
@@ -63,7 +64,8 @@ class Stepper:
     Attributes:
         state: Last accepted state.
         solution: Balance table so far.
-        problem: The step problem, for those who want its parts.
+        problem: Equations of the step, for those who want their parts.
+        solver: The SNES that solves them.
     """
 
     def __init__(
@@ -77,7 +79,10 @@ class Stepper:
         if not (hasattr(integrator, "piola") and hasattr(integrator, "contact_gradient")):
             raise TypeError(f"integrator={integrator!r}: pass Midpoint() or EnergyMomentum()")
         self.newton = newton or Newton()
-        self.problem = StepProblem(system, integrator, self.newton, petsc_options)
+        self.problem = StepProblem(
+            system, integrator, rtol=self.newton.rtol, condense=self.newton.condense
+        )
+        self.solver = StepSolver(self.problem, self.newton, petsc_options)
         self.system, self.state = system, system.initial_state()
         self.solution = Solution(system, rows=[balance.first_row(system, self.state)])
 
@@ -115,7 +120,7 @@ class Stepper:
 
     def _step(self, dt: float, time: float) -> None:
         self.problem.begin(self.state, dt)
-        step = self.problem.solve()
+        step = self.solver.solve()
         state = self._accepted(step, dt, time)
         rows = self.solution.rows
         terms = balance.step_terms(self.problem, step, dt)
@@ -147,6 +152,7 @@ class Stepper:
 
     def close(self) -> None:
         """Free the PETSc objects of the last step."""
+        self.solver.destroy()
         self.problem.destroy()
 
 

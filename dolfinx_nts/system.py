@@ -74,11 +74,11 @@ class System:
                     raise ValueError(
                         f"contacts: the {role} body {surface.body.name!r} is not among bodies={names}"
                     )
+        index = {id(b): i for i, b in enumerate(self.bodies)}
+        self.contact_bodies = [
+            (index[id(c.slave.body)], index[id(c.master.body)]) for c in self.contacts
+        ]
         self._check_penetration()
-
-    def body_index(self, body: Any) -> int:
-        """Position of a body in `bodies`."""
-        return next(i for i, b in enumerate(self.bodies) if b is body)
 
     def initial_state(self) -> State:
         """Undeformed bodies with their initial velocities at t = 0."""
@@ -95,8 +95,9 @@ class System:
     def _check_penetration(self) -> None:
         """Raise on every rank, with the nodes, if slaves start inside their masters."""
         state = self.initial_state()
-        for pair, facets in zip(self.contacts, state.facets, strict=True):
-            slave, master = (self.body_index(s.body) for s in (pair.slave, pair.master))
+        for pair, (slave, master), facets in zip(
+            self.contacts, self.contact_bodies, state.facets, strict=True
+        ):
             found = pair.find(state.u[slave], state.u[master], facets, 0.0)
             deep = found.gap < -INITIAL_PENETRATION * found.length
             nodes = pair.slave.original[pair.slave.owned[found.node[deep]]]

@@ -24,7 +24,7 @@ def box(low, high, n, cell):
     return create_box(COMM, [low, high], [n, n, n], cell, ghost_mode=GhostMode.shared_facet)
 
 
-def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), comm=COMM):
+def two_blocks(cell, gap=0.0, speed=0.0, bcs=()):
     """A small block above a larger one; its lower face is the slave."""
     rubber = nts.NeoHookean(1e3, 0.3)
     upper = nts.Continuum(
@@ -79,20 +79,21 @@ class Linearised:
         self.stepper = nts.Stepper(system, RULES[rule])
         self.problem = problem = self.stepper.problem
         problem.begin(state, dt)
-        self.work = work = problem._work
+        self.solver = self.stepper.solver
         rng = np.random.default_rng(COMM.rank)
-        layout = work.layout
-        with work.x as x:
+        layout = problem.layout
+        fields = range(len(system.bodies), layout.counts.shape[1])
+        with problem.x as x:
             for k, body in enumerate(system.bodies):
                 here = layout.owned(k)
                 push = smooth_motion(body.reference.reshape(-1, 3), 0.02, 5.0 + k).ravel()
                 push[body.fixed] = 0.0
                 x[here] += push
-            if len(problem._fields) == 2:
-                here = layout.owned(problem._fields[0])
+            if len(fields) == 2:
+                here = layout.owned(fields[0])
                 x[here] += 0.03 * rng.uniform(-1, 1, here.stop - here.start)
         contact = problem.contacts[0]
-        gap = problem._at(work.x).contacts[0].gap
+        gap = problem.evaluate(problem.x).contacts[0].gap
         on = {
             "none": np.zeros(len(gap), bool),
             "all": np.ones(len(gap), bool),
@@ -101,18 +102,17 @@ class Linearised:
         margin = np.where(on, -1, 1) * rng.uniform(0.2, 0.4, len(gap))
         force = 0.05 * rng.uniform(-1, 1, (len(gap), contact.num_multipliers))
         force[:, 0] = contact.mass * (margin - gap)
-        with work.x as x:
-            x[layout.owned(problem._fields[-1])] = force.ravel()
-        evaluation = problem._at(work.x)
+        with problem.x as x:
+            x[layout.owned(fields[-1])] = force.ravel()
+        evaluation = problem.evaluate(problem.x)
         assert np.array_equal(evaluation.contacts[0].active, on)
         self.candidates, self.active = len(gap), on
-        problem._jacobian_blocks(work)
-        problem._snes_jacobian(None, work.x, None, None)
+        self.solver.assemble(evaluation)
 
     def residual(self, x):
-        other = self.work.x.duplicate()
+        other = self.problem.x.duplicate()
         other.array_w[:] = x
-        r = self.problem._residual(self.problem.evaluate(other))
+        r = self.problem.residual(self.problem.evaluate(other))
         other.destroy()
         return r
 
@@ -120,8 +120,8 @@ class Linearised:
         self.stepper.close()
 
     def blocks(self):
-        fields = range(self.work.layout.counts.shape[1])
-        return [self.work.layout.owned(f) for f in fields]
+        fields = range(self.problem.layout.counts.shape[1])
+        return [self.problem.layout.owned(f) for f in fields]
 
 
 def dense(a):
@@ -148,14 +148,14 @@ def test_jacobian_is_the_derivative_of_the_residual(cell, rule, active):
     system = two_blocks(cell)
     at = Linearised(system, rule, active, rotated_state(system))
     assert at.candidates == 9
-    x, step = at.work.x.array_r.copy(), 1e-4
+    x, step = at.problem.x.array_r.copy(), 1e-4
     expected = np.zeros((len(x), len(x)))
     for j in range(len(x)):
         for k, weight in STENCIL:
             other = x.copy()
             other[j] += k * step
             expected[:, j] += weight / step * at.residual(other)
-    errors = block_errors(dense(at.work.matrix.aij), expected, at.blocks())
+    errors = block_errors(dense(at.solver.matrix.aij), expected, at.blocks())
     at.close()
     assert max(errors.values()) < 1e-8, errors
 
@@ -166,10 +166,10 @@ def test_prescribed_coordinates_hold_only_a_diagonal(rule):
     bcs = [nts.Dirichlet(lambda x: x[0] > 1 - 1e-9, components=(0, 2))]
     system = two_blocks("hex", bcs=bcs)
     at = Linearised(system, rule, "mixed", rotated_state(system, 0.1, fixed=True))
-    offset = at.work.layout.owned(1).start
+    offset = at.problem.layout.owned(1).start
     fixed = offset + system.bodies[1].fixed
     assert len(fixed) == 18
-    matrix, x, step = dense(at.work.matrix.aij), at.work.x.array_r.copy(), 1e-4
+    matrix, x, step = dense(at.solver.matrix.aij), at.problem.x.array_r.copy(), 1e-4
     off = matrix.copy()
     off[fixed, fixed] = 0.0
     assert (matrix[fixed, fixed] > 0).all()
@@ -194,39 +194,38 @@ def test_nest_and_aij_are_the_same_matrix(rule):
     system = two_blocks("hex")
     at = Linearised(system, rule, "mixed", rotated_state(system))
     for _ in range(2):
-        nest, whole, blocks = at.work.matrix.nest, dense(at.work.matrix.aij), at.blocks()
+        nest, whole, blocks = at.solver.matrix.nest, dense(at.solver.matrix.aij), at.blocks()
         for i, rows in enumerate(blocks):
             for j, cols in enumerate(blocks):
                 part = nest.getNestSubMatrix(i, j)
                 values = dense(part) if part else np.zeros_like(whole[rows, cols])
                 assert np.array_equal(values, whole[rows, cols])
         # Reassembled elsewhere, with the same pattern.
-        with at.work.x as x:
+        with at.problem.x as x:
             x[:] *= 1.01
-        at.problem._snes_jacobian(None, at.work.x, None, None)
-        assert not np.array_equal(dense(at.work.matrix.aij), whole)
+        at.solver.assemble(at.problem.evaluate(at.problem.x))
+        assert not np.array_equal(dense(at.solver.matrix.aij), whole)
     at.close()
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("active", ACTIVE)
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("cell", CELLS)
-def test_jacobian_along_directions(cell, rule, active):
+def test_jacobian_along_directions(cell, rule):
     """As above on any number of ranks: matrix times direction, through AIJ and nest."""
     system = two_blocks(cell)
-    at = Linearised(system, rule, active, rotated_state(system))
+    at = Linearised(system, rule, "mixed", rotated_state(system))
     assert COMM.allreduce(at.candidates) == 9
-    x, step = at.work.x.array_r.copy(), 1e-5
+    x, step = at.problem.x.array_r.copy(), 1e-5
     rng = np.random.default_rng(100 + COMM.rank)
-    direction, product = at.work.x.duplicate(), at.work.x.duplicate()
+    direction, product = at.problem.x.duplicate(), at.problem.x.duplicate()
     for which in range(len(at.blocks())):
         p = np.zeros(len(x))
         here = at.blocks()[which]
         p[here] = rng.uniform(-1, 1, here.stop - here.start)
         direction.array_w[:] = p
         expected = sum(w / step * at.residual(x + k * step * p) for k, w in STENCIL)
-        for matrix in (at.work.matrix.aij, at.work.matrix.nest):
+        for matrix in (at.solver.matrix.aij, at.solver.matrix.nest):
             matrix.mult(direction, product)
             for rows in at.blocks():
                 error = np.abs(product.array_r[rows] - expected[rows]).max(initial=0.0)
@@ -243,22 +242,21 @@ def convergence(system, rule, state, dt):
     stepper = nts.Stepper(system, RULES[rule])
     problem = stepper.problem
     problem.begin(state, dt)
-    problem._jacobian_blocks(problem._work)
-    problem._configure(problem._work)
+    solver = stepper.solver
+    solver.prepare()
     norms, sets = [], []
 
     def record(snes, iteration, norm):
         norms.append(norm)
-        sets.append([c.active.copy() for c in problem._last.contacts])
+        sets.append([c.active.copy() for c in solver._last.contacts])
 
-    problem._work.snes.setMonitor(record)
-    problem.solve()
+    solver.snes.setMonitor(record)
+    solver.solve()
     stepper.close()
     return np.array(norms), sets
 
 
-@pytest.mark.mpi
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("turned", [False, pytest.param(True, marks=pytest.mark.mpi)])
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("cell", CELLS)
 def test_newton_converges_quadratically(cell, rule, turned):
@@ -272,6 +270,8 @@ def test_newton_converges_quadratically(cell, rule, turned):
         changed = any(not np.array_equal(*pair) for pair in zip(a, b, strict=True))
         last = k if COMM.allreduce(changed, op=MPI.LOR) else last
     r = norms[last:] / norms.max()
-    near = np.flatnonzero((r[:-1] < 0.1) & (r[:-1] > 1e-14))
+    # Rounding of masses times positions ends the sequence a little below this.
+    floor = 1e-13
+    near = np.flatnonzero((r[:-1] < 0.3) & (r[:-1] > floor))
     assert len(near) >= 3
-    assert (r[near + 1] < 5 * r[near] ** 2 + 1e-14).all(), r
+    assert (r[near + 1] < 5 * r[near] ** 2 + floor).all(), r

@@ -25,10 +25,11 @@ LEVELS = [
         "search",
         "surfaces",
         "materials",
+        "mesh_input",
         "integrators",
     },
     {"system", "balance"},
-    {"newton", "assembly"},
+    {"newton", "step", "assembly"},
     {"simulate", "output", "tradeoff"},
     {"__init__"},
 ]

@@ -405,7 +405,7 @@ def test_picture(colour, cell, mpi_tmp_path):
     output.picture(system.bodies, path, colour=colour, title="t = 0", labels=True, width=3.0)
     pixels = image.imread(path)
     used = pixels[..., :3].min(axis=-1) < 0.9
-    margin = 0.06 * max(pixels.shape)
+    margin = 0.04 * max(pixels.shape)
     for axis in (0, 1):
         seen = np.flatnonzero(used.any(axis=axis))
         assert seen[0] < margin and seen[-1] > used.shape[1 - axis] - margin

@@ -1,0 +1,358 @@
+"""The equations of one step: unknowns, residual, contact tangents and how well each block is solved.
+
+The momentum equation is multiplied by h/2 and the multipliers are h^2/2 lambda (theory section 8),
+which makes the condition number independent of h. Evaluations are pure: nothing here changes a
+State, and history changes only when a step is accepted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dolfinx_nts.assembly import ElementBlocks, Layout
+from dolfinx_nts.contact import ContactStep, Contribution
+from dolfinx_nts.system import State, System
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+_EPS = float(np.finfo(float).eps)
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTerms:
+    """Parts of a body's equation at an iterate, owned coordinates, [kg m] except u1 and du [m].
+
+    Attributes:
+        u1: Displacement at t_{n+1}.
+        du: u_1 - u_0.
+        internal: h^2/2 internal forces.
+        external: h^2/2 external forces.
+        contact: h^2/2 contact forces G^T lambda.
+        residual: Complete equation, also at prescribed coordinates, where it is h^2/2 times the
+            reaction.
+    """
+
+    u1: FloatArray
+    du: FloatArray
+    internal: FloatArray
+    external: FloatArray
+    contact: FloatArray
+    residual: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The step equations at an iterate.
+
+    Attributes:
+        x: Iterate it belongs to, this rank's part.
+        bodies: Terms of each body.
+        contacts: Contribution of each contact.
+        multipliers: Multipliers of each contact [kg m], shape (n, multipliers).
+        ratio: Residual of each block over what counts as converged; solved when all are <= 1.
+        iterations: Newton iterations it took.
+    """
+
+    x: FloatArray
+    bodies: tuple[BodyTerms, ...]
+    contacts: tuple[Contribution, ...]
+    multipliers: tuple[FloatArray, ...]
+    ratio: dict[str, float]
+    iterations: int = 0
+
+
+class StepProblem:
+    """Equations of one step of a system; `begin` fixes the step.
+
+    Args:
+        system: The scene.
+        integrator: `Midpoint()` or `EnergyMomentum()`.
+        rtol: Residual of a block that counts as solved, relative to the forces or motions of the
+            step.
+        condense: Eliminate (d, f) and their multipliers pair by pair.
+
+    Attributes:
+        contacts: Candidates of each contact in this step.
+        layout: Fields of the unknowns.
+        elements: Unknowns of the contact elements; empty without candidates.
+        x: PETSc vector of the unknowns, holding the first guess after `begin`.
+        version: Changes whenever layout and elements do.
+    """
+
+    def __init__(self, system: System, integrator: Any, *, rtol: float, condense: bool) -> None:
+        self.system, self.integrator = system, integrator
+        self._rtol, self._condense = rtol, condense
+        self._numbers: tuple[Any, ...] | None = None
+        self._petsc: list[Any] = []
+        self.version = 0
+
+    # ---- set-up of a step
+    def begin(self, state: State, dt: float) -> None:
+        """Fix the state at t_n and the step: loads, candidates, layout, first guess.
+
+        Args:
+            state: State at t_n.
+            dt: Step [s].
+        """
+        system = self.system
+        self.state, self.dt, self._factor = state, dt, 0.5 * dt**2
+        for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+            body.begin_step(self.integrator, u, v, state.time, dt)
+        self._inertia = [b.inertia(dt * v) for b, v in zip(system.bodies, state.v, strict=True)]
+        self.first = [u + dt * v for u, v in zip(state.u, state.v, strict=True)]
+        for body, u1 in zip(system.bodies, self.first, strict=True):
+            u1[body.fixed] = body.prescribed(state.time + dt)
+        local = [
+            [np.abs(u1 - u).max(initial=0.0), np.abs(b.reference + u1).max(initial=0.0)]
+            for b, u1, u in zip(system.bodies, self.first, state.u, strict=True)
+        ]
+        self._motion, self._extent = _global_max(system.comm, np.array(local)).T
+        self._rounding = np.zeros(len(system.bodies))
+        self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
+        numbers = tuple(a for c in self.contacts for a in c.points())
+        if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
+            self._numbers = numbers
+            self._lay_out()
+        self._guess()
+
+    def _contact_step(self, index: int) -> ContactStep:
+        pair, state = self.system.contacts[index], self.state
+        slave, master = self.system.contact_bodies[index]
+        reach = np.sqrt(3.0) * float(self._motion[slave] + self._motion[master])
+        found = pair.find(state.u[slave], state.u[master], state.facets[index], reach)
+        corners = pair.master.positions(state.u[master])[pair.master.facets[found.facet]]
+        x = pair.slave.positions(state.u[slave])[pair.slave.owned[found.node]]
+        mass = pair.slave.body.nodal_mass[pair.slave.rows[found.node, 0]]
+        x0 = np.concatenate([x[:, None], corners], axis=1)
+        rule = self.integrator.contact_gradient
+        return ContactStep(pair, found, rule, self._condense, x0, mass)
+
+    def _lay_out(self) -> None:
+        """Layout, vectors and scatter; kept from step to step while no rank's candidates change."""
+        self.destroy()
+        system, contacts, num_bodies = self.system, self.contacts, len(self.system.bodies)
+        sizes = [b.num_owned for b in system.bodies]
+        multipliers = sum(c.num_pairs * c.num_multipliers for c in contacts)
+        self._fields: dict[str, int] = {}
+        if system.comm.allreduce(multipliers) > 0:
+            if any(c.num_augmented for c in contacts):
+                self._fields["augmented"] = num_bodies
+                sizes.append(sum(c.num_pairs * c.num_augmented for c in contacts))
+            self._fields["multipliers"] = len(sizes)
+            sizes.append(multipliers)
+        self.layout = Layout(system.comm, sizes)
+        self.elements = self._element_blocks() if self._fields else []
+        index = [np.empty(0, np.int64)]
+        for c, bodies in zip(contacts, system.contact_bodies, strict=True):
+            parts = [self.layout.to_system(b, p) for b, p in zip(bodies, c.points(), strict=True)]
+            index.append(np.concatenate(parts, axis=1).ravel())
+        needed = np.concatenate(index).astype(PETSc.IntType)
+        self.x = PETSc.Vec().createMPI((self.layout.num_owned, None), comm=system.comm)
+        self._forces = self.x.duplicate()
+        self._local = PETSc.Vec().createSeq(len(needed), comm=PETSc.COMM_SELF)
+        source = PETSc.IS().createGeneral(needed, comm=PETSc.COMM_SELF)
+        self._scatter = PETSc.Scatter().create(self.x, source, self._local, None)
+        source.destroy()
+        self._petsc = [self.x, self._forces, self._local, self._scatter]
+        self.version += 1
+
+    def _element_blocks(self) -> list[ElementBlocks]:
+        """Numbers of the contact elements' unknowns in their fields."""
+        blocks = []
+        offset = {name: self.layout.start(f) for name, f in self._fields.items()}
+        for c, bodies in zip(self.contacts, self.system.contact_bodies, strict=True):
+            own = {"augmented": c.num_augmented, "multipliers": c.num_multipliers}
+            widths = [3, 3 * c.num_corners] + [own[name] for name in self._fields]
+            numbers = list(c.dofs())
+            for name in self._fields:
+                count = c.num_pairs * own[name]
+                new = offset[name] + np.arange(count)
+                numbers.append(new.reshape(c.num_pairs, own[name]))
+                offset[name] += count
+            stops = np.cumsum(widths)
+            pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
+            pattern[stops[-2] :, stops[-2] :] = False
+            pattern[stops[-2], stops[-2]] = True
+            columns = tuple(slice(int(b - w), int(b)) for w, b in zip(widths, stops, strict=True))
+            fields = (*bodies, *self._fields.values())
+            blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
+        return blocks
+
+    def _guess(self) -> None:
+        """First guess: free flight, no contact force, d and f that fit it."""
+        with self.x as x:
+            x[:] = 0.0
+            for k, u1 in enumerate(self.first):
+                x[self.layout.owned(k)] = u1
+        if "augmented" in self._fields:
+            positions = self._positions(self.x)
+            guess = [
+                c.initial_guess(p).ravel() for c, p in zip(self.contacts, positions, strict=True)
+            ]
+            with self.x as x:
+                x[self.layout.owned(self._fields["augmented"])] = np.concatenate(guess)
+
+    # ---- iterates
+    def _positions(self, x: Any) -> list[FloatArray]:
+        """Slave and corners of each contact's pairs at an iterate [m], shape (n, nc + 1, 3)."""
+        self._scatter.scatter(x, self._local, mode=PETSc.ScatterMode.FORWARD)
+        u, start, out = self._local.array_r, 0, []
+        for c in self.contacts:
+            reference = c.reference()
+            out.append(reference + u[start : start + reference.size].reshape(reference.shape))
+            start += reference.size
+        return out
+
+    def _unknowns(self, x: FloatArray, name: str) -> list[FloatArray]:
+        """This rank's "augmented" unknowns or "multipliers" of each contact, shape (n, width)."""
+        widths = [getattr(c, f"num_{name}") for c in self.contacts]
+        shapes = [(c.num_pairs, w) for c, w in zip(self.contacts, widths, strict=True)]
+        if name not in self._fields:
+            return [np.zeros(s) for s in shapes]
+        stops = np.cumsum([n * w for n, w in shapes])
+        parts = np.split(x[self.layout.owned(self._fields[name])], stops[:-1])
+        return [p.reshape(s) for p, s in zip(parts, shapes, strict=True)]
+
+    def evaluate(self, x: Any) -> Evaluation:
+        """The step equations at an iterate; pure. Every rank must call it.
+
+        Args:
+            x: PETSc vector of the unknowns.
+        """
+        values = x.array_r.copy()
+        multipliers = self._unknowns(values, "multipliers")
+        augmented = self._unknowns(values, "augmented")
+        contacts = tuple(
+            c.evaluate(*arguments)
+            for c, *arguments in zip(
+                self.contacts, self._positions(x), augmented, multipliers, strict=True
+            )
+        )
+        force = self._contact_forces(contacts)
+        bodies = []
+        for k, (body, u0) in enumerate(zip(self.system.bodies, self.state.u, strict=True)):
+            here = self.layout.owned(k)
+            u1 = values[here]
+            internal = self._factor * body.internal(u1)
+            external = self._factor * body.external(u1, self.system.gravity)
+            du, contact = u1 - u0, force[here]
+            residual = body.inertia(du) - self._inertia[k] + internal - external + contact
+            bodies.append(BodyTerms(u1, du, internal, external, contact, residual))
+        ratio = self._ratios(bodies, contacts, multipliers)
+        return Evaluation(values, tuple(bodies), contacts, tuple(multipliers), ratio)
+
+    def _contact_forces(self, contacts: tuple[Contribution, ...]) -> FloatArray:
+        """G^T lambda of all contacts in this rank's coordinates [kg m]."""
+        parts = [
+            k.residual[:, : c.num_coordinates].ravel()
+            for c, k in zip(self.contacts, contacts, strict=True)
+        ]
+        self._local.array_w[:] = np.concatenate([np.empty(0), *parts])
+        self._forces.set(0.0)
+        add, reverse = PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE
+        self._scatter.scatter(self._local, self._forces, addv=add, mode=reverse)
+        force: FloatArray = self._forces.array_r.copy()
+        return force
+
+    def residual(self, e: Evaluation) -> FloatArray:
+        """This rank's part of the residual, zero at prescribed coordinates."""
+        out = np.zeros(self.layout.num_owned)
+        for k, (body, terms) in enumerate(zip(self.system.bodies, e.bodies, strict=True)):
+            out[self.layout.owned(k)] = _free(body, terms.residual)
+        for name, f in self._fields.items():
+            rows = [c.rows(k, name).ravel() for c, k in zip(self.contacts, e.contacts, strict=True)]
+            out[self.layout.owned(f)] = np.concatenate(rows)
+        return out
+
+    def body_tangents(self, e: Evaluation) -> list[Any]:
+        """PETSc matrices of the bodies at an iterate, without contact."""
+        tangents = [b.tangent(t.u1) for b, t in zip(self.system.bodies, e.bodies, strict=True)]
+        for k, a in enumerate(tangents):
+            if self._rounding[k] == 0.0:
+                diagonal = a.getDiagonal()
+                # Rounding of the forces: stiffness times position times machine precision.
+                self._rounding[k] = _EPS * diagonal.norm() * self._extent[k]
+                diagonal.destroy()
+        return tangents
+
+    # ---- convergence
+    def _ratios(
+        self,
+        bodies: list[BodyTerms],
+        contacts: tuple[Contribution, ...],
+        multipliers: list[FloatArray],
+    ) -> dict[str, float]:
+        """Residual of each block over what counts as converged there."""
+        squares = []
+        for k, (body, t) in enumerate(zip(self.system.bodies, bodies, strict=True)):
+            free = _free(body, t.residual)
+            parts = (free, self._inertia[k], t.internal, t.external, t.contact)
+            squares.append([float(p @ p) for p in parts])
+        norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
+        ratio = {}
+        for k, body in enumerate(self.system.bodies):
+            limit = self._rtol * norms[k, 1:].max() + self._rounding[k]
+            ratio[body.name] = _over(norms[k, 0], limit)
+        if self._fields:
+            ratio |= self._contact_ratios(bodies, contacts, multipliers)
+        return ratio
+
+    def _contact_ratios(
+        self,
+        bodies: list[BodyTerms],
+        contacts: tuple[Contribution, ...],
+        multipliers: list[FloatArray],
+    ) -> dict[str, float]:
+        moved = max(float(np.abs(b.du).max(initial=0.0)) for b in bodies)
+        # MPI's maximum may swallow a NaN, so it travels as a flag.
+        local = [moved, float(any(np.isnan(k.residual).any() for k in contacts))]
+        for c, k, m in zip(self.contacts, contacts, multipliers, strict=True):
+            arrays = (c.rows(k, "augmented"), c.rows(k, "multipliers"), m, c.mass)
+            local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
+        top = _global_max(self.system.comm, np.array(local))
+        motion = max(top[0], float(self._motion.max()))
+        length = self._rtol * motion + 8 * _EPS * float(self._extent.max())
+        ratio = {}
+        for c, (a, g, force, mass) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
+            broken = np.inf if top[1] else 0.0
+            if c.num_augmented:
+                limit = self._rtol * max(force, mass * motion)
+                ratio[f"{c.pair.name} (d, f)"] = max(_over(a, limit), broken)
+            ratio[f"{c.pair.name} constraints"] = max(_over(g, length), broken)
+        return ratio
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, which Python's collector does not."""
+        for a in self._petsc:
+            a.destroy()
+        self._petsc = []
+
+
+def _free(body: Any, residual: FloatArray) -> FloatArray:
+    """Residual with zeros at the prescribed coordinates, whose equation is the prescription."""
+    free = residual.copy()
+    free[body.fixed] = 0.0
+    return free
+
+
+def _global_max(comm: Any, values: FloatArray) -> FloatArray:
+    out = np.array(values, dtype=np.float64)
+    comm.Allreduce(MPI.IN_PLACE, out, op=MPI.MAX)
+    return out
+
+
+def _over(value: float, limit: float) -> float:
+    if value == 0.0:
+        return 0.0
+    return float(value / limit) if limit > 0 else np.inf
+
+
+def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:
+    return b is not None and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))

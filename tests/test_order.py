@@ -1,0 +1,113 @@
+"""Both integrators are of second order, in free flight and while contact persists."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+INTEGRATORS = {
+    "midpoint": nts.Midpoint(),
+    "energy-momentum": nts.EnergyMomentum(),
+    "mean-value stress": nts.EnergyMomentum(stress="mean-value"),
+    "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
+}
+FREE = [name for name in INTEGRATORS if name != "gonzalez contact"]
+
+
+def box(low, high, n=(1, 1, 1)):
+    return create_box(
+        COMM, [low, high], list(n), CellType.hexahedron, ghost_mode=GhostMode.shared_facet
+    )
+
+
+def run(make_system, integrator, t_end, steps):
+    """Final displacements and velocities of all bodies, and the Stepper."""
+    stepper = nts.Stepper(make_system(), INTEGRATORS[integrator])
+    for k in range(1, steps + 1):
+        stepper.advance(k * t_end / steps - stepper.state.time)
+    stepper.close()
+    assert stepper.solution.retries == 0
+    return np.concatenate(stepper.state.u), np.concatenate(stepper.state.v), stepper
+
+
+def rates(results, reference):
+    """Observed orders between successive halvings of h, and the errors relative to the largest value."""
+    errors = np.array([np.abs(r - reference).max() for r in results]) / np.abs(reference).max()
+    return np.log2(errors[:-1] / errors[1:]), errors
+
+
+def flying_block():
+    """A soft block that spins and is stretched while it flies."""
+
+    def velocity(x):
+        centre = np.array([[1.0], [0.5], [0.5]])
+        r = x - centre
+        spin = np.cross(np.array([1.0, 2.0, 3.0]), r.T).T
+        return spin + np.array([[1.5], [-0.8], [0.4]]) * r + np.array([[0.5], [0.2], [-0.1]])
+
+    body = nts.Continuum(
+        box([0, 0, 0], [2, 1, 1], (2, 1, 1)),
+        nts.NeoHookean(50.0, 0.3),
+        density=1.0,
+        velocity=velocity,
+        name="block",
+    )
+    return nts.System([body])
+
+
+@pytest.mark.parametrize("integrator", FREE)
+def test_free_flight(integrator):
+    t_end, steps = 0.5, (25, 50, 100)
+    *results, reference = [run(flying_block, integrator, t_end, n)[:2] for n in (*steps, 1000)]
+    for which in range(2):
+        order, errors = rates([r[which] for r in results], reference[which])
+        assert errors[0] < 0.1
+        assert np.abs(order - 2.0).max() < 0.1, (order, errors)
+
+
+def sliding_block():
+    """A block pressed harder and harder onto a soft one that it slides over, within one facet.
+
+    The load starts from zero as t^2 does, so the four slave nodes carry from the first step on
+    and no node is ever activated or released.
+    """
+    rubber = nts.NeoHookean(200.0, 0.3)
+    upper = nts.Continuum(
+        box([0.2, 0.25, 1.0], [0.7, 0.75, 1.5]),
+        rubber,
+        density=1.0,
+        velocity=(0.3, -0.2, 0.0),
+        body_force=lambda t: (0.0, 0.0, -60.0 * t**2 * (3.0 - 2.0 * t)),
+        name="upper",
+    )
+    lower = nts.Continuum(
+        box([0, 0, 0], [1, 1, 1]),
+        rubber,
+        density=1.0,
+        bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9)],
+        name="lower",
+    )
+    pair = nts.ContactPair(
+        slave=upper.surface(lambda x: x[2] < 1 + 1e-9),
+        master=lower.surface(lambda x: x[2] > 1 - 1e-9),
+    )
+    return nts.System([upper, lower], contacts=[pair])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_persistent_contact(integrator):
+    t_end, steps = 0.5, (25, 50, 100)
+    results = []
+    for n in (*steps, 1000):
+        u, v, stepper = run(sliding_block, integrator, t_end, n)
+        balance = stepper.solution.balance
+        assert (balance["active"][1:] == 4).all()
+        results.append((u, v))
+    *results, reference = results
+    for which in range(2):
+        order, errors = rates([r[which] for r in results], reference[which])
+        print(integrator, which, order, errors)
+        assert np.abs(order - 2.0).max() < 0.1, (order, errors)

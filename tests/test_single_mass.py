@@ -1,0 +1,216 @@
+"""B6: one mass on a rigid wall, which rebounds with |1 - 2 theta|, theta = g_0/(h v).
+
+The mass is a body of the user's own: three coordinates, a constant mass matrix, no potential. It
+shows all that `System` and `ContactPair` ask of a body and of a surface.
+"""
+
+import dolfinx
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+STALE = "StepProblem._at keeps an Evaluation whose ratio was made before _spread was known"
+MASS, SPEED, STEP = 2.5, 3.0, 0.02
+INTEGRATORS = {
+    "midpoint": nts.Midpoint(),
+    "energy-momentum": nts.EnergyMomentum(),
+    "gonzalez": nts.EnergyMomentum(contact_gradient="gonzalez"),
+}
+
+
+class PointMass:
+    """A mass at one point; rank 0 owns its three coordinates."""
+
+    def __init__(self, comm, mass, position, velocity, name="mass"):
+        self.name, self.comm, self.mass = name, comm, mass
+        self.num_owned = n = 3 if comm.rank == 0 else 0
+        self.reference = np.array(position, dtype=float)[:n]
+        self.initial_velocity = np.array(velocity, dtype=float)[:n]
+        self.nodal_mass = np.full(n, mass)
+        self.fixed = np.empty(0, dtype=np.int64)
+        self.u, self.v = np.zeros(n), self.initial_velocity.copy()
+        self._matrix = PETSc.Mat().createAIJ(((n, None), (n, None)), nnz=3, comm=comm)
+        first = self._matrix.getOwnershipRange()[0]
+        self._rows = np.arange(first, first + n, dtype=PETSc.IntType)
+
+    def begin_step(self, integrator, u0, v0, time, dt):
+        pass
+
+    def inertia(self, v):
+        return self.mass * v
+
+    def internal(self, u1):
+        return np.zeros(self.num_owned)
+
+    def external(self, u1, gravity):
+        return self.mass * gravity[: self.num_owned]
+
+    def tangent(self, u1):
+        self._matrix.zeroEntries()
+        self._matrix.setValues(self._rows, self._rows, self.mass * np.eye(self.num_owned))
+        self._matrix.assemble()
+        return self._matrix
+
+    def prescribed(self, time):
+        return np.empty(0)
+
+    def potential(self, u):
+        return 0.0
+
+    def linear_momentum(self, momentum):
+        return momentum.reshape(-1, 3).sum(axis=0)
+
+    def angular_momentum(self, u, momentum):
+        x = (self.reference + u).reshape(-1, 3)
+        return np.cross(x, momentum.reshape(-1, 3)).sum(axis=0)
+
+    def accept(self, u, v):
+        self.u, self.v = u.copy(), v.copy()
+
+
+class PointSurface(nts.Surface):
+    """The mass as a slave surface: one point, no facets."""
+
+    def __init__(self, body, position):
+        self.body = body
+        self.points, self.original = np.array([0]), np.array([0])
+        self.reference = np.array([position], dtype=float)
+        self.facets, self.area = np.empty((0, 4), dtype=np.int64), np.ones(1)
+        self.owned = np.arange(body.num_owned // 3)
+        self.rows = np.arange(body.num_owned).reshape(-1, 3)
+        self.fixed = np.zeros((1, 3), dtype=bool)
+
+
+def turn(angle=0.7):
+    axis = np.array([1.0, -2.0, 2.0]) / 3
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
+def wall(turned=False):
+    """One fixed hexahedron; its surface is at z = 0, or turned in space."""
+    mesh = create_box(
+        COMM, [[-1, -1, -1], [1, 1, 0]], [2, 2, 1], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    q = turn() if turned else np.eye(3)
+    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
+    tags = dolfinx.mesh.meshtags(mesh, 2, np.sort(top), np.full(len(top), 1, np.int32))
+    mesh.geometry.x[:] = mesh.geometry.x @ q.T
+    body = nts.Continuum(
+        mesh,
+        nts.StVenantKirchhoff(1.0, 0.3),
+        density=1.0,
+        name="wall",
+        bcs=[nts.Dirichlet(lambda x: np.full(x.shape[1], True))],
+    )
+    return body, body.surface(tags, 1), q
+
+
+def mass_on_wall(gap, velocity=(0.0, 0.0, -SPEED), turned=False):
+    body, master, q = wall(turned)
+    position, velocity = q @ [0.3, 0.2, gap], q @ velocity
+    mass = PointMass(COMM, MASS, position, velocity)
+    pair = nts.ContactPair(slave=PointSurface(mass, position), master=master)
+    return nts.System([mass, body], contacts=[pair]), q
+
+
+def run(system, integrator, steps):
+    """Velocities of the mass after each step on every rank, shape (steps + 1, 3), and the Stepper."""
+    stepper = nts.Stepper(system, INTEGRATORS[integrator])
+    v = [COMM.bcast(stepper.state.v[0])]
+    for _ in range(steps):
+        stepper.advance(STEP)
+        v.append(COMM.bcast(stepper.state.v[0]))
+    stepper.close()
+    return np.array(v), stepper
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    "theta",
+    [0.0, 0.1, 0.25, 0.49, 0.51, 0.75, 0.99, 1.0]
+    + [pytest.param(0.5, marks=pytest.mark.xfail(raises=nts.StepFailedError, reason=STALE))],
+)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_rebound(integrator, theta, turned):
+    system, q = mass_on_wall(theta * STEP * SPEED, turned=turned)
+    v, stepper = run(system, integrator, 4)
+    normal = v @ q[:, 2] / SPEED
+    rows = stepper.solution.balance
+    # The step that closes the gap leaves 2 theta - 1 of the speed; a step from contact reflects.
+    expected = [-1.0, 1 - 2 * theta] + 3 * [abs(1 - 2 * theta)]
+    assert np.allclose(normal, expected, rtol=0, atol=1e-12)
+    assert np.allclose(v @ q[:, :2], 0.0, rtol=0, atol=1e-12)
+    if theta not in (0.5, 1.0):
+        # At 0.5 the mass rests on the wall, at 1 it arrives there at the end of a step.
+        contact_steps = 1 if theta < 0.5 else 2
+        assert rows["active"].tolist() == [0.0] + contact_steps * [1.0] + (4 - contact_steps) * [0.0]
+    lost = 2 * MASS * SPEED**2 * theta * (1 - theta)
+    energy = 0.5 * MASS * SPEED**2
+    assert np.allclose(rows["contact_defect"][1:], lost, rtol=0, atol=1e-12 * energy)
+    assert np.allclose(rows["energy"][1:], energy - lost, rtol=0, atol=1e-12 * energy)
+    assert np.abs(rows["ledger_residual"]).max() < 1e-12 * energy
+    assert rows["min_gap"].min() > -1e-12 * STEP * SPEED
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_contact_force_and_momentum(integrator):
+    theta = 0.3
+    system, _ = mass_on_wall(theta * STEP * SPEED, velocity=(0.4, -0.7, -SPEED))
+    v, stepper = run(system, integrator, 1)
+    # m (v_1 - v_0) = h p with v_1 = (1 - 2 theta) v: the tangential velocity is untouched.
+    force = 2 * MASS * SPEED * (1 - theta) / STEP
+    assert np.isclose(COMM.allreduce(stepper.state.force[0].sum()), force, rtol=1e-12)
+    assert np.allclose(v[1], [0.4, -0.7, (1 - 2 * theta) * SPEED], rtol=0, atol=1e-12 * SPEED)
+    momentum = stepper.solution.balance["linear_momentum"]
+    assert np.allclose(momentum[1] - momentum[0], [0, 0, STEP * force], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_free_flight_under_gravity(integrator):
+    """v exact, x exact for a parabola by both rules; the work of gravity is external."""
+    mass = PointMass(COMM, MASS, (1.0, 2.0, 3.0), (0.5, 0.0, 1.0))
+    gravity = np.array([0.0, -1.0, -9.81])
+    stepper = nts.Stepper(nts.System([mass], gravity=gravity), INTEGRATORS[integrator])
+    for k in range(1, 6):
+        stepper.advance(STEP)
+        t = k * STEP
+        if COMM.rank == 0:
+            assert np.allclose(mass.v, [0.5, 0, 1] + gravity * t, rtol=0, atol=1e-13)
+            path = np.array([0.5, 0, 1]) * t + 0.5 * gravity * t**2
+            assert np.allclose(mass.u, path, rtol=0, atol=1e-14)
+    assert np.abs(stepper.solution.balance["ledger_residual"]).max() < 1e-12
+    stepper.close()
+
+
+@pytest.mark.xfail(strict=True, raises=nts.StepFailedError, reason=STALE)
+def test_motion_below_rounding_is_rest():
+    """h v is lost when it is added to u: nothing is left to solve, which must not be a failure."""
+    mass = PointMass(COMM, MASS, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+    stepper = nts.Stepper(nts.System([mass]), nts.Midpoint())
+    n = mass.num_owned
+    stepper.state = nts.State(0.0, (np.full(n, 0.1),), (np.full(n, 1e-17),), (), (), ())
+    stepper.advance(STEP)
+    assert np.array_equal(stepper.state.u[0], np.full(n, 0.1))
+    stepper.close()
+
+
+def test_the_step_decides_what_is_lost():
+    """Halving h at one gap moves theta, not the physics: e follows |1 - 2 theta|."""
+    gap = 0.3 * STEP * SPEED
+    for part in (1, 2):
+        system, _ = mass_on_wall(gap)
+        stepper = nts.Stepper(system, nts.EnergyMomentum())
+        for _ in range(3 * part):
+            stepper.advance(STEP / part)
+        theta = gap * part / (STEP * SPEED)
+        final = COMM.bcast(stepper.state.v[0])[2]
+        assert np.isclose(final, abs(1 - 2 * theta) * SPEED, rtol=1e-12)
+        stepper.close()
