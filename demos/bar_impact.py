@@ -154,12 +154,16 @@ def _bridged(pressing):
     return bridged
 
 
-def plot(results, gravity, path):
+def plot(results, balances, gravity, folder):
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    from dolfinx_nts.output import compare_balances
+
+    folder.mkdir(parents=True, exist_ok=True)
+    compare_balances(balances, str(folder / "balance.png"))
     figure, axes = plt.subplots(2, 1, sharex=True, figsize=(8, 6), layout="constrained")
     last = next(iter(results.values()))["history"]["time"][-1]
     t = np.linspace(0, last, 2001)
@@ -173,9 +177,9 @@ def plot(results, gravity, path):
         axes[1].plot(h["time"], h["pressure"], ".", ms=2, color=line.get_color())
     axes[0].set_ylabel("gap of the end [m]")
     axes[1].set(ylabel="contact pressure [Pa]", xlabel="time [s]")
-    for axis in axes:
-        axis.legend(fontsize="small", loc="lower center")
-    figure.savefig(path, dpi=150)
+    for axis, place in zip(axes, ("upper center", "lower center"), strict=True):
+        axis.legend(fontsize="small", loc=place)
+    figure.savefig(folder / "bar_impact.png", dpi=150)
     plt.close(figure)
 
 
@@ -246,12 +250,8 @@ def main(
         balances[name] = run.balance
     if comm.rank == 0:
         report(results, elements, gravity)
-    if comm.rank == 0 and output is not None:
-        from dolfinx_nts.output import compare_balances
-
-        Path(output).mkdir(parents=True, exist_ok=True)
-        compare_balances(balances, str(Path(output) / "balance.png"))
-        plot(results, gravity, Path(output) / "bar_impact.png")
+        if output is not None:
+            plot(results, balances, gravity, Path(output))
     return results
 
 

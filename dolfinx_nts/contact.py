@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from dolfinx_nts import facets, nts, search
 from dolfinx_nts.surfaces import Surface
+from dolfinx_nts.validation import known_options
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -52,6 +53,7 @@ class Candidates(NamedTuple):
     length: FloatArray
 
 
+@known_options
 class ContactPair:
     """Slave nodes of one surface must not penetrate the facets of another (19)-(21).
 
@@ -70,7 +72,8 @@ class ContactPair:
                 raise TypeError(f"{name}={value!r}: pass a Surface, e.g. body.surface(marker)")
         if slave.body is master.body and np.intersect1d(slave.points, master.points).size:
             raise ValueError(
-                f"slave, master: both surfaces of {slave.body.name!r} share nodes; choose disjoint markers"
+                f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
+                "choose disjoint markers"
             )
         self.slave, self.master = slave, master
         self._free_edges = master.boundary_edges

@@ -6,7 +6,6 @@ coordinates this rank owns.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -19,7 +18,15 @@ from dolfinx import mesh as dolfinx_mesh
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.surfaces import Surface, locate_facets
+from dolfinx_nts.surfaces import Surface, _oriented_nodes, flux, locate_facets
+from dolfinx_nts.validation import (
+    at_points,
+    items,
+    known_options,
+    raise_together,
+    require_positive,
+    vector,
+)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -81,6 +88,7 @@ class Body(Protocol):
         """Make u and v the body's current state."""
 
 
+@known_options
 @dataclass(frozen=True)
 class Dirichlet:
     """Prescribed displacement on a part of the boundary.
@@ -99,10 +107,12 @@ class Dirichlet:
     components: tuple[int, ...] = (0, 1, 2)
 
     def __post_init__(self) -> None:
-        if not self.components or not set(self.components) <= {0, 1, 2}:
-            raise ValueError(f"components={self.components!r}: choose from 0, 1, 2")
+        given = self.components
+        if not isinstance(given, Sequence) or not given or not set(given) <= {0, 1, 2}:
+            raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
 
 
+@known_options
 @dataclass(frozen=True)
 class Traction:
     """Dead traction on a part of the boundary.
@@ -116,9 +126,10 @@ class Traction:
     value: VectorInTime
 
 
-def _at(value: VectorInTime, time: float) -> FloatArray:
-    vector: FloatArray = np.asarray(value(time) if callable(value) else value, dtype=np.float64)
-    return vector
+def _at(name: str, value: VectorInTime, time: float, unit: str) -> FloatArray:
+    if callable(value):
+        name, value = f"{name} at t={time!r}", value(time)
+    return vector(name, value, unit)
 
 
 def _facets(mesh: Any, where: Any, what: str) -> IntArray:
@@ -126,6 +137,7 @@ def _facets(mesh: Any, where: Any, what: str) -> IntArray:
     return locate_facets(mesh, marker, tag, what)
 
 
+@known_options
 class Continuum:
     """A flexible body on a DOLFINx mesh (theory section 2).
 
@@ -176,8 +188,12 @@ class Continuum:
             raise TypeError(
                 f"material={material!r}: pass a callable C -> W(C), e.g. NeoHookean(young=.., poisson=..)"
             )
-        if not (math.isfinite(density) and density > 0):
-            raise ValueError(f"density={density!r}: must be positive and finite [kg/m^3]")
+        require_positive("density", density, "kg/m^3")
+        for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
+            if value is not None and not (isinstance(value, int) and value > 0):
+                raise ValueError(f"{option}={value!r}: must be a positive integer")
+        traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
+        bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")
         _check_mesh(mesh, name)
         self.name, self.mesh, self.comm, self.material, self.density = (
             name,
@@ -191,11 +207,16 @@ class Continuum:
         self.u, self.v = (fem.Function(self.space, name=f"{name}_{s}") for s in "uv")
         self.num_owned = 3 * self.space.dofmap.index_map.size_local
         self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
-        self.body_force, self._traction, self._extra_form = body_force, tuple(traction), extra_form
+        self.body_force, self._traction, self._extra_form = body_force, traction, extra_form
         self._dx = ufl.Measure(
             "dx", mesh, metadata={"quadrature_degree": quadrature_degree or 2 * degree}
         )
         self._ds = self._boundary_measure(quadrature_degree or 2 * degree)
+        _at("body_force", body_force, 0.0, "N/m^3")
+        for load in traction:
+            _at("Traction.value", load.value, 0.0, "Pa")
+        for condition in bcs:
+            _at("Dirichlet.value", condition.value, 0.0, "m")
         self._set_conditions(bcs)
         self._set_velocity(velocity)
         self._build_constant_forms()
@@ -229,10 +250,9 @@ class Continuum:
             np.concatenate([empty, *indices]).astype(np.int32),
             np.concatenate([empty, *tags]),
         )
-        if len(np.unique(index)) < len(index):
-            raise ValueError(
-                "traction: two loads share a facet; add their values up in one Traction"
-            )
+        shared = len(index) - len(np.unique(index))
+        text = f"traction: {shared} facets carry two loads; add their values up in one Traction"
+        raise_together(self.comm, text if shared else None)
         order = np.argsort(index)
         data = dolfinx_mesh.meshtags(self.mesh, 2, index[order], tag[order])
         return ufl.Measure(
@@ -244,8 +264,6 @@ class Continuum:
         self._conditions: list[tuple[IntArray, int, VectorInTime]] = []
         owned = []
         for bc in bcs:
-            if not isinstance(bc, Dirichlet):
-                raise TypeError(f"bcs: {bc!r} is not a Dirichlet(where, value, components)")
             facets = _facets(self.mesh, bc.where, "Dirichlet.where")
             blocks = np.asarray(fem.locate_dofs_topological(self.space, 2, facets))
             for component in bc.components:
@@ -258,19 +276,13 @@ class Continuum:
 
     def _set_velocity(self, velocity: Any) -> None:
         if callable(velocity):
-            self.v.interpolate(velocity)
+            # The nodes of Lagrange elements are their interpolation points.
+            x = self.space.tabulate_dof_coordinates().T
+            values = at_points(self.comm, f"velocity of {self.name!r}", velocity, x, (3,))
+            self.v.x.array[:] = values.T.ravel()
         else:
-            vector = np.asarray(velocity, dtype=np.float64)
-            if vector.shape != (3,):
-                raise ValueError(
-                    f"velocity={velocity!r}: pass three components or a callable x (3, n) -> (3, n)"
-                )
-            self.v.x.array[:] = np.tile(vector, len(self.v.x.array) // 3)
-        wrong = not np.isfinite(self.v.x.array).all()
-        if self.comm.allreduce(wrong, op=MPI.LOR):
-            raise ValueError(
-                f"velocity of {self.name!r}: not finite at some node; check the function for NaN"
-            )
+            constant = vector("velocity", velocity, "m/s, or pass a callable x (3, n) -> (3, n)")
+            self.v.x.array[:] = np.tile(constant, len(self.v.x.array) // 3)
         values = self.v.x.array
         for dofs, _, value in self._conditions:
             if not callable(value):
@@ -288,9 +300,16 @@ class Continuum:
         for k, value in enumerate(self._loads[1:]):
             load += ufl.inner(value, w) * self._ds(k)
         f = ufl.Identity(3) + ufl.grad(self.u)
-        energy = self.material(f.T * f)
-        if ufl.as_ufl(energy).ufl_shape != ():
-            raise TypeError(f"material of {self.name!r}: W(C) must be a UFL scalar")
+        try:
+            energy = ufl.as_ufl(self.material(f.T * f))
+        except Exception as error:
+            raise TypeError(
+                f"material={self.material!r}: W(C) raised {error!r}; return a UFL scalar"
+            ) from error
+        if energy.ufl_shape != ():
+            raise TypeError(
+                f"material={self.material!r}: W(C) has shape {energy.ufl_shape}; return a UFL scalar"
+            )
         mass, self._load_form, self._energy_form = compat.compile_forms(
             [self._rho * ufl.inner(v, w) * self._dx, load, energy * self._dx]
         )
@@ -336,9 +355,9 @@ class Continuum:
         self._fill(self._u0, u0)
         self._h.value = dt
         middle = time + 0.5 * dt
-        self._loads[0].value[:] = _at(self.body_force, middle)
+        self._loads[0].value[:] = _at("body_force", self.body_force, middle, "N/m^3")
         for constant, traction in zip(self._loads[1:], self._traction, strict=True):
-            constant.value[:] = _at(traction.value, middle)
+            constant.value[:] = _at("Traction.value", traction.value, middle, "Pa")
         self._load = self._assemble(self._load_form)
 
     def inertia(self, v: FloatArray) -> FloatArray:
@@ -370,7 +389,7 @@ class Continuum:
         """Prescribed displacements at a time, in the order of `fixed` [m]."""
         values = np.zeros(self.num_owned)
         for dofs, component, value in self._conditions:
-            values[dofs] = _at(value, time)[component]
+            values[dofs] = _at("Dirichlet.value", value, time, "m")[component]
         return values[self.fixed]
 
     def potential(self, u: FloatArray) -> float:
@@ -410,47 +429,57 @@ class Continuum:
 _NEIGHBOURS = np.array([[c ^ 1, c ^ 2, c ^ 4] for c in range(8)])
 #: The triple product flips sign at every second corner.
 _PARITY = np.array([1 - 2 * (bin(c).count("1") % 2) for c in range(8)])
+#: Corners of the six faces, cyclic and counter-clockwise seen from outside.
+_FACES = np.array(
+    [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+)
 
 
 def _check_mesh(mesh: Any, name: str) -> None:
-    """Raise on every rank unless the mesh is a valid 3D hexahedral or tetrahedral mesh of degree 1."""
+    """Raise on every rank unless the mesh is a valid 3D mesh of degree 1."""
+    if not isinstance(mesh, dolfinx_mesh.Mesh):
+        raise TypeError(f"mesh={mesh!r}: pass a dolfinx mesh")
     kind = compat.cell_name(mesh)
     if kind not in ("hexahedron", "tetrahedron") or mesh.geometry.dim != 3:
         raise ValueError(
             f"mesh of {name!r}: {kind} in {mesh.geometry.dim}D; pass 3D hexahedra or tetrahedra"
         )
+    corners = {"hexahedron": 8, "tetrahedron": 4}[kind]
     cells = compat.geometry_dofmap(mesh)
-    if cells.shape[1] not in (0, {"hexahedron": 8, "tetrahedron": 4}[kind]):
-        raise ValueError(f"mesh of {name!r}: geometry of degree above 1; pass a mesh of degree 1")
-    cells = cells[: mesh.topology.index_map(3).size_local]
-    finite = bool(np.isfinite(mesh.geometry.x).all())
-    if not mesh.comm.allreduce(finite, op=MPI.LAND):
-        raise ValueError(f"mesh of {name!r}: a node is not finite; check the coordinates for NaN")
-    x = mesh.geometry.x[cells] if len(cells) else np.empty((0, 8 if kind == "hexahedron" else 4, 3))
-    if kind == "hexahedron":
+    nodes = mesh.comm.allreduce(cells.shape[1], op=MPI.MAX)
+    if nodes != corners:
+        raise ValueError(
+            f"mesh of {name!r}: {nodes} nodes per {kind}, not {corners}; pass a mesh of degree 1"
+        )
+    nan = np.flatnonzero(~np.isfinite(mesh.geometry.x).all(axis=1))
+    text = f"mesh of {name!r}: {len(nan)} nodes are not finite, e.g. {mesh.geometry.x[nan[:1]]}"
+    raise_together(mesh.comm, f"{text}; check the coordinates for NaN" if len(nan) else None)
+    owned = mesh.topology.index_map(3).size_local
+    _check_cells(mesh, name, mesh.geometry.x[cells[:owned].reshape(owned, corners)])
+
+
+def _check_cells(mesh: Any, name: str, x: FloatArray) -> None:
+    """Raise on every rank if one of the cells with corners x (n, 4 or 8, 3) is inverted."""
+    if x.shape[1] == 8:
         edges = x[:, _NEIGHBOURS] - x[:, :, None]
         det = np.linalg.det(edges) * _PARITY
+        volumes = flux(x[:, _FACES] - x[:, :1, None]).sum(axis=1)
     else:
         edges = (x[:, 1:] - x[:, :1])[:, None]
         det = np.linalg.det(edges)
+        volumes = det[:, 0] / 6
     size = np.linalg.norm(edges, axis=-1).prod(axis=-1)
-    degenerate = (np.abs(det) <= 1e-12 * size).any(axis=1)
-    bad = int(np.count_nonzero(degenerate | (np.abs(np.sign(det).sum(axis=1)) < det.shape[1])))
-    volume = np.abs(det.mean(axis=1)).sum() / (1 if kind == "hexahedron" else 6)
-    bad, volume, enclosed = mesh.comm.allreduce(np.array([bad, volume, _enclosed_volume(mesh)]))
-    if bad or (kind == "tetrahedron" and abs(volume - enclosed) > 1e-9 * volume):
+    flat = (np.abs(det) <= 1e-12 * size).any(axis=1)
+    bad = np.flatnonzero(flat | (np.abs(np.sign(det).sum(axis=1)) < det.shape[1]))
+    where = f"e.g. the one at x={x[bad[:1]].mean(axis=(0, 1)).tolist()}" if len(bad) else ""
+    text = f"mesh of {name!r}: {len(bad)} inverted or flat cells, {where}; repair the mesh"
+    raise_together(mesh.comm, text if len(bad) else None)
+    # A cell turned inside out as a whole: the volumes add up to more than the boundary encloses.
+    boundary = mesh.geometry.x[_oriented_nodes(mesh, compat.exterior_facets(mesh))]
+    local = np.array([np.abs(volumes).sum(), flux(boundary).sum()])
+    volume, enclosed = mesh.comm.allreduce(local)
+    if abs(volume - enclosed) > 1e-9 * volume:
         raise ValueError(
-            f"mesh of {name!r}: {int(bad)} inverted or degenerate cells (cell volumes add up to {volume:.6g}, the "
-            f"boundary encloses {enclosed:.6g}); repair the mesh"
+            f"mesh of {name!r}: inverted or overlapping cells, whose volumes add up to "
+            f"{volume:.6g} while the boundary encloses {enclosed:.6g}; repair the mesh"
         )
-
-
-def _enclosed_volume(mesh: Any) -> float:
-    """This rank's part of the volume inside the boundary, by the divergence theorem; triangles only."""
-    from dolfinx_nts.surfaces import _oriented_nodes
-
-    nodes = _oriented_nodes(mesh, compat.exterior_facets(mesh))
-    if nodes.shape[1] != 3:
-        return 0.0
-    a, b, c = mesh.geometry.x[nodes].transpose(1, 0, 2)
-    return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6)

@@ -207,7 +207,7 @@ def assemble_matrix(a: Any, form: Any, bcs: Sequence[Any], diagonal: float) -> N
     a.assemble()
 
 
-# ---- MatSetPreallocationCOO / MatSetValuesCOO, which petsc4py 3.18 and 3.22 do not bind
+# ---- what petsc4py 3.18 and 3.22 do not bind
 _lib: Any = None
 
 
@@ -222,6 +222,7 @@ def _petsc_library() -> Any:
         count, pointer = ctypes.c_ssize_t, ctypes.c_void_p
         _lib.MatSetPreallocationCOO.argtypes = (pointer, count, pointer, pointer)
         _lib.MatSetValuesCOO.argtypes = (pointer, pointer, ctypes.c_int)
+        _lib.PetscOptionsUsed.argtypes = (pointer, ctypes.c_char_p, pointer)
     return _lib
 
 
@@ -246,3 +247,11 @@ def set_values_coo(a: Any, values: npt.ArrayLike) -> None:
     mode = int(PETSc.InsertMode.INSERT_VALUES)
     if error := _petsc_library().MatSetValuesCOO(a.handle, values.ctypes.data, mode):
         raise PETSc.Error(error)
+
+
+def option_used(name: str) -> bool:
+    """Whether PETSc has asked for an option of its global database."""
+    used = ctypes.c_int(0)  # PetscBool is an enum, since 3.24 a C99 bool; zero is false in both
+    if error := _petsc_library().PetscOptionsUsed(None, name.encode(), ctypes.byref(used)):
+        raise PETSc.Error(error)
+    return bool(used.value)

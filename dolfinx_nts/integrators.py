@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from dolfinx_nts.discrete_gradient import gonzalez_stress, mean_value_stress, strain_derivative
+from dolfinx_nts.validation import known_options
 
 Energy = Callable[[Any], Any]
 
@@ -30,6 +31,7 @@ class Midpoint:
         return fm * (2 * strain_derivative(energy, fm.T * fm))
 
 
+@known_options
 @dataclass(frozen=True, kw_only=True)
 class EnergyMomentum:
     """Energy-momentum scheme (61)-(66): keeps linear and angular momentum and closes the energy ledger.

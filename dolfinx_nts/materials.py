@@ -8,6 +8,8 @@ from typing import Any
 
 import ufl
 
+from dolfinx_nts.validation import known_options, require_positive
+
 
 def _require(condition: bool, name: str, value: float, remedy: str) -> None:
     if not condition:
@@ -20,12 +22,13 @@ def _lame(young: float, poisson: float) -> tuple[float, float]:
 
 
 def _check_elastic(young: float, poisson: float) -> None:
-    _require(math.isfinite(young) and young > 0, "young", young, "must be positive and finite [Pa]")
+    require_positive("young", young, "Pa")
     _require(
         -1 < poisson < 0.5, "poisson", poisson, "must lie in (-1, 0.5); use e.g. 0.49 for rubber"
     )
 
 
+@known_options
 @dataclass(frozen=True)
 class StVenantKirchhoff:
     """W = lam/2 (tr E)^2 + mu E : E with E = (C - 1)/2; for moderate strains only.
@@ -51,6 +54,7 @@ class StVenantKirchhoff:
         return lam / 2 * ufl.tr(e) ** 2 + mu * ufl.inner(e, e)
 
 
+@known_options
 @dataclass(frozen=True)
 class NeoHookean:
     """W = mu/2 (tr C - 3 - ln det C) + lam/8 (ln det C)^2.
@@ -76,6 +80,7 @@ class NeoHookean:
         return mu / 2 * (ufl.tr(c) - 3 - log) + lam / 8 * log**2
 
 
+@known_options
 @dataclass(frozen=True)
 class MooneyRivlin:
     """W = a (tr C - 3) + b (tr cof C - 3) + c/2 (J - 1)^2 - d ln J with d = 2 (a + 2 b), stress-free at rest.
@@ -103,9 +108,7 @@ class MooneyRivlin:
             self.a + self.b,
             "must be positive [Pa]: half the shear modulus",
         )
-        _require(
-            math.isfinite(self.c) and self.c > 0, "c", self.c, "must be positive and finite [Pa]"
-        )
+        require_positive("c", self.c, "Pa")
 
     def __call__(self, c: Any) -> Any:
         """W(C) [J/m^3]."""

@@ -12,9 +12,11 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.assembly import StepMatrix
 from dolfinx_nts.contact import ContactStep, Contribution
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
+from dolfinx_nts.validation import known_options
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -30,6 +32,7 @@ DEFAULT_PETSC_OPTIONS: Mapping[str, Any] = {
 _prefixes = itertools.count()
 
 
+@known_options
 @dataclass(frozen=True, kw_only=True)
 class Newton:
     """When a step counts as solved and how hard to try.
@@ -80,6 +83,7 @@ class StepSolver:
         self, problem: StepProblem, newton: Newton, petsc_options: Mapping[str, Any] | None = None
     ) -> None:
         self.problem, self.newton = problem, newton
+        self._unchecked = set(petsc_options or {})
         self._options = {**DEFAULT_PETSC_OPTIONS, **(petsc_options or {})}
         self._keys: list[str] = []
         self._version = -1
@@ -91,10 +95,13 @@ class StepSolver:
 
         Raises:
             StepFailedError: Not converged; names the worst block, node, facet and flips.
+            ValueError: PETSc does not know an option or its value.
         """
         self.prepare()
         self.snes.solve(None, self.problem.x)
         reason, iterations = self.snes.getConvergedReason(), self.snes.getIterationNumber()
+        if iterations:
+            self._check_options()
         last = self._at(self.problem.x)
         if reason <= 0:
             raise StepFailedError(self._diagnosis(last, reason, iterations))
@@ -132,10 +139,31 @@ class StepSolver:
         for key, value in self._options.items():
             database[prefix + key] = value
             self._keys.append(prefix + key)
-        self.snes.setFromOptions()
+        try:
+            self.snes.setFromOptions()
+        except PETSc.Error as error:
+            given = {k: self._options[k] for k in sorted(self._unchecked)}
+            why = str(error).splitlines()[-1].split("] ")[-1]
+            raise ValueError(f"petsc_options={given!r}: {why}; correct the value") from error
         pc = self.snes.getKSP().getPC()
         if pc.getType() == "fieldsplit" and self.problem.elements:
             pc.setFieldSplitIS(*self.matrix.field_sets(len(self.problem.system.bodies)))
+
+    def _check_options(self) -> None:
+        """Raise if PETSc, having solved, never asked for one of the user's options.
+
+        Options of the splits wait for the first contact, without which there are none.
+        """
+        contact = bool(self.problem.elements)
+        judged = {k for k in self._unchecked if contact or not k.startswith("fieldsplit_")}
+        self._unchecked -= judged
+        prefix = self.snes.getOptionsPrefix()
+        for key in sorted(judged):
+            if not compat.option_used(prefix + key):
+                raise ValueError(
+                    f"petsc_options[{key!r}]={self._options[key]!r}: not used by PETSc; "
+                    "correct its name or remove it"
+                )
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:

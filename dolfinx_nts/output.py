@@ -115,7 +115,8 @@ class _Series:
         self._kind, corners = _CELLS[self._cells.shape[1]]
         with h5py.File(f"{self.path}.h5", "w", locking=False) as file:
             file["mesh/points"], file["mesh/cells"] = self._points, self._cells[:, corners]
-        Path(f"{self.path}.xdmf").write_text(_XDMF_HEAD.format(self.path.name) + _XDMF_TAIL)
+        head = _XDMF_HEAD.format(self.path.name)
+        Path(f"{self.path}.xdmf").write_bytes((head + _XDMF_TAIL).encode())
 
     def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
         """Nodal fields of the last accepted state on rank 0; collective."""
@@ -196,7 +197,8 @@ class Fields:
             time [s].
 
     Raises:
-        ValueError: The cadence is out of range or given twice.
+        ValueError: The cadence is out of range or given twice; from `start`: no body has a mesh,
+            or two bodies' names give one file.
         OSError: From `start`, before any step and on all ranks: the folder cannot be written.
     """
 
@@ -221,6 +223,8 @@ class Fields:
             if hasattr(body, "mesh"):
                 own = {n: k for k, n in enumerate(label) if contacts[k].slave.body is body}
                 self._series.append(_Series(body, i, own, self.folder))
+        if not self._series:
+            raise ValueError(f"folder={str(self.folder)!r}: no body has a mesh; leave Fields out")
         files = [s.path.name for s in self._series]
         if len(set(files)) < len(files):
             raise ValueError(f"name of bodies: file names {files} are not unique; rename a body")
@@ -352,7 +356,7 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
     panels = [
         energy,
         _Panel("Ledger residual / largest energy", "[-]", residual, _ROUND_OFF),
-        _Panel("Contact defect and work", "[J]", work),
+        _Panel(", ".join(work).capitalize(), "[J]", work),
         _Panel("Slave nodes in contact", "[-]", nodes, steps=True),
     ]
     for name, unit in (("linear", "kg m/s"), ("angular", "kg m²/s")):

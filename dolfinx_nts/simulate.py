@@ -15,6 +15,7 @@ from dolfinx_nts import balance
 from dolfinx_nts.newton import Newton, StepFailedError, StepSolver
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.system import State, System
+from dolfinx_nts.validation import items, known_options, require_positive
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ class Solution:
             output.plot_balance(self.balance, path)
 
 
+@known_options
 class Stepper:
     """Advances a system step by step.
 
@@ -76,8 +78,15 @@ class Stepper:
         newton: Newton | None = None,
         petsc_options: Mapping[str, Any] | None = None,
     ) -> None:
-        if not (hasattr(integrator, "piola") and hasattr(integrator, "contact_gradient")):
+        if not isinstance(system, System):
+            raise TypeError(f"system={system!r}: pass a System([body, ...])")
+        known = all(hasattr(integrator, name) for name in ("piola", "contact_gradient"))
+        if not known or isinstance(integrator, type):
             raise TypeError(f"integrator={integrator!r}: pass Midpoint() or EnergyMomentum()")
+        if not isinstance(newton, Newton | None):
+            raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")
+        if not isinstance(petsc_options, Mapping | None):
+            raise TypeError(f"petsc_options={petsc_options!r}: pass a dict, e.g. {{'pc_type': 'lu'}}")
         self.newton = newton or Newton()
         self.problem = StepProblem(
             system, integrator, rtol=self.newton.rtol, condense=self.newton.condense
@@ -100,7 +109,7 @@ class Stepper:
             StepFailedError: Not solved even with the smallest step; everything accepted so far is
                 kept.
         """
-        _positive("dt", dt)
+        require_positive("dt", dt, "s")
         end, part, retries = self.state.time + dt, 1, 0
         done = 0
         while done < part:
@@ -156,11 +165,11 @@ class Stepper:
         self.problem.destroy()
 
 
-def _positive(name: str, value: float) -> None:
-    if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-        raise ValueError(f"{name}={value!r}: must be positive and finite [s]")
+def _is_writer(item: Any) -> bool:
+    return all(callable(getattr(item, name, None)) for name in ("start", "write", "close"))
 
 
+@known_options
 def simulate(
     system: System,
     integrator: Any,
@@ -192,8 +201,9 @@ def simulate(
     Raises:
         ValueError: An argument is out of range; before any work.
     """
-    _positive("dt", dt)
-    _positive("t_end", t_end)
+    require_positive("dt", dt, "s")
+    require_positive("t_end", t_end, "s")
+    output = items("output", output, _is_writer, "writers of dolfinx_nts.output")
     stepper = Stepper(system, integrator, newton=newton, petsc_options=petsc_options)
     steps = max(1, math.ceil(t_end / dt * (1 - 1e-12)))
     bar = _progress_bar(steps, progress and system.comm.rank == 0)

@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import facets as facet_math
+from dolfinx_nts import search
+from dolfinx_nts.validation import at_points
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -50,10 +53,8 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
                 f"{what}={marker!r}: pass a function of x with shape (3, n), or meshtags and a tag"
             )
         nodes = compat.entities_to_geometry(mesh, 2, exterior)
-        x = mesh.geometry.x
-        inside = np.asarray(marker(x[np.unique(nodes)].T), dtype=bool)
-        chosen = np.zeros(len(x), dtype=bool)
-        chosen[np.unique(nodes)] = inside
+        used, chosen = np.unique(nodes), np.zeros(len(mesh.geometry.x), dtype=bool)
+        chosen[used] = at_points(mesh.comm, what, marker, mesh.geometry.x[used].T, ())
         found = exterior[chosen[nodes].all(axis=1)]
         wrong = 0
     else:
@@ -105,7 +106,8 @@ class Surface:
         local = node_to_dof[nodes]
         index_map = space.dofmap.index_map
         corners = index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
-        ids = np.asarray(mesh.geometry.input_global_indices)[nodes]
+        # An empty rank's list would become an array of floats.
+        ids = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[nodes]
         table = np.stack([corners, ids], axis=-1)
         table = gather_rows(mesh.comm, table)
         x = gather_rows(mesh.comm, mesh.geometry.x[nodes])
@@ -147,10 +149,55 @@ class Surface:
         """Values at all points, shape (p, 3), from this rank's owned body coordinates."""
         return gather_rows(self.body.comm, values[self.rows])
 
+    def depth(self, x: FloatArray) -> FloatArray:
+        """How deep points lie inside the undeformed body, in facet sizes; 0 outside. Collective.
+
+        Args:
+            x: Points [m], shape (n, 3), the same on all ranks.
+
+        Returns:
+            Shape (n,), the same on all ranks.
+        """
+        mesh = self.body.mesh
+        corners = mesh.geometry.x[_oriented_nodes(mesh, compat.exterior_facets(mesh))]
+        box = np.array([corners.min(axis=(0, 1), initial=np.inf), -corners.max(axis=(0, 1), initial=-np.inf)])
+        mesh.comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
+        near = np.flatnonzero(((x >= box[0]) & (x <= -box[1])).all(axis=1))
+        closest = search.closest_facets(x[near], corners, reach=np.inf)
+        distance = closest.distance / np.append(facet_math.size(corners), 1.0)[closest.facet]
+        winding = np.array([_winding(p, corners) for p in x[near]])
+        mesh.comm.Allreduce(MPI.IN_PLACE, distance, op=MPI.MIN)
+        mesh.comm.Allreduce(MPI.IN_PLACE, winding, op=MPI.SUM)
+        depth = np.zeros(len(x))
+        depth[near] = np.where(winding > 0.5, distance, 0.0)
+        return depth
+
     def positions(self, u: FloatArray) -> FloatArray:
         """Current positions of all points [m], shape (p, 3), from this rank's owned displacements."""
         x: FloatArray = self.reference + self.gather(u)
         return x
+
+
+def flux(corners: FloatArray) -> FloatArray:
+    """Volume of the cone from the origin over oriented facets [m^3], (..., nc, 3) -> (...)."""
+    # Under a bilinear facet lies the mean of its two triangulations.
+    triangles = {3: [[0, 1, 2]], 4: [[0, 1, 2], [0, 2, 3], [0, 1, 3], [1, 2, 3]]}
+    nc = corners.shape[-2]
+    a, b, c = np.moveaxis(corners[..., np.array(triangles[nc]), :], -2, 0)
+    volume: FloatArray = np.einsum("...i,...i->...", a, np.cross(b, c)).sum(axis=-1) / 6
+    return volume if nc == 3 else 0.5 * volume
+
+
+def _winding(x: FloatArray, corners: FloatArray) -> float:
+    """How often oriented facets (m, nc, 3) enclose a point: 1 inside a closed surface, 0 outside."""
+    total = 0.0
+    for k in range(1, corners.shape[1] - 1):
+        a, b, c = (corners[:, [0, k, k + 1]] - x).transpose(1, 0, 2)
+        la, lb, lc = (np.linalg.norm(e, axis=1) for e in (a, b, c))
+        ab, bc, ca = ((e * f).sum(axis=1) for e, f in ((a, b), (b, c), (c, a)))
+        volume = (a * np.cross(b, c)).sum(axis=1)
+        total += float(np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum())
+    return total / (2 * np.pi)
 
 
 def _oriented_nodes(mesh: Any, local_facets: IntArray) -> IntArray:

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from dolfinx_nts.contact import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.continuum import Body
+from dolfinx_nts.validation import items, known_options, vector
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -37,6 +39,7 @@ class State:
     gap: tuple[FloatArray, ...]
 
 
+@known_options
 class System:
     """Bodies, contacts between them, and gravity.
 
@@ -46,9 +49,10 @@ class System:
         gravity: Acceleration [m/s^2]; its work counts as external work.
 
     Raises:
-        TypeError: `gravity` is not three numbers.
-        ValueError: No body, equal names, a contact of a body that is not in the system, or initial
-            penetration beyond one part in a hundred of the facet size.
+        TypeError: An item is no body or no contact.
+        ValueError: No body, equal names, several communicators, `gravity` is not three numbers, a
+            contact of a body that is not in the system, or initial penetration beyond one part in a
+            hundred of the facet size.
     """
 
     def __init__(
@@ -58,21 +62,29 @@ class System:
         contacts: Sequence[ContactPair] = (),
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        if not bodies:
+        self.bodies = items("bodies", bodies, lambda b: hasattr(b, "begin_step"), "bodies")
+        self.contacts = items(
+            "contacts", contacts, lambda c: isinstance(c, ContactPair), "ContactPair"
+        )
+        if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
-        names = [b.name for b in bodies]
+        names = [b.name for b in self.bodies]
         if len(set(names)) < len(names):
             raise ValueError(f"bodies: names {names} are not unique; pass name= to each body")
-        self.bodies, self.contacts = tuple(bodies), tuple(contacts)
-        self.gravity = np.asarray(gravity, dtype=np.float64)
-        if self.gravity.shape != (3,) or not np.isfinite(self.gravity).all():
-            raise ValueError(f"gravity={gravity!r}: pass three finite components [m/s^2]")
+        self.gravity = vector("gravity", gravity, "m/s^2")
         self.comm = self.bodies[0].comm
+        for b in self.bodies:
+            if MPI.Comm.Compare(b.comm, self.comm) not in (MPI.IDENT, MPI.CONGRUENT):
+                raise ValueError(
+                    f"bodies: {b.name!r} and {names[0]!r} live on different communicators; "
+                    "make all meshes on one"
+                )
         for pair in self.contacts:
             for role, surface in (("slave", pair.slave), ("master", pair.master)):
                 if not any(surface.body is b for b in self.bodies):
                     raise ValueError(
-                        f"contacts: the {role} body {surface.body.name!r} is not among bodies={names}"
+                        f"contacts: the {role} body {surface.body.name!r} is not among "
+                        f"bodies={names}; add it"
                     )
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.contact_bodies = [
@@ -99,14 +111,15 @@ class System:
             self.contacts, self.contact_bodies, state.facets, strict=True
         ):
             found = pair.find(state.u[slave], state.u[master], facets, 0.0)
-            deep = found.gap < -INITIAL_PENETRATION * found.length
-            nodes = pair.slave.original[pair.slave.owned[found.node[deep]]]
-            worst = float((found.gap / found.length).min(initial=0.0))
-            gathered = self.comm.allgather((nodes.tolist(), worst))
-            all_nodes = sorted(n for part, _ in gathered for n in part)
-            if all_nodes:
+            depth = np.zeros(len(pair.slave.points))
+            depth[pair.slave.owned[found.node]] = -found.gap / found.length
+            self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)
+            if slave != master:  # the search looks half a facet deep; this, through the whole body
+                depth = np.maximum(depth, pair.master.depth(pair.slave.reference))
+            deep = depth > INITIAL_PENETRATION
+            if deep.any():
                 raise ValueError(
-                    f"contact {pair.name!r}: {len(all_nodes)} slave nodes start inside the master, up to "
-                    f"{-min(w for _, w in gathered):.3g} of a facet (allowed {INITIAL_PENETRATION}); nodes "
-                    f"{all_nodes[:10]}: move the bodies apart"
+                    f"contact {pair.name!r}: {int(deep.sum())} slave nodes start inside the master, "
+                    f"up to {depth.max():.3g} of a facet (allowed {INITIAL_PENETRATION}), nodes "
+                    f"{np.sort(pair.slave.original[deep])[:10].tolist()}; move the bodies apart"
                 )

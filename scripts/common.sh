@@ -52,6 +52,8 @@ clean_environment() {
   export PYTHONNOUSERSITE=1 # a numpy in ~/.local would break Debian's petsc4py
   export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
   export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
+  # Ranks that wait give way: tests share two cores with whatever else runs.
+  export OMPI_MCA_mpi_yield_when_idle=1
   export PRTE_ALLOW_RUN_AS_ROOT=1 PRTE_ALLOW_RUN_AS_ROOT_CONFIRM=1 # newer OpenMPI
   # One machine: shared memory will do, and containers often allow neither sockets nor ptrace.
   export OMPI_MCA_btl=^tcp OMPI_MCA_btl_vader_single_copy_mechanism=none

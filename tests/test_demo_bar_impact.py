@@ -1,16 +1,9 @@
 """The elastic bar on a rigid wall: exact solution, closed forms, and an independent linear code."""
 
-import importlib
-import sys
-from pathlib import Path
-
+import bar_impact as demo
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "demos"))
-demo = importlib.import_module("bar_impact")
-
-BOTH = tuple(demo.INTEGRATORS)
 #: Elements: E/E0, rebound of the centre of mass over v0.
 REFERENCE = {50: (0.9978, 0.9841), 100: (0.9987, 0.9892), 200: (0.9992, 0.9927)}
 
@@ -67,14 +60,26 @@ def check_impact(result, elements):
     # The end of the bar reaches the wall at the end of a step, so rounding decides which one.
     np.testing.assert_allclose(result["contact_start"], [0.5], atol=1.01 * dt)
     np.testing.assert_allclose(result["contact_end"], [0.5 + demo.CONTACT], atol=2.01 * dt)
-    np.testing.assert_allclose(result["pressure"], [0.3], rtol=1 / elements)
-    np.testing.assert_allclose(result["impulse"], [0.2], rtol=0.5 / elements)
-    assert result["shortening"] == pytest.approx(demo.SPEED / 3, rel=1 / elements)
+    # The momentum that goes into vibration shrinks like the root of the mesh size.
+    np.testing.assert_allclose(result["pressure"], [0.3], rtol=0.2 / elements**0.5)
+    np.testing.assert_allclose(result["impulse"], [0.2], rtol=0.1 / elements**0.5)
+    mass = demo.DENSITY * demo.LENGTH
+    assert result["impulse"].sum() == pytest.approx(mass * demo.SPEED * (1 + result["rebound"]))
+    assert result["shortening"] == pytest.approx(demo.SPEED / 3, rel=0.2 / elements**0.5)
     assert result["min_gap"] > -1e-13 * demo.LENGTH
     assert result["newton_iterations"] < 2
 
 
 @pytest.mark.mpi
+def test_impact_is_the_same_on_two_ranks():
+    results = demo.main(elements=10, t_end=0.8, integrators=("energy-momentum",))
+    _, gap, pressure, _, _ = linear_bar(10, False, 0.8)
+    h = results["energy-momentum"]["history"]
+    np.testing.assert_allclose(h["gap"], gap, atol=1e-3 * demo.GAP)
+    np.testing.assert_allclose(h["pressure"], pressure, atol=0.01 * 0.3)
+    assert results["energy-momentum"]["ledger"] < 1e-12
+
+
 def test_bar_follows_the_linear_bar():
     elements, t_end = 20, 1.3
     results = demo.main(elements=elements, t_end=t_end)
@@ -106,7 +111,7 @@ def test_impact(elements):
 
 @pytest.mark.slow
 def test_dropped_bar():
-    elements = 100
+    elements = 50
     dt = demo.LENGTH / elements / demo.WAVE
     results = demo.main(elements=elements, gravity=True)
     for result in results.values():

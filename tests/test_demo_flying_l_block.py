@@ -1,15 +1,9 @@
 """The flying L-block: energy and momenta after the loads have gone."""
 
-import importlib
-import sys
-from pathlib import Path
-
+import flying_l_block as demo
 import numpy as np
 import pytest
 from mpi4py import MPI
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "demos"))
-demo = importlib.import_module("flying_l_block")
 
 
 @pytest.mark.mpi

@@ -14,6 +14,7 @@ RULES = {
     "energy-momentum": nts.EnergyMomentum(),
     "mean-value stress": nts.EnergyMomentum(stress="mean-value"),
     "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
+    "condensed": nts.EnergyMomentum(),
 }
 ACTIVE = ("none", "all", "mixed")
 #: Exact for polynomials up to degree 4.
@@ -72,11 +73,15 @@ def rotated_state(system, angle=0.8, fixed=False):
     return nts.State(0.0, tuple(u), tuple(v), start.facets, start.force, start.gap)
 
 
+def stepper_of(system, rule):
+    return nts.Stepper(system, RULES[rule], newton=nts.Newton(condense=rule == "condensed"))
+
+
 class Linearised:
     """A step problem at an iterate away from its solution."""
 
     def __init__(self, system, rule, active, state, dt=0.02):
-        self.stepper = nts.Stepper(system, RULES[rule])
+        self.stepper = stepper_of(system, rule)
         self.problem = problem = self.stepper.problem
         problem.begin(state, dt)
         self.solver = self.stepper.solver
@@ -239,7 +244,7 @@ def test_jacobian_along_directions(cell, rule):
 
 def convergence(system, rule, state, dt):
     """Residual norm and active set of every iterate of a step."""
-    stepper = nts.Stepper(system, RULES[rule])
+    stepper = stepper_of(system, rule)
     problem = stepper.problem
     problem.begin(state, dt)
     solver = stepper.solver
@@ -275,3 +280,26 @@ def test_newton_converges_quadratically(cell, rule, turned):
     near = np.flatnonzero((r[:-1] < 0.3) & (r[:-1] > floor))
     assert len(near) >= 3
     assert (r[near + 1] < 5 * r[near] ** 2 + floor).all(), r
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("cell", CELLS)
+def test_condensing_changes_no_solution(cell):
+    results = []
+    for rule in ("energy-momentum", "condensed"):
+        system = two_blocks(cell, gap=0.02, speed=6.0)
+        stepper = stepper_of(system, rule)
+        stepper.state = rotated_state(system)
+        for _ in range(3):
+            stepper.advance(0.02)
+        results.append(stepper.state)
+        stepper.close()
+    full, condensed = results
+    for name in ("u", "v", "force", "gap"):
+        for a, b in zip(getattr(full, name), getattr(condensed, name), strict=True):
+            finite = np.isfinite(a)
+            assert np.array_equal(finite, np.isfinite(b))
+            top = COMM.allreduce(np.abs(a[finite]).max(initial=0.0), op=MPI.MAX)
+            tolerance = 1e-10 * top if name != "gap" else 1e-12
+            assert np.abs(a[finite] - b[finite]).max(initial=0.0) <= tolerance
+    assert COMM.allreduce(int((full.force[0] > 0).sum())) >= 3

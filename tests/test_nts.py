@@ -53,8 +53,9 @@ def constraints_of_invariants(pi, nc):
     """Theory section 3 in single sums; takes complex numbers."""
     n, dn = shape(pi[-2:], nc)
     yy = {}
-    for k, (i, j) in enumerate((i, j) for i in range(nc) for j in range(i, nc)):
-        yy[i, j] = yy[j, i] = pi[k]
+    pairs = [(i, j) for i in range(nc) for j in range(i, nc)]
+    for (i, j), value in zip(pairs, pi[: len(pairs)], strict=True):
+        yy[i, j] = yy[j, i] = value
     yd = pi[len(pi) - 3 - nc : -3]
     g = [-sum(n[i] * yd[i] for i in range(nc))]
     g += [sum(dn[i, a] * yd[i] for i in range(nc)) for a in range(2)]
@@ -68,7 +69,7 @@ def constraints_of_invariants(pi, nc):
 def complex_step(function, x):
     """Jacobian of a complex-safe function, to round-off, shape (rows, len(x))."""
     step = 1e-40
-    columns = [function(x + 1j * step * e).imag / step for e in np.eye(len(x))]
+    columns = [function(x + 1j * step * unit).imag / step for unit in np.eye(len(x))]
     return np.stack(columns, axis=-1)
 
 
@@ -345,7 +346,7 @@ def test_momentum(nc, rule):
     vectors = force[:, :-2].reshape(100, nc + 2, 3)
     scale = np.abs(force).max()
     assert np.abs(vectors[:, :-1].sum(axis=1)).max() < 1e-14 * scale
-    # The invariants do not change under a rotation of x and d, hence sum x cross F + d cross F_d = 0.
+    # Rotating x and d leaves the invariants alone, hence sum x cross F + d cross F_d = 0.
     assert np.abs(np.cross(middle, vectors).sum(axis=1)).max() < 1e-14 * scale
 
 

@@ -33,9 +33,14 @@ def run(make_system, integrator, t_end, steps):
     return np.concatenate(stepper.state.u), np.concatenate(stepper.state.v), stepper
 
 
-def rates(results, reference):
-    """Observed orders between successive halvings of h, and the errors relative to the largest value."""
-    errors = np.array([np.abs(r - reference).max() for r in results]) / np.abs(reference).max()
+def rates(results):
+    """Observed orders from the differences between runs with h, h/2, h/4, .., and the differences.
+
+    |x_h - x_h/2| is the error of x_h but for a factor that tends to 3/4; no run serves as a
+    reference, whose own error would bend the last rate.
+    """
+    change = [np.abs(a - b).max() for a, b in zip(results[:-1], results[1:], strict=True)]
+    errors = np.array(change) / np.abs(results[-1]).max()
     return np.log2(errors[:-1] / errors[1:]), errors
 
 
@@ -50,7 +55,7 @@ def flying_block():
 
     body = nts.Continuum(
         box([0, 0, 0], [2, 1, 1], (2, 1, 1)),
-        nts.NeoHookean(50.0, 0.3),
+        nts.NeoHookean(20.0, 0.3),
         density=1.0,
         velocity=velocity,
         name="block",
@@ -60,11 +65,10 @@ def flying_block():
 
 @pytest.mark.parametrize("integrator", FREE)
 def test_free_flight(integrator):
-    t_end, steps = 0.5, (25, 50, 100)
-    *results, reference = [run(flying_block, integrator, t_end, n)[:2] for n in (*steps, 1000)]
-    for which in range(2):
-        order, errors = rates([r[which] for r in results], reference[which])
-        assert errors[0] < 0.1
+    results = [run(flying_block, integrator, 0.4, n)[:2] for n in (40, 80, 160, 320)]
+    for name, values in zip("uv", zip(*results, strict=True), strict=True):
+        order, errors = rates(values)
+        print(integrator, name, order, errors)
         assert np.abs(order - 2.0).max() < 0.1, (order, errors)
 
 
@@ -74,13 +78,13 @@ def sliding_block():
     The load starts from zero as t^2 does, so the four slave nodes carry from the first step on
     and no node is ever activated or released.
     """
-    rubber = nts.NeoHookean(200.0, 0.3)
+    rubber = nts.NeoHookean(20.0, 0.3)
     upper = nts.Continuum(
         box([0.2, 0.25, 1.0], [0.7, 0.75, 1.5]),
         rubber,
         density=1.0,
         velocity=(0.3, -0.2, 0.0),
-        body_force=lambda t: (0.0, 0.0, -60.0 * t**2 * (3.0 - 2.0 * t)),
+        body_force=lambda t: (0.0, 0.0, -20.0 * t**2 * (3.0 - 2.0 * t)),
         name="upper",
     )
     lower = nts.Continuum(
@@ -97,17 +101,15 @@ def sliding_block():
     return nts.System([upper, lower], contacts=[pair])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_persistent_contact(integrator):
-    t_end, steps = 0.5, (25, 50, 100)
     results = []
-    for n in (*steps, 1000):
-        u, v, stepper = run(sliding_block, integrator, t_end, n)
-        balance = stepper.solution.balance
-        assert (balance["active"][1:] == 4).all()
+    for n in (40, 80, 160, 320):
+        u, v, stepper = run(sliding_block, integrator, 0.5, n)
+        assert (stepper.solution.balance["active"][1:] == 4).all()
         results.append((u, v))
-    *results, reference = results
-    for which in range(2):
-        order, errors = rates([r[which] for r in results], reference[which])
-        print(integrator, which, order, errors)
+    for name, values in zip("uv", zip(*results, strict=True), strict=True):
+        order, errors = rates(values)
+        print(integrator, name, order, errors)
         assert np.abs(order - 2.0).max() < 0.1, (order, errors)

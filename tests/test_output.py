@@ -471,6 +471,12 @@ def test_a_place_that_cannot_be_written_stops_before_any_step(mpi_tmp_path):
         output.picture(flying().bodies, mpi_tmp_path / "p.xyz", width=1.0)
 
 
+def test_fields_of_bodies_without_a_mesh(tmp_path):
+    system = SimpleNamespace(bodies=["ball"], contacts=[], comm=COMM)
+    with pytest.raises(ValueError, match=r"folder='.*no body has a mesh; leave Fields out"):
+        output.Fields(tmp_path).start(SimpleNamespace(system=system))
+
+
 @mpi
 def test_body_names_that_give_one_file(mpi_tmp_path):
     mesh = box([0.0, 0, 0], [1.0, 1, 1], [1, 1, 1])

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-STALE = "StepProblem._at keeps an Evaluation whose ratio was made before _spread was known"
+STALE = "StepSolver._at keeps an Evaluation whose ratio is older than StepProblem._rounding"
 MASS, SPEED, STEP = 2.5, 3.0, 0.02
 INTEGRATORS = {
     "midpoint": nts.Midpoint(),
@@ -121,7 +121,7 @@ def mass_on_wall(gap, velocity=(0.0, 0.0, -SPEED), turned=False):
 
 
 def run(system, integrator, steps):
-    """Velocities of the mass after each step on every rank, shape (steps + 1, 3), and the Stepper."""
+    """Velocities of the mass after each step, shape (steps + 1, 3), and the Stepper."""
     stepper = nts.Stepper(system, INTEGRATORS[integrator])
     v = [COMM.bcast(stepper.state.v[0])]
     for _ in range(steps):
@@ -131,11 +131,11 @@ def run(system, integrator, steps):
     return np.array(v), stepper
 
 
-@pytest.mark.mpi
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize(
     "theta",
-    [0.0, 0.1, 0.25, 0.49, 0.51, 0.75, 0.99, 1.0]
+    [0.0, 0.1, 0.25, 0.49, 0.51, 0.99, 1.0]
+    + [pytest.param(0.75, marks=pytest.mark.mpi)]
     + [pytest.param(0.5, marks=pytest.mark.xfail(raises=nts.StepFailedError, reason=STALE))],
 )
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -150,8 +150,8 @@ def test_rebound(integrator, theta, turned):
     assert np.allclose(v @ q[:, :2], 0.0, rtol=0, atol=1e-12)
     if theta not in (0.5, 1.0):
         # At 0.5 the mass rests on the wall, at 1 it arrives there at the end of a step.
-        contact_steps = 1 if theta < 0.5 else 2
-        assert rows["active"].tolist() == [0.0] + contact_steps * [1.0] + (4 - contact_steps) * [0.0]
+        active = [0, 1, 0, 0, 0] if theta < 0.5 else [0, 1, 1, 0, 0]
+        assert rows["active"].tolist() == active
     lost = 2 * MASS * SPEED**2 * theta * (1 - theta)
     energy = 0.5 * MASS * SPEED**2
     assert np.allclose(rows["contact_defect"][1:], lost, rtol=0, atol=1e-12 * energy)
@@ -197,7 +197,8 @@ def test_motion_below_rounding_is_rest():
     stepper = nts.Stepper(nts.System([mass]), nts.Midpoint())
     n = mass.num_owned
     stepper.state = nts.State(0.0, (np.full(n, 0.1),), (np.full(n, 1e-17),), (), (), ())
-    stepper.advance(STEP)
+    for _ in range(2):
+        stepper.advance(STEP)
     assert np.array_equal(stepper.state.u[0], np.full(n, 0.1))
     stepper.close()
 

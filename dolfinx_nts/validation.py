@@ -1,0 +1,102 @@
+"""Checks of arguments that name the argument, its value and a remedy, on every rank alike."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import numbers
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+T = TypeVar("T")
+
+
+def known_options(target: T) -> T:
+    """Decorate a function or class so that an unknown keyword raises with the list of known ones."""
+    function: Any = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
+    known = [p for p in inspect.signature(function).parameters if p != "self"]
+
+    @functools.wraps(function)
+    def checked(*args: Any, **options: Any) -> Any:
+        for name in options:
+            if name not in known:
+                raise TypeError(
+                    f"{name}={options[name]!r}: unknown option of {target.__name__}; "  # type: ignore[attr-defined]
+                    f"choose from {', '.join(known)}"
+                )
+        return function(*args, **options)
+
+    if not isinstance(target, type):
+        return checked  # type: ignore[return-value]
+    type.__setattr__(target, "__init__", checked)
+    return target
+
+
+def require_positive(name: str, value: Any, unit: str) -> None:
+    """Raise ValueError unless the value is a positive, finite number."""
+    if not (isinstance(value, numbers.Real) and math.isfinite(value) and value > 0):
+        raise ValueError(f"{name}={value!r}: must be positive and finite [{unit}]")
+
+
+def vector(name: str, value: Any, unit: str) -> FloatArray:
+    """The value as three finite components, shape (3,)."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise ValueError(f"{name}={value!r}: pass three finite components [{unit}]")
+    return array
+
+
+def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tuple[Any, ...]:
+    """The items of a sequence argument, all of the wanted kind."""
+    if not isinstance(value, Iterable):
+        raise TypeError(f"{name}={value!r}: pass a sequence of {wanted}")
+    found = tuple(value)
+    for k, item in enumerate(found):
+        if not fits(item):
+            raise TypeError(f"{name}[{k}]={item!r}: pass a sequence of {wanted}")
+    return found
+
+
+def raise_together(comm: Any, problem: str | None) -> None:
+    """Raise ValueError with the first rank's problem on every rank, if any rank has one."""
+    found = next((p for p in comm.allgather(problem) if p is not None), None)
+    if found is not None:
+        raise ValueError(found)
+
+
+def at_points(
+    comm: Any, name: str, function: Callable[[Any], Any], x: FloatArray, rows: tuple[int, ...]
+) -> npt.NDArray[Any]:
+    """The user's function at this rank's points; what fails on one rank raises on all.
+
+    Args:
+        comm: MPI communicator.
+        name: Name of the argument.
+        function: Callable x (3, n) -> (*rows, n).
+        x: Points [m], shape (3, n).
+        rows: Leading shape of the result.
+    """
+    problem, shape, values = None, (*rows, x.shape[1]), np.empty(0)
+    try:
+        values = np.asarray(function(x))
+    except Exception as error:  # any: a rank that raises alone would leave the others waiting
+        problem = f"{name}={function!r}: raised {error!r} for x of shape {x.shape}; correct it"
+    else:
+        if values.shape != shape:
+            problem = (
+                f"{name}={function!r}: returned shape {values.shape} for x of shape {x.shape}; "
+                f"return shape {shape}"
+            )
+        elif not np.isfinite(values).all():
+            bad = x[:, np.flatnonzero(~np.isfinite(values.reshape(-1, x.shape[1])).all(axis=0))[0]]
+            problem = f"{name}={function!r}: not finite at x={bad.tolist()}; check it for NaN"
+    raise_together(comm, problem)
+    return values

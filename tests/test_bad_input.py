@@ -1,0 +1,495 @@
+"""Bad input raises on every rank, before any work, and names the argument, its value and a remedy.
+
+Serial tests show the message; on two ranks the wrong data sit on one rank only where they can.
+"""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import (
+    CellType,
+    GhostMode,
+    create_box,
+    create_unit_cube,
+    create_unit_square,
+    locate_entities_boundary,
+    meshtags,
+)
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
+CELLS = {"hexahedron": CellType.hexahedron, "tetrahedron": CellType.tetrahedron}
+
+pytestmark = pytest.mark.mpi
+
+
+def box(low=(0.0, 0.0, 0.0), high=(1.0, 1.0, 1.0), cells=(2, 2, 2), cell_type="hexahedron"):
+    return create_box(
+        COMM, [low, high], cells, CELLS[cell_type], ghost_mode=GhostMode.shared_facet
+    )
+
+
+def continuum(mesh=None, material=RUBBER, density=1e3, **options):
+    return nts.Continuum(mesh or box(), material, density=density, **options)
+
+
+def top(x):
+    return x[2] > 1 - 1e-9
+
+
+def bottom(x):
+    return x[2] < 1e-9
+
+
+def stacked(gap=0.1, **upper):
+    """A column on a column, their facing surfaces in contact."""
+    low = continuum(name="low")
+    high = continuum(box((0.2, 0.2, 1 + gap), (0.8, 0.8, 2 + gap)), name="high", **upper)
+    pair = nts.ContactPair(high.surface(lambda x: x[2] < 1 + gap + 1e-9), low.surface(top))
+    return low, high, pair
+
+
+def run(system=None, integrator=None, **options):
+    options = {"dt": 1e-3, "t_end": 1e-3} | options
+    return nts.simulate(
+        system or nts.System([continuum()]), integrator or nts.EnergyMomentum(), **options
+    )
+
+
+def facet_tags(mesh, dim=2, where=top, value=3):
+    mesh.topology.create_connectivity(dim, 3)
+    found = np.sort(locate_entities_boundary(mesh, dim, where)).astype(np.int32)
+    return meshtags(mesh, dim, found, np.full(len(found), value, np.int32))
+
+
+def interior_tags(mesh):
+    """The facets at mid-height of the unit cube, none of them on the boundary, tagged 3."""
+    mesh.topology.create_entities(2)
+    mesh.topology.create_connectivity(2, 3)
+    from dolfinx.mesh import locate_entities
+
+    found = np.sort(locate_entities(mesh, 2, lambda x: np.isclose(x[2], 0.5))).astype(np.int32)
+    return meshtags(mesh, 2, found, np.full(len(found), 3, np.int32))
+
+
+def raises(kind, pattern, action):
+    """The action raises on this rank, with a one-sentence message that matches the pattern."""
+    with pytest.raises(kind) as caught:
+        action()
+    message = str(caught.value)
+    assert re.search(pattern, message), message
+    assert "\n" not in message and len(message) < 400, message
+    assert len(set(COMM.allgather(kind.__name__))) == 1
+    return message
+
+
+# ---- numbers
+@pytest.mark.parametrize("density", [0.0, -1.0, np.nan, np.inf, "heavy", None])
+def test_density(density):
+    pattern = rf"^density={re.escape(repr(density))}: must be positive and finite \[kg/m\^3\]"
+    raises(ValueError, pattern, lambda: continuum(density=density))
+
+
+@pytest.mark.parametrize("dt", [0.0, -1e-3, np.nan, np.inf, "1"])
+@pytest.mark.parametrize("name", ["dt", "t_end"])
+def test_time(name, dt):
+    pattern = rf"^{name}={re.escape(repr(dt))}: must be positive and finite \[s\]"
+    raises(ValueError, pattern, lambda: run(**{name: dt}))
+
+
+def test_step_of_the_stepper():
+    stepper = nts.Stepper(nts.System([continuum()]), nts.Midpoint())
+    raises(ValueError, r"^dt=-1: must be positive", lambda: stepper.advance(-1))
+    stepper.close()
+
+
+@pytest.mark.parametrize("material", [nts.NeoHookean, nts.StVenantKirchhoff])
+def test_stiffness(material):
+    for young in (0.0, -1e6, np.nan, "soft"):
+        pattern = rf"^young={re.escape(repr(young))}: must be positive and finite \[Pa\]"
+        raises(ValueError, pattern, lambda young=young: material(young=young, poisson=0.3))
+    for poisson in (0.5, 0.7, -1.0, np.nan):
+        pattern = rf"^poisson={re.escape(repr(poisson))}: must lie in \(-1, 0.5\)"
+        raises(ValueError, pattern, lambda nu=poisson: material(young=1.0, poisson=nu))
+
+
+def test_mooney_rivlin():
+    raises(ValueError, r"^c=0: must be positive", lambda: nts.MooneyRivlin(a=1, b=1, c=0))
+    raises(ValueError, r"^a \+ b=-1: must be positive", lambda: nts.MooneyRivlin(a=1, b=-2, c=1))
+
+
+@pytest.mark.parametrize("gravity", [(0, 0), 9.81, (0, 0, np.nan), "down", None])
+def test_gravity(gravity):
+    pattern = rf"^gravity={re.escape(repr(gravity))}: pass three finite components \[m/s\^2\]"
+    raises(ValueError, pattern, lambda: nts.System([continuum()], gravity=gravity))
+
+
+@pytest.mark.parametrize("name", ["degree", "quadrature_degree"])
+def test_degree(name):
+    pattern = rf"^{name}=0: must be a positive integer"
+    raises(ValueError, pattern, lambda: continuum(**{name: 0}))
+
+
+# ---- materials
+def test_material_that_is_no_function():
+    raises(TypeError, r"^material=1000000.0: pass a callable C -> W", lambda: continuum(None, 1e6))
+
+
+def test_material_that_is_no_scalar():
+    pattern = r"^material=<function.*shape \(3, 3\); return a UFL scalar"
+    raises(TypeError, pattern, lambda: continuum(None, lambda c: c))
+    pattern = r"^material=<function.*raised .*return a UFL scalar"
+    raises(TypeError, pattern, lambda: continuum(None, lambda c: None))
+
+
+def test_material_that_raises():
+    def broken(c):
+        raise RuntimeError("no such invariant")
+
+    pattern = r"^material=<function.*raised RuntimeError\('no such invariant'\); return"
+    raises(TypeError, pattern, lambda: continuum(None, broken))
+
+
+# ---- velocity, loads, conditions
+@pytest.mark.parametrize("velocity", [(1, 2), 3.0, (1, np.nan, 0), (1, 2, "x"), np.zeros((3, 3))])
+def test_velocity(velocity):
+    pattern = r"(?s)^velocity=.*: pass three finite components \[m/s, or pass a callable"
+    with pytest.raises(ValueError, match=pattern):
+        continuum(velocity=velocity)
+
+
+def test_velocity_of_wrong_shape():
+    pattern = r"^velocity of 'body'=<function.*returned shape \(2, \d+\).*return shape \(3, \d+\)"
+    raises(ValueError, pattern, lambda: continuum(velocity=lambda x: x[:2]))
+
+
+def test_velocity_not_finite_on_one_rank():
+    def corner(x):
+        v = np.zeros_like(x)
+        v[1, (np.abs(x - 1.0) < 1e-9).all(axis=0)] = np.nan
+        return v
+
+    pattern = r"^velocity of 'body'=<function.*not finite at x=\[1.0, 1.0, 1.0\]; check it for NaN"
+    raises(ValueError, pattern, lambda: continuum(velocity=corner))
+
+
+def test_velocity_that_raises_on_one_rank():
+    def picky(x):
+        if COMM.rank == COMM.size - 1:
+            raise KeyError("table")
+        return 0 * x
+
+    pattern = r"^velocity of 'body'=.*raised KeyError\('table'\).*correct it"
+    raises(ValueError, pattern, lambda: continuum(velocity=picky))
+
+
+def test_loads():
+    traction = nts.Traction(top, (1.0, 0.0))
+    pattern = r"^Traction.value=\(1.0, 0.0\): pass three finite components \[Pa\]"
+    raises(ValueError, pattern, lambda: continuum(traction=[traction]))
+    pattern = r"^traction=Traction\(.*: pass a sequence of Traction"
+    raises(TypeError, pattern, lambda: continuum(traction=nts.Traction(top, (1, 0, 0))))
+    pattern = r"^traction\[0\]='push': pass a sequence of Traction"
+    raises(TypeError, pattern, lambda: continuum(traction=["push"]))
+    pattern = r"^body_force at t=0.0=4.0: pass three finite components \[N/m\^3\]"
+    raises(ValueError, pattern, lambda: continuum(body_force=lambda t: 4.0))
+    pattern = r"^Traction.where.*selects no exterior facet; check the marker"
+    raises(
+        ValueError, pattern, lambda: continuum(traction=[nts.Traction(lambda x: x[0] > 9, (1, 0, 0))])
+    )
+
+
+def test_tractions_overlap_on_one_rank():
+    def corner(x):
+        return top(x) & (x[0] < 0.5 + 1e-9) & (x[1] < 0.5 + 1e-9)
+
+    loads = [nts.Traction(top, (1, 0, 0)), nts.Traction(corner, (0, 1, 0))]
+    pattern = r"^traction: 1 facets carry two loads; add their values up in one Traction"
+    raises(ValueError, pattern, lambda: continuum(traction=loads))
+
+
+@pytest.mark.parametrize("components", [(3,), (), 0, ("x",)])
+def test_components_of_a_condition(components):
+    pattern = rf"^components={re.escape(repr(components))}: pass a tuple of some of 0, 1, 2"
+    raises(ValueError, pattern, lambda: nts.Dirichlet(top, components=components))
+
+
+def test_conditions():
+    pattern = r"^bcs\[0\]=.*: pass a sequence of Dirichlet"
+    raises(TypeError, pattern, lambda: continuum(bcs=[top]))
+    raises(TypeError, r"^bcs=Dirichlet.*sequence", lambda: continuum(bcs=nts.Dirichlet(top)))
+    pattern = r"^Dirichlet.value=\(0, 0\): pass three finite components \[m\]"
+    raises(ValueError, pattern, lambda: continuum(bcs=[nts.Dirichlet(top, (0, 0))]))
+    pattern = r"^Dirichlet.value at t=0.0=\(0, nan, 0\): pass three finite"
+    moving = nts.Dirichlet(top, lambda t: (0, np.nan, 0))
+    raises(ValueError, pattern, lambda: continuum(bcs=[moving]))
+    pattern = r"^Dirichlet.where=5: pass a function of x"
+    raises(TypeError, pattern, lambda: continuum(bcs=[nts.Dirichlet(5)]))
+
+
+# ---- meshes
+def test_mesh_in_two_dimensions():
+    pattern = r"^mesh of 'body': triangle in 2D; pass 3D hexahedra or tetrahedra"
+    raises(ValueError, pattern, lambda: continuum(create_unit_square(COMM, 2, 2)))
+
+
+def test_mesh_that_is_no_mesh():
+    raises(TypeError, r"^mesh='cube': pass a dolfinx mesh", lambda: continuum("cube"))
+
+
+def test_mesh_with_nan_on_one_rank():
+    mesh = create_unit_cube(COMM, 2, 2, 2, CellType.hexahedron)
+    corner = np.flatnonzero((np.abs(mesh.geometry.x - 1) < 1e-9).all(axis=1))
+    mesh.geometry.x[corner, 1] = np.nan
+    pattern = r"^mesh of 'body': 1 nodes are not finite.*nan.*check the coordinates for NaN"
+    raises(ValueError, pattern, lambda: continuum(mesh))
+
+
+@pytest.mark.parametrize("kind", CELLS)
+def test_inverted_cell_on_one_rank(kind):
+    """A corner node moved through its cells, which no other rank may hold."""
+    mesh = box(cell_type=kind)
+    corner = np.flatnonzero((np.abs(mesh.geometry.x - 1) < 1e-9).all(axis=1))
+    mesh.geometry.x[corner] = -0.9
+    pattern = r"^mesh of 'body': .*inverted or (flat|overlapping) cells.*repair the mesh"
+    raises(ValueError, pattern, lambda: continuum(mesh))
+
+
+@pytest.mark.parametrize("kind", CELLS)
+def test_cells_turned_inside_out_as_a_whole(kind):
+    mesh = box(cells=(1, 1, 3), cell_type=kind)
+    middle = np.abs(mesh.geometry.x[:, 2] - 1 / 3) < 1e-9
+    mesh.geometry.x[middle, 2] = 0.9
+    pattern = r"overlapping cells, whose volumes add up to .* encloses .*; repair the mesh"
+    raises(ValueError, pattern, lambda: continuum(mesh))
+
+
+def test_flat_cell():
+    mesh = box(cells=(1, 1, 3))
+    mesh.geometry.x[np.abs(mesh.geometry.x[:, 2] - 1 / 3) < 1e-9, 2] = 0.0
+    pattern = r"^mesh of 'body': 1 inverted or flat cells, e.g. the one at x=\[0.5, 0.5, 0"
+    raises(ValueError, pattern, lambda: continuum(mesh))
+
+
+def test_distorted_mesh_is_no_error():
+    """Curved faces: the volumes of trilinear cells and of what their faces enclose are exact."""
+    mesh = box((5.0, 5.0, 5.0), (6.0, 6.0, 6.0))
+    x = mesh.geometry.x
+    x += 0.08 * np.sin(7 * x[:, [1, 2, 0]]) * np.cos(5 * x[:, [2, 0, 1]])
+    assert continuum(mesh).num_owned >= 0
+
+
+# ---- surfaces
+def test_empty_marker():
+    pattern = r"^marker of a surface of 'body': selects no exterior facet; check the marker's tol"
+    raises(ValueError, pattern, lambda: continuum().surface(lambda x: x[0] > 2))
+    body = continuum()
+    pattern = r"^marker of a surface of 'body' \(tag 4\): selects no exterior facet; .* or the tag"
+    raises(ValueError, pattern, lambda: body.surface(facet_tags(body.mesh), 4))
+
+
+def test_marker_of_wrong_kind():
+    body = continuum()
+    pattern = r"^marker of a surface of 'body'=7: pass a function of x .*, or meshtags and a tag"
+    raises(TypeError, pattern, lambda: body.surface(7))
+    tags = facet_tags(body.mesh)
+    raises(TypeError, r"pass a function of x .*, or meshtags and a tag", lambda: body.surface(tags))
+    pattern = r"pass facet meshtags \(dimension 2\), not cell or edge tags"
+    body.mesh.topology.create_entities(1)
+    edges = facet_tags(body.mesh, dim=1)
+    raises(ValueError, pattern, lambda: body.surface(edges, 3))
+    raises(ValueError, pattern, lambda: body.surface(top, 3))
+
+
+def test_marker_of_wrong_shape():
+    pattern = r"returned shape \(3, \d+\) for x of shape \(3, \d+\); return shape \(\d+,\)"
+    raises(ValueError, pattern, lambda: continuum().surface(lambda x: x > 0))
+
+
+def test_marker_that_raises_on_one_rank():
+    def picky(x):
+        if COMM.rank == COMM.size - 1:
+            raise ZeroDivisionError
+        return top(x)
+
+    raises(ValueError, r"raised ZeroDivisionError", lambda: continuum().surface(picky))
+
+
+def test_interior_facets():
+    body = continuum()
+    pattern = r"\(tag 3\): 4 interior facets selected; a contact surface must lie on the boundary"
+    raises(ValueError, pattern, lambda: body.surface(interior_tags(body.mesh), 3))
+
+
+def test_facets_are_oriented_outward_whatever_their_numbering():
+    body = continuum(box(cell_type="tetrahedron"))
+    surface = body.surface(lambda x: np.ones_like(x[0], dtype=bool))
+    a, b, c = surface.reference[surface.facets].transpose(1, 0, 2)
+    outward = np.einsum("ni,ni->n", np.cross(b - a, c - a), (a + b + c) / 3 - 0.5)
+    assert (outward > 0).all()
+
+
+def test_surface_of_a_quadratic_body():
+    body = continuum(box(cells=(1, 1, 1)), degree=2)
+    pattern = r"^degree=2 of body 'body': contact surfaces need degree 1"
+    raises(ValueError, pattern, lambda: body.surface(top))
+
+
+# ---- contacts and systems
+def test_slave_is_master():
+    body = continuum()
+    surface, other = body.surface(top), body.surface(lambda x: x[0] < 1e-9)
+    pattern = r"^slave, master: both surfaces of 'body' share nodes; choose disjoint markers"
+    raises(ValueError, pattern, lambda: nts.ContactPair(surface, surface))
+    raises(ValueError, pattern, lambda: nts.ContactPair(surface, other))
+    assert nts.ContactPair(surface, body.surface(bottom)).name == "body-body"
+
+
+def test_contact_of_no_surface():
+    surface = continuum().surface(top)
+    pattern = r"^master='floor': pass a Surface, e.g. body.surface\(marker\)"
+    raises(TypeError, pattern, lambda: nts.ContactPair(surface, "floor"))
+
+
+def test_contact_of_a_body_that_is_not_in_the_system():
+    low, high, pair = stacked()
+    pattern = r"^contacts: the slave body 'high' is not among bodies=\['low'\]; add it"
+    raises(ValueError, pattern, lambda: nts.System([low], contacts=[pair]))
+    raises(TypeError, r"^contacts=<.*sequence", lambda: nts.System([low, high], contacts=pair))
+    pattern = r"^contacts\[0\]='pair': pass a sequence of ContactPair"
+    raises(TypeError, pattern, lambda: nts.System([low, high], contacts=["pair"]))
+
+
+def test_bodies():
+    raises(ValueError, r"^bodies=\[\]: pass at least one body", lambda: nts.System([]))
+    mesh = box()
+    raises(TypeError, r"^bodies\[0\]=.*: pass a sequence", lambda: nts.System([mesh]))
+    body = continuum(mesh)
+    raises(TypeError, r"^bodies=.*: pass a sequence", lambda: nts.System(body))
+    pattern = r"^bodies: names \['body', 'body'\] are not unique; pass name= to each body"
+    raises(ValueError, pattern, lambda: nts.System([body, continuum()]))
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="one rank: all communicators are alike")
+def test_bodies_on_different_communicators():
+    alone = continuum(create_unit_cube(MPI.COMM_SELF, 1, 1, 1, CellType.hexahedron), name="alone")
+    pattern = r"^bodies: 'alone' and 'body' live on different communicators; make all meshes on one"
+    raises(ValueError, pattern, lambda: nts.System([continuum(), alone]))
+
+
+@pytest.mark.parametrize(
+    ("gap", "size"), [(-0.05, "0.1"), (-0.3, "0.6"), (-0.6, "0.8"), (-0.9, "0.2")]
+)
+def test_penetration_however_deep(gap, size):
+    low, high, pair = stacked(gap)
+    message = raises(
+        ValueError,
+        rf"^contact 'high-low': 9 slave nodes start inside the master, up to {size} of a facet "
+        r"\(allowed 0.01\), nodes \[.*\]; move the bodies apart",
+        lambda: nts.System([low, high], contacts=[pair]),
+    )
+    nodes = [int(n) for n in re.search(r"nodes \[(.*)\]", message).group(1).split(",")]
+    assert nodes == sorted(pair.slave.original)
+
+
+def test_penetration_on_one_rank():
+    """One corner of the slave surface, owned by one rank, reaches through the master."""
+    mesh = box((0.2, 0.2, 1.1), (0.8, 0.8, 2.1))
+    corner = np.flatnonzero((np.abs(mesh.geometry.x - [0.8, 0.8, 1.1]) < 1e-9).all(axis=1))
+    mesh.geometry.x[corner, 2] = 0.95
+    low, high = continuum(name="low"), continuum(mesh, name="high")
+    pair = nts.ContactPair(high.surface(lambda x: x[2] < 1.1 + 1e-9), low.surface(top))
+    pattern = r": 1 slave nodes start inside the master, up to 0.1 of a facet"
+    raises(ValueError, pattern, lambda: nts.System([low, high], contacts=[pair]))
+
+
+@pytest.mark.parametrize("gap", [-0.004, 0.0, 0.3])
+def test_no_penetration(gap):
+    low, high, pair = stacked(gap)
+    assert nts.System([low, high], contacts=[pair]).bodies == (low, high)
+
+
+def test_slaves_behind_the_master_body_are_not_inside():
+    """The body the master surface belongs to counts, not the half space behind the surface."""
+    low, high = continuum(name="low"), continuum(box((0.2, 0.2, -1.5), (0.8, 0.8, -0.5)), name="h")
+    pair = nts.ContactPair(high.surface(lambda x: x[2] > -0.5 - 1e-9), low.surface(top))
+    assert nts.System([low, high], contacts=[pair]).contacts == (pair,)
+
+
+# ---- unknown options
+@pytest.mark.parametrize(
+    ("action", "known"),
+    [
+        (lambda o: continuum(**o), "density, velocity"),
+        (lambda o: nts.System([continuum()], **o), "contacts, gravity"),
+        (lambda o: run(**o), "dt, t_end, newton"),
+        (lambda o: nts.Stepper(None, None, **o), "newton, petsc_options"),
+        (lambda o: nts.EnergyMomentum(**o), "stress, contact_gradient"),
+        (lambda o: nts.Newton(**o), "rtol, max_iterations"),
+        (lambda o: nts.NeoHookean(young=1, poisson=0, **o), "young, poisson"),
+        (lambda o: nts.ContactPair(None, None, **o), "slave, master"),
+        (lambda o: nts.Dirichlet(top, **o), "where, value, components"),
+        (lambda o: nts.Traction(top, (0, 0, 1), **o), "where, value"),
+    ],
+    ids="Continuum System simulate Stepper EnergyMomentum Newton material pair bc load".split(),
+)
+def test_unknown_option(action, known):
+    pattern = rf"^colour='red': unknown option of \w+; choose from .*{known}"
+    raises(TypeError, pattern, lambda: action({"colour": "red"}))
+
+
+def test_unknown_rule():
+    pattern = r"^stress='gonzales': choose one of 'gonzalez', 'mean-value'"
+    raises(ValueError, pattern, lambda: nts.EnergyMomentum(stress="gonzales"))
+    pattern = r"^contact_gradient='none': choose one of 'mean-value', 'gonzalez'"
+    raises(ValueError, pattern, lambda: nts.EnergyMomentum(contact_gradient="none"))
+    pattern = r"^quadrature_points=9: choose 1 to 7"
+    raises(ValueError, pattern, lambda: nts.EnergyMomentum(quadrature_points=9))
+
+
+def test_newton():
+    raises(TypeError, r"^newton=1e-08: pass Newton\(rtol=", lambda: run(newton=1e-8))
+    raises(TypeError, r"^newton=\{\}: pass Newton", lambda: run(newton={}))
+    raises(ValueError, r"^rtol=0: must lie in \(0, 1\)", lambda: nts.Newton(rtol=0))
+    pattern = r"^max_iterations=0: must be at least 1"
+    raises(ValueError, pattern, lambda: nts.Newton(max_iterations=0))
+    raises(ValueError, r"^max_retries=-1: must not be", lambda: nts.Newton(max_retries=-1))
+
+
+def test_integrator():
+    pattern = r"^integrator='midpoint': pass Midpoint\(\) or EnergyMomentum\(\)"
+    raises(TypeError, pattern, lambda: run(integrator="midpoint"))
+    raises(TypeError, r"^integrator=<class.*: pass Midp", lambda: run(integrator=nts.Midpoint))
+    raises(TypeError, r"^system=.*: pass a System\(", lambda: run(continuum()))
+
+
+def test_output():
+    pattern = r"^output\[0\]='fields': pass a sequence of writers of dolfinx_nts.output"
+    raises(TypeError, pattern, lambda: run(output=["fields"]))
+    raises(TypeError, r"^output=.*: pass a sequence of writers", lambda: run(output=SimpleNamespace()))
+
+
+def test_petsc_options():
+    """A misspelt option is found as soon as PETSc has solved once without asking for it."""
+    system = nts.System([continuum(velocity=lambda x: 0.1 * x[[1, 2, 0]])])
+    pattern = r"^petsc_options\['ksp_tpye'\]='gmres': not used by PETSc; correct its name or remove"
+    raises(ValueError, pattern, lambda: run(system, petsc_options={"ksp_tpye": "gmres"}))
+    pattern = r"^petsc_options={'pc_type': 'magic'}: .*PC type magic.*; correct the value"
+    raises(ValueError, pattern, lambda: run(system, petsc_options={"pc_type": "magic"}))
+    raises(TypeError, r"^petsc_options='-help': pass a dict", lambda: run(petsc_options="-help"))
+    good = {"ksp_type": "gmres", "pc_type": "bjacobi", "sub_pc_type": "ilu", "ksp_rtol": 1e-12}
+    assert run(system, petsc_options=good).status == "completed"
+
+
+def test_material_written_by_the_user_is_accepted():
+    def energy(c):
+        return 1e5 * (ufl.tr(c) - 3 - ufl.ln(ufl.det(c)))
+
+    assert isinstance(continuum(None, energy).u, fem.Function)

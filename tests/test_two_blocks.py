@@ -1,0 +1,204 @@
+"""B1, the oblique impact of two cubes: what each integrator keeps, on any mesh, unit and rank."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import two_blocks
+from dolfinx.mesh import CellType
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+ENERGY_MOMENTUM = nts.EnergyMomentum()
+#: Energy lost to activation in B1 (benchmarks.md).
+REFERENCE_LOSS = 0.051
+
+
+def impact(comm=COMM, integrator=ENERGY_MOMENTUM, t_end=0.2, newton=None, **scene):
+    return nts.simulate(
+        two_blocks.scene(comm, **scene), integrator, dt=2e-3, t_end=t_end, newton=newton
+    )
+
+
+def assert_conserved(result, ledger=1e-11):
+    assert result["status"] == "completed"
+    assert result["ledger"] <= ledger
+    assert result["linear_momentum"] <= 1e-12
+    assert result["angular_momentum"] <= 1e-12
+    assert result["min_gap"] >= -1e-10
+    assert abs(result["energy_lost"] - result["contact_defect"]) <= ledger
+
+
+@pytest.mark.mpi
+def test_demo_reaches_the_reference_figures():
+    results = two_blocks.main(COMM)
+    scheme, midpoint = results["energy-momentum"], results["midpoint"]
+    assert_conserved(scheme)
+    assert abs(scheme["energy_lost"] - REFERENCE_LOSS) <= 5e-4
+    assert scheme["max_active"] == 25
+    # The midpoint rule keeps the momenta but leaves the ledger open.
+    assert midpoint["linear_momentum"] <= 1e-12
+    assert midpoint["angular_momentum"] <= 1e-12
+    assert midpoint["min_gap"] >= -1e-10
+    assert midpoint["ledger"] > 1e-6
+
+
+VARIANTS = {
+    "gonzalez contact": (nts.EnergyMomentum(contact_gradient="gonzalez"), {}),
+    "StVK": (ENERGY_MOMENTUM, {"material": nts.StVenantKirchhoff(young=1e6, poisson=0.3)}),
+    "Mooney-Rivlin": (ENERGY_MOMENTUM, {"material": nts.MooneyRivlin(a=1.5e5, b=4e4, c=6e5)}),
+    "tetrahedra": (ENERGY_MOMENTUM, {"cell_type": CellType.tetrahedron}),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_ledger_closes_for(variant):
+    integrator, scene = VARIANTS[variant]
+    result = two_blocks.figures(impact(integrator=integrator, **scene))
+    assert_conserved(result)
+    assert 0.04 < result["energy_lost"] < 0.06
+
+
+def test_tetrahedra_agree_with_hexahedra():
+    """Same blocks, other cells: the centre of mass leaves with nearly the same momentum."""
+    runs = [impact(cell_type=c) for c in (CellType.hexahedron, CellType.tetrahedron)]
+    impulse = [r.status == "completed" and r.balance["energy"][-1] for r in runs]
+    assert abs(impulse[0] / impulse[1] - 1) < 0.01
+
+
+def test_mean_value_stress_closes_to_quadrature_error():
+    result = two_blocks.figures(impact(integrator=nts.EnergyMomentum(stress="mean-value")))
+    assert_conserved(result)
+
+
+@pytest.mark.mpi
+def test_ledger_closes_when_the_step_changes():
+    stepper = nts.Stepper(two_blocks.scene(COMM), ENERGY_MOMENTUM)
+    for k in range(60):
+        stepper.advance((2e-3, 1e-3, 0.7e-3)[k % 3])
+    stepper.solution.status = "completed"
+    assert stepper.solution.balance["active"].max() == 25
+    assert_conserved(two_blocks.figures(stepper.solution))
+    stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", [nts.Midpoint(), ENERGY_MOMENTUM])
+def test_metres_millimetres_micrometres(integrator):
+    """Mass in kg and time in s stay; lengths, and with them pressure and density, are converted."""
+    runs = [
+        impact(
+            integrator=integrator,
+            t_end=0.08,
+            metre=m,
+            density=1e3 / m**3,
+            material=nts.NeoHookean(young=1e6 / m, poisson=0.3),
+        ).balance
+        for m in (1.0, 1e3, 1e6)
+    ]
+    for run, metre in zip(runs[1:], (1e3, 1e6), strict=True):
+        assert np.array_equal(run["newton_iterations"], runs[0]["newton_iterations"])
+        assert np.array_equal(run["active"], runs[0]["active"])
+        assert np.allclose(run["energy"] / metre**2, runs[0]["energy"], rtol=1e-9, atol=0)
+        spin, before = (r["angular_momentum"] for r in (run, runs[0]))
+        assert np.abs(spin / metre**2 - before).max() <= 1e-9 * np.abs(before).max()
+
+
+def history(comm, integrator, t_end, **scene):
+    """Active nodes of every step, by input number, and the balance."""
+    stepper = nts.Stepper(two_blocks.scene(comm, **scene), integrator)
+    active = []
+    for _ in range(round(t_end / 2e-3)):
+        state = stepper.advance(2e-3)
+        surface = stepper.system.contacts[0].slave
+        nodes = surface.original[surface.owned[state.force[0] > 0]]
+        active.append(sorted(n for part in comm.allgather(nodes.tolist()) for n in part))
+    table = stepper.solution.balance
+    stepper.close()
+    return active, table
+
+
+def assert_same_as_serial(integrator, t_end, **scene):
+    active, table = history(COMM, integrator, t_end, **scene)
+    serial_active, serial = history(MPI.COMM_SELF, integrator, t_end, **scene)
+    assert active == serial_active
+    assert any(active)
+    energy = serial["energy"][0]
+    for name in ("kinetic", "potential", "energy", "contact_defect"):
+        assert np.abs(table[name] - serial[name]).max() <= 1e-9 * energy, name
+    for name in ("linear_momentum", "angular_momentum"):
+        assert np.abs(table[name] - serial[name]).max() <= 1e-9 * np.abs(serial[name]).max(), name
+    assert np.array_equal(table["newton_iterations"], serial["newton_iterations"])
+
+
+@pytest.mark.mpi
+@pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
+@pytest.mark.parametrize("integrator", [nts.Midpoint(), ENERGY_MOMENTUM])
+def test_ranks_agree_with_a_serial_run(integrator):
+    assert_same_as_serial(integrator, 0.08)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(COMM.size > 1, reason="starts its own ranks")
+@pytest.mark.parametrize("ranks", [3, 4])
+def test_more_ranks_agree_with_a_serial_run(ranks):
+    """On 3 ranks one owns no slave node, on 4 the contact zone is cut by the partition."""
+    # This process is a rank of its own; its MPI variables would mislead the new ones.
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_"))}
+    environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    environment["PYTHONPATH"] = str(Path(two_blocks.__file__).parent)
+    command = ["mpirun", "--bind-to", "none", "--oversubscribe", "-n", str(ranks)]
+    done = subprocess.run(
+        [*command, sys.executable, __file__],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("same as serial") == ranks
+
+
+@pytest.mark.mpi
+def test_condensation_changes_nothing():
+    full, condensed = (
+        impact(t_end=0.08, newton=nts.Newton(condense=c)).balance for c in (False, True)
+    )
+    assert np.abs(full["energy"] - condensed["energy"]).max() <= 1e-12 * full["energy"][0]
+    assert np.array_equal(full["active"], condensed["active"])
+
+
+@pytest.mark.mpi
+def test_field_split_finds_the_same_solution():
+    options = {
+        "ksp_type": "fgmres",
+        "ksp_rtol": 1e-8,
+        "pc_type": "fieldsplit",
+        "pc_fieldsplit_type": "schur",
+        "pc_fieldsplit_schur_fact_type": "full",
+        "pc_fieldsplit_schur_precondition": "selfp",
+        "fieldsplit_bodies_ksp_type": "preonly",
+        "fieldsplit_bodies_pc_type": "lu",
+        "fieldsplit_bodies_pc_factor_mat_solver_type": "mumps",
+        "fieldsplit_contact_ksp_type": "gmres",
+        "fieldsplit_contact_ksp_rtol": 1e-10,
+        "fieldsplit_contact_pc_type": "lu",
+        "fieldsplit_contact_pc_factor_mat_solver_type": "mumps",
+    }
+    system = two_blocks.scene(COMM)
+    run = nts.simulate(system, ENERGY_MOMENTUM, dt=2e-3, t_end=0.04, petsc_options=options)
+    direct = impact(t_end=0.04)
+    assert run.status == "completed"
+    energy = direct.balance["energy"]
+    assert np.abs(run.balance["energy"] - energy).max() <= 1e-11 * energy[0]
+
+
+if __name__ == "__main__":
+    assert_same_as_serial(ENERGY_MOMENTUM, 0.05)
+    print("same as serial", flush=True)
