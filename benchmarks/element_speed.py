@@ -54,7 +54,9 @@ def main() -> None:
         ) -> object:
             return nts.element(z0, z1, m, rule)
 
-        rates = [rate(lambda r=r: element(r), n, options.seconds) for r in ("mean-value", "gonzalez")]
+        rates = [
+            rate(lambda r=r: element(r), n, options.seconds) for r in ("mean-value", "gonzalez")
+        ]
         rates.append(rate(direct, n, options.seconds))
         print(f"{n:>8}" + "".join(f"{r:14.0f}" for r in rates), flush=True)
 

@@ -26,7 +26,8 @@ def tumbling(comm: MPI.Comm) -> nts.System:
     spin = lambda x: np.array([0.3 + 0 * x[0], 0.4 * (x[2] - 0.5), -0.4 * (x[1] - 0.5)])  # noqa: E731
     cube = nts.Continuum(high, rubber, density=1e3, velocity=spin, name="cube")
     pair = nts.ContactPair(
-        slave=cube.surface(lambda x: x[2] < 0.02 + 1e-9), master=base.surface(lambda x: x[2] > -1e-9)
+        slave=cube.surface(lambda x: x[2] < 0.02 + 1e-9),
+        master=base.surface(lambda x: x[2] > -1e-9),
     )
     return nts.System([base, cube], contacts=[pair], gravity=(0, 0, -9.81))
 

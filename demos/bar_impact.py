@@ -160,7 +160,7 @@ def plot(results, balances, gravity, folder):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from dolfinx_nts.output import compare_balances
+    from dolfinx_nts.plots import compare_balances
 
     folder.mkdir(parents=True, exist_ok=True)
     compare_balances(balances, str(folder / "balance.png"))

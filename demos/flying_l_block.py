@@ -126,14 +126,14 @@ def main(
         results[name], balances[name] = figures(run), run.balance
         results[name]["seconds"] = time.perf_counter() - clock
         if output is not None:
-            from dolfinx_nts.output import picture
+            from dolfinx_nts.pictures import picture
 
             Path(output).mkdir(parents=True, exist_ok=True)
             picture(system.bodies, str(Path(output) / f"block_{name}.png"), colour="speed")
     if comm.rank == 0:
         report(results, dt)
     if comm.rank == 0 and output is not None:
-        from dolfinx_nts.output import compare_balances
+        from dolfinx_nts.plots import compare_balances
 
         compare_balances(balances, str(Path(output) / "balance.png"))
     return results

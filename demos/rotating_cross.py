@@ -121,7 +121,7 @@ def main(
     if comm.rank == 0:
         report(results)
     if comm.rank == 0 and output is not None:
-        from dolfinx_nts.output import compare_balances
+        from dolfinx_nts.plots import compare_balances
 
         Path(output).mkdir(parents=True, exist_ok=True)
         compare_balances(balances, str(Path(output) / "balance.png"))

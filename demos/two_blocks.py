@@ -27,7 +27,9 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import output as out
+from dolfinx_nts.output import BalanceCSV, Fields
+from dolfinx_nts.pictures import picture
+from dolfinx_nts.plots import compare_balances
 
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
@@ -125,16 +127,16 @@ def main(
         if output:
             folder = Path(output) / name
             folder.mkdir(parents=True, exist_ok=True)
-            writers = [out.Fields(folder, every=5), out.BalanceCSV(folder / "balance.csv")]
+            writers = [Fields(folder, every=5), BalanceCSV(folder / "balance.csv")]
         run = nts.simulate(
             system, integrator, dt=dt, t_end=t_end, output=writers, progress=progress
         )
         results[name], tables[name] = figures(run), run.balance
         if output:
             run.plot(folder / "balance.png")
-            out.picture(system.bodies, folder / "speed.png", colour="speed")
+            picture(system.bodies, folder / "speed.png", colour="speed")
     if output and comm.rank == 0:
-        out.compare_balances(tables, Path(output) / "two_blocks.png")
+        compare_balances(tables, Path(output) / "two_blocks.png")
     if comm.rank == 0:
         _print(results)
     return results

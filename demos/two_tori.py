@@ -86,7 +86,7 @@ class Pictures:
 
     def write(self, stepper, last):
         """Draw if it is time."""
-        from dolfinx_nts.output import picture
+        from dolfinx_nts.pictures import picture
 
         t = stepper.state.time
         if t < self.next - 1e-9 and not last:
@@ -146,6 +146,17 @@ def report(result, integrator, refinement, dt):
         print(f"{name:24}{f'{value:.6g}' if isinstance(value, float) else value}")
 
 
+def writers(output):
+    """What a run leaves in the folder, if there is one."""
+    if output is None:
+        return []
+    from dolfinx_nts.output import BalanceCSV, Fields
+
+    folder = Path(output)
+    fields = Fields(folder, interval=0.1)
+    return [fields, BalanceCSV(folder / "balance.csv"), Pictures(folder, 2.0)]
+
+
 def main(
     *,
     integrator="em",
@@ -171,21 +182,18 @@ def main(
         See `figures`; with "seconds", the time for everything.
     """
     clock = time.perf_counter()
-    writers = []
-    if output is not None:
-        from dolfinx_nts.output import BalanceCSV, Fields
-
-        folder = Path(output)
-        writers = [
-            Fields(folder, interval=0.1), BalanceCSV(folder / "balance.csv"), Pictures(folder, 2.0)
-        ]  # fmt: skip
     system = scene(comm, refinement)
     run = nts.simulate(
-        system, INTEGRATORS[integrator], dt=dt, t_end=t_end, output=writers, progress=progress
+        system,
+        INTEGRATORS[integrator],
+        dt=dt,
+        t_end=t_end,
+        output=writers(output),
+        progress=progress,
     )
     result = figures(run) | {"seconds": time.perf_counter() - clock}
     if output is not None:
-        run.plot(str(folder / "balance.png"))
+        run.plot(str(Path(output) / "balance.png"))
     if comm.rank == 0:
         report(result, integrator, refinement, dt)
     return result

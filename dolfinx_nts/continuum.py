@@ -18,7 +18,7 @@ from dolfinx import mesh as dolfinx_mesh
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.surfaces import Surface, _oriented_nodes, flux, locate_facets
+from dolfinx_nts.surfaces import Surface, flux, locate_facets, oriented_nodes
 from dolfinx_nts.validation import (
     at_points,
     items,
@@ -475,7 +475,7 @@ def _check_cells(mesh: Any, name: str, x: FloatArray) -> None:
     text = f"mesh of {name!r}: {len(bad)} inverted or flat cells, {where}; repair the mesh"
     raise_together(mesh.comm, text if len(bad) else None)
     # A cell turned inside out as a whole: the volumes add up to more than the boundary encloses.
-    boundary = mesh.geometry.x[_oriented_nodes(mesh, compat.exterior_facets(mesh))]
+    boundary = mesh.geometry.x[oriented_nodes(mesh, compat.exterior_facets(mesh))]
     local = np.array([np.abs(volumes).sum(), flux(boundary).sum()])
     volume, enclosed = mesh.comm.allreduce(local)
     if abs(volume - enclosed) > 1e-9 * volume:

@@ -184,7 +184,7 @@ def bodies_from_tags(
             f"mesh: {kind} in {mesh.geometry.dim}D; pass a 3D mesh of hexahedra or tetrahedra"
         )
     for what, tags, dim in (("cell_tags", cell_tags, 3), ("facet_tags", facet_tags, 2)):
-        if tags is not None and getattr(tags, "dim", None) != dim:
+        if getattr(tags, "dim", None) != dim and not (tags is None and dim == 2):
             raise ValueError(f"{what}={tags!r}: pass meshtags of dimension {dim}")
     local = (*_tagged_cells(mesh, cell_tags), *_tagged_facets(mesh, facet_tags))
     gathered = mesh.comm.gather(local)
@@ -273,15 +273,14 @@ def _find_facets(mesh: Any, facets: IntArray, tags: IntArray) -> tuple[IntArray,
 
 
 # ---- DOLFINx meshes
-def _tagged_cells(mesh: Any, cell_tags: Any) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """This rank's owned tagged cells: tags, original numbers, nodes (m, corners), positions."""
+def _tagged_cells(mesh: Any, cell_tags: Any) -> tuple[IntArray, IntArray, FloatArray]:
+    """This rank's owned tagged cells: tags, nodes (m, corners), positions (m, corners, 3)."""
     owned = cell_tags.indices < mesh.topology.index_map(3).size_local
     index = cell_tags.indices[owned]
     table = compat.geometry_dofmap(mesh)
     nodes = table[index] if len(index) else np.empty((0, table.shape[1]), np.int32)
     ids = np.asarray(mesh.geometry.input_global_indices)
-    original = np.asarray(mesh.topology.original_cell_index)[index]
-    return cell_tags.values[owned], original, ids[nodes], mesh.geometry.x[nodes]
+    return cell_tags.values[owned], ids[nodes], mesh.geometry.x[nodes]
 
 
 def _tagged_facets(mesh: Any, facet_tags: Any) -> tuple[IntArray, IntArray]:
@@ -296,13 +295,13 @@ def _merge(
     kind: str, gathered: list[Any], names: dict[str, int], surfaces: dict[str, int]
 ) -> _Input:
     """The input from the tagged cells and facets of all ranks; on rank 0."""
-    gathered = [part for part in gathered if len(part[0])]
-    if not gathered:
+    tags, cells, x, values, facets = (_joined(tables) for tables in zip(*gathered, strict=True))
+    if not len(tags):
         raise ValueError("cell_tags: no cell has a tag; tag the cells of each body")
-    tags, original, cells, x, values, facets = map(np.concatenate, zip(*gathered, strict=True))
     if cells.shape[1] != _CORNERS[kind]:
         raise ValueError("mesh: geometry of degree above 1; pass a mesh of degree 1")
-    order = np.argsort(original)
+    # An order that does not depend on the ranks; a submesh does not know the original one.
+    order = np.lexsort(cells.T)
     tags, cells, x = tags[order], cells[order], x[order]
     names = names or {f"volume_{tag}": int(tag) for tag in np.unique(tags)}
     for what, mapping, known in (("names", names, tags), ("surfaces", surfaces, values)):
@@ -313,6 +312,12 @@ def _merge(
     nodes, first = np.unique(cells, return_index=True)
     volumes = [_Volume(n, kind, cells[tags == tag], facets, values) for n, tag in names.items()]
     return _Input(nodes, x.reshape(-1, 3)[first], volumes, surfaces)
+
+
+def _joined(tables: Iterable[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Rows of all ranks; ranks without rows may not know how wide they are."""
+    tables = list(tables)
+    return np.concatenate([t for t in tables if len(t)] or tables[:1])
 
 
 # ---- Gmsh

@@ -47,10 +47,10 @@ class Solution:
         Args:
             path: Picture file; its ending chooses the format.
         """
-        from dolfinx_nts import output
+        from dolfinx_nts.plots import plot_balance
 
         if self.system.comm.rank == 0:
-            output.plot_balance(self.balance, path)
+            plot_balance(self.balance, path)
 
 
 @known_options
@@ -86,7 +86,9 @@ class Stepper:
         if not isinstance(newton, Newton | None):
             raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")
         if not isinstance(petsc_options, Mapping | None):
-            raise TypeError(f"petsc_options={petsc_options!r}: pass a dict, e.g. {{'pc_type': 'lu'}}")
+            raise TypeError(
+                f"petsc_options={petsc_options!r}: pass a dict, e.g. {{'pc_type': 'lu'}}"
+            )
         self.newton = newton or Newton()
         self.problem = StepProblem(
             system, integrator, rtol=self.newton.rtol, condense=self.newton.condense

@@ -98,7 +98,7 @@ class Surface:
     def __init__(self, body: Any, local_facets: IntArray) -> None:
         mesh, space = body.mesh, body.space
         self.body = body
-        nodes = _oriented_nodes(mesh, local_facets)
+        nodes = oriented_nodes(mesh, local_facets)
         node_to_dof = np.full(len(mesh.geometry.x), -1, dtype=np.int64)
         geometry = compat.geometry_dofmap(mesh)
         cells = len(geometry)
@@ -159,8 +159,10 @@ class Surface:
             Shape (n,), the same on all ranks.
         """
         mesh = self.body.mesh
-        corners = mesh.geometry.x[_oriented_nodes(mesh, compat.exterior_facets(mesh))]
-        box = np.array([corners.min(axis=(0, 1), initial=np.inf), -corners.max(axis=(0, 1), initial=-np.inf)])
+        corners = mesh.geometry.x[oriented_nodes(mesh, compat.exterior_facets(mesh))]
+        box = np.array(
+            [corners.min(axis=(0, 1), initial=np.inf), -corners.max(axis=(0, 1), initial=-np.inf)]
+        )
         mesh.comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
         near = np.flatnonzero(((x >= box[0]) & (x <= -box[1])).all(axis=1))
         closest = search.closest_facets(x[near], corners, reach=np.inf)
@@ -200,7 +202,7 @@ def _winding(x: FloatArray, corners: FloatArray) -> float:
     return total / (2 * np.pi)
 
 
-def _oriented_nodes(mesh: Any, local_facets: IntArray) -> IntArray:
+def oriented_nodes(mesh: Any, local_facets: IntArray) -> IntArray:
     """Geometry nodes of facets in cyclic order, counter-clockwise seen from outside the adjacent cell."""
     nodes = compat.entities_to_geometry(mesh, 2, local_facets)
     nodes = nodes[:, _CYCLIC[nodes.shape[1]]]

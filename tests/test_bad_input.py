@@ -31,9 +31,7 @@ pytestmark = pytest.mark.mpi
 
 
 def box(low=(0.0, 0.0, 0.0), high=(1.0, 1.0, 1.0), cells=(2, 2, 2), cell_type="hexahedron"):
-    return create_box(
-        COMM, [low, high], cells, CELLS[cell_type], ghost_mode=GhostMode.shared_facet
-    )
+    return create_box(COMM, [low, high], cells, CELLS[cell_type], ghost_mode=GhostMode.shared_facet)
 
 
 def continuum(mesh=None, material=RUBBER, density=1e3, **options):
@@ -202,7 +200,9 @@ def test_loads():
     raises(ValueError, pattern, lambda: continuum(body_force=lambda t: 4.0))
     pattern = r"^Traction.where.*selects no exterior facet; check the marker"
     raises(
-        ValueError, pattern, lambda: continuum(traction=[nts.Traction(lambda x: x[0] > 9, (1, 0, 0))])
+        ValueError,
+        pattern,
+        lambda: continuum(traction=[nts.Traction(lambda x: x[0] > 9, (1, 0, 0))]),
     )
 
 
@@ -473,7 +473,9 @@ def test_integrator():
 def test_output():
     pattern = r"^output\[0\]='fields': pass a sequence of writers of dolfinx_nts.output"
     raises(TypeError, pattern, lambda: run(output=["fields"]))
-    raises(TypeError, r"^output=.*: pass a sequence of writers", lambda: run(output=SimpleNamespace()))
+    raises(
+        TypeError, r"^output=.*: pass a sequence of writers", lambda: run(output=SimpleNamespace())
+    )
 
 
 def test_petsc_options():

@@ -318,7 +318,7 @@ def test_rigid_rotation_strains_only_the_midpoint_rule():
     middle = 0.5 * (EYE + turn)
     s = np.linalg.solve(middle, piola(body, INTEGRATORS["midpoint"], EYE, turn))
     strain = (s - LAM / (3 * LAM + 2 * MU) * np.trace(s) * EYE) / (2 * MU)
-    spurious = -np.sin(0.05) ** 2 / 2
+    spurious = -(np.sin(0.05) ** 2) / 2
     assert np.isclose(spurious, -1.24896e-3, rtol=1e-5)
     assert np.allclose(strain, np.diag([spurious, spurious, 0]), rtol=0, atol=1e-16)
     for name in ("gonzalez", "mean-value"):

@@ -150,6 +150,19 @@ def test_touching_blocks_of_tags(kind, cells, facets):
     assert parts["a"].where("middle")[1] == 3
 
 
+@pytest.mark.mpi
+def test_bodies_of_a_submesh_without_facet_tags():
+    """Its cells may leave ranks empty, and 0.5.2 does not number them."""
+    mesh, cell_tags, _ = tagged_bar()
+    sub, parents, _ = compat.create_submesh(mesh, 3, cell_tags.find(9))
+    value = np.full(len(parents), 2, np.int32)
+    tags = dolfinx_mesh.meshtags(sub, 3, np.arange(len(parents), dtype=np.int32), value)
+    parts = bodies_from_tags(sub, tags, names={"only": 2})
+    body = parts["only"].continuum(RUBBER, density=1.0)
+    assert COMM.allreduce(body.nodal_mass.sum()) == pytest.approx(3.0, rel=1e-14)
+    assert COMM.allreduce(len(parts["only"].facet_tags.indices)) == 0
+
+
 def impact(parts, left, right):
     """The left block turns while the right one runs into it; a few steps."""
     a = parts[left].continuum(
@@ -264,6 +277,8 @@ def test_wrong_tags_and_names_are_named():
     mesh, cell_tags, facet_tags = tagged_bar()
     with pytest.raises(ValueError, match="cell_tags=.*dimension 3"):
         bodies_from_tags(mesh, facet_tags)
+    with pytest.raises(ValueError, match="cell_tags=None.*dimension 3"):
+        bodies_from_tags(mesh, None)
     with pytest.raises(ValueError, match="facet_tags=.*dimension 2"):
         bodies_from_tags(mesh, cell_tags, cell_tags)
     with pytest.raises(ValueError, match=r"names\['a'\]=8: no such tag; the mesh has 7, 9"):

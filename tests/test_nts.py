@@ -60,9 +60,7 @@ def constraints_of_invariants(pi, nc):
     g = [-sum(n[i] * yd[i] for i in range(nc))]
     g += [sum(dn[i, a] * yd[i] for i in range(nc)) for a in range(2)]
     g += [(pi[-3] - 1) / 2]
-    g += [
-        -sum(n[i] * dn[j, a] * yy[i, j] for i in range(nc) for j in range(nc)) for a in range(2)
-    ]
+    g += [-sum(n[i] * dn[j, a] * yy[i, j] for i in range(nc) for j in range(nc)) for a in range(2)]
     return np.array(g)
 
 
@@ -387,9 +385,7 @@ def test_at_rest(nc, rule):
         e = nts.element(z, z, multiplier, rule)
     gradient = [complex_step(lambda x: geometric_constraints(x, nc), row) for row in z]
     assert np.allclose(e.force_gradient, gradient, rtol=0, atol=1e-14)
-    assert np.allclose(
-        e.force, np.einsum("nm,nmz->nz", multiplier, gradient), rtol=0, atol=2e-14
-    )
+    assert np.allclose(e.force, np.einsum("nm,nmz->nz", multiplier, gradient), rtol=0, atol=2e-14)
 
     def force(x):
         rows = [complex_step(lambda r: geometric_constraints(r, nc), row) for row in x]

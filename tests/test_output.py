@@ -11,7 +11,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import balance, output
+from dolfinx_nts import balance, output, pictures, plots
 
 h5py = pytest.importorskip("h5py")
 image = pytest.importorskip("matplotlib.image")
@@ -182,8 +182,8 @@ def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
     file = read(mpi_tmp_path / "body.xdmf")
     assert len(file.points) == np.prod(np.array(cells) + 1)
     assert np.allclose(file.fields[0]["velocity"], file.points[:, [1, 2, 0]], atol=1e-14)
-    output.picture([body], mpi_tmp_path / "speed.png", width=2.0)
-    output.picture([body], mpi_tmp_path / "stress.png", colour="stress", width=2.0)
+    pictures.picture([body], mpi_tmp_path / "speed.png", width=2.0)
+    pictures.picture([body], mpi_tmp_path / "stress.png", colour="stress", width=2.0)
     run.close()
 
 
@@ -321,8 +321,8 @@ def test_plots(mpi_tmp_path):
     runs["midpoint"].plot(mpi_tmp_path / "one.png")
     if COMM.rank == 0:
         tables = {name: run.balance for name, run in runs.items()}
-        output.compare_balances(tables, mpi_tmp_path / "both.png")
-        output.compare_balances(tables, mpi_tmp_path / "both.pdf")
+        plots.compare_balances(tables, mpi_tmp_path / "both.png")
+        plots.compare_balances(tables, mpi_tmp_path / "both.pdf")
     COMM.Barrier()
     for name in ("one.png", "both.png"):
         pixels = image.imread(mpi_tmp_path / name)
@@ -332,15 +332,15 @@ def test_plots(mpi_tmp_path):
 
 def test_plot_of_a_run_without_a_step(tmp_path):
     table = {n: np.zeros((1, 3) if "momentum" in n else 1) for n in balance.COLUMNS}
-    output.plot_balance(table, tmp_path / "empty.png")
+    plots.plot_balance(table, tmp_path / "empty.png")
     assert (tmp_path / "empty.png").stat().st_size > 5000
 
 
 def test_plots_refuse_what_is_no_balance(tmp_path):
     with pytest.raises(ValueError, match=r"balance: columns \[.*'energy'.*pass Solution.balance"):
-        output.plot_balance({"time": np.zeros(3)}, tmp_path / "a.png")
+        plots.plot_balance({"time": np.zeros(3)}, tmp_path / "a.png")
     with pytest.raises(ValueError, match=r"balances=\{\}.*at least one"):
-        output.compare_balances({}, tmp_path / "a.png")
+        plots.compare_balances({}, tmp_path / "a.png")
 
 
 # ---- von Mises stress and pictures
@@ -370,13 +370,13 @@ def neo_hooke(f):
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", [CellType.hexahedron, CellType.tetrahedron])
 def test_von_mises_of_a_homogeneous_deformation(cell, degree):
-    stress = output.von_mises(homogeneous(RUBBER, degree, cell))
+    stress = pictures.von_mises(homogeneous(RUBBER, degree, cell))
     assert np.allclose(stress.x.array, equivalent(neo_hooke(SHEAR)), rtol=1e-12)
 
 
 @mpi
 def test_von_mises_of_a_users_energy():
-    stress = output.von_mises(homogeneous(lambda c: 5.0 * ufl.tr(c * c), 1))
+    stress = pictures.von_mises(homogeneous(lambda c: 5.0 * ufl.tr(c * c), 1))
     c = SHEAR.T @ SHEAR
     cauchy = SHEAR @ (2 * 10.0 * c) @ SHEAR.T / np.linalg.det(SHEAR)
     assert np.allclose(stress.x.array, equivalent(cauchy), rtol=1e-12)
@@ -385,7 +385,7 @@ def test_von_mises_of_a_users_energy():
 @mpi
 def test_a_rotation_is_free_of_stress():
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    stress = output.von_mises(homogeneous(RUBBER, 1, gradient=turn))
+    stress = pictures.von_mises(homogeneous(RUBBER, 1, gradient=turn))
     assert np.all(stress.x.array < 1e-8)
 
 
@@ -402,7 +402,7 @@ def test_picture(colour, cell, mpi_tmp_path):
     for body in system.bodies:
         body.u.interpolate(lambda x: 0.1 * np.stack([x[1], x[2] ** 2, x[0]]))
     path = mpi_tmp_path / "new" / "picture.png"
-    output.picture(system.bodies, path, colour=colour, title="t = 0", labels=True, width=3.0)
+    pictures.picture(system.bodies, path, colour=colour, title="t = 0", labels=True, width=3.0)
     pixels = image.imread(path)
     used = pixels[..., :3].min(axis=-1) < 0.9
     margin = 0.04 * max(pixels.shape)
@@ -420,7 +420,9 @@ def test_picture_has_true_proportions_and_hides_what_is_behind(mpi_tmp_path):
         box([2.0, 1, 0.5], [3.0, 3, 1.5], [1, 2, 2]), RUBBER, density=1.0, velocity=(0, 0, 1.0)
     )
     for order in ([back, front], [front, back]):
-        output.picture(order, mpi_tmp_path / "p.png", view=(0.0, 0.0), limits=(0.0, 1.0), width=4.0)
+        pictures.picture(
+            order, mpi_tmp_path / "p.png", view=(0.0, 0.0), limits=(0.0, 1.0), width=4.0
+        )
         pixels = image.imread(mpi_tmp_path / "p.png")[..., :3]
         COMM.Barrier()
         body = coloured(pixels)[:, :810]
@@ -466,9 +468,9 @@ def test_a_place_that_cannot_be_written_stops_before_any_step(mpi_tmp_path):
             nts.simulate(system, nts.Midpoint(), dt=1e-3, t_end=1e-3, output=[writer])
         assert not system.bodies[0].u.x.array.any()
     with pytest.raises(OSError, match="path='.*file.*cannot be written"):
-        output.picture(flying().bodies, blocked / "p.png")
+        pictures.picture(flying().bodies, blocked / "p.png")
     with pytest.raises(RuntimeError, match="path='.*p.xyz'.*not supported"):
-        output.picture(flying().bodies, mpi_tmp_path / "p.xyz", width=1.0)
+        pictures.picture(flying().bodies, mpi_tmp_path / "p.xyz", width=1.0)
 
 
 def test_fields_of_bodies_without_a_mesh(tmp_path):
@@ -499,11 +501,11 @@ def test_body_names_that_give_one_file(mpi_tmp_path):
 )
 def test_bad_picture_options(options, message, mpi_tmp_path):
     with pytest.raises(ValueError, match=message):
-        output.picture(flying().bodies, mpi_tmp_path / "p.png", **options)
+        pictures.picture(flying().bodies, mpi_tmp_path / "p.png", **options)
 
 
 def test_pictures_of_what_has_no_mesh(tmp_path):
     with pytest.raises(ValueError, match=r"bodies=\[\].*at least one"):
-        output.picture([], tmp_path / "p.png")
+        pictures.picture([], tmp_path / "p.png")
     with pytest.raises(TypeError, match=r"bodies: 'ball' has no mesh"):
-        output.picture(["ball"], tmp_path / "p.png")
+        pictures.picture(["ball"], tmp_path / "p.png")
