@@ -28,6 +28,8 @@ _CONTACT_POINTS = 2
 #: three-point rule is exact to rounding (error ~ x^7), while the plain difference would leave
 # rounding noise ~ eps / x in the stress.
 _SMALL_STRAIN = 1e-2
+#: Relative strain increment whose square is below rounding.
+_REST_STRAIN = 1e-8
 
 
 def strain_derivative(energy: Callable[[Any], Any], strain: Any) -> Any:
@@ -60,9 +62,12 @@ def gonzalez_stress(energy: Callable[[Any], Any], c0: Any, c1: Any) -> Any:
     by_quadrature = ufl.inner(w0 * outer + (w1 - 1.0) * middle, dc)
     by_difference = energy(c1) - energy(c0) - ufl.inner(middle, dc)
     size, scale = ufl.inner(dc, dc), ufl.inner(cm, cm)
-    bracket = ufl.conditional(ufl.lt(size, _SMALL_STRAIN**2 * scale), by_quadrature, by_difference)
-    # The addend is far below any increment that rounding lets exist; it only keeps 0/0 away at
-    # rest.
+    bracket = ufl.conditional(
+        ufl.lt(size, _SMALL_STRAIN**2 * scale), by_quadrature, by_difference
+    )
+    # Next to rest the term is below rounding, but its derivative would be rounding noise over DC.
+    bracket = ufl.conditional(ufl.lt(size, _REST_STRAIN**2 * scale), 0.0, bracket)
+    # The addend is far below any increment that rounding lets exist; it keeps 0/0 away at rest.
     return 2 * (middle + bracket / (size + 1e-60 * scale) * dc)
 
 
@@ -96,20 +101,17 @@ def gonzalez(
     pi0: FloatArray,
     pi1: FloatArray,
     multiplier: FloatArray,
-    value: Callable[[FloatArray], FloatArray],
     gradient: Callable[[FloatArray], FloatArray],
     curvature: Callable[[FloatArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
     """Gonzalez's discrete gradient (67) with the sign corrected, row by row, and its tangent.
 
-    Mixes the units of the invariants and is 0/0 at rest, which is why the mean value is the
-    default.
+    Mixes the units of the invariants and is 0/0 at rest, which is why the mean value is the default.
 
     Args:
         pi0: Invariants at t_n, shape (n, p).
         pi1: Invariants at t_{n+1}, shape (n, p).
         multiplier: lambda, shape (n, m).
-        value: g(pi), shape (n, m).
         gradient: dg/dpi, shape (n, m, p).
         curvature: d2(lambda . g)/dpi2, shape (n, p, p).
 
@@ -121,7 +123,10 @@ def gonzalez(
     size = np.einsum("np,np->n", dpi, dpi)
     at_rest = size <= (64 * np.finfo(float).eps) ** 2 * np.einsum("np,np->n", pm, pm)
     inverse = np.where(at_rest, 0.0, 1.0 / np.where(at_rest, 1.0, size))[:, None]
-    defect = value(pi1) - value(pi0) - np.einsum("nmp,np->nm", middle, dpi)
+    # g(pi_1) - g(pi_0) by the exact mean value: the difference of values would leave rounding noise
+    # ~ eps / |Dpi|^2 in the tangent.
+    mean, _ = mean_value(pi0, pi1, gradient, curvature)
+    defect = np.einsum("nmp,np->nm", mean - middle, dpi)
     discrete = middle + (defect * inverse)[:, :, None] * dpi[:, None]
 
     rest = np.einsum("nm,nm->n", multiplier, defect)[:, None] * inverse

@@ -187,7 +187,8 @@ class StepSolver:
     def _converged(self, _snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
         assert self._last is not None
         reasons = PETSc.SNES.ConvergedReason
-        worst = max(self._last.ratio.values())
+        # After the Jacobian of the same iterate rounding may be known better than before.
+        worst = max(self.problem.ratios(self._last).values())
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
             return reasons.DIVERGED_FNORM_NAN
         if worst <= 1.0:
@@ -200,7 +201,8 @@ class StepSolver:
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:
         """One sentence that names what failed and where; every rank must call it."""
         problem = self.problem
-        worst = max(e.ratio, key=lambda name: np.nan_to_num(e.ratio[name], nan=np.inf))
+        ratio = problem.ratios(e)
+        worst = max(ratio, key=lambda name: np.nan_to_num(ratio[name], nan=np.inf))
         notes = [
             _contact_note(c, k, flips)
             for c, k, flips in zip(problem.contacts, e.contacts, self._flips, strict=True)
@@ -216,7 +218,7 @@ class StepSolver:
         return (
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
             f"{iterations} iterations (SNES reason {reason}); worst block {worst!r} at "
-            f"{e.ratio[worst]:.3g} times its tolerance; {'; '.join(top)}"
+            f"{ratio[worst]:.3g} times its tolerance; {'; '.join(top)}"
         )
 
     def destroy(self) -> None:

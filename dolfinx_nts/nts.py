@@ -243,7 +243,6 @@ def element(z0: FloatArray, z1: FloatArray, multiplier: FloatArray, rule: str) -
             pi0,
             pi1,
             multiplier,
-            lambda pi: constraints(pi, nc),
             lambda pi: constraint_gradient(pi, nc),
             lambda pi: _full_curvature(constraint_curvature(pi, multiplier, nc)),
         )

@@ -56,7 +56,6 @@ class Evaluation:
         bodies: Terms of each body.
         contacts: Contribution of each contact.
         multipliers: Multipliers of each contact [kg m], shape (n, multipliers).
-        ratio: Residual of each block over what counts as converged; solved when all are <= 1.
         iterations: Newton iterations it took.
     """
 
@@ -64,7 +63,6 @@ class Evaluation:
     bodies: tuple[BodyTerms, ...]
     contacts: tuple[Contribution, ...]
     multipliers: tuple[FloatArray, ...]
-    ratio: dict[str, float]
     iterations: int = 0
 
 
@@ -245,8 +243,7 @@ class StepProblem:
             du, contact = u1 - u0, force[here]
             residual = body.inertia(du) - self._inertia[k] + internal - external + contact
             bodies.append(BodyTerms(u1, du, internal, external, contact, residual))
-        ratio = self._ratios(bodies, contacts, multipliers)
-        return Evaluation(values, tuple(bodies), contacts, tuple(multipliers), ratio)
+        return Evaluation(values, tuple(bodies), contacts, tuple(multipliers))
 
     def _contact_forces(self, contacts: tuple[Contribution, ...]) -> FloatArray:
         """G^T lambda of all contacts in this rank's coordinates [kg m]."""
@@ -283,15 +280,10 @@ class StepProblem:
         return tangents
 
     # ---- convergence
-    def _ratios(
-        self,
-        bodies: list[BodyTerms],
-        contacts: tuple[Contribution, ...],
-        multipliers: list[FloatArray],
-    ) -> dict[str, float]:
-        """Residual of each block over what counts as converged there."""
+    def ratios(self, e: Evaluation) -> dict[str, float]:
+        """Residual of each block over what counts as converged there; solved when all are <= 1."""
         squares = []
-        for k, (body, t) in enumerate(zip(self.system.bodies, bodies, strict=True)):
+        for k, (body, t) in enumerate(zip(self.system.bodies, e.bodies, strict=True)):
             free = _free(body, t.residual)
             parts = (free, self._inertia[k], t.internal, t.external, t.contact)
             squares.append([float(p @ p) for p in parts])
@@ -301,19 +293,14 @@ class StepProblem:
             limit = self._rtol * norms[k, 1:].max() + self._rounding[k]
             ratio[body.name] = _over(norms[k, 0], limit)
         if self._fields:
-            ratio |= self._contact_ratios(bodies, contacts, multipliers)
+            ratio |= self._contact_ratios(e)
         return ratio
 
-    def _contact_ratios(
-        self,
-        bodies: list[BodyTerms],
-        contacts: tuple[Contribution, ...],
-        multipliers: list[FloatArray],
-    ) -> dict[str, float]:
-        moved = max(float(np.abs(b.du).max(initial=0.0)) for b in bodies)
+    def _contact_ratios(self, e: Evaluation) -> dict[str, float]:
+        moved = max(float(np.abs(b.du).max(initial=0.0)) for b in e.bodies)
         # MPI's maximum may swallow a NaN, so it travels as a flag.
-        local = [moved, float(any(np.isnan(k.residual).any() for k in contacts))]
-        for c, k, m in zip(self.contacts, contacts, multipliers, strict=True):
+        local = [moved, float(any(np.isnan(k.residual).any() for k in e.contacts))]
+        for c, k, m in zip(self.contacts, e.contacts, e.multipliers, strict=True):
             arrays = (c.rows(k, "augmented"), c.rows(k, "multipliers"), m, c.mass)
             local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
         top = _global_max(self.system.comm, np.array(local))

@@ -206,6 +206,8 @@ def oriented_nodes(mesh: Any, local_facets: IntArray) -> IntArray:
     """Geometry nodes of facets in cyclic order, counter-clockwise seen from outside the adjacent cell."""
     nodes = compat.entities_to_geometry(mesh, 2, local_facets)
     nodes = nodes[:, _CYCLIC[nodes.shape[1]]]
+    if not len(nodes):
+        return nodes
     to_cell = mesh.topology.connectivity(2, 3)
     cells = np.array([to_cell.links(f)[0] for f in local_facets], dtype=np.int32)
     x, centre = mesh.geometry.x, mesh.geometry.x[compat.geometry_dofmap(mesh)[cells]].mean(axis=1)

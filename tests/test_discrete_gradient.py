@@ -396,7 +396,6 @@ def test_step_from_rest_is_finite_and_exact(name, rule):
         assert np.abs(dense - expected).max() < 1e-8 * np.abs(expected).max()
 
 
-@pytest.mark.xfail(strict=True, reason="the derivative of bracket / (DC : DC): noise eps / |DC|")
 @pytest.mark.parametrize("size", [1e-12, 1e-14, 1e-15])
 def test_gonzalez_tangent_near_rest_has_no_noise(size):
     """The tangent at a deformed state changes in proportion to the increment."""

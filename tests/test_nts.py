@@ -435,7 +435,6 @@ def test_forces_do_not_depend_on_the_numbering_of_the_corners(nc):
     assert relative(there[:, -2:], here[:, -2:] @ np.linalg.inv(a)) < 1e-14
 
 
-@pytest.mark.xfail(strict=True, reason="rounding of g over |D pi|^2: noise eps / |D pi|^2")
 @pytest.mark.parametrize("nc", KINDS)
 @pytest.mark.parametrize("motion", [1e-6, 1e-8, 1e-10])
 def test_gonzalez_near_rest_has_no_noise(nc, motion):

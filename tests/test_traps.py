@@ -1,0 +1,213 @@
+"""Scenes that trip contact codes: zero gap, edges, corners, prescribed slaves, empty ranks, bounces.
+
+A cube of one cell stands on, hits or leaves a plate of 2 x 2 facets whose top is z = 0.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
+ROUND_OFF = 1e-12
+RUBBER = nts.NeoHookean(young=1e5, poisson=0.3)
+#: Lower left corner of the cube (edge 0.5): its four slaves lie inside facets, on edges of the
+#: plate's facets, on their corners.
+PLACES = {"inside": (0.2, 0.3), "edge": (0.5, 0.3), "corner": (0.5, 0.5), "across": (0.25, 0.25)}
+
+pytestmark = pytest.mark.mpi
+
+
+@pytest.fixture(params=INTEGRATORS)
+def integrator(request):
+    return INTEGRATORS[request.param]
+
+
+def everywhere(x):
+    return np.ones_like(x[0], dtype=bool)
+
+
+def scene(
+    place="inside",
+    gap=0.0,
+    velocity=(0.0, 0.0, 0.0),
+    *,
+    cube=(),
+    plate=(),
+    cells=2,
+    gravity=(0.0, 0.0, 0.0),
+    plate_velocity=(0.0, 0.0, 0.0),
+):
+    """Cube over plate; `cube` and `plate` are their Dirichlet conditions."""
+
+    def box(low, high, n):
+        kind = CellType.hexahedron
+        return create_box(COMM, [low, high], n, kind, ghost_mode=GhostMode.shared_facet)
+
+    x, y = PLACES[place]
+    mesh = box((x, y, gap), (x + 0.5, y + 0.5, gap + 0.5), (1, 1, 1))
+    options = {"density": 1e3, "material": RUBBER}
+    cube = nts.Continuum(mesh, velocity=velocity, bcs=cube, name="cube", **options)
+    plate_mesh = box((0.0, 0.0, -0.5), (1.0, 1.0, 0.0), (cells, cells, 1))
+    plate = nts.Continuum(plate_mesh, velocity=plate_velocity, bcs=plate, name="plate", **options)
+    slave = cube.surface(lambda x: x[2] < gap + 1e-9)
+    pair = nts.ContactPair(slave, plate.surface(lambda x: x[2] > -1e-9))
+    return nts.System([cube, plate], contacts=[pair], gravity=gravity)
+
+
+def run(system, integrator, dt=2e-3, steps=8):
+    """Run and check what holds in every scene; the balance table."""
+    solution = nts.simulate(system, integrator, dt=dt, t_end=steps * dt)
+    assert solution.status == "completed"
+    assert solution.retries == 0
+    table = solution.balance
+    # No shorter step may be needed for what these scenes contain.
+    assert len(table["time"]) == steps + 1
+    scale = max(np.abs(table[k]).max() for k in ("energy", "external_work", "kinetic"))
+    if integrator == INTEGRATORS["energy-momentum"]:
+        assert np.abs(table["ledger_residual"]).max() <= ROUND_OFF * scale
+    assert table["min_gap"].min() >= -ROUND_OFF
+    if not any(len(b.fixed) for b in system.bodies) and not system.gravity.any():
+        for k in ("linear_momentum", "angular_momentum"):
+            momentum = table[k]
+            assert np.abs(momentum - momentum[0]).max() <= ROUND_OFF * max(1, np.abs(momentum).max())
+    return table
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_touching_at_rest_stays_at_rest(place, integrator):
+    table = run(scene(place), integrator)
+    assert np.abs(table["energy"]).max() <= 1e-20
+    assert np.abs(table["min_gap"][1:]).max() <= ROUND_OFF
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_touching_and_leaving_takes_no_force(place, integrator):
+    table = run(scene(place, velocity=(0.0, 0.0, 1.0)), integrator)
+    assert table["active"].sum() == 0
+    np.testing.assert_allclose(table["linear_momentum"][:, 2], 125.0, rtol=1e-12)
+    np.testing.assert_allclose(table["kinetic"], 62.5, rtol=1e-12)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_touching_and_sliding_takes_no_force(place, integrator):
+    """Frictionless sliding over edges of facets, at zero gap all the time."""
+    table = run(scene(place, velocity=(-2.0, -1.0, 0.0)), integrator, dt=5e-3)
+    np.testing.assert_allclose(table["kinetic"], 312.5, rtol=1e-9)
+    assert np.abs(table["min_gap"][1:]).max() <= 1e-9
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_pressed_from_zero_gap(place, integrator):
+    """A closed gap stays closed for a step, which throws the slaves back; nothing is lost by it."""
+    table = run(scene(place, velocity=(0.0, 0.0, -1.0)), integrator)
+    assert table["active"][1] == 4
+    assert table["linear_momentum"][:, 2] == pytest.approx(-125.0, rel=1e-11)
+    if integrator == INTEGRATORS["energy-momentum"]:
+        assert np.abs(table["contact_defect"]).max() <= ROUND_OFF * table["energy"][0]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_falls_onto_edges_and_corners(place, integrator):
+    table = run(scene(place, gap=0.003, velocity=(0.0, 0.0, -1.0)), integrator)
+    assert table["active"].max() == 4
+    assert table["energy"][-1] <= table["energy"][0] * (1 + 1e-3)
+
+
+def test_slides_off_the_end_of_the_plate(integrator):
+    """Slaves leave over the free edge while in contact; no facet is there to hold them."""
+    system = scene("corner", velocity=(2.0, 0.0, -0.2))
+    table = run(system, integrator, dt=1e-2, steps=30)
+    assert table["active"][1:5].max() >= 2
+    assert table["active"][-1] == 0
+
+
+@pytest.mark.parametrize("master", ["free", "driven"])
+def test_slaves_that_cannot_move(master, integrator):
+    """A wholly prescribed cube: the plate that comes up must give way."""
+    below = nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9, lambda t: (0.0, 0.0, 0.5 * t))
+    plate = {"plate_velocity": (0.0, 0.0, 0.5)} if master == "free" else {"plate": [below]}
+    system = scene(gap=0.001, cube=[nts.Dirichlet(everywhere)], **plate)
+    table = run(system, integrator, dt=4e-3, steps=20)
+    assert table["active"].max() == 4
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.001])
+def test_nothing_can_move(gap, integrator):
+    held = [nts.Dirichlet(everywhere)]
+    table = run(scene(gap=gap, cube=held, plate=held), integrator)
+    assert not table["active"].any() and not table["energy"].any()
+
+
+def test_prescribed_slave_bottom_of_a_free_cube(integrator):
+    """Slave nodes held, the rest of their body free, the plate comes up against them."""
+    held = [nts.Dirichlet(lambda x: x[2] < 0.001 + 1e-9)]
+    system = scene(gap=0.001, cube=held, plate_velocity=(0.0, 0.0, 1.0))
+    table = run(system, integrator)
+    assert table["active"].max() == 4
+
+
+@pytest.mark.parametrize("components", [(2,), (0, 1)])
+def test_slaves_held_in_some_components(components, integrator):
+    held = [nts.Dirichlet(lambda x: x[2] < 0.001 + 1e-9, components=components)]
+    system = scene(gap=0.001, cube=held, plate_velocity=(0.1, 0.0, 1.0))
+    table = run(system, integrator)
+    assert table["active"].max() == 4
+
+
+def test_held_slaves_driven_against_a_held_master_have_nothing_to_solve(integrator):
+    """Both sides prescribed: no pair, hence no constraint that could contradict them."""
+    moving = [nts.Dirichlet(everywhere, lambda t: (0.0, 0.0, -0.5 * t))]
+    system = scene(gap=0.01, cube=moving, plate=[nts.Dirichlet(everywhere)])
+    table = run(system, integrator)
+    assert table["active"].max() == 0
+    assert np.isinf(table["min_gap"]).all()
+
+
+@pytest.mark.parametrize("place", ["inside", "corner"])
+def test_contact_comes_and_goes(place, integrator):
+    """Two bounces under gravity on a plate that is held below."""
+    held = [nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)]
+    system = scene(place, gap=0.01, velocity=(0, 0, -1), plate=held, gravity=(0, 0, -20))
+    table = run(system, integrator, dt=4e-3, steps=90)
+    touches = table["active"] > 0
+    assert np.count_nonzero(np.diff(touches.astype(int)) == 1) >= 2
+    assert np.count_nonzero(np.diff(touches.astype(int)) == -1) >= 2
+    assert np.ptp(table["potential"]) > 0
+
+
+def test_one_facet_and_one_slave_cell(integrator):
+    """One cell each: every further rank owns neither facet nor slave."""
+    system = scene(gap=0.002, velocity=(0.0, 0.0, -1.0), cells=1)
+    owned = np.array(COMM.allgather([len(c.slave.owned) for c in system.contacts]))
+    assert owned.sum() == 4
+    assert COMM.size == 1 or owned.min() == 0
+    table = run(system, integrator)
+    assert table["active"].max() == 4
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="starts mpirun itself")
+def test_more_ranks_than_cells():
+    command = shutil.which("mpirun")
+    if command is None:
+        pytest.skip("no mpirun")
+    root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    name = f"{__file__}::test_one_facet_and_one_slave_cell"
+    flags = ["--oversubscribe", "--bind-to", "none", "-n", "3"]
+    done = subprocess.run(
+        [command, *flags, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", name],
+        env=os.environ | root | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
