@@ -1,4 +1,4 @@
-"""Dynamic, large-deformation node-to-surface contact for FEniCSx, with integrators that conserve what physics conserves."""
+"""Node-to-surface contact for FEniCSx, with integrators that conserve what physics conserves."""
 
 from importlib.metadata import version
 
@@ -6,6 +6,7 @@ from dolfinx_nts.contact import ContactPair
 from dolfinx_nts.continuum import Body, Continuum, Dirichlet, Traction
 from dolfinx_nts.integrators import EnergyMomentum, Midpoint
 from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
+from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.newton import Newton, StepFailedError
 from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.surfaces import Surface
@@ -30,5 +31,7 @@ __all__ = [
     "Surface",
     "System",
     "Traction",
+    "bodies_from_gmsh",
+    "bodies_from_tags",
     "simulate",
 ]

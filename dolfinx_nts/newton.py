@@ -98,14 +98,18 @@ class StepSolver:
             ValueError: PETSc does not know an option or its value.
         """
         self.prepare()
-        self.snes.solve(None, self.problem.x)
-        reason, iterations = self.snes.getConvergedReason(), self.snes.getIterationNumber()
-        if iterations:
+        for retry in (False, True):
+            if retry:
+                self.problem.guess(flight=False)
+            self.snes.solve(None, self.problem.x)
             self._check_options()
-        last = self._at(self.problem.x)
-        if reason <= 0:
-            raise StepFailedError(self._diagnosis(last, reason, iterations))
-        return replace(last, iterations=iterations)
+            last = self._at(self.problem.x)
+            # A line search of the user's may stop SNES by its own tests; ours decide.
+            solved = max(self.problem.ratios(last).values()) <= 1.0
+            if solved and self.snes.getConvergedReason() > 0:
+                return replace(last, iterations=self.snes.getIterationNumber())
+        reason, iterations = self.snes.getConvergedReason(), self.snes.getIterationNumber()
+        raise StepFailedError(self._diagnosis(last, reason, iterations))
 
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
@@ -154,6 +158,8 @@ class StepSolver:
 
         Options of the splits wait for the first contact, without which there are none.
         """
+        if not self.snes.getIterationNumber():  # nothing was solved for
+            return
         contact = bool(self.problem.elements)
         judged = {k for k in self._unchecked if contact or not k.startswith("fieldsplit_")}
         self._unchecked -= judged
@@ -170,7 +176,9 @@ class StepSolver:
         """Evaluation at an iterate, reused while SNES asks for the same one."""
         same = self._last is not None and np.array_equal(self._last.x, x.array_r)
         if not self.problem.system.comm.allreduce(same, op=MPI.LAND):
-            new = self.problem.evaluate(x)
+            # A diverging iterate may overflow; the convergence test sees it.
+            with np.errstate(over="ignore", invalid="ignore"):
+                new = self.problem.evaluate(x)
             if self._last is not None:
                 for count, a, b in zip(self._flips, self._last.contacts, new.contacts, strict=True):
                     count += a.active != b.active
@@ -188,7 +196,8 @@ class StepSolver:
         assert self._last is not None
         reasons = PETSc.SNES.ConvergedReason
         # After the Jacobian of the same iterate rounding may be known better than before.
-        worst = max(self.problem.ratios(self._last).values())
+        with np.errstate(over="ignore", invalid="ignore"):
+            worst = max(self.problem.ratios(self._last).values())
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
             return reasons.DIVERGED_FNORM_NAN
         if worst <= 1.0:

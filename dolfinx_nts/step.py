@@ -118,7 +118,7 @@ class StepProblem:
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
             self._numbers = numbers
             self._lay_out()
-        self._guess()
+        self.guess(flight=True)
 
     def _contact_step(self, index: int) -> ContactStep:
         pair, state = self.system.contacts[index], self.state
@@ -183,12 +183,19 @@ class StepProblem:
             blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
         return blocks
 
-    def _guess(self) -> None:
-        """First guess: free flight, no contact force, d and f that fit it."""
+    def guess(self, *, flight: bool) -> None:
+        """Write a first guess into `x`: no contact force, d and f that fit the positions.
+
+        Args:
+            flight: Free flight from t_n, else the positions of t_n, which free flight of a fast
+                turning or vibrating body may invert; prescribed coordinates are at t_{n+1}.
+        """
         with self.x as x:
             x[:] = 0.0
-            for k, u1 in enumerate(self.first):
-                x[self.layout.owned(k)] = u1
+            for k, (body, u1) in enumerate(zip(self.system.bodies, self.first, strict=True)):
+                start = u1 if flight else self.state.u[k].copy()
+                start[body.fixed] = u1[body.fixed]
+                x[self.layout.owned(k)] = start
         if "augmented" in self._fields:
             positions = self._positions(self.x)
             guess = [

@@ -75,7 +75,7 @@ def run(system, integrator, dt=2e-3, steps=8):
     if integrator == INTEGRATORS["energy-momentum"]:
         assert np.abs(table["ledger_residual"]).max() <= ROUND_OFF * scale
     assert table["min_gap"].min() >= -ROUND_OFF
-    if not any(len(b.fixed) for b in system.bodies) and not system.gravity.any():
+    if not COMM.allreduce(sum(len(b.fixed) for b in system.bodies)) and not system.gravity.any():
         for k in ("linear_momentum", "angular_momentum"):
             momentum = table[k]
             assert np.abs(momentum - momentum[0]).max() <= ROUND_OFF * max(1, np.abs(momentum).max())
