@@ -2,7 +2,7 @@
 
 A unit cube of 4 x 4 x 4 hexahedra flies at 2 m/s, turning slowly, into a larger cube of 3 x 3 x 3
 hexahedra at rest. Both are rubber-like (neo-Hookean, E = 1 MPa, nu = 0.3, 1000 kg/m^3), there is no
-friction, no gravity and no support: linear momentum, angular momentum and energy have nowhere to go.
+friction, no gravity and no support: linear and angular momentum and energy have nowhere to go.
 
 What to see:
 

@@ -14,16 +14,15 @@ Meshes. `--refinement 1` reads meshes/two_tori.msh, as one would read a mesh of 
 Reference. There are pictures but no numbers, so what must hold is the balance: linear and
 angular momentum constant, and every change of energy in the ledger.
 
-What to see. The rims meet at t = 0.23, the tubes flatten, 40 % of the energy turns into strain
-at t = 4.9, and the tori part at t = 7.4. With the energy-momentum scheme the ledger closes to
-1e-13 of the energy in every step. What the energy itself does is `contact_defect`: a gap that
-closes within a step and a node that slides from one facet to the next have no gap function in
-common over the step, so energy is lost at ridges and gained in valleys of the faceted surface, up
-to 0.5 % of it at times and 0.05 % in the end (dt = 0.05). Such a node ends the step up to 0.6
-behind the facet it has come to, and the next step moves it out; `min_gap` is that of the facets the
-step was solved with. The midpoint rule adds an error of its
-own that the ledger does not explain and that grows with the step: 0.04 %, 0.2 % and 0.6 % of the
-energy with dt = 0.05, 0.1 and 0.2.
+What to see. The rims meet at t = 0.23, the tubes flatten, 40 % of the energy turns into strain at
+t = 4.9, and the tori part at t = 7.4. With the energy-momentum scheme the ledger closes to 1e-13 of
+the energy in every step. What the energy itself does is `contact_defect`: a gap that closes within
+a step and a node that slides from one facet to the next have no gap function in common over the
+step, so energy is lost at ridges and gained in valleys of the faceted surface, up to 0.5 % of it at
+times and 0.05 % in the end (dt = 0.05). Such a node ends the step up to 0.6 behind the facet it has
+come to, and the next step moves it out; `min_gap` is that of the facets the step was solved with.
+The midpoint rule adds an error of its own that the ledger does not explain and that grows with the
+step: 0.04 %, 0.2 % and 0.6 % of the energy with dt = 0.05, 0.1 and 0.2.
 
     mpirun -n 2 python demos/two_tori.py --output out/two_tori
 """

@@ -1,8 +1,8 @@
-"""The only file that creates the PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> AIJ.
+"""The PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> AIJ.
 
-Fields of the step problem are the bodies, then (with the energy-momentum scheme) the augmented
-unknowns (d, f), then the multipliers. A rank's unknowns are contiguous: its part of body 1, body 2,
-.., (d, f), multipliers.
+No other file creates any. Fields of the step problem are the bodies, then (with the energy-momentum
+scheme) the augmented unknowns (d, f), then the multipliers. A rank's unknowns are contiguous: its
+part of body 1, body 2, .., (d, f), multipliers.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Layout:
 
 
 class ElementBlocks(NamedTuple):
-    """Unknowns of a batch of elements: for each part a field, its columns in the element, and numbers in the field.
+    """Unknowns of a batch of elements: their fields, columns and numbers, part by part.
 
     Attributes:
         fields: Field of each part.
@@ -133,7 +133,7 @@ class StepMatrix:
         return a
 
     def assemble(self, tangents: Sequence[FloatArray]) -> None:
-        """Add the contact tangents (n, r, r) to freshly assembled bodies and refresh nest and AIJ."""
+        """Add the contact tangents (n, r, r) to freshly assembled bodies; refresh nest and AIJ."""
         for key, sources in self._sources.items():
             if key in self._blocks:
                 values = [self._values(s, tangents) for s in sources]

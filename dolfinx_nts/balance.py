@@ -1,4 +1,4 @@
-"""The ledger: momenta, energy and its changes as pure functions of states and steps (theory section 7)."""
+"""The ledger (theory section 7): momenta, energy and its changes, from states and steps alone."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def first_row(system: System, state: State) -> dict[str, Any]:
 def next_row(
     first: dict[str, Any], last: dict[str, Any], measured: dict[str, Any], terms: dict[str, float]
 ) -> dict[str, Any]:
-    """Row of an accepted step; external work, dissipation, defect and ledger residual are cumulative.
+    """Row of an accepted step; work, dissipation, defect and ledger residual are cumulative.
 
     Args:
         first: Row the ledger is opened with.

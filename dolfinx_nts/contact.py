@@ -1,4 +1,4 @@
-"""Contact between two surfaces: which slave nodes may touch which facet in a step, and what they contribute.
+"""Contact between two surfaces: which slaves may touch which facet, and what they contribute.
 
 A `ContactPair` is part of the scene and holds no history; a `ContactStep` lives for one step. Both
 integrators share it: the midpoint rule has one unknown per candidate (lambda_N), the
@@ -24,10 +24,10 @@ BoolArray = npt.NDArray[np.bool_]
 #: Part of a facet's size by which a slave may penetrate at the start of a run.
 INITIAL_PENETRATION = 0.01
 #: A node may project this far (in convective coordinates) beyond an edge that the master surface
-# ends at ...
+#: ends at ...
 _OVERHANG = 0.05
 #: ... and this far beyond an edge shared with another facet: between the normal cones of a convex
-# edge.
+#: edge.
 _WEDGE = 0.5
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 _MARGIN = 0.5
@@ -108,7 +108,9 @@ class ContactPair:
         length = size[facet]
         legal = converged & self._over_facet(facet, xi) & self._movable(node, facet)
         legal &= (gap > -_MARGIN * length) & (gap < reach + _MARGIN * length)
-        return Candidates(*(a[legal] for a in (node, facet, xi, normal, gap, length)))
+        return Candidates(
+            node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
+        )
 
     def _over_facet(self, facet: IntArray, xi: FloatArray) -> BoolArray:
         beyond = _beyond_edges(xi, self.master.facets.shape[1])
@@ -117,18 +119,18 @@ class ContactPair:
         return inside
 
     def _movable(self, node: IntArray, facet: IntArray) -> BoolArray:
-        """Whether any coordinate of a pair is free; a pair that cannot move has nothing to solve for."""
+        """Whether any coordinate of a pair is free; without one there is nothing to solve for."""
         slave = self.slave.fixed[self.slave.owned[node]].all(axis=1)
         master = self.master.fixed[self.master.facets[facet]].all(axis=(1, 2))
         return ~(slave & master)
 
 
 def _beyond_edges(xi: FloatArray, nc: int) -> FloatArray:
-    """How far xi lies beyond edge k (corner k to k + 1) of the reference facet, negative inside, shape (n, nc)."""
+    """How far xi lies beyond edge k (corner k to k + 1), negative inside, shape (n, nc)."""
     a, b = xi.T
     if nc == 4:
-        return np.column_stack([-1 - b, a - 1, b - 1, -1 - a])
-    return 2 * np.column_stack([-b, a + b - 1, -a])
+        return np.column_stack([-1.0 - b, a - 1.0, b - 1.0, -1.0 - a])
+    return 2.0 * np.column_stack([-b, a + b - 1.0, -a])
 
 
 def _solve(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -138,7 +140,7 @@ def _solve(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 class Contribution(NamedTuple):
-    """Step equations of the pairs at an iterate, scaled to [kg m] (coordinates, d, f) and [m] (constraints).
+    """Step equations of the pairs at an iterate: [kg m] for x, d and f, [m] for constraints.
 
     Attributes:
         residual: Shape (n, r), r = 3 (nc + 1) + augmented + multipliers.
@@ -203,7 +205,7 @@ class ContactStep:
         return 1 if self._only_normal else nts.NUM_CONSTRAINTS
 
     def dofs(self) -> tuple[IntArray, IntArray]:
-        """Global coordinates of the slaves (n, 3) and of the facets (n, 3 nc) in their bodies; -1 where prescribed."""
+        """Global coordinates of slaves (n, 3) and facets (n, 3 nc); -1 where prescribed."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
         points, corners = slave.owned[c.node], master.facets[c.facet]
         s = np.where(slave.fixed, -1, slave.dofs)[points]
@@ -225,7 +227,7 @@ class ContactStep:
         return np.concatenate([nodes[:, None], master.reference[master.facets[c.facet]]], axis=1)
 
     def rows(self, k: Contribution, name: str) -> FloatArray:
-        """The residual's rows of the "augmented" unknowns or the "multipliers", shape (n, width)."""
+        """The residual's rows of "augmented" unknowns or "multipliers", shape (n, width)."""
         start = self.num_coordinates
         middle = start + self.num_augmented
         return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
@@ -299,7 +301,7 @@ class ContactStep:
         return residual, tangent, e.constraint[:, 0]
 
     def _condensed(self, x: FloatArray, multiplier: FloatArray) -> Contribution:
-        """The element in (x, lambda_N) alone: five constraints fix d and f, whose rows fix the rest.
+        """The element in (x, lambda_N): five constraints fix d and f, whose rows fix the rest.
 
         At the projection of t_{n+1} the augmented constraints hold, and the rows of d and f are
         linear in their multipliers; the Schur complement is then the exact tangent.
@@ -330,7 +332,7 @@ class ContactStep:
         force: FloatArray,
         row: int,
     ) -> Contribution:
-        """Semi-smooth active set (theory section 9): g_N = 0 where active, lambda_N = 0 where not."""
+        """Semi-smooth active set (theory section 9): g_N = 0 where active, else lambda_N = 0."""
         gap = gap.copy()
         active = -force - self.mass * gap > 0
         off = ~active

@@ -70,7 +70,10 @@ class Body(Protocol):
         """External forces of the step [N]; their work is f . (u_1 - u_0)."""
 
     def tangent(self, u1: FloatArray) -> Any:
-        """PETSc matrix M + h^2/2 d(internal - external)/du_1; `fixed` rows and columns hold only a diagonal."""
+        """PETSc matrix M + h^2/2 d(internal - external)/du_1.
+
+        Rows and columns of `fixed` hold only a diagonal.
+        """
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacement of the `fixed` coordinates [m]."""
@@ -186,7 +189,8 @@ class Continuum:
     ) -> None:
         if not callable(material):
             raise TypeError(
-                f"material={material!r}: pass a callable C -> W(C), e.g. NeoHookean(young=.., poisson=..)"
+                f"material={material!r}: pass a callable C -> W(C), "
+                "e.g. NeoHookean(young=1e6, poisson=0.3)"
             )
         require_positive("density", density, "kg/m^3")
         for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
@@ -308,7 +312,8 @@ class Continuum:
             ) from error
         if energy.ufl_shape != ():
             raise TypeError(
-                f"material={self.material!r}: W(C) has shape {energy.ufl_shape}; return a UFL scalar"
+                f"material={self.material!r}: W(C) has shape {energy.ufl_shape}; "
+                "return a UFL scalar"
             )
         mass, self._load_form, self._energy_form = compat.compile_forms(
             [self._rho * ufl.inner(v, w) * self._dx, load, energy * self._dx]
@@ -372,7 +377,7 @@ class Continuum:
         return self._assemble(self._forms[0])
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
-        """Body force, traction and gravity at the midpoint in time, less the extra virtual work [N]."""
+        """Body force, traction and gravity at the midpoint in time, less the extra work [N]."""
         force = self._load + self.nodal_mass * np.tile(gravity, self.num_owned // 3)
         if self._forms[2] is not None:
             self._fill(self._u1, u1)

@@ -1,7 +1,7 @@
-"""Discrete gradients, one formula each: for stored energies (UFL) and for contact constraints (arrays).
+"""Discrete gradients, one formula each: stored energies (UFL), contact constraints (arrays).
 
-A discrete gradient D of f between a and b satisfies D . (b - a) = f(b) - f(a) exactly, which is what makes the energy
-balance of the energy-momentum scheme exact (theory sections 2 and 5).
+A discrete gradient D of f between a and b satisfies D . (b - a) = f(b) - f(a) exactly, which is
+what makes the energy balance of the energy-momentum scheme exact (theory sections 2 and 5).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _GAUSS = {
 _CONTACT_POINTS = 2
 #: Relative strain increment below which W(C_1) - W(C_0) is taken from quadrature: there the
 #: three-point rule is exact to rounding (error ~ x^7), while the plain difference would leave
-# rounding noise ~ eps / x in the stress.
+#: rounding noise ~ eps / x in the stress.
 _SMALL_STRAIN = 1e-2
 #: Relative strain increment whose square is below rounding.
 _REST_STRAIN = 1e-8
@@ -51,9 +51,9 @@ def mean_value_stress(energy: Callable[[Any], Any], c0: Any, c1: Any, points: in
 def gonzalez_stress(energy: Callable[[Any], Any], c0: Any, c1: Any) -> Any:
     """Discrete derivative of W between C_0 and C_1 after Gonzalez (2000) (UFL).
 
-    S = 2 dW(Cm) + 2 [W(C_1) - W(C_0) - dW(Cm) : DC] / (DC : DC) DC. The bracket is O(DC^3); for small DC it is taken from
-    quadrature, which is as exact and free of the cancellation that makes the plain form 0/0 at
-    rest.
+    S = 2 dW(Cm) + 2 [W(C_1) - W(C_0) - dW(Cm) : DC] / (DC : DC) DC. The bracket is O(DC^3); for
+    small DC it is taken from quadrature, which is as exact and free of the cancellation that makes
+    the plain form 0/0 at rest.
     """
     cm, dc = 0.5 * (c0 + c1), c1 - c0
     middle = strain_derivative(energy, cm)
@@ -62,9 +62,7 @@ def gonzalez_stress(energy: Callable[[Any], Any], c0: Any, c1: Any) -> Any:
     by_quadrature = ufl.inner(w0 * outer + (w1 - 1.0) * middle, dc)
     by_difference = energy(c1) - energy(c0) - ufl.inner(middle, dc)
     size, scale = ufl.inner(dc, dc), ufl.inner(cm, cm)
-    bracket = ufl.conditional(
-        ufl.lt(size, _SMALL_STRAIN**2 * scale), by_quadrature, by_difference
-    )
+    bracket = ufl.conditional(ufl.lt(size, _SMALL_STRAIN**2 * scale), by_quadrature, by_difference)
     # Next to rest the term is below rounding, but its derivative would be rounding noise over DC.
     bracket = ufl.conditional(ufl.lt(size, _REST_STRAIN**2 * scale), 0.0, bracket)
     # The addend is far below any increment that rounding lets exist; it keeps 0/0 away at rest.
@@ -77,7 +75,7 @@ def mean_value(
     gradient: Callable[[FloatArray], FloatArray],
     curvature: Callable[[FloatArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Two-point mean value of dg/dpi: exact for constraints of degree <= 4, no denominator, unit independent.
+    """Two-point mean value of dg/dpi: exact for constraints of degree <= 4, unit independent.
 
     Args:
         pi0: Invariants at t_n, shape (n, p).
@@ -106,7 +104,8 @@ def gonzalez(
 ) -> tuple[FloatArray, FloatArray]:
     """Gonzalez's discrete gradient (67) with the sign corrected, row by row, and its tangent.
 
-    Mixes the units of the invariants and is 0/0 at rest, which is why the mean value is the default.
+    Mixes the units of the invariants and is 0/0 at rest, which is why the mean value is the
+    default.
 
     Args:
         pi0: Invariants at t_n, shape (n, p).

@@ -1,4 +1,4 @@
-"""Everything that differs between DOLFINx 0.5.2, 0.9 and 0.11 (and their PETSc), and nothing else."""
+"""What differs between DOLFINx 0.5.2, 0.9 and 0.11 (and their PETSc), and nothing else."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def _quiet_compiler() -> Iterator[None]:
 
 
 def compile_forms(forms: Sequence[Any]) -> list[Any]:
-    """Compile forms; all signatures come first because 0.5.2's depend on what was compiled before."""
+    """Compile forms; signatures first because 0.5.2's depend on what was compiled before."""
     for f in forms:
         f.signature()
     options = {"cffi_extra_compile_args": ["-O2"], "timeout": 600}

@@ -1,4 +1,7 @@
-"""Time integrators: evaluation rules only. Both use v_1 = 2 (q_1 - q_0)/h - v_0 and constraints at t_{n+1}."""
+"""Time integrators: evaluation rules only.
+
+Both use v_1 = 2 (q_1 - q_0)/h - v_0 and constraints at t_{n+1}.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ class Midpoint:
     """Midpoint rule (58)-(60): keeps linear and angular momentum, not the energy."""
 
     #: Contact is described directly: the projection is eliminated, the gap multiplier is the only
-    # unknown.
+    #: unknown.
     contact_gradient: ClassVar[str] = "direct"
 
     def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:
@@ -34,11 +37,12 @@ class Midpoint:
 @known_options
 @dataclass(frozen=True, kw_only=True)
 class EnergyMomentum:
-    """Energy-momentum scheme (61)-(66): keeps linear and angular momentum and closes the energy ledger.
+    """Energy-momentum scheme (61)-(66): keeps both momenta and closes the energy ledger.
 
     Attributes:
         stress: Discrete derivative of the strain energy, "gonzalez" (exact for every W) or
-            "mean-value" (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to quadrature error otherwise).
+            "mean-value" (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to
+            quadrature error otherwise).
         contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit
             independent) or "gonzalez" (the paper's (67), for comparison).
         quadrature_points: Gauss points in time of the mean-value stress, 1 to 7.

@@ -1,4 +1,4 @@
-"""Strain energies W(C) per reference volume, in UFL; any callable C -> UFL scalar serves as well."""
+"""Strain energies W(C) per reference volume in UFL; any callable C -> UFL scalar serves, too."""
 
 from __future__ import annotations
 
@@ -83,7 +83,9 @@ class NeoHookean:
 @known_options
 @dataclass(frozen=True)
 class MooneyRivlin:
-    """W = a (tr C - 3) + b (tr cof C - 3) + c/2 (J - 1)^2 - d ln J with d = 2 (a + 2 b), stress-free at rest.
+    """W = a (tr C - 3) + b (tr cof C - 3) + c/2 (J - 1)^2 - d ln J, d = 2 (a + 2 b).
+
+    This d makes the undeformed body free of stress.
 
     Attributes:
         a: Coefficient of the first invariant [Pa], a + b > 0.

@@ -1,4 +1,4 @@
-"""Solves the equations of a step with PETSc SNES: nested Jacobian, convergence per block, diagnosis."""
+"""PETSc SNES for a step: nested Jacobian, convergence per block, diagnosis."""
 
 from __future__ import annotations
 
@@ -165,7 +165,8 @@ class StepSolver:
         self._unchecked -= judged
         prefix = self.snes.getOptionsPrefix()
         for key in sorted(judged):
-            if not compat.option_used(prefix + key):
+            used = compat.option_used(prefix + key)
+            if not self.problem.system.comm.allreduce(used, op=MPI.LOR):
                 raise ValueError(
                     f"petsc_options[{key!r}]={self._options[key]!r}: not used by PETSc; "
                     "correct its name or remove it"

@@ -1,11 +1,10 @@
 """Batched node-to-surface element: gap, invariants, constraints, gradients and exact tangents.
 
 Axis 0 of every array is the pair (one slave node, one master facet with nc corners). Two
-descriptions of the same
-element: the direct one (projection and normal eliminated, for the midpoint rule, theory section 4)
-    and the one in
-invariants (normal d and convective coordinates f as unknowns, for the energy-momentum scheme,
-sections 3 and 5). Nothing here knows about MPI, PETSc or bodies.
+descriptions of the same element: the direct one (projection and normal eliminated, for the midpoint
+rule, theory section 4) and the one in invariants (normal d and convective coordinates f as
+unknowns, for the energy-momentum scheme, sections 3 and 5). Nothing here knows about MPI, PETSc or
+bodies.
 """
 
 from __future__ import annotations

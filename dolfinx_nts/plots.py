@@ -1,4 +1,4 @@
-"""Plots of the balance table: energies, ledger and momenta over time, one run or several together."""
+"""Plots of the balance table: energies, ledger and momenta over time, of one or several runs."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ class Stepper:
         self.solution = Solution(system, rows=[balance.first_row(system, self.state)])
 
     def advance(self, dt: float) -> State:
-        """Advance by dt; a step that is not solved is dropped and halved, up to `newton.max_retries` times.
+        """Advance by dt; a step that is not solved is halved, up to `newton.max_retries` times.
 
         Args:
             dt: Time to advance [s], > 0.

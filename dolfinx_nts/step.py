@@ -1,4 +1,4 @@
-"""The equations of one step: unknowns, residual, contact tangents and how well each block is solved.
+"""The equations of one step: unknowns, residual, contact tangents, convergence of each block.
 
 The momentum equation is multiplied by h/2 and the multipliers are h^2/2 lambda (theory section 8),
 which makes the condition number independent of h. Evaluations are pure: nothing here changes a

@@ -1,8 +1,8 @@
 """Contact surfaces: oriented facets and their corner points, known on every rank.
 
-Every point of a body is linear in its coordinates, x = X + B u; on a continuum of nodes B only selects, so a surface keeps
-the node numbers of its corner points. Topology is gathered once; positions are gathered when a
-search needs them.
+Every point of a body is linear in its coordinates, x = X + B u; on a continuum of nodes B only
+selects, so a surface keeps the node numbers of its corner points. Topology is gathered once;
+positions are gathered when a search needs them.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class Surface:
 
     @property
     def boundary_edges(self) -> npt.NDArray[np.bool_]:
-        """Whether edge k (corner k to k + 1) of a facet belongs to no other facet, shape (m, nc)."""
+        """Whether edge k (corner k to k + 1) of a facet is no other facet's, shape (m, nc)."""
         edges = np.stack([self.facets, np.roll(self.facets, -1, axis=1)], axis=-1)
         key = np.sort(edges.reshape(-1, 2), axis=1)
         _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
@@ -175,7 +175,7 @@ class Surface:
         return depth
 
     def positions(self, u: FloatArray) -> FloatArray:
-        """Current positions of all points [m], shape (p, 3), from this rank's owned displacements."""
+        """Positions of all points [m], shape (p, 3), from this rank's owned displacements."""
         x: FloatArray = self.reference + self.gather(u)
         return x
 
@@ -191,7 +191,7 @@ def flux(corners: FloatArray) -> FloatArray:
 
 
 def _winding(x: FloatArray, corners: FloatArray) -> float:
-    """How often oriented facets (m, nc, 3) enclose a point: 1 inside a closed surface, 0 outside."""
+    """How often facets (m, nc, 3) enclose a point: 1 inside a closed surface, 0 outside."""
     total = 0.0
     for k in range(1, corners.shape[1] - 1):
         a, b, c = (corners[:, [0, k, k + 1]] - x).transpose(1, 0, 2)
@@ -203,7 +203,7 @@ def _winding(x: FloatArray, corners: FloatArray) -> float:
 
 
 def oriented_nodes(mesh: Any, local_facets: IntArray) -> IntArray:
-    """Geometry nodes of facets in cyclic order, counter-clockwise seen from outside the adjacent cell."""
+    """Geometry nodes of facets, cyclic and counter-clockwise seen from outside the cell."""
     nodes = compat.entities_to_geometry(mesh, 2, local_facets)
     nodes = nodes[:, _CYCLIC[nodes.shape[1]]]
     if not len(nodes):

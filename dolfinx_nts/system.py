@@ -119,7 +119,7 @@ class System:
             deep = depth > INITIAL_PENETRATION
             if deep.any():
                 raise ValueError(
-                    f"contact {pair.name!r}: {int(deep.sum())} slave nodes start inside the master, "
+                    f"contact {pair.name!r}: {deep.sum()} slave nodes start inside the master, "
                     f"up to {depth.max():.3g} of a facet (allowed {INITIAL_PENETRATION}), nodes "
                     f"{np.sort(pair.slave.original[deep])[:10].tolist()}; move the bodies apart"
                 )

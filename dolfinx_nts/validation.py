@@ -17,8 +17,10 @@ T = TypeVar("T")
 
 
 def known_options(target: T) -> T:
-    """Decorate a function or class so that an unknown keyword raises with the list of known ones."""
-    function: Any = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
+    """Decorate a function or class: an unknown keyword raises with the list of known ones."""
+    wrapped: Any = target
+    is_class = isinstance(target, type)
+    function = wrapped.__init__ if is_class else wrapped
     known = [p for p in inspect.signature(function).parameters if p != "self"]
 
     @functools.wraps(function)
@@ -26,20 +28,21 @@ def known_options(target: T) -> T:
         for name in options:
             if name not in known:
                 raise TypeError(
-                    f"{name}={options[name]!r}: unknown option of {target.__name__}; "  # type: ignore[attr-defined]
+                    f"{name}={options[name]!r}: unknown option of {wrapped.__name__}; "
                     f"choose from {', '.join(known)}"
                 )
         return function(*args, **options)
 
-    if not isinstance(target, type):
-        return checked  # type: ignore[return-value]
-    type.__setattr__(target, "__init__", checked)
-    return target
+    if is_class:
+        wrapped.__init__ = checked
+        return target
+    decorated: Any = checked
+    return decorated
 
 
 def require_positive(name: str, value: Any, unit: str) -> None:
     """Raise ValueError unless the value is a positive, finite number."""
-    if not (isinstance(value, numbers.Real) and math.isfinite(value) and value > 0):
+    if not (isinstance(value, numbers.Real) and math.isfinite(value) and float(value) > 0):
         raise ValueError(f"{name}={value!r}: must be positive and finite [{unit}]")
 
 

@@ -133,9 +133,7 @@ def run(system, integrator, steps):
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize(
     "theta",
-    [0.0, 0.1, 0.25, 0.49, 0.51, 0.99, 1.0]
-    + [pytest.param(0.75, marks=pytest.mark.mpi)]
-    + [0.5],
+    [0.0, 0.1, 0.25, 0.49, 0.51, 0.99, 1.0] + [pytest.param(0.75, marks=pytest.mark.mpi)] + [0.5],
 )
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_rebound(integrator, theta, turned):
