@@ -87,6 +87,7 @@ class StepSolver:
         self._options = {**DEFAULT_PETSC_OPTIONS, **(petsc_options or {})}
         self._keys: list[str] = []
         self._version = -1
+        self._assembled: Evaluation | None = None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
 
@@ -118,7 +119,7 @@ class StepSolver:
         if self._version != self.problem.version:
             self.destroy()
             self._version = self.problem.version
-            self.assemble(self.problem.evaluate(self.problem.x))
+            self.assemble(self._at(self.problem.x))
             self._configure()
 
     def assemble(self, e: Evaluation) -> StepMatrix:
@@ -127,6 +128,7 @@ class StepSolver:
         if self.matrix is None:
             self.matrix = StepMatrix(self.problem.layout, bodies, self.problem.elements)
         self.matrix.assemble([c.tangent for c in e.contacts] if self.problem.elements else [])
+        self._assembled = e
         return self.matrix
 
     def _configure(self) -> None:
@@ -191,7 +193,9 @@ class StepSolver:
         f.array_w[:] = self.problem.residual(self._at(x))
 
     def _jacobian(self, _snes: Any, x: Any, _j: Any, _p: Any) -> None:
-        self.assemble(self._at(x))
+        e = self._at(x)
+        if e is not self._assembled:
+            self.assemble(e)
 
     def _converged(self, _snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
         assert self._last is not None
