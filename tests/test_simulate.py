@@ -1,0 +1,155 @@
+"""The time loop: rejected steps, failed runs, the end of a run, moving supports in the ledger."""
+
+import numpy as np
+import pytest
+import two_blocks
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+INTEGRATORS = [nts.Midpoint(), nts.EnergyMomentum()]
+
+
+def fail_once(stepper, at_call):
+    """Make one solve of the stepper fail, after it has spoilt whatever a solve may spoil."""
+    solve, calls = stepper.solver.solve, []
+
+    def failing():
+        calls.append(None)
+        step = solve()
+        if len(calls) == at_call:
+            raise nts.StepFailedError("on purpose")
+        return step
+
+    stepper.solver.solve = failing
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_cut_back_step_equals_the_small_steps(integrator):
+    """Nothing of a rejected step survives: the halves are those of a run that never tried."""
+    tried, plain = (nts.Stepper(two_blocks.scene(COMM), integrator) for _ in range(2))
+    fail_once(tried, at_call=7)
+    for stepper in (tried, plain):
+        for _ in range(6):
+            stepper.advance(4e-3)
+    tried.advance(4e-3)
+    plain.advance(2e-3)
+    plain.advance(2e-3)
+    assert tried.solution.retries == 1
+    assert plain.solution.balance["active"][-1] > 0
+    for a, b in zip(tried.state.u + tried.state.v, plain.state.u + plain.state.v, strict=True):
+        scale = COMM.allreduce(np.abs(b).max(initial=0.0), op=MPI.MAX)
+        assert np.abs(a - b).max(initial=0.0) <= 1e-11 * scale
+    assert np.isclose(tried.state.time, plain.state.time, rtol=1e-14)
+    for body, u, v in zip(tried.system.bodies, tried.state.u, tried.state.v, strict=True):
+        assert np.array_equal(body.u.x.array[: body.num_owned], u)
+        assert np.array_equal(body.v.x.array[: body.num_owned], v)
+    tried.close()
+    plain.close()
+
+
+@pytest.mark.mpi
+def test_a_failed_run_keeps_what_it_has_and_says_where():
+    newton = nts.Newton(max_iterations=1, max_retries=2)
+    run = nts.simulate(
+        two_blocks.scene(COMM), nts.EnergyMomentum(), dt=2e-3, t_end=0.05, newton=newton
+    )
+    assert run.retries >= 2
+    assert "with dt=0.0005" in run.status  # 2 ms halved twice, then given up
+    assert run.status.startswith("step from t=")
+    for word in ("worst block", "contact 'left-right': node", "facet", "flips", "body 'left'"):
+        assert word in run.status
+    assert "Try a smaller dt" in run.status
+    table = run.balance
+    assert 2 < len(table["time"]) < 25
+    assert np.abs(table["ledger_residual"]).max() <= 1e-6 * table["energy"][0]
+
+
+@pytest.mark.mpi
+def test_the_last_step_ends_at_t_end():
+    run = nts.simulate(two_blocks.scene(COMM), nts.Midpoint(), dt=2e-3, t_end=7e-3)
+    assert run.status == "completed"
+    assert np.allclose(run.balance["time"], [0, 2e-3, 4e-3, 6e-3, 7e-3], rtol=1e-14)
+
+
+def block(**options):
+    mesh = create_box(
+        COMM,
+        [[0, 0, 0], [1, 1, 1]],
+        [2, 2, 2],
+        CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )
+    return nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, name="block", **options
+    )
+
+
+def bottom(x):
+    return x[2] < 1e-9
+
+
+def top(x):
+    return x[2] > 1 - 1e-9
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"bcs": [nts.Dirichlet(bottom, lambda t: (0.1 * np.sin(40 * t), 0, 0.02 * t))]},
+        {
+            "bcs": [nts.Dirichlet(bottom)],
+            "traction": [nts.Traction(top, lambda t: (0, 1e4 * t, 0))],
+        },
+        {"body_force": lambda t: (2e3 * np.cos(30 * t), 0, 0), "velocity": (0, 1, 0)},
+    ],
+    ids=["moving support", "traction", "body force"],
+)
+def test_the_work_of_loads_and_supports_closes_the_ledger(options):
+    system = nts.System([block(**options)], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.1)
+    table = run.balance
+    assert run.status == "completed"
+    scale = max(table["energy"].max(), np.abs(table["external_work"]).max())
+    assert np.abs(table["external_work"]).max() > 0.1
+    assert np.abs(table["ledger_residual"]).max() <= 1e-11 * scale
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_free_fall(integrator):
+    """Closed form: work of gravity m g s, momentum m g t, and both integrators are exact."""
+    gravity, time, mass = 9.81, 0.1, 1e3
+    run = nts.simulate(
+        nts.System([block()], gravity=(0, 0, -gravity)), integrator, dt=0.01, t_end=time
+    )
+    fallen = 0.5 * gravity * time**2
+    assert np.isclose(run.balance["external_work"][-1], mass * gravity * fallen, rtol=1e-12)
+    assert np.isclose(run.balance["kinetic"][-1], mass * gravity * fallen, rtol=1e-12)
+    momentum = run.balance["linear_momentum"][-1]
+    assert np.allclose(momentum, [0, 0, -mass * gravity * time], rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.mpi
+def test_extra_form_is_external_work():
+    """Mass-proportional drag on a rigid flight: v' = -c v by the midpoint rule, in closed form."""
+    import ufl
+
+    drag, density, dt, steps = 5.0, 1e3, 0.01, 10
+    system = nts.System(
+        [
+            block(
+                velocity=(1, 0, 0),
+                extra_form=lambda u, v, w: drag * density * ufl.inner(v, w) * ufl.dx,
+            )
+        ]
+    )
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=steps * dt)
+    decay = ((1 - drag * dt / 2) / (1 + drag * dt / 2)) ** steps
+    assert np.isclose(run.balance["linear_momentum"][-1, 0], density * decay, rtol=1e-12)
+    assert np.isclose(run.balance["energy"][-1], 0.5 * density * decay**2, rtol=1e-12)
+    assert np.abs(run.balance["ledger_residual"]).max() <= 1e-12 * run.balance["energy"][0]
