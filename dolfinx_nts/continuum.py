@@ -98,7 +98,10 @@ class Dirichlet:
 
     Attributes:
         where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
-        value: Displacement [m]: a vector, or a function of time; its work is external work.
+        value: Displacement [m]: a vector, or a function of time; its work is external work. Give
+            the body an initial velocity that fits the motion at t = 0: as v_1 = 2 (u_1 - u_0)/h -
+            v_0, velocities at prescribed nodes alternate otherwise. Where the value is constant the
+            initial velocity is set to zero.
         components: Which of x, y, z are prescribed.
 
     Raises:

@@ -10,6 +10,7 @@ Under mpirun every rank runs the same tests. After each test the ranks exchange 
 
 import io
 import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -106,3 +107,32 @@ def pytest_sessionfinish(session, exitstatus):
 def mpi_tmp_path(tmp_path):
     """Rank 0's tmp_path, on every rank: for files that the ranks write together."""
     return Path(COMM.bcast(str(tmp_path)))
+
+
+@pytest.fixture
+def on_ranks():
+    """Function (ranks, *arguments) that runs Python under mpirun and returns what it printed."""
+    if COMM.size > 1:
+        pytest.skip("starts ranks of its own")
+    return _on_ranks
+
+
+def _on_ranks(ranks: int, *arguments: str) -> str:
+    # This process is a rank itself; its own MPI variables would mislead the new ones.
+    own = ("OMPI_COMM", "OMPI_UNIVERSE", "PMIX_", "PRTE_")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(own)}
+    environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    environment |= {"OMP_NUM_THREADS": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
+    demos = str(Path(__file__).resolve().parents[1] / "demos")
+    environment["PYTHONPATH"] = demos
+    command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), sys.executable]
+    done = subprocess.run(
+        [*command, *arguments],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout

@@ -3,11 +3,6 @@
 A cube of one cell stands on, hits or leaves a plate of 2 x 2 facets whose top is z = 0.
 """
 
-import os
-import shutil
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
@@ -195,20 +190,6 @@ def test_one_facet_and_one_slave_cell(integrator):
     assert table["active"].max() == 4
 
 
-@pytest.mark.skipif(COMM.size > 1, reason="starts mpirun itself")
-def test_more_ranks_than_cells():
-    command = shutil.which("mpirun")
-    if command is None:
-        pytest.skip("no mpirun")
-    root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+def test_more_ranks_than_cells(on_ranks):
     name = f"{__file__}::test_one_facet_and_one_slave_cell"
-    flags = ["--oversubscribe", "--bind-to", "none", "-n", "3"]
-    done = subprocess.run(
-        [command, *flags, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", name],
-        env=os.environ | root | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    on_ranks(3, "-m", "pytest", "-q", "-p", "no:cacheprovider", name)
