@@ -43,6 +43,7 @@ def scene(
     cell_type: CellType = CellType.hexahedron,
     density: float = 1e3,
     metre: float = 1.0,
+    speed: float | None = None,
 ) -> nts.System:
     """Two cubes, the first about to hit the second.
 
@@ -53,6 +54,7 @@ def scene(
         cell_type: Hexahedra or tetrahedra.
         density: Reference density [kg/m^3] in the units of the scene.
         metre: Length of a metre in the units of the scene, e.g. 1e3 for a scene in mm.
+        speed: Speed of the first cube, 2 m/s if not given; the spin scales with it.
     """
 
     def box(corner: list[float], size: float, shift: float, n: int) -> Any:
@@ -63,8 +65,9 @@ def scene(
 
     def spin(x: np.ndarray) -> np.ndarray:
         """2 m/s along x and 0.5 rad/s about the y axis through the centre."""
-        arm = x - 0.5 * metre
-        return np.array([2.0 * metre + 0.5 * arm[2], 0 * x[0], -0.5 * arm[0]])
+        arm = (x / metre - 0.5) / 4
+        along = 2.0 * metre if speed is None else speed
+        return along * np.array([1.0 + arm[2], 0 * x[0], -arm[0]])
 
     left = nts.Continuum(
         box([0, 0, 0], 1.0, 0.0, cells[0]), material, density=density, velocity=spin, name="left"

@@ -26,8 +26,8 @@ INITIAL_PENETRATION = 0.01
 #: A node may project this far (in convective coordinates) beyond an edge that the master surface
 #: ends at ...
 _OVERHANG = 0.05
-#: ... and this far beyond an edge shared with another facet: between the normal cones of a convex
-#: edge.
+#: ... and this far beyond an edge shared with another facet, between the normal cones of a convex
+#: edge, and further by what the node may be away.
 _WEDGE = 0.5
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 _MARGIN = 0.5
@@ -60,13 +60,19 @@ class ContactPair:
     Args:
         slave: Surface whose nodes are kept outside.
         master: Surface whose facets keep them outside.
+        friction: Coulomb's coefficient [-]; this version knows 0 only.
 
     Raises:
         TypeError: An argument is not a Surface.
+        NotImplementedError: friction is not 0.
         ValueError: The surfaces share nodes.
     """
 
-    def __init__(self, slave: Surface, master: Surface) -> None:
+    def __init__(self, slave: Surface, master: Surface, *, friction: float = 0.0) -> None:
+        if friction != 0.0:
+            raise NotImplementedError(
+                f"friction={friction!r}: this version has frictionless contact; pass 0 or leave it"
+            )
         for name, value in (("slave", slave), ("master", master)):
             if not isinstance(value, Surface):
                 raise TypeError(f"{name}={value!r}: pass a Surface, e.g. body.surface(marker)")
@@ -106,15 +112,17 @@ class ContactPair:
         foot, _, normal = facets.frame(pair, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
         length = size[facet]
-        legal = converged & self._over_facet(facet, xi) & self._movable(node, facet)
+        legal = converged & self._over_facet(facet, xi, reach / length) & self._movable(node, facet)
         legal &= (gap > -_MARGIN * length) & (gap < reach + _MARGIN * length)
         return Candidates(
             node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
         )
 
-    def _over_facet(self, facet: IntArray, xi: FloatArray) -> BoolArray:
+    def _over_facet(self, facet: IntArray, xi: FloatArray, reach: FloatArray) -> BoolArray:
+        """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide."""
         beyond = _beyond_edges(xi, self.master.facets.shape[1])
-        limit = np.where(self._free_edges[facet], _OVERHANG, _WEDGE)
+        wedge = _WEDGE + 2.0 * (reach + _MARGIN)
+        limit = np.where(self._free_edges[facet], _OVERHANG, wedge[:, None])
         inside: BoolArray = (beyond <= limit).all(axis=1)
         return inside
 
@@ -135,12 +143,11 @@ def _beyond_edges(xi: FloatArray, nc: int) -> FloatArray:
 
 def _solve(a: FloatArray, b: FloatArray) -> FloatArray:
     """Solve a (n, k, k) y = b (n, k)."""
-    y: FloatArray = np.linalg.solve(a, b[:, :, None])[:, :, 0]
-    return y
+    return nts.solve(a, b[:, :, None])[:, :, 0]
 
 
 class Contribution(NamedTuple):
-    """Step equations of the pairs at an iterate: [kg m] for x, d and f, [m] for constraints.
+    """Step equations of the pairs at an iterate, all rows [kg m] for unknowns in [m].
 
     Attributes:
         residual: Shape (n, r), r = 3 (nc + 1) + augmented + multipliers.
@@ -237,8 +244,7 @@ class ContactStep:
         return self._augmented(x) if self.num_augmented else np.empty((self.num_pairs, 0))
 
     def _augmented(self, x: FloatArray) -> FloatArray:
-        xi, converged = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
-        xi = np.where(converged[:, None], xi, self.candidates.xi)
+        xi = self._projection(x)
         _, _, normal = facets.frame(x[:, 1:], xi)
         return np.column_stack([normal, xi]) * self.candidates.length[:, None]
 
@@ -250,8 +256,22 @@ class ContactStep:
         Args:
             x: Slave and corners at t_{n+1} [m], shape (n, nc + 1, 3).
             augmented: Facet size times (d, f) [m], shape (n, 5) or (n, 0).
-            multiplier: h^2/2 lambda of the scaled constraints [kg m], shape (n, 6) or (n, 1).
+            multiplier: h^2/2 lambda of the scaled constraints over the nodal mass [m], shape
+                (n, 6) or (n, 1).
         """
+        mass = self.mass[:, None]
+        part = self._evaluate(x, augmented, mass * multiplier)
+        # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
+        rows = slice(part.residual.shape[1] - self.num_multipliers, None)
+        part.residual[:, rows] *= mass
+        part.tangent[:, rows] *= mass[:, None]
+        part.tangent[:, :, rows] *= mass[:, None]
+        return part
+
+    def _evaluate(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> Contribution:
+        """As `evaluate` for multipliers in [kg m] and constraints in [m]."""
         if self.rule == "direct":
             return self._direct(x, multiplier)
         if self.condense:
@@ -272,8 +292,13 @@ class ContactStep:
         return self._complementarity(residual, tangent, end.value, multiplier[:, 0], size)
 
     def _gap(self, x: FloatArray) -> nts.Gap:
-        xi, _ = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
-        return nts.gap(x, xi)
+        return nts.gap(x, self._projection(x))
+
+    def _projection(self, x: FloatArray) -> FloatArray:
+        """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
+        xi, converged = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
+        xi[~converged] = np.nan
+        return xi
 
     def _invariants(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
@@ -318,9 +343,7 @@ class ContactStep:
         outer = np.r_[:size, normal]
         inner = np.setdiff1d(np.arange(tangent.shape[1]), outer)
         left = tangent[:, outer[:, None], inner]
-        inside = np.linalg.solve(
-            tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer]
-        )
+        inside = nts.solve(tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer])
         reduced = tangent[:, outer[:, None], outer] - np.matmul(left, inside)
         return self._complementarity(residual[:, outer], reduced, gap, multiplier[:, 0], size)
 

@@ -98,10 +98,8 @@ class Dirichlet:
 
     Attributes:
         where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
-        value: Displacement [m]: a vector, or a function of time; its work is external work. Give
-            the body an initial velocity that fits the motion at t = 0: as v_1 = 2 (u_1 - u_0)/h -
-            v_0, velocities at prescribed nodes alternate otherwise. Where the value is constant the
-            initial velocity is set to zero.
+        value: Displacement [m]: a vector, or a function of time; its work is external work. The
+            nodes start where and as fast as the value says at t = 0.
         components: Which of x, y, z are prescribed.
 
     Raises:
@@ -424,6 +422,12 @@ class Continuum:
         self._fill(self.u, u)
         self._fill(self.v, v)
 
+    def destroy(self) -> None:
+        """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
+        for a in (self._mass, self._in, self._out, getattr(self, "_matrix", None)):
+            if a is not None:
+                a.destroy()
+
     def _fill(self, function: Any, owned: FloatArray) -> None:
         function.x.array[: self.num_owned] = owned
         function.x.scatter_forward()
@@ -483,11 +487,14 @@ def _check_cells(mesh: Any, name: str, x: FloatArray) -> None:
     text = f"mesh of {name!r}: {len(bad)} inverted or flat cells, {where}; repair the mesh"
     raise_together(mesh.comm, text if len(bad) else None)
     # A cell turned inside out as a whole: the volumes add up to more than the boundary encloses.
-    boundary = mesh.geometry.x[oriented_nodes(mesh, compat.exterior_facets(mesh))]
+    # Seen from a point of the mesh: from a far origin the cones over its boundary would cancel.
+    corner = np.append(mesh.geometry.x, np.full((1, 3), np.inf), axis=0).min(axis=0)
+    mesh.comm.Allreduce(MPI.IN_PLACE, corner, op=MPI.MIN)
+    boundary = mesh.geometry.x[oriented_nodes(mesh, compat.exterior_facets(mesh))] - corner
     local = np.array([np.abs(volumes).sum(), flux(boundary).sum()])
     volume, enclosed = mesh.comm.allreduce(local)
     if abs(volume - enclosed) > 1e-9 * volume:
         raise ValueError(
             f"mesh of {name!r}: inverted or overlapping cells, whose volumes add up to "
-            f"{volume:.6g} while the boundary encloses {enclosed:.6g}; repair the mesh"
+            f"{volume:.12g} while the boundary encloses {enclosed:.12g}; repair the mesh"
         )

@@ -20,6 +20,7 @@ def _choose(name: str, value: str, known: tuple[str, ...]) -> None:
         raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, known))}")
 
 
+@known_options
 @dataclass(frozen=True)
 class Midpoint:
     """Midpoint rule (58)-(60): keeps linear and angular momentum, not the energy."""
@@ -40,7 +41,7 @@ class EnergyMomentum:
     """Energy-momentum scheme (61)-(66): keeps both momenta and closes the energy ledger.
 
     Attributes:
-        stress: Discrete derivative of the strain energy, "gonzalez" (exact for every W) or
+        stress: Discrete derivative of the strain energy, "gonzalez" (exact for every W of order-one growth) or
             "mean-value" (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to
             quadrature error otherwise).
         contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit

@@ -102,7 +102,17 @@ class StepSolver:
         for retry in (False, True):
             if retry:
                 self.problem.guess(flight=False)
-            self.snes.solve(None, self.problem.x)
+            try:
+                self.snes.solve(None, self.problem.x)
+            except PETSc.Error as error:
+                # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
+                self.destroy()
+                state = self.problem.state
+                raise StepFailedError(
+                    f"step from t={state.time:.6g} with dt={self.problem.dt:.3g}: PETSc stopped "
+                    f"with error {error.ierr}; do two contacts, or a contact and a support, close "
+                    "the same gap?"
+                ) from error
             self._check_options()
             last = self._at(self.problem.x)
             # A line search of the user's may stop SNES by its own tests; ours decide.
@@ -153,7 +163,10 @@ class StepSolver:
             raise ValueError(f"petsc_options={given!r}: {why}; correct the value") from error
         pc = self.snes.getKSP().getPC()
         if pc.getType() == "fieldsplit" and self.problem.elements:
-            pc.setFieldSplitIS(*self.matrix.field_sets(len(self.problem.system.bodies)))
+            parts = self.matrix.field_sets(len(self.problem.system.bodies))
+            pc.setFieldSplitIS(*parts)
+            for _, index in parts:
+                index.destroy()
 
     def _check_options(self) -> None:
         """Raise if PETSc, having solved, never asked for one of the user's options.
@@ -215,8 +228,8 @@ class StepSolver:
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:
         """One sentence that names what failed and where; every rank must call it."""
         problem = self.problem
-        ratio = problem.ratios(e)
-        worst = max(ratio, key=lambda name: np.nan_to_num(ratio[name], nan=np.inf))
+        ratio = {k: float(np.nan_to_num(r, nan=np.inf)) for k, r in problem.ratios(e).items()}
+        worst = max(ratio, key=lambda name: ratio[name])
         notes = [
             _contact_note(c, k, flips)
             for c, k, flips in zip(problem.contacts, e.contacts, self._flips, strict=True)
@@ -228,7 +241,10 @@ class StepSolver:
             if body.num_owned
         ]
         gathered = [n for part in problem.system.comm.allgather(notes) for n in part]
-        top = [text for _, text in sorted(gathered, key=lambda n: -n[0])[:4]]
+        # Of each body and contact the rank with the largest residual speaks, the worst one first.
+        best = {name: text for name, _, text in sorted(gathered, key=lambda n: n[1])}
+        trouble = {name: max(r for k, r in ratio.items() if k.startswith(name)) for name in best}
+        top = [best[name] for name in sorted(best, key=lambda name: -trouble[name])[:4]]
         return (
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
             f"{iterations} iterations (SNES reason {reason}); worst block {worst!r} at "
@@ -251,20 +267,20 @@ class StepSolver:
         self._version = -1
 
 
-def _contact_note(c: ContactStep, k: Contribution, flips: IntArray) -> tuple[float, str]:
-    """The pair that flipped most or is worst solved, with its rank among all notes."""
+def _contact_note(c: ContactStep, k: Contribution, flips: IntArray) -> tuple[str, float, str]:
+    """Name, weight and text of the pair that flipped most or is worst solved."""
     rows = np.abs(k.residual[:, c.num_coordinates :]).max(axis=1)
     weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips)
     i = int(np.argmax(weight))
     node = int(c.pair.slave.original[c.pair.slave.owned[c.candidates.node[i]]])
     facet, count = int(c.candidates.facet[i]), int(flips[i])
     text = f"contact {c.pair.name!r}: node {node} on facet {facet}, {count} active-set flips"
-    return float(weight[i]), text
+    return c.pair.name, float(weight[i]), text
 
 
-def _body_note(body: Any, terms: BodyTerms) -> tuple[float, str]:
-    """Where the body's equation is worst solved; ranked below contact."""
+def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:
+    """Name, weight and text of where the body's equation is worst solved."""
     r = np.nan_to_num(np.abs(terms.residual), nan=np.inf)
     r[body.fixed] = 0.0
     x = ", ".join(f"{c:.4g}" for c in body.reference.reshape(-1, 3)[int(np.argmax(r)) // 3])
-    return 0.0, f"body {body.name!r}: largest residual at X = ({x})"
+    return body.name, float(r.max()), f"body {body.name!r}: largest residual at X = ({x})"

@@ -92,7 +92,19 @@ def gap(x: FloatArray, xi: FloatArray) -> Gap:
 def _solve2(a: FloatArray, b: FloatArray) -> FloatArray:
     """Solve the 2x2 systems a (n, 2, 2) for b (n, 2, ...)."""
     columns = int(np.prod(b.shape[2:]))
-    return np.linalg.solve(a, b.reshape(len(b), 2, columns)).reshape(b.shape)
+    return solve(a, b.reshape(len(b), 2, columns)).reshape(b.shape)
+
+
+def solve(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Solve the systems a (n, k, k) for b (n, k, m); NaN for all if one of them is singular.
+
+    An exception would leave the other ranks waiting; a NaN ends the step on all of them.
+    """
+    try:
+        x: FloatArray = np.linalg.solve(a, b)
+    except np.linalg.LinAlgError:
+        return np.full_like(b, np.nan)
+    return x
 
 
 @lru_cache

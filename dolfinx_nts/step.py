@@ -116,8 +116,8 @@ class StepProblem:
         self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
         numbers = tuple(a for c in self.contacts for a in c.points())
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
-            self._numbers = numbers
             self._lay_out()
+            self._numbers = numbers
         self.guess(flight=True)
 
     def _contact_step(self, index: int) -> ContactStep:
@@ -250,7 +250,8 @@ class StepProblem:
             du, contact = u1 - u0, force[here]
             residual = body.inertia(du) - self._inertia[k] + internal - external + contact
             bodies.append(BodyTerms(u1, du, internal, external, contact, residual))
-        return Evaluation(values, tuple(bodies), contacts, tuple(multipliers))
+        forces = tuple(c.mass[:, None] * m for c, m in zip(self.contacts, multipliers, strict=True))
+        return Evaluation(values, tuple(bodies), contacts, forces)
 
     def _contact_forces(self, contacts: tuple[Contribution, ...]) -> FloatArray:
         """G^T lambda of all contacts in this rank's coordinates [kg m]."""
@@ -308,7 +309,8 @@ class StepProblem:
         # MPI's maximum may swallow a NaN, so it travels as a flag.
         local = [moved, float(any(np.isnan(k.residual).any() for k in e.contacts))]
         for c, k, m in zip(self.contacts, e.contacts, e.multipliers, strict=True):
-            arrays = (c.rows(k, "augmented"), c.rows(k, "multipliers"), m, c.mass)
+            gaps = c.rows(k, "multipliers") / c.mass[:, None]
+            arrays = (c.rows(k, "augmented"), gaps, m, c.mass)
             local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
         top = _global_max(self.system.comm, np.array(local))
         motion = max(top[0], float(self._motion.max()))
@@ -326,7 +328,7 @@ class StepProblem:
         """Free the PETSc objects, which Python's collector does not."""
         for a in self._petsc:
             a.destroy()
-        self._petsc = []
+        self._petsc, self._numbers = [], None
 
 
 def _free(body: Any, residual: FloatArray) -> FloatArray:

@@ -167,8 +167,16 @@ class Surface:
         near = np.flatnonzero(((x >= box[0]) & (x <= -box[1])).all(axis=1))
         closest = search.closest_facets(x[near], corners, reach=np.inf)
         distance = closest.distance / np.append(facet_math.size(corners), 1.0)[closest.facet]
-        winding = np.array([_winding(p, corners) for p in x[near]])
+        nearest = distance.copy()
         mesh.comm.Allreduce(MPI.IN_PLACE, distance, op=MPI.MIN)
+        # Only a point behind its nearest facet can be inside; its winding number costs all facets.
+        behind = np.zeros(len(near), dtype=np.int32)
+        mine = np.flatnonzero((nearest <= distance) & (closest.facet >= 0))
+        foot, _, normal = facet_math.frame(corners[closest.facet[mine]], closest.xi[mine])
+        behind[mine] = np.einsum("ni,ni->n", normal, x[near][mine] - foot) <= 0.0
+        mesh.comm.Allreduce(MPI.IN_PLACE, behind, op=MPI.MAX)
+        near, distance = near[behind > 0], distance[behind > 0]
+        winding = np.array([_winding(p, corners) for p in x[near]])
         mesh.comm.Allreduce(MPI.IN_PLACE, winding, op=MPI.SUM)
         depth = np.zeros(len(x))
         depth[near] = np.where(winding > 0.5, distance, 0.0)

@@ -90,6 +90,7 @@ class System:
         self.contact_bodies = [
             (index[id(c.slave.body)], index[id(c.master.body)]) for c in self.contacts
         ]
+        self._check_overlap()
         self._check_penetration()
 
     def initial_state(self) -> State:
@@ -97,12 +98,32 @@ class System:
         nodes = [len(c.slave.owned) for c in self.contacts]
         return State(
             time=0.0,
-            u=tuple(np.zeros(b.num_owned) for b in self.bodies),
+            u=tuple(self._prescribed(b) for b in self.bodies),
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
             facets=tuple(np.full(n, -1) for n in nodes),
             force=tuple(np.zeros(n) for n in nodes),
             gap=tuple(np.full(n, np.inf) for n in nodes),
         )
+
+    @staticmethod
+    def _prescribed(body: Body) -> FloatArray:
+        u = np.zeros(body.num_owned)
+        u[body.fixed] = body.prescribed(0.0)
+        return u
+
+    def _check_overlap(self) -> None:
+        """Raise if two contacts hold the same nodes out of the same facets."""
+        for i, a in enumerate(self.contacts):
+            for b in self.contacts[:i]:
+                same = a.slave.body is b.slave.body and a.master.body is b.master.body
+                if same and np.intersect1d(a.slave.points, b.slave.points).size:
+                    facets = [{tuple(sorted(f)) for f in c.master.points[c.master.facets].tolist()}
+                              for c in (a, b)]  # fmt: skip
+                    if facets[0] & facets[1]:
+                        raise ValueError(
+                            f"contacts: two of them hold the same nodes of {a.slave.body.name!r} "
+                            f"out of the same facets of {a.master.body.name!r}; drop one"
+                        )
 
     def _check_penetration(self) -> None:
         """Raise on every rank, with the nodes, if slaves start inside their masters."""

@@ -174,7 +174,7 @@ def test_velocity_not_finite_on_one_rank():
         v[1, (np.abs(x - 1.0) < 1e-9).all(axis=0)] = np.nan
         return v
 
-    pattern = r"^velocity of 'body'=<function.*not finite at x=\[1.0, 1.0, 1.0\]; check it for NaN"
+    pattern = r"^velocity of 'body'=<function.*not finite at x=\[1.0.*\]; check it for NaN"
     raises(ValueError, pattern, lambda: continuum(velocity=corner))
 
 

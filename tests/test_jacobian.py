@@ -106,7 +106,7 @@ class Linearised:
         }[active]
         margin = np.where(on, -1, 1) * rng.uniform(0.2, 0.4, len(gap))
         force = 0.05 * rng.uniform(-1, 1, (len(gap), contact.num_multipliers))
-        force[:, 0] = contact.mass * (margin - gap)
+        force[:, 0] = margin - gap
         with problem.x as x:
             x[layout.owned(fields[-1])] = force.ravel()
         evaluation = problem.evaluate(problem.x)

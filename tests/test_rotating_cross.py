@@ -15,7 +15,7 @@ def check_conserved(result, t_end):
     assert result["status"] == "completed" and result["time"] == pytest.approx(t_end)
     assert result["angular_momentum"] == pytest.approx(SPIN)
     assert result["energy"] == pytest.approx(SPIN * demo.OMEGA / 2)
-    assert result["energy_drift"] < 1e-11
+    assert result["energy_drift"] < 1e-12
     assert result["angular_momentum_drift"] < 1e-11
 
 

@@ -69,10 +69,30 @@ def test_a_failed_run_keeps_what_it_has_and_says_where():
 
 
 @pytest.mark.mpi
-def test_the_last_step_ends_at_t_end():
-    run = nts.simulate(two_blocks.scene(COMM), nts.Midpoint(), dt=2e-3, t_end=7e-3)
+@pytest.mark.parametrize(("t_end", "steps"), [(7e-3, 4), (8e-3, 4), (8e-3 * (1 + 1e-12), 4)])
+def test_equal_steps_reach_t_end(t_end, steps):
+    run = nts.simulate(two_blocks.scene(COMM), nts.Midpoint(), dt=2e-3, t_end=t_end)
     assert run.status == "completed"
-    assert np.allclose(run.balance["time"], [0, 2e-3, 4e-3, 6e-3, 7e-3], rtol=1e-14)
+    assert np.allclose(run.balance["time"], np.linspace(0, t_end, steps + 1), rtol=1e-13)
+
+
+@pytest.mark.mpi
+def test_a_single_precision_step_costs_no_precision():
+    run = nts.simulate(
+        two_blocks.scene(COMM), nts.EnergyMomentum(), dt=np.float32(2e-3), t_end=0.04
+    )
+    assert np.abs(run.balance["ledger_residual"]).max() <= 1e-12 * run.balance["energy"][0]
+
+
+@pytest.mark.mpi
+def test_a_closed_stepper_goes_on():
+    kept, closed = (nts.Stepper(two_blocks.scene(COMM), nts.Midpoint()) for _ in range(2))
+    for _ in range(2):
+        kept.advance(2e-3)
+        closed.advance(2e-3)
+        closed.close()
+    assert closed.solution.balance["energy"][-1] == kept.solution.balance["energy"][-1]
+    kept.close()
 
 
 def block(**options):
@@ -117,6 +137,32 @@ def test_the_work_of_loads_and_supports_closes_the_ledger(options):
     scale = max(table["energy"].max(), np.abs(table["external_work"]).max())
     assert np.abs(table["external_work"]).max() > 0.1
     assert np.abs(table["ledger_residual"]).max() <= 1e-11 * scale
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_driven_nodes_have_the_velocity_of_their_support(integrator):
+    """They start with it and do not alternate about it; exact for motion at constant speed."""
+    speed = np.array([0.5, -0.2, 0.3])
+    body = block(bcs=[nts.Dirichlet(lambda x: x[0] > -1, lambda t: 0.1 + speed * t)])
+    stepper = nts.Stepper(nts.System([body]), integrator)
+    driven = body.fixed.reshape(-1, 3)
+    assert np.allclose(stepper.state.u[0][driven], 0.1)
+    for _ in range(5):
+        stepper.advance(2e-3)
+        assert np.allclose(stepper.state.v[0][driven], speed, rtol=0, atol=1e-11)
+    stepper.close()
+    fixed = block(bcs=[nts.Dirichlet(lambda x: x[0] > -1, lambda t: (0.1 * np.sin(40 * t), 0, 0))])
+    errors = []
+    for dt in (2e-3, 1e-3):
+        stepper = nts.Stepper(nts.System([fixed]), integrator)
+        while stepper.state.time < 0.02 - 1e-9:
+            stepper.advance(dt)
+        error = stepper.state.v[0][driven[:, 0]] - 4.0 * np.cos(40 * stepper.state.time)
+        errors.append(COMM.allreduce(np.abs(error).max(initial=0.0), op=MPI.MAX))
+        stepper.close()
+    assert errors[0] < 0.02
+    assert 3.5 < errors[0] / errors[1] < 4.5
 
 
 @pytest.mark.mpi

@@ -211,3 +211,30 @@ def test_the_step_decides_what_is_lost():
         final = COMM.bcast(stepper.state.v[0])[2]
         assert np.isclose(final, abs(1 - 2 * theta) * SPEED, rtol=1e-12)
         stepper.close()
+
+
+@pytest.mark.parametrize(("away", "motion"), [(0.2, 0.3), (0.4, 0.6), (0.45, 0.8), (0.45, 1.2)])
+def test_a_ridge_is_no_gap_in_the_wall(away, motion):
+    """A mass flies at a convex edge, from where neither facet faces it: it bounces, none is won."""
+    speed, side = motion / STEP, np.sqrt(0.5)
+    mesh = create_box(COMM, [[-2, -1, -2], [0, 1, 0]], [2, 2, 2], CellType.hexahedron)
+    everywhere = nts.Dirichlet(lambda x: x[0] < 1)
+    wall = nts.Continuum(
+        mesh, nts.StVenantKirchhoff(young=1.0, poisson=0.3), density=1.0, bcs=[everywhere]
+    )
+    start = np.array([away * side + 0.01, 0.3, away * side - 0.01])
+    mass = PointMass(COMM, 1.0, start, -speed * np.array([side, 0, side]))
+    faces = wall.surface(lambda x: (x[0] > -1e-9) | (x[2] > -1e-9))
+    system = nts.System([mass, wall], contacts=[nts.ContactPair(PointSurface(mass, start), faces)])
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    inside = []
+    for _ in range(8):
+        state = stepper.advance(STEP)
+        x = start + state.u[0]
+        inside.append(min(-x[0], -x[2]) > 1e-12 and min(x[0], x[2]) > -2)
+    table = stepper.solution.balance
+    assert table["active"].max() == 1
+    assert not any(inside)
+    assert table["energy"].max() <= table["energy"][0] * (1 + 1e-12)
+    assert np.abs(table["ledger_residual"]).max() <= 1e-12 * table["energy"][0]
+    stepper.close()

@@ -193,3 +193,30 @@ def test_one_facet_and_one_slave_cell(integrator):
 def test_more_ranks_than_cells(on_ranks):
     name = f"{__file__}::test_one_facet_and_one_slave_cell"
     on_ranks(3, "-m", "pytest", "-q", "-p", "no:cacheprovider", name)
+
+
+def test_the_same_gap_closed_twice_is_refused_or_reported():
+    """Twice the same pair is an error; two fixed plates in one plane end a run, with all it has."""
+    whole = [nts.Dirichlet(lambda x: x[2] < 9)]
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+
+    def box(low, high, cells, name, **options):
+        mesh = create_box(COMM, [low, high], cells, CellType.hexahedron)
+        return nts.Continuum(mesh, rubber, density=1e3, name=name, **options)
+
+    cube = box([0, 0, 0.05], [1, 1, 1.05], [2, 2, 2], "cube", velocity=(0, 0, -2))
+    plates = [
+        box([k - 0.5, -0.2, -0.5], [k + 0.5, 1.2, 0], [1, 1, 1], f"plate{k}", bcs=whole)
+        for k in (0, 1)
+    ]
+    bottom = cube.surface(lambda x: x[2] < 0.05 + 1e-9)
+    pairs = [nts.ContactPair(bottom, p.surface(lambda x: x[2] > -1e-9)) for p in plates]
+    with pytest.raises(
+        ValueError, match=r"same nodes of 'cube'.*same facets of 'plate0'; drop one"
+    ):
+        nts.System([cube, *plates], contacts=[pairs[0], pairs[0]])
+    run = nts.simulate(
+        nts.System([cube, *plates], contacts=pairs), nts.EnergyMomentum(), dt=5e-3, t_end=0.06
+    )
+    assert len(run.rows) > 4
+    assert run.status == "completed" or "Try a smaller dt" in run.status
