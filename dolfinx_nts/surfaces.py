@@ -150,7 +150,9 @@ class Surface:
         return gather_rows(self.body.comm, values[self.rows])
 
     def depth(self, x: FloatArray) -> FloatArray:
-        """How deep points lie inside the undeformed body, in facet sizes; 0 outside. Collective.
+        """How deep points lie inside the undeformed body, in facet sizes. Collective.
+
+        Outside, and less than a thousandth of a facet deep, the depth is 0.
 
         Args:
             x: Points [m], shape (n, 3), the same on all ranks.
@@ -169,11 +171,13 @@ class Surface:
         distance = closest.distance / np.append(facet_math.size(corners), 1.0)[closest.facet]
         nearest = distance.copy()
         mesh.comm.Allreduce(MPI.IN_PLACE, distance, op=MPI.MIN)
-        # Only a point behind its nearest facet can be inside; its winding number costs all facets.
+        # Only a point behind its nearest facet can be inside, and few are; a winding number costs
+        # all facets.
         behind = np.zeros(len(near), dtype=np.int32)
         mine = np.flatnonzero((nearest <= distance) & (closest.facet >= 0))
         foot, _, normal = facet_math.frame(corners[closest.facet[mine]], closest.xi[mine])
-        behind[mine] = np.einsum("ni,ni->n", normal, x[near][mine] - foot) <= 0.0
+        side = np.einsum("ni,ni->n", normal, x[near][mine] - foot)
+        behind[mine] = (side < 0.0) & (distance[mine] > 1e-3)
         mesh.comm.Allreduce(MPI.IN_PLACE, behind, op=MPI.MAX)
         near, distance = near[behind > 0], distance[behind > 0]
         winding = np.array([_winding(p, corners) for p in x[near]])
