@@ -27,7 +27,7 @@ _CONTACT_POINTS = 2
 #: Relative strain increment below which W(C_1) - W(C_0) is taken from quadrature: there the
 #: three-point rule is exact to rounding (error ~ x^7), while the plain difference would leave
 #: rounding noise ~ eps / x in the stress.
-_SMALL_STRAIN = 5e-3
+_SMALL_STRAIN = 1e-2
 #: Relative strain increment whose square is below rounding.
 _REST_STRAIN = 1e-8
 

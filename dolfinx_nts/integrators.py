@@ -42,7 +42,7 @@ class EnergyMomentum:
 
     Attributes:
         stress: Discrete derivative of the strain energy, "gonzalez" (exact; for increments below
-            0.5 % by quadrature, which only a very steep W would notice) or "mean-value" (Gauss
+            1 % by three-point quadrature, which only a very steep W notices) or "mean-value" (Gauss
             points in time: exact for polynomial W such as StVenantKirchhoff, to quadrature error
             otherwise).
         contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit
