@@ -120,7 +120,7 @@ class ContactPair:
 
     def _over_facet(self, facet: IntArray, xi: FloatArray, reach: FloatArray) -> BoolArray:
         """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide."""
-        beyond = _beyond_edges(xi, self.master.facets.shape[1])
+        beyond = facets.edge_excess(xi, self.master.facets.shape[1])
         wedge = _WEDGE + 2.0 * (reach + _MARGIN)
         limit = np.where(self._free_edges[facet], _OVERHANG, wedge[:, None])
         inside: BoolArray = (beyond <= limit).all(axis=1)
@@ -131,14 +131,6 @@ class ContactPair:
         slave = self.slave.fixed[self.slave.owned[node]].all(axis=1)
         master = self.master.fixed[self.master.facets[facet]].all(axis=(1, 2))
         return ~(slave & master)
-
-
-def _beyond_edges(xi: FloatArray, nc: int) -> FloatArray:
-    """How far xi lies beyond edge k (corner k to k + 1), negative inside, shape (n, nc)."""
-    a, b = xi.T
-    if nc == 4:
-        return np.column_stack([-1.0 - b, a - 1.0, b - 1.0, -1.0 - a])
-    return 2.0 * np.column_stack([-b, a + b - 1.0, -a])
 
 
 def _solve(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -100,23 +100,21 @@ def size(corners: FloatArray) -> FloatArray:
     return np.linalg.norm(edges, axis=2).mean(axis=1)
 
 
-def excess(xi: FloatArray, nc: int) -> FloatArray:
-    """How far coordinates lie outside the reference facet, in half facet widths.
+def edge_excess(xi: FloatArray, nc: int) -> FloatArray:
+    """How far coordinates lie beyond each edge of the reference facet, in half facet widths.
 
     Args:
         xi: Convective coordinates [-], shape (n, 2).
         nc: Number of corners, 3 or 4.
 
     Returns:
-        max(|xi|) - 1 for quadrilaterals and its analogue -2 min(N) for triangles [-], shape (n,);
-        0 inside.
+        For edge k (corner k to k + 1), negative inside [-], shape (n, nc).
     """
     _reference(nc)
+    a, b = xi.T
     if nc == 4:
-        outside = np.abs(xi).max(axis=1) - 1.0
-    else:
-        outside = -2.0 * np.minimum(xi.min(axis=1), 1.0 - xi.sum(axis=1))
-    return np.maximum(outside, 0.0)
+        return np.column_stack([-1.0 - b, a - 1.0, b - 1.0, -1.0 - a])
+    return 2.0 * np.column_stack([-b, a + b - 1.0, -a])
 
 
 def _shares(corners: FloatArray) -> FloatArray:
