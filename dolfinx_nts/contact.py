@@ -164,7 +164,9 @@ class ContactStep:
         rule: "direct" for the midpoint rule, else the discrete gradient.
         condense: Whether (d, f) and their multipliers are eliminated pair by pair.
         x0: Slave and corners at t_n [m], shape (n, nc + 1, 3).
-        mass: Nodal mass of the slaves [kg], shape (n,); the scale of the active set.
+        scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
+            nodal mass [kg] in dynamics; scales multipliers and the active set.
+        theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
     """
 
     pair: ContactPair
@@ -172,7 +174,8 @@ class ContactStep:
     rule: str
     condense: bool
     x0: FloatArray
-    mass: FloatArray
+    scale: FloatArray
+    theta: float
 
     @property
     def num_pairs(self) -> int:
@@ -248,16 +251,16 @@ class ContactStep:
         Args:
             x: Slave and corners at t_{n+1} [m], shape (n, nc + 1, 3).
             augmented: Facet size times (d, f) [m], shape (n, 5) or (n, 0).
-            multiplier: h^2/2 lambda of the scaled constraints over the nodal mass [m], shape
-                (n, 6) or (n, 1).
+            multiplier: h^2/2 lambda of the scaled constraints over `scale` [m], shape (n, 6) or
+                (n, 1).
         """
-        mass = self.mass[:, None]
-        part = self._evaluate(x, augmented, mass * multiplier)
+        scale = self.scale[:, None]
+        part = self._evaluate(x, augmented, scale * multiplier)
         # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
         rows = slice(part.residual.shape[1] - self.num_multipliers, None)
-        part.residual[:, rows] *= mass
-        part.tangent[:, rows] *= mass[:, None]
-        part.tangent[:, :, rows] *= mass[:, None]
+        part.residual[:, rows] *= scale
+        part.tangent[:, rows] *= scale[:, None]
+        part.tangent[:, :, rows] *= scale[:, None]
         return part
 
     def _evaluate(
@@ -273,12 +276,12 @@ class ContactStep:
         return self._complementarity(residual, tangent, gap, multiplier[:, 0], row)
 
     def _direct(self, x: FloatArray, multiplier: FloatArray) -> Contribution:
-        middle, end = (self._gap(p) for p in (0.5 * (self.x0 + x), x))
+        middle, end = (self._gap(p) for p in (self.x0 + self.theta * (x - self.x0), x))
         n, size = self.num_pairs, self.num_coordinates
         gradient = middle.gradient.reshape(n, size)
         residual = np.concatenate([multiplier * gradient, end.value[:, None]], axis=1)
         tangent = np.zeros((n, size + 1, size + 1))
-        tangent[:, :size, :size] = 0.5 * multiplier[:, :, None] * middle.hessian
+        tangent[:, :size, :size] = self.theta * multiplier[:, :, None] * middle.hessian
         tangent[:, :size, size] = gradient
         tangent[:, size, :size] = end.gradient.reshape(n, size)
         return self._complementarity(residual, tangent, end.value, multiplier[:, 0], size)
@@ -349,9 +352,9 @@ class ContactStep:
     ) -> Contribution:
         """Semi-smooth active set (theory section 9): g_N = 0 where active, else lambda_N = 0."""
         gap = gap.copy()
-        active = -force - self.mass * gap > 0
+        active = -force - self.scale * gap > 0
         off = ~active
-        residual[off, row] = force[off] / self.mass[off]
+        residual[off, row] = force[off] / self.scale[off]
         tangent[off, row] = 0.0
-        tangent[off, row, row] = 1.0 / self.mass[off]
+        tangent[off, row, row] = 1.0 / self.scale[off]
         return Contribution(residual, tangent, gap, active)

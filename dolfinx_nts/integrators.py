@@ -28,6 +28,7 @@ class Midpoint:
     #: Contact is described directly: the projection is eliminated, the gap multiplier is the only
     #: unknown.
     contact_gradient: ClassVar[str] = "direct"
+    theta: ClassVar[float] = 0.5
 
     def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:
         """First Piola-Kirchhoff stress P = F_m 2 dW(C(F_m)) in UFL [Pa]."""
@@ -56,6 +57,7 @@ class EnergyMomentum:
     stress: str = "gonzalez"
     contact_gradient: str = "mean-value"
     quadrature_points: int = 3
+    theta: ClassVar[float] = 0.5
 
     def __post_init__(self) -> None:
         _choose("stress", self.stress, ("gonzalez", "mean-value"))

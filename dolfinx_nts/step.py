@@ -127,10 +127,10 @@ class StepProblem:
         found = pair.find(state.u[slave], state.u[master], state.facets[index], reach)
         corners = pair.master.positions(state.u[master])[pair.master.facets[found.facet]]
         x = pair.slave.positions(state.u[slave])[pair.slave.owned[found.node]]
-        mass = pair.slave.body.nodal_mass[pair.slave.rows[found.node, 0]]
+        scale = pair.slave.body.nodal_mass[pair.slave.rows[found.node, 0]]
         x0 = np.concatenate([x[:, None], corners], axis=1)
-        rule = self.integrator.contact_gradient
-        return ContactStep(pair, found, rule, self._condense, x0, mass)
+        rule, theta = self.integrator.contact_gradient, self.integrator.theta
+        return ContactStep(pair, found, rule, self._condense, x0, scale, theta)
 
     def _lay_out(self) -> None:
         """Layout, vectors and scatter; kept from step to step while no rank's candidates change."""
@@ -250,7 +250,9 @@ class StepProblem:
             du, contact = u1 - u0, force[here]
             residual = body.inertia(du) - self._inertia[k] + internal - external + contact
             bodies.append(BodyTerms(u1, du, internal, external, contact, residual))
-        forces = tuple(c.mass[:, None] * m for c, m in zip(self.contacts, multipliers, strict=True))
+        forces = tuple(
+            c.scale[:, None] * m for c, m in zip(self.contacts, multipliers, strict=True)
+        )
         return Evaluation(values, tuple(bodies), contacts, forces)
 
     def _contact_forces(self, contacts: tuple[Contribution, ...]) -> FloatArray:
@@ -309,17 +311,17 @@ class StepProblem:
         # MPI's maximum may swallow a NaN, so it travels as a flag.
         local = [moved, float(any(np.isnan(k.residual).any() for k in e.contacts))]
         for c, k, m in zip(self.contacts, e.contacts, e.multipliers, strict=True):
-            gaps = c.rows(k, "multipliers") / c.mass[:, None]
-            arrays = (c.rows(k, "augmented"), gaps, m, c.mass)
+            gaps = c.rows(k, "multipliers") / c.scale[:, None]
+            arrays = (c.rows(k, "augmented"), gaps, m, c.scale)
             local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
         top = _global_max(self.system.comm, np.array(local))
         motion = max(top[0], float(self._motion.max()))
         length = self._rtol * motion + 8 * _EPS * float(self._extent.max())
         ratio = {}
-        for c, (a, g, force, mass) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
+        for c, (a, g, force, scale) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
             broken = np.inf if top[1] else 0.0
             if c.num_augmented:
-                limit = self._rtol * max(force, mass * motion)
+                limit = self._rtol * max(force, scale * motion)
                 ratio[f"{c.pair.name} (d, f)"] = max(_over(a, limit), broken)
             ratio[f"{c.pair.name} constraints"] = max(_over(g, length), broken)
         return ratio
