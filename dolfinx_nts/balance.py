@@ -62,13 +62,15 @@ def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, f
     """Works and counts of an accepted step, the same on all ranks.
 
     The contact defect is -sum lambda_N g_0: what activation loses and what a change of facet gains
-    or loses.
+    or loses. Friction dissipates sum lambda_T . (f_1 - f_0).
 
     Returns:
-        external_work [J], contact_defect [J], active, min_gap [m] (infinite without candidates).
+        external_work, friction_dissipation, contact_defect [J], active, stick, slip, min_gap [m]
+        (infinite without candidates).
     """
     scale = 2.0 / dt**2
-    work = defect = active = 0.0
+    work = dissipation = defect = 0.0
+    counts = np.zeros(3)
     for body, terms in zip(problem.system.bodies, step.bodies, strict=True):
         work += scale * float(terms.external @ terms.du)
         work += scale * float(terms.residual[body.fixed] @ terms.du[body.fixed])
@@ -77,15 +79,16 @@ def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, f
         problem.contacts, step.contacts, step.multipliers, strict=True
     ):
         defect -= scale * float(multiplier[:, 0] @ contact.candidates.gap)
-        active += int(part.active.sum())
+        if contact.num_tangential:
+            slipping = part.active & ~part.stick
+            dissipation += scale * float((multiplier[:, -2:] * part.slip)[slipping].sum())
+            counts[1:] += part.stick.sum(), slipping.sum()
+        counts[0] += part.active.sum()
         smallest = min(smallest, float(part.gap.min(initial=np.inf)))
     comm = problem.system.comm
-    total = np.empty(3)
-    comm.Allreduce(np.array([work, defect, active]), total, op=MPI.SUM)
-    return {
-        "external_work": float(total[0]),
-        "contact_defect": float(total[1]),
-        "active": float(total[2]),
+    local = np.array([work, dissipation, defect, *counts])
+    names = ("external_work", "friction_dissipation", "contact_defect", "active", "stick", "slip")
+    return dict(zip(names, comm.allreduce(local).tolist(), strict=True)) | {
         "min_gap": float(comm.allreduce(smallest, op=MPI.MIN)),
     }
 
@@ -110,7 +113,7 @@ def next_row(
         terms: `step_terms` of the step.
     """
     row = {**last, **measured, **terms}
-    for name in ("external_work", "contact_defect"):
+    for name in ("external_work", "friction_dissipation", "contact_defect"):
         row[name] = last[name] + terms[name]
     row["energy"] = row["kinetic"] + row["potential"]
     row["ledger_residual"] = (

@@ -2,18 +2,21 @@
 
 A `ContactPair` is part of the scene and holds no history; a `ContactStep` lives for one step. Both
 integrators share it: the midpoint rule has one unknown per candidate (lambda_N), the
-energy-momentum scheme eleven (d, f and six multipliers).
+energy-momentum scheme eleven (d, f and six multipliers). Friction adds two (lambda_T).
 """
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import facets, nts, search
+from dolfinx_nts.friction import return_map
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.validation import known_options
 
@@ -29,6 +32,12 @@ _OVERHANG = 0.05
 #: ... and this far beyond an edge shared with another facet, between the normal cones of a convex
 #: edge, and further by what the node may be away.
 _WEDGE = 0.5
+#: Algorithmic scale c of the return map over the scale of the active set. No result depends on it;
+#: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which
+#: with a consistent mass matrix is a small part of the nodal mass.
+TANGENTIAL_SCALE = 0.05
+#: Square of the part of a tangential direction's motion that counts as none.
+_IMMOVABLE = 1e-12
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 _MARGIN = 0.5
 
@@ -60,19 +69,15 @@ class ContactPair:
     Args:
         slave: Surface whose nodes are kept outside.
         master: Surface whose facets keep them outside.
-        friction: Coulomb's coefficient [-]; this version knows 0 only.
+        friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact never slip.
 
     Raises:
         TypeError: An argument is not a Surface.
-        NotImplementedError: friction is not 0.
-        ValueError: The surfaces share nodes.
+        ValueError: friction is negative or no number, or the surfaces share nodes.
     """
 
     def __init__(self, slave: Surface, master: Surface, *, friction: float = 0.0) -> None:
-        if friction != 0.0:
-            raise NotImplementedError(
-                f"friction={friction!r}: this version has frictionless contact; pass 0 or leave it"
-            )
+        _check_friction(friction)
         for name, value in (("slave", slave), ("master", master)):
             if not isinstance(value, Surface):
                 raise TypeError(f"{name}={value!r}: pass a Surface, e.g. body.surface(marker)")
@@ -81,7 +86,7 @@ class ContactPair:
                 f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
                 "choose disjoint markers"
             )
-        self.slave, self.master = slave, master
+        self.slave, self.master, self.friction = slave, master, float(friction)
         self._free_edges = master.boundary_edges
 
     @property
@@ -133,6 +138,11 @@ class ContactPair:
         return ~(slave & master)
 
 
+def _check_friction(friction: Any) -> None:
+    if not isinstance(friction, numbers.Real) or not float(friction) >= 0.0:
+        raise ValueError(f"friction={friction!r}: pass a number >= 0 (math.inf: never slips)")
+
+
 def _solve(a: FloatArray, b: FloatArray) -> FloatArray:
     """Solve a (n, k, k) y = b (n, k)."""
     return nts.solve(a, b[:, :, None])[:, :, 0]
@@ -146,12 +156,29 @@ class Contribution(NamedTuple):
         tangent: Shape (n, r, r).
         gap: g_N at t_{n+1} [m], shape (n,).
         active: Active set of the iterate, shape (n,).
+        stick: Active pairs that stick, shape (n,).
+        slip: Facet size times f_1 - f_0 [m], shape (n, 2); (n, 0) without friction.
+        distance: Length of the slip in the metric [m], shape (n,); 0 where not active.
+        tangential: Contact force on the slave less its part along the normal [kg m], shape (n, 3).
     """
 
     residual: FloatArray
     tangent: FloatArray
     gap: FloatArray
     active: BoolArray
+    stick: BoolArray
+    slip: FloatArray
+    distance: FloatArray
+    tangential: FloatArray
+
+
+class _Slip(NamedTuple):
+    """Slip and metric in facet sizes with their derivatives by the unknowns of the element."""
+
+    value: FloatArray
+    gradient: FloatArray
+    metric: FloatArray
+    metric_gradient: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +221,7 @@ class ContactStep:
 
     @property
     def _only_normal(self) -> bool:
+        """Whether lambda_N is the only multiplier of a constraint."""
         return self.condense or self.rule == "direct"
 
     @property
@@ -202,9 +230,27 @@ class ContactStep:
         return 0 if self._only_normal else nts.NUM_AUGMENTED
 
     @property
+    def num_tangential(self) -> int:
+        """Tangential multipliers per pair, the last ones."""
+        return 2 if self.pair.friction else 0
+
+    @property
+    def _num_constraints(self) -> int:
+        return 1 if self._only_normal else nts.NUM_CONSTRAINTS
+
+    @property
     def num_multipliers(self) -> int:
         """Multipliers per pair."""
-        return 1 if self._only_normal else nts.NUM_CONSTRAINTS
+        return self._num_constraints + self.num_tangential
+
+    @property
+    def multiplier_pattern(self) -> BoolArray:
+        """Which multipliers stand in the rows of which multipliers, shape (m, m)."""
+        pattern = np.zeros((self.num_multipliers,) * 2, dtype=bool)
+        pattern[0, 0] = True
+        pattern[self._num_constraints :, 0] = True
+        pattern[self._num_constraints :, self._num_constraints :] = True
+        return pattern
 
     def dofs(self) -> tuple[IntArray, IntArray]:
         """Global coordinates of slaves (n, 3) and facets (n, 3 nc); -1 where prescribed."""
@@ -221,6 +267,30 @@ class ContactStep:
         return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(
             -1, 3 * self.num_corners
         )
+
+    @cached_property
+    def blocked(self) -> FloatArray:
+        """Projector on the lambda_T that act on prescribed coordinates only, shape (n, 2, 2).
+
+        There the slip is prescribed, sticking is no equation, and lambda_T is set to zero.
+        """
+        s, m = self.dofs()
+        free = np.concatenate([s, m], axis=1) >= 0
+        out = np.zeros((self.num_pairs, 2, 2))
+        some = np.flatnonzero(~free.all(axis=1))
+        x, xi = self.x0[some], self.candidates.xi[some]
+        gradient = nts.projection(x, xi, np.zeros_like(xi)).gradient
+        whole = np.einsum("naz,nbz->nab", gradient, gradient)
+        part = np.einsum("naz,nbz->nab", gradient * free[some, None], gradient)
+        inverse = np.linalg.inv(np.linalg.cholesky(whole))
+        movable, vector = np.linalg.eigh(inverse @ part @ inverse.transpose(0, 2, 1))
+        vector = np.matmul(inverse.transpose(0, 2, 1), vector)
+        vector /= np.linalg.norm(vector, axis=1, keepdims=True)
+        vector *= (movable < _IMMOVABLE)[:, None]
+        out[some] = np.matmul(vector, vector.transpose(0, 2, 1))
+        both = some[(movable < _IMMOVABLE).all(axis=1)]
+        out[both] = np.eye(2)
+        return out
 
     def reference(self) -> FloatArray:
         """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
@@ -251,11 +321,20 @@ class ContactStep:
         Args:
             x: Slave and corners at t_{n+1} [m], shape (n, nc + 1, 3).
             augmented: Facet size times (d, f) [m], shape (n, 5) or (n, 0).
-            multiplier: h^2/2 lambda of the scaled constraints over `scale` [m], shape (n, 6) or
-                (n, 1).
+            multiplier: h^2/2 lambda of the scaled constraints, and of lambda_T over the facet
+                size, over `scale` [m], shape (n, multipliers).
         """
         scale = self.scale[:, None]
-        part = self._evaluate(x, augmented, scale * multiplier)
+        multiplier = scale * multiplier
+        if self.rule == "direct":
+            residual, tangent, gap, slip = self._direct(x, multiplier)
+        elif self.condense:
+            residual, tangent, gap, slip = self._condensed(x, multiplier)
+        else:
+            residual, tangent, gap, slip = self._invariants(x, augmented, multiplier)
+        part = self._laws(residual, tangent, gap, slip, multiplier)
+        if slip is not None:
+            part.tangential[:] = self._tangential(x, -residual[:, :3])
         # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
         rows = slice(part.residual.shape[1] - self.num_multipliers, None)
         part.residual[:, rows] *= scale
@@ -263,31 +342,54 @@ class ContactStep:
         part.tangent[:, :, rows] *= scale[:, None]
         return part
 
-    def _evaluate(
-        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
-    ) -> Contribution:
-        """As `evaluate` for multipliers in [kg m] and constraints in [m]."""
-        if self.rule == "direct":
-            return self._direct(x, multiplier)
-        if self.condense:
-            return self._condensed(x, multiplier)
-        residual, tangent, gap = self._invariants(x, augmented, multiplier)
-        row = residual.shape[1] - nts.NUM_CONSTRAINTS
-        return self._complementarity(residual, tangent, gap, multiplier[:, 0], row)
-
-    def _direct(self, x: FloatArray, multiplier: FloatArray) -> Contribution:
-        middle, end = (self._gap(p) for p in (self.x0 + self.theta * (x - self.x0), x))
-        n, size = self.num_pairs, self.num_coordinates
-        gradient = middle.gradient.reshape(n, size)
-        residual = np.concatenate([multiplier * gradient, end.value[:, None]], axis=1)
-        tangent = np.zeros((n, size + 1, size + 1))
-        tangent[:, :size, :size] = self.theta * multiplier[:, :, None] * middle.hessian
+    def _direct(
+        self, x: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, _Slip | None]:
+        """Residual and tangent of (x, multipliers) in [kg m] and [m], gap and slip."""
+        n, size, theta = self.num_pairs, self.num_coordinates, self.theta
+        middle = self.x0 + theta * (x - self.x0)
+        xi_middle, xi_end = self._projection(middle), self._projection(x)
+        force, end = nts.gap(middle, xi_middle), nts.gap(x, xi_end)
+        gradient = force.gradient.reshape(n, size)
+        residual = np.zeros((n, size + self.num_multipliers))
+        tangent = np.zeros((*residual.shape, residual.shape[1]))
+        residual[:, :size] = multiplier[:, :1] * gradient
+        residual[:, size] = end.value
+        tangent[:, :size, :size] = theta * multiplier[:, :1, None] * force.hessian
         tangent[:, :size, size] = gradient
         tangent[:, size, :size] = end.gradient.reshape(n, size)
-        return self._complementarity(residual, tangent, end.value, multiplier[:, 0], size)
+        if not self.num_tangential:
+            return residual, tangent, end.value, None
 
-    def _gap(self, x: FloatArray) -> nts.Gap:
-        return nts.gap(x, self._projection(x))
+        length, t = self.candidates.length, multiplier[:, -2:]
+        middle_xi = nts.projection(middle, xi_middle, t)
+        end_xi = nts.projection(x, xi_end, np.zeros_like(t))
+        along = length[:, None, None] * middle_xi.gradient
+        residual[:, :size] += np.einsum("na,naz->nz", t, along)
+        tangent[:, :size, :size] += theta * length[:, None, None] * middle_xi.hessian
+        tangent[:, :size, -2:] = along.transpose(0, 2, 1)
+        value = length[:, None] * (xi_end - self.candidates.xi)
+        gradient = np.zeros((n, 2, residual.shape[1]))
+        gradient[..., :size] = length[:, None, None] * end_xi.gradient
+        metric_gradient = np.zeros((n, 2, 2, residual.shape[1]))
+        metric_gradient[..., :size] = theta * middle_xi.metric_gradient
+        return (
+            residual,
+            tangent,
+            end.value,
+            self._slip(value, gradient, middle_xi.metric, metric_gradient),
+        )
+
+    def _slip(
+        self,
+        value: FloatArray,
+        gradient: FloatArray,
+        metric: FloatArray,
+        metric_gradient: FloatArray,
+    ) -> _Slip:
+        """Slip [m] and its gradient as given, the metric per square of the facet size."""
+        area = self.candidates.length[:, None, None] ** 2
+        return _Slip(value, gradient, metric / area, metric_gradient / area[..., None])
 
     def _projection(self, x: FloatArray) -> FloatArray:
         """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
@@ -297,8 +399,8 @@ class ContactStep:
 
     def _invariants(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Scaled residual and tangent of (x, d, f, multipliers), and the gap."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray, _Slip | None]:
+        """Scaled residual and tangent of (x, d, f, multipliers), gap and slip."""
         c, n = self.candidates, self.num_pairs
         length = c.length[:, None]
         positions = (n, self.num_coordinates)
@@ -309,52 +411,139 @@ class ContactStep:
         row, one = 1.0 / length, np.ones_like(length)
         scale_z = np.concatenate([np.ones(positions), np.tile(row, nts.NUM_AUGMENTED)], axis=1)
         scale_g = np.concatenate([one, one, one, length, row, row], axis=1)
-        e = nts.element(z0, z1, multiplier * scale_g, self.rule)
+        normal = multiplier[:, : nts.NUM_CONSTRAINTS]
+        e = nts.element(z0, z1, normal * scale_g, self.rule)
         size = z1.shape[1]
-        total = size + nts.NUM_CONSTRAINTS
-        residual = np.concatenate([e.force * scale_z, e.constraint * scale_g], axis=1)
-        tangent = np.zeros((n, total, total))
+        stop = size + nts.NUM_CONSTRAINTS
+        residual = np.zeros((n, stop + self.num_tangential))
+        residual[:, :size], residual[:, size:stop] = e.force * scale_z, e.constraint * scale_g
+        tangent = np.zeros((*residual.shape, residual.shape[1]))
         tangent[:, :size, :size] = e.stiffness * scale_z[:, :, None] * scale_z[:, None]
         mixed = scale_g[:, :, None] * scale_z[:, None]
-        tangent[:, :size, size:] = (e.force_gradient * mixed).transpose(0, 2, 1)
-        tangent[:, size:, :size] = e.constraint_gradient * mixed
-        return residual, tangent, e.constraint[:, 0]
+        tangent[:, :size, size:stop] = (e.force_gradient * mixed).transpose(0, 2, 1)
+        tangent[:, size:stop, :size] = e.constraint_gradient * mixed
+        if not self.num_tangential:
+            return residual, tangent, e.constraint[:, 0], None
 
-    def _condensed(self, x: FloatArray, multiplier: FloatArray) -> Contribution:
-        """The element in (x, lambda_N): five constraints fix d and f, whose rows fix the rest.
+        f = slice(size - 2, size)
+        residual[:, f] += multiplier[:, -2:]
+        tangent[:, f, -2:] = np.eye(2)
+        gradient = np.zeros((n, 2, residual.shape[1]))
+        gradient[:, :, f] = np.eye(2)
+        d1 = nts.invariant_gradient(z1, self.num_corners)
+        pi = 0.5 * (nts.invariants(z0, self.num_corners) + nts.invariants(z1, self.num_corners, d1))
+        metric, by_pi = nts.metric(pi, self.num_corners)
+        metric_gradient = np.zeros((n, 2, 2, residual.shape[1]))
+        by_z = np.matmul(by_pi.reshape(n, 4, -1), d1).reshape(n, 2, 2, size)
+        metric_gradient[..., :size] = 0.5 * by_z * scale_z[:, None, None]
+        slip = self._slip(augmented[:, 3:] - length * c.xi, gradient, metric, metric_gradient)
+        return residual, tangent, e.constraint[:, 0], slip
+
+    def _condensed(
+        self, x: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, _Slip | None]:
+        """The element in (x, lambda_N, lambda_T): constraints fix d and f, whose rows fix the rest.
 
         At the projection of t_{n+1} the augmented constraints hold, and the rows of d and f are
         linear in their multipliers; the Schur complement is then the exact tangent.
         """
-        n, size = self.num_pairs, self.num_coordinates
-        normal = size + nts.NUM_AUGMENTED
+        size = self.num_coordinates
+        normal, tangential = size + nts.NUM_AUGMENTED, multiplier[:, 1:]
         augmented = self._augmented(x)
-        full = np.zeros((n, nts.NUM_CONSTRAINTS))
-        full[:, :1] = multiplier
-        rows, columns = slice(size, normal), slice(normal + 1, None)
-        residual, tangent, _ = self._invariants(x, augmented, full)
-        full[:, 1:] = -_solve(tangent[:, rows, columns], residual[:, rows])
-        residual, tangent, gap = self._invariants(x, augmented, full)
-        outer = np.r_[:size, normal]
-        inner = np.setdiff1d(np.arange(tangent.shape[1]), outer)
-        left = tangent[:, outer[:, None], inner]
+        hidden = np.zeros((self.num_pairs, nts.NUM_AUGMENTED))
+        rows, columns = slice(size, normal), slice(normal + 1, normal + 1 + nts.NUM_AUGMENTED)
+        full = np.concatenate([multiplier[:, :1], hidden, tangential], axis=1)
+        residual, tangent, _, _ = self._invariants(x, augmented, full)
+        full[:, 1 : 1 + nts.NUM_AUGMENTED] = -_solve(tangent[:, rows, columns], residual[:, rows])
+        residual, tangent, gap, slip = self._invariants(x, augmented, full)
+        inner = np.r_[rows, columns]
+        outer = np.setdiff1d(np.arange(tangent.shape[1]), inner)
         inside = nts.solve(tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer])
-        reduced = tangent[:, outer[:, None], outer] - np.matmul(left, inside)
-        return self._complementarity(residual[:, outer], reduced, gap, multiplier[:, 0], size)
 
-    def _complementarity(
+        def reduce(a: FloatArray) -> FloatArray:
+            """Derivatives by the outer unknowns from those by all."""
+            reduced: FloatArray = a[..., outer] - np.matmul(a[..., inner], inside)
+            return reduced
+
+        tangent = reduce(tangent[:, outer])
+        if slip is not None:
+            n = self.num_pairs
+            by_metric = reduce(slip.metric_gradient.reshape(n, 4, -1)).reshape(n, 2, 2, -1)
+            slip = slip._replace(gradient=reduce(slip.gradient), metric_gradient=by_metric)
+        return residual[:, outer], tangent, gap, slip
+
+    def _laws(
         self,
         residual: FloatArray,
         tangent: FloatArray,
         gap: FloatArray,
-        force: FloatArray,
-        row: int,
+        slip: _Slip | None,
+        multiplier: FloatArray,
     ) -> Contribution:
-        """Semi-smooth active set (theory section 9): g_N = 0 where active, else lambda_N = 0."""
-        gap = gap.copy()
-        active = -force - self.scale * gap > 0
+        """Semi-smooth laws of contact (theory section 9) and friction (section 6).
+
+        g_N = 0 where active, else lambda_N = 0; there Coulomb's law, else lambda_T = 0.
+        """
+        gap, force, scale = gap.copy(), multiplier[:, 0], self.scale
+        active = -force - scale * gap > 0
         off = ~active
-        residual[off, row] = force[off] / self.scale[off]
+        row = residual.shape[1] - self.num_multipliers
+        residual[off, row] = force[off] / scale[off]
         tangent[off, row] = 0.0
-        tangent[off, row, row] = 1.0 / self.scale[off]
-        return Contribution(residual, tangent, gap, active)
+        tangent[off, row, row] = 1.0 / scale[off]
+        part = Contribution(
+            residual,
+            tangent,
+            gap,
+            active,
+            stick=np.zeros_like(active),
+            slip=np.empty((self.num_pairs, 0)) if slip is None else slip.value,
+            distance=np.zeros(self.num_pairs),
+            tangential=np.zeros((self.num_pairs, 3)),
+        )
+        if slip is not None:
+            part.stick[:] = self._coulomb(residual, tangent, slip, multiplier, active)
+            square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
+            part.distance[active] = np.sqrt(square[active])
+        return part
+
+    def _tangential(self, x: FloatArray, force: FloatArray) -> FloatArray:
+        """Force (n, 3) less its part along the normal where the contact force acts."""
+        middle = self.x0 + self.theta * (x - self.x0)
+        _, _, normal = facets.frame(middle[:, 1:], self._projection(middle))
+        along: FloatArray = np.einsum("ni,ni->n", force, normal)
+        return force - along[:, None] * normal
+
+    def _coulomb(
+        self,
+        residual: FloatArray,
+        tangent: FloatArray,
+        slip: _Slip,
+        multiplier: FloatArray,
+        active: BoolArray,
+    ) -> BoolArray:
+        """Write the rows of lambda_T [m]; returns which pairs stick."""
+        mu, t, scale = self.pair.friction, multiplier[:, -2:], self.scale[:, None, None]
+        pressing = -multiplier[:, 0] > 0
+        rigid = np.isinf(mu)
+        pressure = np.inf if rigid else -mu * multiplier[:, 0]
+        bound = np.where(active & (pressing | rigid), pressure, 0.0)
+        law = return_map(t, slip.value, slip.metric, bound, TANGENTIAL_SCALE * self.scale)
+        stick = law.stick & active
+        rows = np.einsum("nab,nbz->naz", law.d_slip, slip.gradient)
+        rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)
+        rows[:, :, -2:] += law.d_multiplier
+        if not rigid:
+            normal = rows.shape[2] - self.num_multipliers
+            rows[:, :, normal] -= np.where(pressing, mu, 0.0)[:, None] * law.d_bound
+        value = law.residual
+        value[~active], rows[~active] = t[~active], 0.0
+        rows[~active, :, -2:] = np.eye(2)
+        slipping = ~stick
+        value[slipping] /= scale[slipping, 0]
+        rows[slipping] /= scale[slipping]
+        blocked = self.blocked[stick] / scale[stick]
+        value[stick] += np.einsum("nab,nb->na", blocked, t[stick])
+        rows[stick, :, -2:] += blocked
+        residual[:, -2:], tangent[:, -2:] = value, rows
+        return stick

@@ -89,6 +89,68 @@ def gap(x: FloatArray, xi: FloatArray) -> Gap:
     return Gap(value, np.einsum("nk,ni->nki", weight, normal), hessian.reshape(len(x), size, size))
 
 
+class Projection(NamedTuple):
+    """Convective coordinates of the slave as functions of the positions.
+
+    Attributes:
+        gradient: dxi^a/dx [1/m], shape (n, 2, 3 (nc + 1)).
+        metric: m_ab = a_a . a_b [m^2], shape (n, 2, 2).
+        metric_gradient: dm_ab/dx [m], shape (n, 2, 2, 3 (nc + 1)).
+        hessian: multiplier_a d2xi^a/dx2, shape (n, 3 (nc + 1), 3 (nc + 1)).
+    """
+
+    gradient: FloatArray
+    metric: FloatArray
+    metric_gradient: FloatArray
+    hessian: FloatArray
+
+
+def projection(x: FloatArray, xi: FloatArray, multiplier: FloatArray) -> Projection:
+    """Exact derivatives of the orthogonal projection r_a = (x_s - xbar) . a_a = 0.
+
+    Args:
+        x: Slave node and facet corners [m], shape (n, nc + 1, 3).
+        xi: Orthogonal projection of the slave onto the facet, shape (n, 2); must be converged.
+        multiplier: Weights lambda_a of the second derivative, shape (n, 2).
+    """
+    n, nc = len(x), x.shape[1] - 1
+    size = 3 * (nc + 1)
+    shape, dshape, ddshape = (
+        np.concatenate([np.zeros_like(s[:, :1]), s], axis=1) for s in facets.shape(xi, nc)
+    )
+    weight = -shape
+    weight[:, 0] = 1.0
+    offset = np.einsum("nk,nki->ni", weight, x)
+    tangents = np.einsum("nka,nki->nai", dshape, x)
+    bend = np.einsum("nkab,nki->nabi", ddshape, x)
+    metric = np.einsum("nai,nbi->nab", tangents, tangents)
+    slope = metric - np.einsum("nabi,ni->nab", bend, offset)
+
+    rows = np.einsum("nk,nai->naki", weight, tangents)
+    rows += np.einsum("nka,ni->naki", dshape, offset)
+    gradient = _solve2(slope, rows).reshape(n, 2, size)
+
+    # mu . r has the derivatives of lambda . xi once mu solves the adjoint equation.
+    mu = _solve2(slope, multiplier[:, :, None])[:, :, 0]
+    along = np.einsum("na,nka->nk", mu, dshape)
+    xx = weight[:, :, None] * along[:, None] + along[:, :, None] * weight[:, None]
+    hessian = np.einsum("nkl,ij->nkilj", xx, np.eye(3)).reshape(n, size, size)
+    mixed = np.einsum("nk,nci->nkic", weight, np.einsum("na,naci->nci", mu, bend))
+    mixed -= np.einsum("nkc,ni->nkic", dshape, np.einsum("na,nai->ni", mu, tangents))
+    mixed += np.einsum("nkc,ni->nkic", np.einsum("na,nkac->nkc", mu, ddshape), offset)
+    mixed -= np.einsum("nk,nci->nkic", along, tangents)
+    mixed = mixed.reshape(n, size, 2)
+    bent = np.einsum("na,naci,ndi->ncd", mu, bend, tangents)
+    inner = -np.einsum("ncdi,nai,na->ncd", bend, tangents, mu) - bent - bent.transpose(0, 2, 1)
+    cross = np.matmul(mixed, gradient)
+    hessian += cross + cross.transpose(0, 2, 1)
+    hessian += np.matmul(gradient.transpose(0, 2, 1), np.matmul(inner, gradient))
+
+    half = np.einsum("nka,nbi->nabki", dshape, tangents).reshape(n, 2, 2, size)
+    half += np.einsum("naci,nbi,ncz->nabz", bend, tangents, gradient)
+    return Projection(gradient, metric, half + half.transpose(0, 2, 1, 3), hessian)
+
+
 def _solve2(a: FloatArray, b: FloatArray) -> FloatArray:
     """Solve the 2x2 systems a (n, 2, 2) for b (n, 2, ...)."""
     columns = int(np.prod(b.shape[2:]))
@@ -221,6 +283,29 @@ def constraint_curvature(pi: FloatArray, multiplier: FloatArray, nc: int) -> Flo
     mixed = np.matmul(dshape.transpose(0, 2, 1), np.matmul(yy, bent))
     out[:, -2:] = ff - mixed - mixed.transpose(0, 2, 1)
     return out
+
+
+def metric(pi: FloatArray, nc: int) -> tuple[FloatArray, FloatArray]:
+    """Metric of the tangents m_ab = sum N_I,a N_J,b y_I . y_J from the invariants (theory 6).
+
+    Args:
+        pi: Invariants, shape (n, p).
+        nc: Corners of a facet.
+
+    Returns:
+        m_ab [m^2], shape (n, 2, 2), and dm_ab/dpi, shape (n, 2, 2, p).
+    """
+    _, dshape, ddshape = facets.shape(pi[:, -2:], nc)
+    yy, _, _ = _split(pi, nc)
+    i, j = _invariant_maps(nc)[2]
+    value = np.einsum("nia,nij,njb->nab", dshape, yy, dshape)
+    gradient = np.zeros((len(pi), 2, 2, pi.shape[1]))
+    products = np.einsum("nka,nkb->nabk", dshape[:, i], dshape[:, j])
+    products += products.transpose(0, 2, 1, 3)
+    gradient[..., : len(i)] = products * np.where(i == j, 0.5, 1.0)
+    bent = np.einsum("niac,nij,njb->nabc", ddshape, yy, dshape)
+    gradient[..., -2:] = bent + bent.transpose(0, 2, 1, 3)
+    return value, gradient
 
 
 def element(z0: FloatArray, z1: FloatArray, multiplier: FloatArray, rule: str) -> Element:

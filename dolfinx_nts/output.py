@@ -123,7 +123,7 @@ class _Series:
         for label, k in self.contacts.items():
             contact = stepper.system.contacts[k]
             for name, (elsewhere, values) in _contact_fields(contact, state, k).items():
-                nodal = np.full(owned, elsewhere)
+                nodal = np.full((owned, *values.shape[1:]), elsewhere)
                 nodal[contact.slave.rows[:, 0] // 3] = values
                 fields[f"{name}_{label}"] = self._nodal(nodal)
         return fields
@@ -167,12 +167,16 @@ def _contact_fields(pair: ContactPair, state: State, k: int) -> dict[str, tuple[
     """Name -> value elsewhere and values at the owned slave nodes."""
     slave, force, gap = pair.slave, state.force[k], state.gap[k]
     near = np.isfinite(gap)
-    return {
+    fields = {
         "contact_force": (0.0, force),
         "contact_pressure": (0.0, force / slave.area[slave.owned]),
         "contact_gap": (np.nan, np.where(near, gap, np.nan)),
-        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float))),
+        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + state.stick[k]),
     }
+    if pair.friction:
+        fields["contact_friction"] = (0.0, state.tangential[k])
+        fields["contact_slip"] = (0.0, state.slip[k])
+    return fields
 
 
 class Fields:
@@ -181,9 +185,10 @@ class Fields:
     Displacement [m] and velocity [m/s] at the mesh's nodes. At the slave body of a contact also,
     with the contact's name appended, contact_force p_N [N], contact_pressure (force per tributary
     reference area) [Pa], contact_gap [m] (NaN where unknown) and contact_status (-1 not a slave
-    node, 0 far away, 1 near, 2 in contact). The initial and the last accepted state are always
-    written, and every time is on disk before the run goes on. Bodies without a mesh are left out;
-    existing files of the same names are replaced.
+    node, 0 far away, 1 near, 2 in contact, 3 sticking); with friction contact_friction, the
+    tangential force on the node [N], and contact_slip, the distance slipped so far [m]. The initial
+    and the last accepted state are always written, and every time is on disk before the run goes
+    on. Bodies without a mesh are left out; existing files of the same names are replaced.
 
     Args:
         folder: Where the files go; made if missing.

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import balance
+from dolfinx_nts.contact import ContactStep
 from dolfinx_nts.newton import Newton, StepFailedError, StepSolver
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.system import State, System
@@ -178,29 +179,40 @@ class Stepper:
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
         """State at t_{n+1}, with v_1 = 2 (u_1 - u_0)/h - v_0."""
-        old, facets, force, gap = self.state, [], [], []
-        for k, contact in enumerate(self.problem.contacts):
-            node = contact.candidates.node
-            facets.append(np.full_like(old.facets[k], -1))
-            facets[-1][node] = contact.candidates.facet
-            force.append(np.zeros_like(old.force[k]))
-            normal = np.where(step.contacts[k].active, step.multipliers[k][:, 0], 0.0)
-            force[-1][node] = -2.0 / dt**2 * normal
-            gap.append(np.full_like(old.gap[k], np.inf))
-            gap[-1][node] = step.contacts[k].gap
+        old, scale = self.state, 2.0 / dt**2
+        contact = [
+            {
+                "facets": _at_nodes(c, c.candidates.facet, -1),
+                "force": _at_nodes(c, -scale * np.where(k.active, m[:, 0], 0.0), 0.0),
+                "gap": _at_nodes(c, k.gap, np.inf),
+                "tangential": _at_nodes(c, scale * k.tangential, 0.0),
+                "stick": _at_nodes(c, k.stick, False),
+                "slip": slip + _at_nodes(c, k.distance, 0.0),
+            }
+            for c, k, m, slip in zip(
+                self.problem.contacts, step.contacts, step.multipliers, old.slip, strict=True
+            )
+        ]
+        names = ("facets", "force", "gap", "tangential", "stick", "slip")
         return State(
             time=time,
             u=tuple(b.u1.copy() for b in step.bodies),
             v=tuple(2.0 / dt * b.du - v for b, v in zip(step.bodies, old.v, strict=True)),
-            facets=tuple(facets),
-            force=tuple(force),
-            gap=tuple(gap),
+            **{name: tuple(c[name] for c in contact) for name in names},
         )
 
     def close(self) -> None:
         """Free the PETSc objects of the last step."""
         self.solver.destroy()
         self.problem.destroy()
+
+
+def _at_nodes(contact: ContactStep, values: npt.NDArray[Any], elsewhere: Any) -> npt.NDArray[Any]:
+    """Values of the pairs at this rank's slave nodes, which are candidates or not."""
+    shape = (len(contact.pair.slave.owned), *values.shape[1:])
+    out = np.full(shape, elsewhere, dtype=values.dtype)
+    out[contact.candidates.node] = values
+    return out
 
 
 def _is_writer(item: Any) -> bool:

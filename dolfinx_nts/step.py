@@ -176,8 +176,7 @@ class StepProblem:
                 offset[name] += count
             stops = np.cumsum(widths)
             pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
-            pattern[stops[-2] :, stops[-2] :] = False
-            pattern[stops[-2], stops[-2]] = True
+            pattern[stops[-2] :, stops[-2] :] = c.multiplier_pattern
             columns = tuple(slice(int(b - w), int(b)) for w, b in zip(widths, stops, strict=True))
             fields = (*bodies, *self._fields.values())
             blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))

@@ -29,6 +29,9 @@ class State:
         facets: Facet of each owned slave node of each contact in the last step, or -1.
         force: Contact force p_N of the same nodes [N], >= 0.
         gap: Gap of the same nodes [m], infinite where a node was no candidate.
+        tangential: Friction force on the same nodes [N], shape (n, 3).
+        stick: Which of the same nodes stick.
+        slip: Distance that the same nodes have slipped since the start [m].
     """
 
     time: float
@@ -37,6 +40,9 @@ class State:
     facets: tuple[IntArray, ...]
     force: tuple[FloatArray, ...]
     gap: tuple[FloatArray, ...]
+    tangential: tuple[FloatArray, ...]
+    stick: tuple[npt.NDArray[np.bool_], ...]
+    slip: tuple[FloatArray, ...]
 
 
 @known_options
@@ -103,6 +109,9 @@ class System:
             facets=tuple(np.full(n, -1) for n in nodes),
             force=tuple(np.zeros(n) for n in nodes),
             gap=tuple(np.full(n, np.inf) for n in nodes),
+            tangential=tuple(np.zeros((n, 3)) for n in nodes),
+            stick=tuple(np.zeros(n, dtype=bool) for n in nodes),
+            slip=tuple(np.zeros(n) for n in nodes),
         )
 
     @staticmethod

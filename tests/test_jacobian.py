@@ -1,5 +1,7 @@
 """The Jacobian of a step against differences of its residual, and the convergence it gives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
@@ -17,6 +19,7 @@ RULES = {
     "condensed": nts.EnergyMomentum(),
 }
 ACTIVE = ("none", "all", "mixed")
+FRICTION = {"none": 0.0, "slip": 0.02, "mixed": 0.4, "stick": np.inf}
 #: Exact for polynomials up to degree 4.
 STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 
@@ -25,7 +28,7 @@ def box(low, high, n, cell):
     return create_box(COMM, [low, high], [n, n, n], cell, ghost_mode=GhostMode.shared_facet)
 
 
-def two_blocks(cell, gap=0.0, speed=0.0, bcs=()):
+def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
     """A small block above a larger one; its lower face is the slave."""
     rubber = nts.NeoHookean(1e3, 0.3)
     upper = nts.Continuum(
@@ -41,6 +44,7 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=()):
     pair = nts.ContactPair(
         slave=upper.surface(lambda x: x[2] < 1 + gap + 1e-9),
         master=lower.surface(lambda x: x[2] > 1 - 1e-9),
+        friction=friction,
     )
     return nts.System([upper, lower], contacts=[pair])
 
@@ -70,7 +74,7 @@ def rotated_state(system, angle=0.8, fixed=False):
         if fixed:
             u[-1][body.fixed] = v[-1][body.fixed] = 0.0
     start = system.initial_state()
-    return nts.State(0.0, tuple(u), tuple(v), start.facets, start.force, start.gap)
+    return replace(start, u=tuple(u), v=tuple(v))
 
 
 def stepper_of(system, rule):
@@ -112,6 +116,7 @@ class Linearised:
         evaluation = problem.evaluate(problem.x)
         assert np.array_equal(evaluation.contacts[0].active, on)
         self.candidates, self.active = len(gap), on
+        self.stick = evaluation.contacts[0].stick
         self.solver.assemble(evaluation)
 
     def residual(self, x):
@@ -147,12 +152,17 @@ def block_errors(found, expected, blocks):
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("active", ACTIVE)
+@pytest.mark.parametrize("friction", FRICTION)
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("cell", CELLS)
-def test_jacobian_is_the_derivative_of_the_residual(cell, rule, active):
-    system = two_blocks(cell)
+def test_jacobian_is_the_derivative_of_the_residual(cell, rule, friction, active):
+    system = two_blocks(cell, friction=FRICTION[friction])
     at = Linearised(system, rule, active, rotated_state(system))
     assert at.candidates == 9
+    number = {"none": 0, "slip": 0, "mixed": (1, 8), "stick": 9}[friction]
+    if active == "all":
+        low, high = np.broadcast_to(number, 2)
+        assert low <= at.stick.sum() <= high
     x, step = at.problem.x.array_r.copy(), 1e-4
     expected = np.zeros((len(x), len(x)))
     for j in range(len(x)):

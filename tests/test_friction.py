@@ -1,0 +1,326 @@
+"""Coulomb friction: the law alone, and what two blocks that rub against each other must keep."""
+
+import math
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+from dolfinx_nts import contact, facets
+from dolfinx_nts.friction import return_map
+from dolfinx_nts.nts import invariants, metric, projection
+
+COMM = MPI.COMM_WORLD
+INTEGRATORS = {
+    "midpoint": nts.Midpoint(),
+    "energy-momentum": nts.EnergyMomentum(),
+    "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
+}
+COLUMNS = ("kinetic", "potential", "friction_dissipation", "contact_defect", "angular_momentum")
+
+
+# ---- the law
+def random_law(n=200):
+    rng = np.random.default_rng(3)
+    a = rng.normal(size=(n, 2, 2))
+    metric = a @ a.transpose(0, 2, 1) + 0.1 * np.eye(2)
+    t, s = rng.normal(size=(2, n, 2))
+    return t, s, metric, 3.0 * rng.random(n), rng.uniform(0.1, 2.0, n)
+
+
+def test_return_map_derivatives():
+    t, s, m, bound, c = random_law()
+    law, step = return_map(t, s, m, bound, c), 1e-6
+    assert 20 < law.stick.sum() < 180
+
+    def difference(*change):
+        ends = [
+            return_map(
+                *(a + k * step * d for a, d in zip((t, s, m, bound), change, strict=True)), c
+            )
+            for k in (1, -1)
+        ]
+        return (ends[0].residual - ends[1].residual) / (2 * step)
+
+    rng = np.random.default_rng(4)
+    dt, ds, dm, db = (rng.normal(size=a.shape) for a in (t, s, m, bound))
+    dm += dm.transpose(0, 2, 1)
+    expected = np.einsum("nab,nb->na", law.d_multiplier, dt)
+    expected += np.einsum("nab,nb->na", law.d_slip, ds)
+    expected += np.einsum("nabc,nbc->na", law.d_metric, dm) + law.d_bound * db[:, None]
+    assert np.abs(difference(dt, ds, dm, db) - expected).max() < 1e-7
+
+
+def test_slip_force_is_parallel_to_the_slip_whatever_c():
+    _, s, m, bound, c = random_law()
+    length = np.sqrt(np.einsum("na,nab,nb->n", s, m, s))
+    t = bound[:, None] * np.einsum("nab,nb->na", m, s) / length[:, None]
+    for factor in (1e-6, 1.0, 1e6):
+        law = return_map(t, s, m, bound, factor * c)
+        assert not law.stick.any()
+        assert np.abs(law.residual).max() < 1e-14 * np.abs(t).max()
+
+
+def test_without_pressure_there_is_no_friction():
+    t, s, m, bound, c = random_law()
+    law = return_map(t, s, m, 0 * bound, c)
+    assert np.array_equal(law.residual, t)
+    at_rest = return_map(0 * t, 0 * s, m, 0 * bound, c)
+    assert at_rest.stick.all() and not at_rest.residual.any()
+
+
+@pytest.mark.parametrize("nc", [3, 4])
+def test_projection_and_metric_derivatives(nc):
+    rng = np.random.default_rng(nc)
+    n, size, step = 6, 3 * (nc + 1), 1e-6
+    corner = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])[:nc]
+    x = np.concatenate([[[0.3, 0.3, 0.2]], corner]) + 0.1 * rng.normal(size=(n, nc + 1, 3))
+    weight = rng.normal(size=(n, 2))
+
+    def foot(x):
+        xi, converged = facets.project(x[:, 0], x[:, 1:], np.full((n, 2), 0.3))
+        assert converged.all()
+        return xi
+
+    at = projection(x, foot(x), weight)
+    for k in range(size):
+        shift = np.zeros(size)
+        shift[k] = step
+        ends = [x + sign * shift.reshape(nc + 1, 3) for sign in (1, -1)]
+        a, b = (projection(e, foot(e), weight) for e in ends)
+        slope = (foot(ends[0]) - foot(ends[1])) / (2 * step)
+        assert np.abs(slope - at.gradient[:, :, k]).max() < 1e-8
+        bend = np.einsum("na,naz->nz", weight, a.gradient - b.gradient) / (2 * step)
+        assert np.abs(bend - at.hessian[:, :, k]).max() < 1e-7
+        stretch = (a.metric - b.metric) / (2 * step)
+        assert np.abs(stretch - at.metric_gradient[..., k]).max() < 1e-8
+    z = np.concatenate([x.reshape(n, -1), rng.normal(size=(n, 3)), foot(x)], axis=1)
+    pi = invariants(z, nc)
+    value, gradient = metric(pi, nc)
+    assert np.abs(value - at.metric).max() < 1e-14
+    change = rng.normal(size=pi.shape)
+    ends = [metric(pi + sign * step * change, nc)[0] for sign in (1, -1)]
+    expected = np.einsum("nabp,np->nab", gradient, change)
+    assert np.abs((ends[0] - ends[1]) / (2 * step) - expected).max() < 1e-8
+
+
+# ---- two blocks
+def rubbing_blocks(friction, metre=1.0, turn=None, cell=CellType.hexahedron, cells=(3, 2)):
+    """A block thrown at a larger one with half its speed along the contact, turned as a whole."""
+    turn = np.eye(3) if turn is None else turn
+    rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
+    boxes = (([0, 0, 0], [1, 1, 1]), ([1.05, -0.1, -0.1], [2.05, 1.1, 1.1]))
+    bodies = []
+    for corners, n, name in zip(boxes, cells, ("left", "right"), strict=True):
+        low, high = metre * np.array(corners)
+        mesh = create_box(COMM, [low, high], [n] * 3, cell, ghost_mode=GhostMode.shared_facet)
+        mesh.geometry.x[:] = mesh.geometry.x @ turn.T
+        bodies.append((mesh, name))
+
+    def throw(x):
+        arm = (turn.T @ x) / metre - 0.5
+        v = np.array([2 + 0.5 * arm[2], 1 + 0 * arm[0], 0.3 - 0.5 * arm[0]])
+        return metre * turn @ v
+
+    left, right = (
+        nts.Continuum(mesh, rubber, density=1e3 / metre**3, name=name, velocity=v)
+        for (mesh, name), v in zip(bodies, (throw, (0, 0, 0)), strict=True)
+    )
+    pair = nts.ContactPair(
+        slave=left.surface(lambda x: (turn.T @ x)[0] > metre * (1 - 1e-9)),
+        master=right.surface(lambda x: (turn.T @ x)[0] < metre * (1.05 + 1e-9)),
+        friction=friction,
+    )
+    return nts.System([left, right], contacts=[pair])
+
+
+def run(system, integrator="energy-momentum", t_end=0.08, **options):
+    result = nts.simulate(system, INTEGRATORS[integrator], dt=2e-3, t_end=t_end, **options)
+    assert result.status == "completed"
+    return result
+
+
+def difference(a, b):
+    """Largest difference of the balance tables, over the energy or the momentum of the scene."""
+    worst = 0.0
+    for name in COLUMNS:
+        scale = a["energy"][0] if a[name].ndim == 1 else np.abs(a[name]).max()
+        worst = max(worst, float(np.abs(a[name] - b[name]).max() / scale))
+    return worst
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("cell", [CellType.hexahedron, CellType.tetrahedron])
+@pytest.mark.parametrize("friction", [0.1, 0.3, math.inf])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_friction_keeps_the_momenta_and_the_ledger(integrator, friction, cell):
+    table = run(rubbing_blocks(friction, cell=cell), integrator).balance
+    energy = table["energy"][0]
+    for name in ("linear_momentum", "angular_momentum"):
+        top = np.abs(table[name][0]).max()
+        assert np.abs(table[name] - table[name][0]).max() < 1e-12 * top
+    dissipation = table["friction_dissipation"]
+    assert np.diff(dissipation).min() > -1e-15 * energy
+    if math.isinf(friction):
+        assert not dissipation.any() and table["slip"].max() == 0
+        assert table["stick"].max() >= 9
+    else:
+        assert dissipation[-1] > 5e-3 * energy and table["slip"].max() >= 4
+    if integrator != "midpoint":
+        assert np.abs(np.diff(table["ledger_residual"])).max() < 1e-11 * energy
+        assert np.abs(table["ledger_residual"]).max() < 1e-10 * energy
+    assert table["min_gap"].min() > -1e-10
+
+
+@pytest.mark.mpi
+def test_stick_and_slip_occur_together_and_h_may_change():
+    stepper = nts.Stepper(rubbing_blocks(0.3), nts.EnergyMomentum())
+    for k in range(60):
+        stepper.advance((2e-3, 0.7e-3, 1.5e-3)[k % 3])
+    table = stepper.solution.balance
+    stepper.close()
+    energy = table["energy"][0]
+    assert ((table["stick"] > 0) & (table["slip"] > 0)).sum() >= 3
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * energy
+    assert np.diff(table["friction_dissipation"]).min() > -1e-15 * energy
+
+
+@pytest.mark.parametrize("factor", [4e-5, 1e-3, 1e-1, 4.0])
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+def test_result_does_not_depend_on_the_algorithmic_scale(integrator, factor, monkeypatch):
+    # A small c weighs the direction of the slip little, in the residual as in the iteration.
+    newton = nts.Newton(rtol=1e-14, max_iterations=60)
+    reference = run(rubbing_blocks(0.3), integrator, newton=newton).balance
+    monkeypatch.setattr(contact, "TANGENTIAL_SCALE", factor * contact.TANGENTIAL_SCALE)
+    table = run(rubbing_blocks(0.3), integrator, newton=newton).balance
+    assert difference(reference, table) < 1e-9
+    assert np.array_equal(reference["stick"], table["stick"])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+def test_result_does_not_depend_on_the_direction_in_space(integrator, seed):
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    turn = q * np.sign(np.diag(r))
+    turn[:, 0] *= np.linalg.det(turn)
+    a = run(rubbing_blocks(0.3), integrator).balance
+    b = run(rubbing_blocks(0.3, turn=turn), integrator).balance
+    for name in ("linear_momentum", "angular_momentum"):
+        b[name] = b[name] @ turn
+    assert difference(a, b) < 1e-9
+    assert np.array_equal(a["slip"], b["slip"]) and np.array_equal(a["stick"], b["stick"])
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+def test_result_does_not_depend_on_the_numbering_of_facets(integrator):
+    """The same master facets start at another corner and come in another order."""
+    reference = run(rubbing_blocks(0.3), integrator).balance
+    system = rubbing_blocks(0.3)
+    master = system.contacts[0].master
+    master.facets = np.array([np.roll(f, k) for k, f in enumerate(master.facets)])[::-1].copy()
+    table = run(system, integrator).balance
+    assert difference(reference, table) < 1e-9
+    assert np.array_equal(reference["stick"], table["stick"])
+
+
+@pytest.mark.parametrize("metre", [1e3, 1e6])
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+def test_units_change_nothing(integrator, metre):
+    a = run(rubbing_blocks(0.3), integrator).balance
+    b = run(rubbing_blocks(0.3, metre=metre), integrator).balance
+    assert np.array_equal(a["newton_iterations"], b["newton_iterations"])
+    for name in COLUMNS:
+        b[name] = b[name] / metre**2
+    assert difference(a, b) < 1e-9
+
+
+@pytest.mark.mpi
+def test_condensing_changes_nothing():
+    a, b = (
+        run(rubbing_blocks(0.3), newton=nts.Newton(condense=condense)).balance
+        for condense in (False, True)
+    )
+    assert difference(a, b) < 1e-11
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+def test_ranks_change_nothing(integrator):
+    """The scene of this many ranks against the one that every rank computes alone."""
+    together = run(rubbing_blocks(0.3), integrator).balance
+    global COMM
+    world, COMM = COMM, MPI.COMM_SELF
+    alone = run(rubbing_blocks(0.3), integrator).balance
+    COMM = world
+    assert difference(alone, together) < 1e-9
+    for name in ("stick", "slip", "active"):
+        assert np.array_equal(alone[name], together[name])
+
+
+# ---- prescribed coordinates and nodal results
+def plane_strain_slider(friction, integrator, speed=0.0):
+    """A block pressed on a plate, both held across: the slip has one free direction only."""
+    across = nts.Dirichlet(lambda x: np.full(x.shape[1], True), components=(2,))
+    whole = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    kind = CellType.hexahedron
+    meshes = [
+        create_box(COMM, [low, high], n, kind, ghost_mode=GhostMode.shared_facet)
+        for low, high, n in (
+            ([0.2, 0, 0], [0.8, 0.5, 0.3], [3, 2, 1]),
+            ([-1, -0.5, 0], [2, 0, 0.3], [4, 1, 1]),
+        )
+    ]
+    block = nts.Continuum(
+        meshes[0], rubber, density=1e3, bcs=[across], velocity=(speed, 0, 0), name="block"
+    )
+    plate = nts.Continuum(meshes[1], rubber, density=1e3, bcs=[whole], name="plate")
+    pair = nts.ContactPair(
+        slave=block.surface(lambda x: x[1] < 1e-9),
+        master=plate.surface(lambda x: x[1] > -1e-9),
+        friction=friction,
+    )
+    system = nts.System([block, plate], contacts=[pair], gravity=(0, -9.81, 0))
+    stepper = nts.Stepper(system, INTEGRATORS[integrator])
+    for _ in range(20):
+        stepper.advance(1e-3)
+    return stepper
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize(("friction", "speed"), [(math.inf, 0.0), (0.5, 0.0), (0.2, 1.0)])
+def test_prescribed_tangential_direction_carries_no_force(friction, speed, integrator):
+    stepper = plane_strain_slider(friction, integrator, speed)
+    state = stepper.state
+    force, tangential = state.force[0], state.tangential[0]
+    top = COMM.allreduce(force.max(initial=0.0), op=MPI.MAX)
+    assert top > 0
+    assert np.abs(tangential[:, 1:]).max(initial=0.0) < 1e-9 * top
+    if speed:
+        assert np.allclose(tangential[force > 0, 0], -friction * force[force > 0], rtol=1e-9)
+        assert not state.stick[0].any()
+        assert np.abs(state.slip[0] - 0.02 * speed).max(initial=0.0) < 2e-3
+    elif math.isinf(friction):
+        assert np.array_equal(state.stick[0], force > 0)
+        assert state.slip[0].max(initial=0.0) < 1e-12
+    else:
+        bound = friction * force * (1 + 1e-9)
+        assert (np.linalg.norm(tangential, axis=1) <= bound).all()
+    stepper.close()
+
+
+@pytest.mark.parametrize("friction", [-0.1, math.nan, "a", None])
+def test_bad_coefficient(friction):
+    with pytest.raises(ValueError, match="friction=.*pass a number >= 0"):
+        rubbing_blocks(friction)
+
+
+def test_without_friction_nothing_tangential_is_allocated():
+    stepper = nts.Stepper(rubbing_blocks(0.0), nts.Midpoint())
+    stepper.advance(0.04)
+    counts = [c.num_multipliers for c in stepper.problem.contacts]
+    assert counts == [1] and stepper.problem.contacts[0].num_tangential == 0
+    stepper.close()
