@@ -58,7 +58,7 @@ def measure(system: System, state: State) -> dict[str, Any]:
     }
 
 
-def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, float]:
+def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     """Works and counts of an accepted step, the same on all ranks.
 
     The contact defect is -sum lambda_N g_0: what activation loses and what a change of facet gains
@@ -67,7 +67,7 @@ def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, f
     Returns:
         external_work [J], contact_defect [J], active, min_gap [m] (infinite without candidates).
     """
-    scale = 2.0 / dt**2
+    scale = 1.0 / problem.factor
     work = defect = active = 0.0
     for body, terms in zip(problem.system.bodies, step.bodies, strict=True):
         work += scale * float(terms.external @ terms.du)
