@@ -6,6 +6,7 @@ coordinates this rank owns.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -97,6 +98,9 @@ class Body(Protocol):
 
     def potential(self, u: FloatArray) -> float:
         """Stored energy on this rank [J]."""
+
+    def inverted(self, u: FloatArray) -> float:
+        """Volume that u turns inside out, on this rank [m^3]; statics alone asks for it."""
 
     def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum x cross p about the origin [kg m^2/s], shape (3,)."""
@@ -226,7 +230,9 @@ class Continuum:
         )
         self.degree = degree
         self.space = compat.vector_space(mesh, degree)
-        self.u, self.v = (fem.Function(self.space, name=f"{name}_{s}") for s in "uv")
+        # DOLFINx makes C identifiers of the names.
+        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
+        self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
         self.num_owned = 3 * self.space.dofmap.index_map.size_local
         self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
         self.body_force, self._traction, self._extra_form = body_force, traction, extra_form
@@ -337,8 +343,14 @@ class Continuum:
                 f"material={self.material!r}: W(C) has shape {energy.ufl_shape}; "
                 "return a UFL scalar"
             )
-        mass, self._load_form, self._energy_form = compat.compile_forms(
-            [self._rho * ufl.inner(v, w) * self._dx, load, energy * self._dx]
+        inside_out = ufl.conditional(ufl.lt(ufl.det(f), 0.0), 1.0, 0.0)
+        mass, self._load_form, self._energy_form, self._inverted_form = compat.compile_forms(
+            [
+                self._rho * ufl.inner(v, w) * self._dx,
+                load,
+                energy * self._dx,
+                inside_out * self._dx,
+            ]
         )
         self._mass = compat.create_matrix(mass)
         compat.assemble_matrix(self._mass, mass, (), 0.0)
@@ -446,11 +458,19 @@ class Continuum:
 
     def potential(self, u: FloatArray) -> float:
         """Strain energy on this rank [J]."""
+        return self._integral(self._energy_form, u)
+
+    def inverted(self, u: FloatArray) -> float:
+        """Volume at whose quadrature points det F < 0, on this rank [m^3]."""
+        return self._integral(self._inverted_form, u)
+
+    def _integral(self, form: Any, u: FloatArray) -> float:
+        """This rank's part of the integral of a function of `self.u`, at u."""
         kept = self.u.x.array.copy()
         self._fill(self.u, u)
-        energy = float(fem.assemble_scalar(self._energy_form))
+        value = float(fem.assemble_scalar(form))
         self.u.x.array[:] = kept
-        return energy
+        return value
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum p [kg m/s]."""

@@ -24,8 +24,12 @@ FloatArray = npt.NDArray[np.float64]
 #: candidate of.
 _MISSED = 0.1
 #: Relaxations of one load step before it counts as without equilibrium.
-_RELAXATIONS = 60
-#: What a relaxation that reduces the force of the stabilization lowers the next one's by.
+_RELAXATIONS = 100
+#: A failed relaxation is repeated with a stiffer stabilization, up to this.
+_STIFFEST = 10.0
+#: A relaxation that leaves less than this part of the stabilization's force ...
+_RELIEVED = 0.5
+#: ... lowers the next one's stiffness by this. What falls freely, whose force stays, is held on.
 _RELIEF = 0.1
 
 _REMEDY = (
@@ -87,7 +91,6 @@ class _LoadStepper(Stepper):
     def _step(self, dt: float, time: float) -> None:
         old = self.state
         step, state, iterations = self._relax(dt, time)
-        self._check_missed(state)
         self._rates = [(a - b) / dt for a, b in zip(state.u, old.u, strict=True)]
         forces = [t.external.copy() for t in step.bodies]
         work = 0.0
@@ -116,21 +119,41 @@ class _LoadStepper(Stepper):
         try:
             for _ in range(_RELAXATIONS):
                 problem.begin(state, dt)
-                step = self.solver.solve()
+                try:
+                    step = self.solver.solve()
+                    reached = self._accepted(step, dt, time)
+                    self._check_inverted(reached)
+                    self._check_missed(reached)
+                except StepFailedError:
+                    # Bodies in search of each other move by load over stabilization, whatever dt.
+                    if not 0.0 < problem.stabilization < _STIFFEST:
+                        raise
+                    problem.stabilization /= _RELIEF
+                    continue
                 iterations += step.iterations
-                state, dt = self._accepted(step, dt, time), 0.0
+                state, dt = reached, 0.0
                 unrest = problem.unrest(step)
                 if unrest <= 1.0:
                     return step, state, iterations
-                if unrest < last:
+                if unrest < _RELIEVED * last:
                     problem.stabilization *= _RELIEF
                 last = unrest
         finally:
-            self.problem.stabilization = 0.0
+            problem.stabilization = 0.0
         raise StepFailedError(
-            f"step from t={kept.time:.6g}: no rest after {_RELAXATIONS} relaxations, the "
-            f"stabilization still carries {unrest:.3g} times what counts as nothing"
+            f"step from t={kept.time:.6g}: not at rest after {_RELAXATIONS} relaxations; what "
+            "holds the bodies, and do contacts close?"
         )
+
+    def _check_inverted(self, state: State) -> None:
+        """Raise if a body is inside out somewhere, which W(C) cannot see and a long step may do."""
+        for body, u in zip(self.system.bodies, state.u, strict=True):
+            volume = self.system.comm.allreduce(body.inverted(u))
+            if volume > 0.0:
+                raise StepFailedError(
+                    f"step from t={self.state.time:.6g}: a volume of {volume:.3g} m^3 of body "
+                    f"{body.name!r} ends inside out"
+                )
 
     def _check_missed(self, state: State) -> None:
         """Raise if a slave went through a facet whose candidate it was not."""

@@ -212,7 +212,9 @@ def _first_state(system: System, start: Any) -> State:
     if start is None:
         return system.initial_state()
     if not (isinstance(start, Solution) and hasattr(start, "state")):
-        raise TypeError(f"start={start!r}: pass the result of equilibrium(...)")
+        raise TypeError(
+            f"start of type {type(start).__name__}: pass the result of equilibrium(...)"
+        )
     return system.state_from(start.system, start.state)
 
 
