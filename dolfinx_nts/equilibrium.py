@@ -23,8 +23,12 @@ FloatArray = npt.NDArray[np.float64]
 #: A load step is dropped if it leaves a slave this part of a facet behind one that it was no
 #: candidate of.
 _MISSED = 0.1
+#: Searches for contact, each for the motion that came of the one before.
+_SEARCHES = 4
 #: Relaxations of one load step before it counts as without equilibrium.
 _RELAXATIONS = 100
+#: From this part of the forces on, the stabilization's moves no node to another facet.
+_NEARLY_AT_REST = 1e-2
 #: A failed relaxation is repeated with a stiffer stabilization, up to this.
 _STIFFEST = 10.0
 #: A relaxation that leaves less than this part of the stabilization's force ...
@@ -114,13 +118,13 @@ class _LoadStepper(Stepper):
         stabilization: a proximal-point iteration, whose limit knows nothing of it.
         """
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
+        search = True
         problem.stabilization = self._stabilization
         state = replace(kept, v=tuple(self._rates))
         try:
             for _ in range(_RELAXATIONS):
-                problem.begin(state, dt)
                 try:
-                    step = self.solver.solve()
+                    step = self._solve(state, dt, search)
                     reached = self._accepted(step, dt, time)
                     self._check_inverted(reached)
                     self._check_missed(reached)
@@ -138,11 +142,27 @@ class _LoadStepper(Stepper):
                 if unrest < _RELIEVED * last:
                     problem.stabilization *= _RELIEF
                 last = unrest
+                # A node on an edge could change its facet for ever, and its place with it.
+                search = unrest * self.newton.rtol > _NEARLY_AT_REST
         finally:
             problem.stabilization = 0.0
         raise StepFailedError(
             f"step from t={kept.time:.6g}: not at rest after {_RELAXATIONS} relaxations; what "
             "holds the bodies, and do contacts close?"
+        )
+
+    def _solve(self, state: State, dt: float, search: bool) -> Evaluation:
+        """Solution from a state; contact is sought as far as the bodies turn out to move."""
+        motion = np.zeros(len(self.system.bodies))
+        for _ in range(_SEARCHES):
+            self.problem.begin(state, dt, motion, search=search)
+            step = self.solver.solve()
+            motion = self.problem.motion(step)
+            if not search or self.problem.covers(motion):
+                return step
+        raise StepFailedError(
+            f"step from t={state.time:.6g}: bodies move by {motion.max():.3g} m, too far to find "
+            "their contacts"
         )
 
     def _check_inverted(self, state: State) -> None:

@@ -98,12 +98,16 @@ class StepProblem:
         self.stabilization = 0.0
 
     # ---- set-up of a step
-    def begin(self, state: State, dt: float) -> None:
+    def begin(
+        self, state: State, dt: float, motion: FloatArray | None = None, *, search: bool = True
+    ) -> None:
         """Fix the state at t_n and the step: loads, candidates, layout, first guess.
 
         Args:
             state: State at t_n.
             dt: Step [s].
+            motion: Motion of each body [m] that contact is sought for at least, as from `motion`.
+            search: Seek candidates; False keeps those of the last step, for statics only.
         """
         system = self.system
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
@@ -124,8 +128,11 @@ class StepProblem:
             for b, u1, u in zip(system.bodies, self.first, state.u, strict=True)
         ]
         self._motion, self._extent = _global_max(system.comm, np.array(local)).T
+        if motion is not None:
+            self._motion = np.maximum(self._motion, motion)
         self._rounding = np.zeros(len(system.bodies))
-        self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
+        if search:
+            self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
         numbers = tuple(a for c in self.contacts for a in c.points())
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
             self._lay_out()
@@ -145,10 +152,14 @@ class StepProblem:
         stiffness[body.fixed] = 0.0
         return stiffness
 
+    def _reach(self, index: int, motion: FloatArray) -> float:
+        slave, master = self.system.contact_bodies[index]
+        return np.sqrt(3.0) * float(motion[slave] + motion[master])
+
     def _contact_step(self, index: int) -> ContactStep:
         pair, state = self.system.contacts[index], self.state
         slave, master = self.system.contact_bodies[index]
-        reach = np.sqrt(3.0) * float(self._motion[slave] + self._motion[master])
+        reach = self._reach(index, self._motion)
         found = pair.find(state.u[slave], state.u[master], state.facets[index], reach)
         corners = pair.master.positions(state.u[master])[pair.master.facets[found.facet]]
         x = pair.slave.positions(state.u[slave])[pair.slave.owned[found.node]]
@@ -346,6 +357,21 @@ class StepProblem:
         return tangents
 
     # ---- convergence
+    def motion(self, e: Evaluation) -> FloatArray:
+        """Largest component of each body's motion in the step [m], the same on all ranks."""
+        local = [np.abs(b.du).max(initial=0.0) for b in e.bodies]
+        return _global_max(self.system.comm, np.array(local))
+
+    def covers(self, motion: FloatArray) -> bool:
+        """Whether the step's candidates are all that may touch in such a motion. Collective."""
+        reached = [
+            self._reach(k, motion) <= pair.cover(self.state.u[master], self._reach(k, self._motion))
+            for k, (pair, (_, master)) in enumerate(
+                zip(self.system.contacts, self.system.contact_bodies, strict=True)
+            )
+        ]
+        return all(reached)
+
     def unrest(self, e: Evaluation) -> float:
         """Force of the stabilization over what counts as converged, the largest of the bodies."""
         squares = []

@@ -382,7 +382,7 @@ def test_passing_by_a_facet_is_noticed():
         name="soft",
     )
     hard = nts.Continuum(
-        box([0, 0, 0], [1, 1, 0.5], [6, 6, 2]),
+        box([0, 0, 0], [1.5, 1.5, 0.5], [9, 9, 2]),
         RUBBER,
         density=1.0,
         bcs=[nts.Dirichlet(at(2, 0.0))],
@@ -392,8 +392,10 @@ def test_passing_by_a_facet_is_noticed():
     system = nts.System([soft, hard], contacts=[pair])
     run = nts.equilibrium(system, stabilization=1e-3)
     assert run.status == "completed"
-    assert max(d.max() for d in system.penetration(run.state)) < 1e-9
-    assert abs(run.contact_forces[-1, 0, 2] / 3e4 - 1) < 1e-9
+    # Slaves may reach over an edge of their facets, not through one.
+    assert max(d.max() for d in system.penetration(run.state)) < 0.01
+    assert abs(run.contact_forces[-1, 0, 2] / 3e4 - 1) < 1e-11
+    assert run.balance["active"][-1] == 16
 
 
 # ---- start of a dynamic run
