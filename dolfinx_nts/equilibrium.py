@@ -147,8 +147,8 @@ class _LoadStepper(Stepper):
         finally:
             problem.stabilization = 0.0
         raise StepFailedError(
-            f"step from t={kept.time:.6g}: not at rest after {_RELAXATIONS} relaxations; what "
-            "holds the bodies, and do contacts close?"
+            f"step from t={kept.time:.6g}: not at rest after {_RELAXATIONS} relaxations; nothing "
+            "holds a body, or it hops from facet to facet"
         )
 
     def _solve(self, state: State, dt: float, search: bool) -> Evaluation:
@@ -216,6 +216,15 @@ def _pseudo_times(load_steps: Any) -> list[float]:
     )
 
 
+def _check_bodies(system: System) -> None:
+    for body in system.bodies:
+        for name in ("nodal_stiffness", "reactions", "inverted"):
+            if not callable(getattr(body, name, None)):
+                raise TypeError(
+                    f"body {body.name!r} has no {name}(): equilibrium needs it, see Body"
+                )
+
+
 @known_options
 def equilibrium(
     system: System,
@@ -277,6 +286,8 @@ def equilibrium(
     if stabilization is not None:
         require_positive("stabilization", stabilization, "-")
     output = writers(output)
+    if isinstance(system, System):
+        _check_bodies(system)
     stepper = _LoadStepper(
         system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options
     )

@@ -1,4 +1,4 @@
-"""Equilibrium: closed forms, reactions, the patch test B7, load stepping, start of a dynamic run."""
+"""Equilibrium: closed forms, the patch test B7, load stepping, start of a dynamic run."""
 
 import numpy as np
 import pytest
@@ -498,5 +498,9 @@ def test_other_arguments_are_checked():
         nts.equilibrium(held_cube((0, 0, 0)), steps=3)
     with pytest.raises(TypeError, match=r"^system='cube': pass a System"):
         nts.equilibrium("cube")
+    body = cube([])
+    body.nodal_stiffness = None
+    with pytest.raises(TypeError, match=r"^body 'cube' has no nodal_stiffness"):
+        nts.equilibrium(nts.System([body]))
     with pytest.raises(TypeError, match=r"^output=3: pass a sequence of writers"):
         nts.equilibrium(held_cube((0, 0, 0)), output=3)
