@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from scipy.optimize import fsolve
@@ -171,6 +172,27 @@ def test_loads_in_pseudo_time():
     weight = DENSITY * GRAVITY
     expected = [0.0, 0.5 * weight - 25.0, weight - 100.0, weight - 400.0]
     assert np.abs(run.reactions["cube"][:, 2, 2] - expected).max() < 1e-11 * weight
+
+
+@pytest.mark.mpi
+def test_extra_form_is_at_the_end_and_at_rest():
+    """An elastic foundation k u moves a free body by b/k everywhere; a dashpot does nothing."""
+    stiffness, load = 2e5, np.array([3e3, 0.0, -1e4])
+
+    def foundation(u, v, w):
+        return (stiffness * ufl.inner(u, w) + 1e9 * ufl.inner(v, w)) * ufl.dx
+
+    body = nts.Continuum(
+        box([0, 0, 0], [1, 1, 1], [2, 2, 2]),
+        RUBBER,
+        density=DENSITY,
+        body_force=load,
+        extra_form=foundation,
+    )
+    run = nts.equilibrium(nts.System([body]), load_steps=2)
+    assert run.status == "completed"
+    assert np.abs(run.state.u[0].reshape(-1, 3) - load / stiffness).max() < 1e-13
+    assert run.balance["potential"][-1] < 1e-20 * YOUNG
 
 
 # ---- B7: contact patch test
