@@ -4,6 +4,7 @@ from importlib.metadata import version
 
 from dolfinx_nts.contact import ContactPair
 from dolfinx_nts.continuum import Body, Continuum, Dirichlet, Traction
+from dolfinx_nts.equilibrium import Equilibrium, equilibrium
 from dolfinx_nts.integrators import EnergyMomentum, Midpoint
 from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
@@ -19,6 +20,7 @@ __all__ = [
     "Continuum",
     "Dirichlet",
     "EnergyMomentum",
+    "Equilibrium",
     "Midpoint",
     "MooneyRivlin",
     "NeoHookean",
@@ -33,5 +35,6 @@ __all__ = [
     "Traction",
     "bodies_from_gmsh",
     "bodies_from_tags",
+    "equilibrium",
     "simulate",
 ]

@@ -58,7 +58,7 @@ def measure(system: System, state: State) -> dict[str, Any]:
     }
 
 
-def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, float]:
+def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     """Works and counts of an accepted step, the same on all ranks.
 
     The contact defect is -sum lambda_N g_0: what activation loses and what a change of facet gains
@@ -68,7 +68,7 @@ def step_terms(problem: StepProblem, step: Evaluation, dt: float) -> dict[str, f
         external_work, friction_dissipation, contact_defect [J], active, stick, slip, min_gap [m]
         (infinite without candidates).
     """
-    scale = 2.0 / dt**2
+    scale = 1.0 / problem.factor
     work = dissipation = defect = 0.0
     counts = np.zeros(3)
     for body, terms in zip(problem.system.bodies, step.bodies, strict=True):

@@ -123,6 +123,11 @@ class ContactPair:
             node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
         )
 
+    def cover(self, master_u: FloatArray, reach: float) -> float:
+        """Relative motion [m] for which `find` with this reach misses no contact. Collective."""
+        corners = self.master.positions(master_u)[self.master.facets]
+        return reach + _MARGIN * float(facets.size(corners).min())
+
     def _over_facet(self, facet: IntArray, xi: FloatArray, reach: FloatArray) -> BoolArray:
         """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide."""
         beyond = facets.edge_excess(xi, self.master.facets.shape[1])

@@ -6,6 +6,7 @@ coordinates this rank owns.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -18,6 +19,7 @@ from dolfinx import mesh as dolfinx_mesh
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.integrators import Static
 from dolfinx_nts.surfaces import Surface, flux, locate_facets, oriented_nodes
 from dolfinx_nts.validation import (
     at_points,
@@ -70,16 +72,35 @@ class Body(Protocol):
         """External forces of the step [N]; their work is f . (u_1 - u_0)."""
 
     def tangent(self, u1: FloatArray) -> Any:
-        """PETSc matrix M + h^2/2 d(internal - external)/du_1.
+        """PETSc matrix M + factor d(internal - external)/du_1, without M in statics.
 
         Rows and columns of `fixed` hold only a diagonal.
+        """
+
+    def nodal_stiffness(self) -> FloatArray:
+        """Stiffness of each node's neighbourhood at rest [N/m], > 0, shape (num_owned,).
+
+        What the nodal mass is in dynamics, a scale, is this in statics, which alone asks for it.
         """
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacement of the `fixed` coordinates [m]."""
 
+    def reactions(self, residual: FloatArray) -> FloatArray:
+        """Resultant of a force [N] on the coordinates of each condition, this rank's part.
+
+        Args:
+            residual: Force on all owned coordinates, shape (num_owned,).
+
+        Returns:
+            Shape (conditions, 3).
+        """
+
     def potential(self, u: FloatArray) -> float:
         """Stored energy on this rank [J]."""
+
+    def inverted(self, u: FloatArray) -> float:
+        """Volume that u turns inside out, on this rank [m^3]; statics alone asks for it."""
 
     def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum x cross p about the origin [kg m^2/s], shape (3,)."""
@@ -99,7 +120,7 @@ class Dirichlet:
     Attributes:
         where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
         value: Displacement [m]: a vector, or a function of time; its work is external work. The
-            nodes start where and as fast as the value says at t = 0.
+            nodes start where and as fast as the value says at the start.
         components: Which of x, y, z are prescribed.
 
     Raises:
@@ -160,8 +181,8 @@ class Continuum:
         quadrature_degree: For energy, stress and mass alike; default 2 x 2 x 2 Gauss points on
             trilinear hexahedra.
         extra_form: Further virtual work as UFL, a callable (u_m, v_m, w) -> form of the midpoint
-            displacement, velocity and test function; it is added to the internal virtual work and
-            its work counts as external.
+            displacement, velocity and test function (in statics the displacement at the end and
+            zero); it is added to the internal virtual work and its work counts as external.
 
     Attributes:
         u: Displacement [m], dolfinx Function of the last accepted state.
@@ -209,7 +230,9 @@ class Continuum:
         )
         self.degree = degree
         self.space = compat.vector_space(mesh, degree)
-        self.u, self.v = (fem.Function(self.space, name=f"{name}_{s}") for s in "uv")
+        # DOLFINx makes C identifiers of the names.
+        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
+        self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
         self.num_owned = 3 * self.space.dofmap.index_map.size_local
         self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
         self.body_force, self._traction, self._extra_form = body_force, traction, extra_form
@@ -226,6 +249,7 @@ class Continuum:
         self._set_velocity(velocity)
         self._build_constant_forms()
         self._compiled: dict[Any, tuple[Any, Any, Any]] = {}
+        self._stiffness: FloatArray | None = None
 
     def surface(self, marker: Any, tag: int | None = None) -> Surface:
         """A part of the boundary for contact.
@@ -267,8 +291,9 @@ class Continuum:
     def _set_conditions(self, bcs: Sequence[Dirichlet]) -> None:
         self._bcs: list[Any] = []
         self._conditions: list[tuple[IntArray, int, VectorInTime]] = []
-        owned = []
-        for bc in bcs:
+        self._num_conditions = len(bcs)
+        owner = np.full(self.num_owned, -1)
+        for number, bc in enumerate(bcs):
             facets = _facets(self.mesh, bc.where, "Dirichlet.where")
             blocks = np.asarray(fem.locate_dofs_topological(self.space, 2, facets))
             for component in bc.components:
@@ -276,8 +301,10 @@ class Continuum:
                 dofs = np.sort(blocks * 3 + component)
                 dofs = dofs[dofs < self.num_owned]
                 self._conditions.append((dofs, component, bc.value))
-                owned.append(dofs)
-        self.fixed = np.unique(np.concatenate([np.empty(0, np.int64), *owned]).astype(np.int64))
+                owner[dofs] = number
+        self.fixed = np.flatnonzero(owner >= 0)
+        # Where two conditions meet, the later one's value holds, so it carries the force.
+        self._condition = owner[self.fixed]
 
     def _set_velocity(self, velocity: Any) -> None:
         if callable(velocity):
@@ -316,32 +343,37 @@ class Continuum:
                 f"material={self.material!r}: W(C) has shape {energy.ufl_shape}; "
                 "return a UFL scalar"
             )
-        mass, self._load_form, self._energy_form = compat.compile_forms(
-            [self._rho * ufl.inner(v, w) * self._dx, load, energy * self._dx]
+        inside_out = ufl.conditional(ufl.lt(ufl.det(f), 0.0), 1.0, 0.0)
+        mass, self._load_form, self._energy_form, self._inverted_form = compat.compile_forms(
+            [
+                self._rho * ufl.inner(v, w) * self._dx,
+                load,
+                energy * self._dx,
+                inside_out * self._dx,
+            ]
         )
         self._mass = compat.create_matrix(mass)
         compat.assemble_matrix(self._mass, mass, (), 0.0)
         self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
         self.nodal_mass = self.inertia(np.ones(self.num_owned))
-        total = self.comm.allreduce(np.array([self.nodal_mass.sum(), self.num_owned]))
-        self._diagonal = float(total[0] / total[1])
 
     def _compile(self, integrator: Any) -> tuple[Any, Any, Any]:
         """Compiled internal virtual work, tangent and extra virtual work of an integrator."""
         if integrator not in self._compiled:
             if not self._compiled:
                 self._u0, self._u1, self._v0 = (fem.Function(self.space) for _ in range(3))
-                self._h = fem.Constant(self.mesh, 1.0)
+                self._factor, self._rate = (fem.Constant(self.mesh, 1.0) for _ in range(2))
             du, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
             f0, f1 = (ufl.Identity(3) + ufl.grad(u) for u in (self._u0, self._u1))
             work = ufl.inner(integrator.piola(self.material, f0, f1), ufl.grad(w)) * self._dx
             virtual, extra = work, None
             if self._extra_form is not None:
-                um, vm = (self._u0 + self._u1) / 2, (self._u1 - self._u0) / self._h
-                extra = self._extra_form(um, vm, w)
+                moved, theta = self._u1 - self._u0, integrator.theta
+                extra = self._extra_form(self._u0 + theta * moved, self._rate * moved, w)
                 virtual = work + extra
-            stiffness = self._h**2 / 2 * ufl.derivative(virtual, self._u1, du)
-            tangent = self._rho * ufl.inner(du, w) * self._dx + stiffness
+            tangent = self._factor * ufl.derivative(virtual, self._u1, du)
+            if integrator.inertia:
+                tangent += self._rho * ufl.inner(du, w) * self._dx
             forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
             self._compiled[integrator] = (
                 forms[0],
@@ -356,14 +388,20 @@ class Continuum:
     def begin_step(
         self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float
     ) -> None:
-        """Set the state at t_n, the step and the loads at the midpoint."""
+        """Set the state at t_n, the step and its loads."""
+        scale = self.nodal_mass if integrator.inertia else self.nodal_stiffness()
+        total = self.comm.allreduce(np.array([scale.sum(), self.num_owned]))
+        self._diagonal = float(total[0] / total[1])
         self._forms = self._compile(integrator)
         self._fill(self._u0, u0)
-        self._h.value = dt
-        middle = time + 0.5 * dt
-        self._loads[0].value[:] = _at("body_force", self.body_force, middle, "N/m^3")
-        for constant, traction in zip(self._loads[1:], self._traction, strict=True):
-            constant.value[:] = _at("Traction.value", traction.value, middle, "Pa")
+        self._factor.value = integrator.factor(dt)
+        self._rate.value = 1.0 / dt if integrator.inertia else 0.0
+        when = time + integrator.theta * dt
+        loads = [("body_force", self.body_force, "N/m^3")]
+        loads += [("Traction.value", traction.value, "Pa") for traction in self._traction]
+        for constant, (name, value, unit) in zip(self._loads, loads, strict=True):
+            part = 1.0 if callable(value) else integrator.ramp(when)
+            constant.value[:] = part * _at(name, value, when, unit)
         self._load = self._assemble(self._load_form)
 
     def inertia(self, v: FloatArray) -> FloatArray:
@@ -378,7 +416,7 @@ class Continuum:
         return self._assemble(self._forms[0])
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
-        """Body force, traction and gravity at the midpoint in time, less the extra work [N]."""
+        """Body force, traction and gravity, less the extra work [N]."""
         force = self._load + self.nodal_mass * np.tile(gravity, self.num_owned // 3)
         if self._forms[2] is not None:
             self._fill(self._u1, u1)
@@ -386,10 +424,30 @@ class Continuum:
         return force
 
     def tangent(self, u1: FloatArray) -> Any:
-        """M + h^2/2 K; contact may add to it before the next call."""
+        """M + factor K, K alone in statics; contact may add to it before the next call."""
         self._fill(self._u1, u1)
         compat.assemble_matrix(self._matrix, self._forms[1], self._bcs, self._diagonal)
         return self._matrix
+
+    def nodal_stiffness(self) -> FloatArray:
+        """Mean diagonal of the static tangent at each node of the undeformed body [N/m]."""
+        if self._stiffness is None:
+            tangent = self._compile(Static())[1]
+            for u in (self._u0, self._u1):
+                self._fill(u, np.zeros(self.num_owned))
+            self._factor.value, self._rate.value = 1.0, 0.0
+            compat.assemble_matrix(self._matrix, tangent, (), 0.0)
+            diagonal = self._matrix.getDiagonal()
+            # The mean of a node's three entries does not depend on the directions of the axes.
+            self._stiffness = np.repeat(diagonal.array_r.reshape(-1, 3).mean(axis=1), 3)
+            diagonal.destroy()
+        return self._stiffness
+
+    def reactions(self, residual: FloatArray) -> FloatArray:
+        """Resultants on the coordinates of each `Dirichlet` condition, this rank's part [N]."""
+        total = np.zeros((self._num_conditions, 3))
+        np.add.at(total, (self._condition, self.fixed % 3), residual[self.fixed])
+        return total
 
     def prescribed(self, time: float) -> FloatArray:
         """Prescribed displacements at a time, in the order of `fixed` [m]."""
@@ -400,11 +458,19 @@ class Continuum:
 
     def potential(self, u: FloatArray) -> float:
         """Strain energy on this rank [J]."""
+        return self._integral(self._energy_form, u)
+
+    def inverted(self, u: FloatArray) -> float:
+        """Volume at whose quadrature points det F < 0, on this rank [m^3]."""
+        return self._integral(self._inverted_form, u)
+
+    def _integral(self, form: Any, u: FloatArray) -> float:
+        """This rank's part of the integral of a function of `self.u`, at u."""
         kept = self.u.x.array.copy()
         self._fill(self.u, u)
-        energy = float(fem.assemble_scalar(self._energy_form))
+        value = float(fem.assemble_scalar(form))
         self.u.x.array[:] = kept
-        return energy
+        return value
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum p [kg m/s]."""

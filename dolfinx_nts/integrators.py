@@ -1,7 +1,4 @@
-"""Time integrators: evaluation rules only.
-
-Both use v_1 = 2 (q_1 - q_0)/h - v_0 and constraints at t_{n+1}.
-"""
+"""Time integrators and the static rule: evaluation rules only; constraints hold at t_{n+1}."""
 
 from __future__ import annotations
 
@@ -9,9 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+import numpy.typing as npt
+
 from dolfinx_nts.discrete_gradient import gonzalez_stress, mean_value_stress, strain_derivative
 from dolfinx_nts.validation import known_options
 
+FloatArray = npt.NDArray[np.float64]
 Energy = Callable[[Any], Any]
 
 
@@ -20,15 +21,38 @@ def _choose(name: str, value: str, known: tuple[str, ...]) -> None:
         raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, known))}")
 
 
+class _InTime:
+    """What the integrators in time share; forces act at the midpoint.
+
+    Attributes:
+        inertia: Whether there are inertial forces.
+        theta: Where between t_n and t_{n+1} loads and the direct rule's contact forces are taken.
+    """
+
+    inertia: ClassVar[bool] = True
+    theta: ClassVar[float] = 0.5
+
+    def factor(self, dt: float) -> float:
+        """What the step equations multiply forces by: h^2/2 [s^2]."""
+        return 0.5 * dt**2
+
+    def ramp(self, time: float) -> float:
+        """Part of a constant load that acts at a time."""
+        return 1.0
+
+    def velocity(self, du: FloatArray, v0: FloatArray, dt: float) -> FloatArray:
+        """v_1 = 2 (q_1 - q_0)/h - v_0 [m/s]."""
+        return 2.0 / dt * du - v0
+
+
 @known_options
 @dataclass(frozen=True)
-class Midpoint:
+class Midpoint(_InTime):
     """Midpoint rule (58)-(60): keeps linear and angular momentum, not the energy."""
 
     #: Contact is described directly: the projection is eliminated, the gap multiplier is the only
     #: unknown.
     contact_gradient: ClassVar[str] = "direct"
-    theta: ClassVar[float] = 0.5
 
     def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:
         """First Piola-Kirchhoff stress P = F_m 2 dW(C(F_m)) in UFL [Pa]."""
@@ -38,7 +62,7 @@ class Midpoint:
 
 @known_options
 @dataclass(frozen=True, kw_only=True)
-class EnergyMomentum:
+class EnergyMomentum(_InTime):
     """Energy-momentum scheme (61)-(66): keeps both momenta and closes the energy ledger.
 
     Attributes:
@@ -57,7 +81,6 @@ class EnergyMomentum:
     stress: str = "gonzalez"
     contact_gradient: str = "mean-value"
     quadrature_points: int = 3
-    theta: ClassVar[float] = 0.5
 
     def __post_init__(self) -> None:
         _choose("stress", self.stress, ("gonzalez", "mean-value"))
@@ -73,3 +96,28 @@ class EnergyMomentum:
         else:
             stress = mean_value_stress(energy, c0, c1, self.quadrature_points)
         return 0.5 * (f0 + f1) * stress
+
+
+@dataclass(frozen=True)
+class Static:
+    """Equilibrium at the end of a load step: no inertia, forces at t_{n+1}; t is pseudo time."""
+
+    contact_gradient: ClassVar[str] = "direct"
+    inertia: ClassVar[bool] = False
+    theta: ClassVar[float] = 1.0
+
+    def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:
+        """First Piola-Kirchhoff stress P = F_1 2 dW(C_1) in UFL [Pa]."""
+        return f1 * (2 * strain_derivative(energy, f1.T * f1))
+
+    def factor(self, dt: float) -> float:
+        """Nothing: the equations are forces [N]."""
+        return 1.0
+
+    def ramp(self, time: float) -> float:
+        """Constant loads grow with pseudo time up to 1."""
+        return min(time, 1.0)
+
+    def velocity(self, du: FloatArray, v0: FloatArray, dt: float) -> FloatArray:
+        """At rest."""
+        return np.zeros_like(v0)

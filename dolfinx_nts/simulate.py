@@ -66,6 +66,7 @@ class Stepper:
         integrator: `Midpoint()` or `EnergyMomentum()`.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
+        start: Result of `equilibrium` to start from; see there.
 
     Attributes:
         state: Last accepted state.
@@ -81,6 +82,7 @@ class Stepper:
         *,
         newton: Newton | None = None,
         petsc_options: Mapping[str, Any] | None = None,
+        start: Solution | None = None,
     ) -> None:
         if not isinstance(system, System):
             raise TypeError(f"system={system!r}: pass a System([body, ...])")
@@ -100,7 +102,7 @@ class Stepper:
         self.solver = StepSolver(self.problem, self.newton, petsc_options)
         self.system = system
         self._started = False
-        self._accept(system.initial_state())
+        self._accept(_first_state(system, start))
         self.solution = Solution(system, rows=[balance.first_row(system, self.state)])
 
     def advance(self, dt: float) -> State:
@@ -138,7 +140,7 @@ class Stepper:
         return self.state
 
     def start(self, dt: float) -> None:
-        """Give prescribed coordinates the rate of their motion at t = 0; later calls do nothing.
+        """Give prescribed coordinates the rate of their motion; later calls do nothing.
 
         As v_1 = 2 (u_1 - u_0)/h - v_0, another start would make their velocities alternate for
         ever. The rate is a one-sided difference of second order, as accurate as the integrators.
@@ -166,7 +168,7 @@ class Stepper:
         step = self.solver.solve()
         state = self._accepted(step, dt, time)
         rows = self.solution.rows
-        terms = balance.step_terms(self.problem, step, dt)
+        terms = balance.step_terms(self.problem, step)
         terms |= {"time": time, "newton_iterations": step.iterations}
         rows.append(balance.next_row(rows[0], rows[-1], balance.measure(self.system, state), terms))
         self._accept(state)
@@ -178,8 +180,8 @@ class Stepper:
             )  # fmt: skip
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
-        """State at t_{n+1}, with v_1 = 2 (u_1 - u_0)/h - v_0."""
-        old, scale = self.state, 2.0 / dt**2
+        """State at t_{n+1}."""
+        old, scale = self.state, 1.0 / self.problem.factor
         contact = [
             {
                 "facets": _at_nodes(c, c.candidates.facet, -1),
@@ -197,7 +199,10 @@ class Stepper:
         return State(
             time=time,
             u=tuple(b.u1.copy() for b in step.bodies),
-            v=tuple(2.0 / dt * b.du - v for b, v in zip(step.bodies, old.v, strict=True)),
+            v=tuple(
+                self.problem.integrator.velocity(b.du, v, dt)
+                for b, v in zip(step.bodies, old.v, strict=True)
+            ),
             **{name: tuple(c[name] for c in contact) for name in names},
         )
 
@@ -215,6 +220,16 @@ def _at_nodes(contact: ContactStep, values: npt.NDArray[Any], elsewhere: Any) ->
     return out
 
 
+def _first_state(system: System, start: Any) -> State:
+    if start is None:
+        return system.initial_state()
+    if not (isinstance(start, Solution) and hasattr(start, "state")):
+        raise TypeError(
+            f"start of type {type(start).__name__}: pass the result of equilibrium(...)"
+        )
+    return system.state_from(start.system, start.state)
+
+
 def _is_writer(item: Any) -> bool:
     return all(callable(getattr(item, name, None)) for name in ("start", "write", "close"))
 
@@ -230,8 +245,9 @@ def simulate(
     petsc_options: Mapping[str, Any] | None = None,
     output: Sequence[Any] = (),
     progress: bool = False,
+    start: Solution | None = None,
 ) -> Solution:
-    """Run a system from t = 0 to t_end.
+    """Run a system from t = 0, or from where an equilibrium ended, to t_end.
 
     Args:
         system: The scene.
@@ -244,6 +260,7 @@ def simulate(
         output: Writers of `dolfinx_nts.output`; each is called after every accepted step that its
             cadence asks for.
         progress: Show a progress line on rank 0.
+        start: Result of `equilibrium` to start from; see there.
 
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then.
@@ -253,21 +270,41 @@ def simulate(
     """
     require_positive("dt", dt, "s")
     require_positive("t_end", t_end, "s")
-    output = items("output", output, _is_writer, "writers of dolfinx_nts.output")
-    stepper = Stepper(system, integrator, newton=newton, petsc_options=petsc_options)
+    output = writers(output)
+    stepper = Stepper(system, integrator, newton=newton, petsc_options=petsc_options, start=start)
+    begin = stepper.state.time
+    if not t_end > begin:
+        raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
     # Equal steps: a last step much shorter than the others would expel a node that the one before
     # left behind a facet with a speed of gap / dt.
-    steps = max(1, math.ceil(t_end / dt * (1 - 1e-9)))
-    dt = float(t_end) / steps
+    steps = max(1, math.ceil((t_end - begin) / dt * (1 - 1e-9)))
+    dt = (float(t_end) - begin) / steps
     stepper.start(dt)
-    bar = _progress_bar(steps, progress and system.comm.rank == 0)
+    times = [begin + (k + 1) * dt for k in range(steps)]
+    remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
+    return run(stepper, times, output, progress=progress, remedy=remedy)
+
+
+def run(
+    stepper: Stepper, times: Sequence[float], output: Sequence[Any], *, progress: bool, remedy: str
+) -> Solution:
+    """Advance to each of the times, write, say how it ended, and free the stepper.
+
+    Args:
+        stepper: Started stepper.
+        times: Where to go, increasing.
+        output: Writers.
+        progress: Show a progress line on rank 0.
+        remedy: What to do if a step fails, for `status`.
+    """
+    bar = _progress_bar(len(times), progress and stepper.system.comm.rank == 0)
     try:
         for writer in output:
             writer.start(stepper)
-        for k in range(steps):
-            stepper.advance((k + 1) * dt - stepper.state.time)
+        for k, time in enumerate(times):
+            stepper.advance(time - stepper.state.time)
             for writer in output:
-                writer.write(stepper, last=k == steps - 1)
+                writer.write(stepper, last=k == len(times) - 1)
             if bar is not None:
                 row = stepper.solution.rows[-1]
                 bar.set_postfix(
@@ -276,9 +313,7 @@ def simulate(
                 bar.update()
         stepper.solution.status = "completed"
     except StepFailedError as failure:
-        stepper.solution.status = (
-            f"{failure}. Try a smaller dt, a softer start, or inspect the nodes named here"
-        )
+        stepper.solution.status = f"{failure}. {remedy}"
         logger.warning("%s", stepper.solution.status)
     finally:
         for writer in output:
@@ -287,6 +322,11 @@ def simulate(
         if bar is not None:
             bar.close()
     return stepper.solution
+
+
+def writers(output: Any) -> tuple[Any, ...]:
+    """The argument `output`, checked."""
+    return items("output", output, _is_writer, "writers of dolfinx_nts.output")
 
 
 def _progress_bar(steps: int, wanted: bool) -> Any:

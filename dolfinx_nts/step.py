@@ -1,8 +1,9 @@
 """The equations of one step: unknowns, residual, contact tangents, convergence of each block.
 
 The momentum equation is multiplied by h/2 and the multipliers are h^2/2 lambda (theory section 8),
-which makes the condition number independent of h. Evaluations are pure: nothing here changes a
-State, and history changes only when a step is accepted.
+which makes the condition number independent of h. Equilibrium has a factor 1 for h^2/2 and no
+inertia: its equations are in [N] where [kg m] stands here, its matrix in [N/m]. Evaluations are
+pure: nothing here changes a State, and history changes only when a step is accepted.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
 _EPS = float(np.finfo(float).eps)
+#: In statics a node nearer to its facet than this part of the facet's size starts as active.
+_TOUCHING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,7 @@ class StepProblem:
 
     Args:
         system: The scene.
-        integrator: `Midpoint()` or `EnergyMomentum()`.
+        integrator: `Midpoint()`, `EnergyMomentum()` or `Static()`.
         rtol: Residual of a block that counts as solved, relative to the forces or motions of the
             step.
         condense: Eliminate (d, f) and their multipliers pair by pair.
@@ -82,6 +85,8 @@ class StepProblem:
         elements: Unknowns of the contact elements; empty without candidates.
         x: PETSc vector of the unknowns, holding the first guess after `begin`.
         version: Changes whenever layout and elements do.
+        factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
+        stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
     """
 
     def __init__(self, system: System, integrator: Any, *, rtol: float, condense: bool) -> None:
@@ -90,20 +95,31 @@ class StepProblem:
         self._numbers: tuple[Any, ...] | None = None
         self._petsc: list[Any] = []
         self.version = 0
+        self.stabilization = 0.0
 
     # ---- set-up of a step
-    def begin(self, state: State, dt: float) -> None:
+    def begin(
+        self, state: State, dt: float, motion: FloatArray | None = None, *, search: bool = True
+    ) -> None:
         """Fix the state at t_n and the step: loads, candidates, layout, first guess.
 
         Args:
             state: State at t_n.
             dt: Step [s].
+            motion: Motion of each body [m] that contact is sought for at least, as from `motion`.
+            search: Seek candidates; False keeps those of the last step, for statics only.
         """
         system = self.system
-        self.state, self.dt, self._factor = state, dt, 0.5 * dt**2
+        self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
+        ramp = self.integrator.ramp(state.time + self.integrator.theta * dt)
+        self._gravity = ramp * system.gravity
         for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
             body.begin_step(self.integrator, u, v, state.time, dt)
-        self._inertia = [b.inertia(dt * v) for b, v in zip(system.bodies, state.v, strict=True)]
+        # In statics v only predicts the first guess.
+        momentum = dt if self.integrator.inertia else 0.0
+        self._inertia = [
+            self._inertial(b, momentum * v) for b, v in zip(system.bodies, state.v, strict=True)
+        ]
         self.first = [u + dt * v for u, v in zip(state.u, state.v, strict=True)]
         for body, u1 in zip(system.bodies, self.first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
@@ -112,22 +128,44 @@ class StepProblem:
             for b, u1, u in zip(system.bodies, self.first, state.u, strict=True)
         ]
         self._motion, self._extent = _global_max(system.comm, np.array(local)).T
+        if motion is not None:
+            self._motion = np.maximum(self._motion, motion)
         self._rounding = np.zeros(len(system.bodies))
-        self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
+        if search:
+            self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
         numbers = tuple(a for c in self.contacts for a in c.points())
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
             self._lay_out()
             self._numbers = numbers
         self.guess(flight=True)
 
+    def _inertial(self, body: Any, du: FloatArray) -> FloatArray:
+        """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
+        if self.integrator.inertia:
+            force: FloatArray = body.inertia(du)
+            return force
+        return self._stabilization(body) * du
+
+    def _stabilization(self, body: Any) -> FloatArray:
+        """Stiffness that holds each free coordinate at t_n [N/m]."""
+        stiffness: FloatArray = self.stabilization * body.nodal_stiffness()
+        stiffness[body.fixed] = 0.0
+        return stiffness
+
+    def _reach(self, index: int, motion: FloatArray) -> float:
+        slave, master = self.system.contact_bodies[index]
+        return np.sqrt(3.0) * float(motion[slave] + motion[master])
+
     def _contact_step(self, index: int) -> ContactStep:
         pair, state = self.system.contacts[index], self.state
         slave, master = self.system.contact_bodies[index]
-        reach = np.sqrt(3.0) * float(self._motion[slave] + self._motion[master])
+        reach = self._reach(index, self._motion)
         found = pair.find(state.u[slave], state.u[master], state.facets[index], reach)
         corners = pair.master.positions(state.u[master])[pair.master.facets[found.facet]]
         x = pair.slave.positions(state.u[slave])[pair.slave.owned[found.node]]
-        scale = pair.slave.body.nodal_mass[pair.slave.rows[found.node, 0]]
+        body = pair.slave.body
+        mass = body.nodal_mass if self.integrator.inertia else body.nodal_stiffness()
+        scale = mass[pair.slave.rows[found.node, 0]]
         x0 = np.concatenate([x[:, None], corners], axis=1)
         rule, theta = self.integrator.contact_gradient, self.integrator.theta
         return ContactStep(pair, found, rule, self._condense, x0, scale, theta)
@@ -195,6 +233,15 @@ class StepProblem:
                 start = u1 if flight else self.state.u[k].copy()
                 start[body.fixed] = u1[body.fixed]
                 x[self.layout.owned(k)] = start
+        if not self.integrator.inertia and self._fields:
+            guess = [
+                self._closed(c, p, force).ravel()
+                for c, p, force in zip(
+                    self.contacts, self._positions(self.x), self.state.force, strict=True
+                )
+            ]
+            with self.x as x:
+                x[self.layout.owned(self._fields["multipliers"])] = np.concatenate(guess)
         if "augmented" in self._fields:
             positions = self._positions(self.x)
             guess = [
@@ -202,6 +249,20 @@ class StepProblem:
             ]
             with self.x as x:
                 x[self.layout.owned(self._fields["augmented"])] = np.concatenate(guess)
+
+    @staticmethod
+    def _closed(c: ContactStep, x: FloatArray, force: FloatArray) -> FloatArray:
+        """Multipliers that start the nodes which touch at t_n as active, shape (n, multipliers).
+
+        Without inertia a body may have nothing but its contacts to hold it.
+        """
+        last = force[c.candidates.node] / c.scale
+        near = _TOUCHING * c.candidates.length
+        touching = (last > 0.0) | (c.candidates.gap <= near)
+        multipliers = np.zeros((c.num_pairs, c.num_multipliers))
+        gap = c.evaluate(x, np.empty((c.num_pairs, 0)), multipliers).gap
+        multipliers[:, 0] = np.where(touching, -(last + near + np.maximum(gap, 0.0)), 0.0)
+        return multipliers
 
     # ---- iterates
     def _positions(self, x: Any) -> list[FloatArray]:
@@ -244,10 +305,10 @@ class StepProblem:
         for k, (body, u0) in enumerate(zip(self.system.bodies, self.state.u, strict=True)):
             here = self.layout.owned(k)
             u1 = values[here]
-            internal = self._factor * body.internal(u1)
-            external = self._factor * body.external(u1, self.system.gravity)
+            internal = self.factor * body.internal(u1)
+            external = self.factor * body.external(u1, self._gravity)
             du, contact = u1 - u0, force[here]
-            residual = body.inertia(du) - self._inertia[k] + internal - external + contact
+            residual = self._inertial(body, du) - self._inertia[k] + internal - external + contact
             bodies.append(BodyTerms(u1, du, internal, external, contact, residual))
         forces = tuple(
             c.scale[:, None] * m for c, m in zip(self.contacts, multipliers, strict=True)
@@ -280,6 +341,12 @@ class StepProblem:
     def body_tangents(self, e: Evaluation) -> list[Any]:
         """PETSc matrices of the bodies at an iterate, without contact."""
         tangents = [b.tangent(t.u1) for b, t in zip(self.system.bodies, e.bodies, strict=True)]
+        if self.stabilization:
+            for body, a in zip(self.system.bodies, tangents, strict=True):
+                held = a.createVecLeft()
+                held.array_w[:] = self._stabilization(body)
+                a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
+                held.destroy()
         for k, a in enumerate(tangents):
             if self._rounding[k] == 0.0:
                 diagonal = a.getDiagonal()
@@ -289,6 +356,31 @@ class StepProblem:
         return tangents
 
     # ---- convergence
+    def motion(self, e: Evaluation) -> FloatArray:
+        """Largest component of each body's motion in the step [m], the same on all ranks."""
+        local = [np.abs(b.du).max(initial=0.0) for b in e.bodies]
+        return _global_max(self.system.comm, np.array(local))
+
+    def covers(self, motion: FloatArray) -> bool:
+        """Whether the step's candidates are all that may touch in such a motion. Collective."""
+        reached = [
+            self._reach(k, motion) <= pair.cover(self.state.u[master], self._reach(k, self._motion))
+            for k, (pair, (_, master)) in enumerate(
+                zip(self.system.contacts, self.system.contact_bodies, strict=True)
+            )
+        ]
+        return all(reached)
+
+    def unrest(self, e: Evaluation) -> float:
+        """Force of the stabilization over what counts as converged, the largest of the bodies."""
+        squares = []
+        for body, t in zip(self.system.bodies, e.bodies, strict=True):
+            parts = (self._stabilization(body) * t.du, t.internal, t.external, t.contact)
+            squares.append([float(p @ p) for p in parts])
+        norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
+        limits = self._rtol * norms[:, 1:].max(axis=1) + self._rounding
+        return max(_over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
+
     def ratios(self, e: Evaluation) -> dict[str, float]:
         """Residual of each block over what counts as converged there; solved when all are <= 1."""
         squares = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,13 @@ from mpi4py import MPI
 
 from dolfinx_nts.contact import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.continuum import Body
-from dolfinx_nts.validation import items, known_options, vector
+from dolfinx_nts.validation import items, known_options, raise_together, vector
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
+
+#: Part of a body's coordinates by which a start may differ from prescribed displacements.
+_ON_SUPPORT = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,14 @@ class System:
             (index[id(c.slave.body)], index[id(c.master.body)]) for c in self.contacts
         ]
         self._check_overlap()
-        self._check_penetration()
+        start = self.initial_state()
+        depths = self.penetration(start)
+        for k, (pair, (slave, master)) in enumerate(
+            zip(self.contacts, self.contact_bodies, strict=True)
+        ):
+            if slave != master:  # the search looks half a facet deep; this, the whole body
+                depths[k] = np.maximum(depths[k], pair.master.depth(pair.slave.reference))
+        self._check_penetration(depths)
 
     def initial_state(self) -> State:
         """Undeformed bodies with their initial velocities at t = 0."""
@@ -113,6 +123,61 @@ class System:
             stick=tuple(np.zeros(n, dtype=bool) for n in nodes),
             slip=tuple(np.zeros(n) for n in nodes),
         )
+
+    def state_from(self, other: System, state: State) -> State:
+        """State at the displacements and time of another system's state. Collective.
+
+        Bodies correspond by name. Those of this system move with their initial velocities.
+
+        Args:
+            other: System with bodies of the same names on the same meshes.
+            state: Its state.
+
+        Raises:
+            ValueError: A body has no counterpart, stands off its prescribed displacement, or lies
+                in a master.
+        """
+        index = {b.name: k for k, b in enumerate(other.bodies)}
+        missing = [b.name for b in self.bodies if b.name not in index]
+        if missing:
+            raise ValueError(
+                f"start: has bodies {list(index)}, not {missing}; name the bodies of both alike"
+            )
+        u = tuple(state.u[index[b.name]].copy() for b in self.bodies)
+        for body, now in zip(self.bodies, u, strict=True):
+            old = other.bodies[index[body.name]]
+            self._check_start(body, old, now, state.time)
+        found = self.initial_state()
+        start = replace(found, time=state.time, u=u)
+        for k, pair in enumerate(self.contacts):
+            for j, known in enumerate(other.contacts):
+                same = pair.name == known.name and all(
+                    np.array_equal(a, b)
+                    for a, b in (
+                        (pair.slave.points, known.slave.points),
+                        (pair.master.facets, known.master.facets),
+                    )
+                )
+                if same:
+                    for name in ("facets", "force", "gap", "tangential", "stick", "slip"):
+                        getattr(start, name)[k][:] = getattr(state, name)[j]
+        self._check_penetration(self.penetration(start))
+        return start
+
+    @staticmethod
+    def _check_start(body: Body, old: Body, u: FloatArray, time: float) -> None:
+        """Raise on every rank unless u fits the body's mesh and conditions."""
+        problem = None
+        if not np.array_equal(body.reference, old.reference):
+            problem = f"start: body {body.name!r} has another mesh there; use the same mesh object"
+        else:
+            off = np.abs(body.prescribed(time) - u[body.fixed]).max(initial=0.0)
+            if off > _ON_SUPPORT * np.abs(body.reference).max(initial=0.0):
+                problem = (
+                    f"start: the Dirichlet values of body {body.name!r} at t={time:.6g} are "
+                    f"{off:.3g} m off its displacement; let them go on from there"
+                )
+        raise_together(body.comm, problem)
 
     @staticmethod
     def _prescribed(body: Body) -> FloatArray:
@@ -134,18 +199,26 @@ class System:
                             f"out of the same facets of {a.master.body.name!r}; drop one"
                         )
 
-    def _check_penetration(self) -> None:
-        """Raise on every rank, with the nodes, if slaves start inside their masters."""
-        state = self.initial_state()
+    def penetration(self, state: State) -> list[FloatArray]:
+        """How deep the slaves of each contact lie behind their facets, in facet sizes. Collective.
+
+        Returns:
+            Of each contact, shape (points,), the same on all ranks; 0 outside and deep inside.
+        """
+        depths = []
         for pair, (slave, master), facets in zip(
             self.contacts, self.contact_bodies, state.facets, strict=True
         ):
             found = pair.find(state.u[slave], state.u[master], facets, 0.0)
             depth = np.zeros(len(pair.slave.points))
-            depth[pair.slave.owned[found.node]] = -found.gap / found.length
+            depth[pair.slave.owned[found.node]] = np.maximum(-found.gap, 0.0) / found.length
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)
-            if slave != master:  # the search looks half a facet deep; this, through the whole body
-                depth = np.maximum(depth, pair.master.depth(pair.slave.reference))
+            depths.append(depth)
+        return depths
+
+    def _check_penetration(self, depths: list[FloatArray]) -> None:
+        """Raise on every rank, with the nodes, if slaves start inside their masters."""
+        for pair, depth in zip(self.contacts, depths, strict=True):
             deep = depth > INITIAL_PENETRATION
             if deep.any():
                 raise ValueError(

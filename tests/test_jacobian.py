@@ -8,6 +8,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
+from dolfinx_nts.integrators import Static
 
 COMM = MPI.COMM_WORLD
 CELLS = {"hex": CellType.hexahedron, "tet": CellType.tetrahedron}
@@ -18,6 +19,8 @@ RULES = {
     "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
     "condensed": nts.EnergyMomentum(),
 }
+#: The static rule, with a stabilization, shares the equations but not the steps.
+EQUATIONS = RULES | {"static": Static()}
 ACTIVE = ("none", "all", "mixed")
 FRICTION = {"none": 0.0, "slip": 0.02, "mixed": 0.4, "stick": np.inf}
 #: Exact for polynomials up to degree 4.
@@ -78,7 +81,7 @@ def rotated_state(system, angle=0.8, fixed=False):
 
 
 def stepper_of(system, rule):
-    return nts.Stepper(system, RULES[rule], newton=nts.Newton(condense=rule == "condensed"))
+    return nts.Stepper(system, EQUATIONS[rule], newton=nts.Newton(condense=rule == "condensed"))
 
 
 class Linearised:
@@ -87,6 +90,7 @@ class Linearised:
     def __init__(self, system, rule, active, state, dt=0.02):
         self.stepper = stepper_of(system, rule)
         self.problem = problem = self.stepper.problem
+        problem.stabilization = 0.2 if rule == "static" else 0.0
         problem.begin(state, dt)
         self.solver = self.stepper.solver
         rng = np.random.default_rng(COMM.rank)
@@ -153,7 +157,7 @@ def block_errors(found, expected, blocks):
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("active", ACTIVE)
 @pytest.mark.parametrize("friction", FRICTION)
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", EQUATIONS)
 @pytest.mark.parametrize("cell", CELLS)
 def test_jacobian_is_the_derivative_of_the_residual(cell, rule, friction, active):
     system = two_blocks(cell, friction=FRICTION[friction])
@@ -176,7 +180,7 @@ def test_jacobian_is_the_derivative_of_the_residual(cell, rule, friction, active
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", EQUATIONS)
 def test_prescribed_coordinates_hold_only_a_diagonal(rule):
     bcs = [nts.Dirichlet(lambda x: x[0] > 1 - 1e-9, components=(0, 2))]
     system = two_blocks("hex", bcs=bcs)
@@ -204,7 +208,7 @@ def test_prescribed_coordinates_hold_only_a_diagonal(rule):
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", EQUATIONS)
 def test_nest_and_aij_are_the_same_matrix(rule):
     system = two_blocks("hex")
     at = Linearised(system, rule, "mixed", rotated_state(system))
@@ -224,7 +228,7 @@ def test_nest_and_aij_are_the_same_matrix(rule):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", EQUATIONS)
 @pytest.mark.parametrize("cell", CELLS)
 def test_jacobian_along_directions(cell, rule):
     """As above on any number of ranks: matrix times direction, through AIJ and nest."""

@@ -30,7 +30,7 @@ LEVELS = [
     },
     {"system", "balance"},
     {"newton", "step", "assembly"},
-    {"simulate", "output", "plots", "pictures", "tradeoff"},
+    {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff"},
     {"__init__"},
 ]
 LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}

@@ -1,0 +1,295 @@
+"""Equilibrium of a system: static and quasi-static loading in steps, without inertia."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from dolfinx_nts import balance
+from dolfinx_nts.integrators import Static
+from dolfinx_nts.newton import Newton, StepFailedError
+from dolfinx_nts.simulate import Solution, Stepper, run, writers
+from dolfinx_nts.step import Evaluation
+from dolfinx_nts.system import State, System
+from dolfinx_nts.validation import known_options, require_positive
+
+FloatArray = npt.NDArray[np.float64]
+
+#: A load step is dropped if it leaves a slave this part of a facet behind one that it was no
+#: candidate of.
+_MISSED = 0.1
+#: Searches for contact, each for the motion that came of the one before.
+_SEARCHES = 4
+#: Relaxations of one load step before it counts as without equilibrium.
+_RELAXATIONS = 100
+#: From this part of the forces on, the stabilization's moves no node to another facet.
+_NEARLY_AT_REST = 1e-2
+#: A failed relaxation is repeated with a stiffer stabilization, up to this.
+_STIFFEST = 10.0
+#: A relaxation that leaves less than this part of the stabilization's force ...
+_RELIEVED = 0.5
+#: ... lowers the next one's stiffness by this. What falls freely, whose force stays, is held on.
+_RELIEF = 0.1
+
+_REMEDY = (
+    "Try more load steps, or inspect the nodes named here; a body that nothing but contact holds "
+    "must touch at the start, or needs stabilization=0.1"
+)
+
+
+@dataclass(eq=False)
+class Equilibrium(Solution):
+    """What `equilibrium` computed, complete up to where it ended.
+
+    `balance` has one row per accepted load step: "time" is the pseudo time, "potential" and
+    "energy" the strain energy, "external_work" that of loads and prescribed motion (of the mean of
+    the forces at both ends of each step), "ledger_residual" what the two differ by; "kinetic" and
+    the momenta are 0.
+
+    Attributes:
+        state: Last accepted state: displacements u, and of each contact force and gap of its slave
+            nodes.
+    """
+
+    state: State = field(kw_only=True)
+
+    @property
+    def reactions(self) -> dict[str, FloatArray]:
+        """Of each body, force of each `Dirichlet` condition on it [N], shape (rows, conditions, 3).
+
+        A coordinate that two conditions prescribe counts with the later one.
+        """
+        names = [b.name for b in self.system.bodies]
+        return {n: np.array([r["reactions"][k] for r in self.rows]) for k, n in enumerate(names)}
+
+    @property
+    def contact_forces(self) -> FloatArray:
+        """Resultant of each contact on its slave body [N], shape (rows, contacts, 3)."""
+        return np.array([row["contact_forces"] for row in self.rows])
+
+
+class _LoadStepper(Stepper):
+    """Stepper in pseudo time; a step is relaxed until nothing of the stabilization is left."""
+
+    solution: Equilibrium
+
+    def __init__(self, system: System, stabilization: float, **options: Any) -> None:
+        super().__init__(system, Static(), **options)
+        self._stabilization = stabilization
+        self._rates = [np.zeros_like(u) for u in self.state.u]
+        self._forces = [np.zeros_like(u) for u in self.state.u]
+        self._accept(replace(self.state, v=tuple(self._rates)))
+        row = balance.first_row(system, self.state)
+        row["reactions"] = [b.reactions(np.zeros(b.num_owned)) for b in system.bodies]
+        row["contact_forces"] = np.zeros((len(system.contacts), 3))
+        self.solution = Equilibrium(system, rows=[row], state=self.state)
+
+    def start(self, dt: float) -> None:
+        """Nothing moves at the start."""
+
+    def _step(self, dt: float, time: float) -> None:
+        old = self.state
+        step, state, iterations = self._relax(dt, time)
+        self._rates = [(a - b) / dt for a, b in zip(state.u, old.u, strict=True)]
+        forces = [t.external.copy() for t in step.bodies]
+        work = 0.0
+        for k, (body, t) in enumerate(zip(self.system.bodies, step.bodies, strict=True)):
+            forces[k][body.fixed] += t.residual[body.fixed]
+            work += 0.5 * float((forces[k] + self._forces[k]) @ (state.u[k] - old.u[k]))
+        self._forces = forces
+        terms = balance.step_terms(self.problem, step)
+        terms["external_work"] = self.system.comm.allreduce(work)
+        terms |= {"time": time, "newton_iterations": iterations, "contact_defect": 0.0}
+        rows, measured = self.solution.rows, balance.measure(self.system, state)
+        row = balance.next_row(rows[0], rows[-1], measured, terms)
+        rows.append(row | self._resultants(step))
+        self._accept(state)
+        self.solution.state = state
+
+    def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int]:
+        """Solution of a load step, its state, and the Newton iterations.
+
+        Each relaxation starts where the last one ended and is held there a little by the
+        stabilization: a proximal-point iteration, whose limit knows nothing of it.
+        """
+        problem, kept, iterations, last = self.problem, self.state, 0, np.inf
+        search = True
+        problem.stabilization = self._stabilization
+        state = replace(kept, v=tuple(self._rates))
+        try:
+            for _ in range(_RELAXATIONS):
+                try:
+                    step = self._solve(state, dt, search)
+                    reached = self._accepted(step, dt, time)
+                    self._check_inverted(reached)
+                    self._check_missed(reached)
+                except StepFailedError:
+                    # Bodies in search of each other move by load over stabilization, whatever dt.
+                    if not 0.0 < problem.stabilization < _STIFFEST:
+                        raise
+                    problem.stabilization /= _RELIEF
+                    continue
+                iterations += step.iterations
+                state, dt = reached, 0.0
+                unrest = problem.unrest(step)
+                if unrest <= 1.0:
+                    return step, state, iterations
+                if unrest < _RELIEVED * last:
+                    problem.stabilization *= _RELIEF
+                last = unrest
+                # A node on an edge could change its facet for ever, and its place with it.
+                search = unrest * self.newton.rtol > _NEARLY_AT_REST
+        finally:
+            problem.stabilization = 0.0
+        raise StepFailedError(
+            f"step from t={kept.time:.6g}: not at rest after {_RELAXATIONS} relaxations; nothing "
+            "holds a body, or it hops from facet to facet"
+        )
+
+    def _solve(self, state: State, dt: float, search: bool) -> Evaluation:
+        """Solution from a state; contact is sought as far as the bodies turn out to move."""
+        motion = np.zeros(len(self.system.bodies))
+        for _ in range(_SEARCHES):
+            self.problem.begin(state, dt, motion, search=search)
+            step = self.solver.solve()
+            motion = self.problem.motion(step)
+            if not search or self.problem.covers(motion):
+                return step
+        raise StepFailedError(
+            f"step from t={state.time:.6g}: bodies move by {motion.max():.3g} m, too far to find "
+            "their contacts"
+        )
+
+    def _check_inverted(self, state: State) -> None:
+        """Raise if a body is inside out somewhere, which W(C) cannot see and a long step may do."""
+        for body, u in zip(self.system.bodies, state.u, strict=True):
+            volume = self.system.comm.allreduce(body.inverted(u))
+            if volume > 0.0:
+                raise StepFailedError(
+                    f"step from t={self.state.time:.6g}: a volume of {volume:.3g} m^3 of body "
+                    f"{body.name!r} ends inside out"
+                )
+
+    def _check_missed(self, state: State) -> None:
+        """Raise if a slave went through a facet whose candidate it was not."""
+        depths = self.system.penetration(state)
+        for pair, depth in zip(self.system.contacts, depths, strict=True):
+            if depth.max(initial=0.0) > _MISSED:
+                node = int(pair.slave.original[depth.argmax()])
+                raise StepFailedError(
+                    f"step from t={self.state.time:.6g}: contact {pair.name!r}: node {node} passed "
+                    f"by its facet and ended {depth.max():.3g} of a facet inside the master"
+                )
+
+    def _resultants(self, step: Evaluation) -> dict[str, Any]:
+        """Forces [N] of supports and contacts, the same on all ranks."""
+        bodies, contacts = self.system.bodies, len(self.system.contacts)
+        reactions = [b.reactions(t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
+        forces = [-k.residual[:, :3].sum(axis=0) for k in step.contacts]
+        local = np.concatenate([*reactions, *np.reshape(forces, (contacts, 1, 3))])
+        total = np.empty_like(local)
+        self.system.comm.Allreduce(local, total, op=MPI.SUM)
+        parts = np.split(total, np.cumsum([len(r) for r in reactions]))
+        return {"reactions": parts[:-1], "contact_forces": parts[-1]}
+
+
+def _pseudo_times(load_steps: Any) -> list[float]:
+    """End of each load step."""
+    if isinstance(load_steps, int | np.integer) and not isinstance(load_steps, bool):
+        if load_steps >= 1:
+            return [(k + 1) / int(load_steps) for k in range(int(load_steps))]
+    elif isinstance(load_steps, Sequence | np.ndarray) and not isinstance(load_steps, str):
+        try:
+            times = np.asarray(load_steps, dtype=np.float64)
+        except (TypeError, ValueError):
+            times = np.empty(0)
+        good = times.ndim == 1 and times.size and np.isfinite(times).all()
+        if good and (np.diff(times, prepend=0.0) > 0).all():
+            return [float(t) for t in times]
+    raise ValueError(
+        f"load_steps={load_steps!r}: pass a number of steps >= 1, or increasing pseudo times > 0"
+    )
+
+
+def _check_bodies(system: System) -> None:
+    for body in system.bodies:
+        for name in ("nodal_stiffness", "reactions", "inverted"):
+            if not callable(getattr(body, name, None)):
+                raise TypeError(
+                    f"body {body.name!r} has no {name}(): equilibrium needs it, see Body"
+                )
+
+
+@known_options
+def equilibrium(
+    system: System,
+    *,
+    load_steps: int | Sequence[float] | FloatArray = 1,
+    stabilization: float | None = None,
+    newton: Newton | None = None,
+    petsc_options: Mapping[str, Any] | None = None,
+    output: Sequence[Any] = (),
+    progress: bool = False,
+) -> Equilibrium:
+    """Equilibrium of a system under its loads, reached in load steps of a pseudo time from 0.
+
+    Constant loads (gravity, body forces, tractions) grow in proportion to the pseudo time and are
+    complete at 1; loads and Dirichlet values given as functions of time are taken at the pseudo
+    time; constant Dirichlet values hold from the start. Velocities and mass play no part. A load
+    step that is not solved is halved, up to `newton.max_retries` times.
+
+    A body that nothing but contact holds has an equilibrium only once the contact is closed: nodes
+    that touch at the start count as closed, so a block that stands on its support needs nothing
+    more, save conditions against sliding and turning. Where bodies have to find each other first,
+    or where directions stay free, pass `stabilization`.
+
+    A dynamic run starts from the result, at its pseudo time and with the initial velocities of the
+    bodies. Bodies correspond by name, so that what holds them may differ:
+
+        def block(bcs=()):
+            return nts.Continuum(mesh, rubber, density=1e3, bcs=bcs, name="block")
+
+        def scene(block):
+            pair = nts.ContactPair(slave=block.surface(below), master=floor.surface(above))
+            return nts.System([block, floor], contacts=[pair], gravity=(0, 0, -9.81))
+
+        pulled = nts.Dirichlet(top, value=lambda t: (0, 0, -0.02 * t))
+        settled = nts.equilibrium(scene(block([pulled])), load_steps=10)
+        run = nts.simulate(scene(block()), nts.EnergyMomentum(), dt=1e-3, t_end=1.2, start=settled)
+
+    Args:
+        system: The scene.
+        load_steps: Number of equal steps from 0 to 1, or the increasing pseudo times where they
+            end.
+        stabilization: Stiffness, over that of its own, that holds each node where it was while a
+            load step is solved; the step is then repeated until nothing of it is left in the
+            forces. 0.1 is a good value.
+        newton: Tolerances and retries.
+        petsc_options: PETSc options of the step's SNES, without prefix.
+        output: Writers of `dolfinx_nts.output`; each is called after every load step that its
+            cadence asks for.
+        progress: Show a progress line on rank 0.
+
+    Returns:
+        The Equilibrium; the bodies' u hold it. A run that fails says so in `status` and keeps
+        everything computed until then.
+
+    Raises:
+        ValueError: An argument is out of range; before any work.
+    """
+    times = _pseudo_times(load_steps)
+    if stabilization is not None:
+        require_positive("stabilization", stabilization, "-")
+    output = writers(output)
+    if isinstance(system, System):
+        _check_bodies(system)
+    stepper = _LoadStepper(
+        system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options
+    )
+    run(stepper, times, output, progress=progress, remedy=_REMEDY)
+    return stepper.solution
