@@ -313,6 +313,21 @@ class ContactStep:
         """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
         return self._augmented(x) if self.num_augmented else np.empty((self.num_pairs, 0))
 
+    def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
+        """Multipliers of given contact forces on the slaves [N], shape (n, multipliers).
+
+        Args:
+            normal: p_N, shape (n,).
+            tangential: Friction, shape (n, 3).
+        """
+        out = np.zeros((self.num_pairs, self.num_multipliers))
+        out[:, 0] = -normal
+        if self.num_tangential:
+            _, tangents, _ = facets.frame(self.x0[:, 1:], self.candidates.xi)
+            out[:, -2:] = -np.einsum("nai,ni->na", tangents, tangential)
+            out[:, -2:] /= self.candidates.length[:, None]
+        return out
+
     def _augmented(self, x: FloatArray) -> FloatArray:
         xi = self._projection(x)
         _, _, normal = facets.frame(x[:, 1:], xi)

@@ -221,11 +221,12 @@ class StepProblem:
         return blocks
 
     def guess(self, *, flight: bool) -> None:
-        """Write a first guess into `x`: no contact force, d and f that fit the positions.
+        """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 
         Args:
-            flight: Free flight from t_n, else the positions of t_n, which free flight of a fast
-                turning or vibrating body may invert; prescribed coordinates are at t_{n+1}.
+            flight: Free flight from t_n under the contact forces of the last step; else the
+                positions of t_n, which free flight of a fast turning or vibrating body may invert,
+                and no forces. Prescribed coordinates are at t_{n+1}.
         """
         with self.x as x:
             x[:] = 0.0
@@ -233,12 +234,9 @@ class StepProblem:
                 start = u1 if flight else self.state.u[k].copy()
                 start[body.fixed] = u1[body.fixed]
                 x[self.layout.owned(k)] = start
-        if not self.integrator.inertia and self._fields:
+        if self._fields and (flight or not self.integrator.inertia):
             guess = [
-                self._closed(c, p, force).ravel()
-                for c, p, force in zip(
-                    self.contacts, self._positions(self.x), self.state.force, strict=True
-                )
+                self._forces_as_before(k, p).ravel() for k, p in enumerate(self._positions(self.x))
             ]
             with self.x as x:
                 x[self.layout.owned(self._fields["multipliers"])] = np.concatenate(guess)
@@ -250,18 +248,22 @@ class StepProblem:
             with self.x as x:
                 x[self.layout.owned(self._fields["augmented"])] = np.concatenate(guess)
 
-    @staticmethod
-    def _closed(c: ContactStep, x: FloatArray, force: FloatArray) -> FloatArray:
-        """Multipliers that start the nodes which touch at t_n as active, shape (n, multipliers).
+    def _forces_as_before(self, index: int, x: FloatArray) -> FloatArray:
+        """Multipliers of the contact forces of the last step, shape (n, multipliers).
 
-        Without inertia a body may have nothing but its contacts to hold it.
+        In statics nodes that touch at t_n start as active: without inertia a body may have nothing
+        but its contacts to hold it.
         """
-        last = force[c.candidates.node] / c.scale
-        near = _TOUCHING * c.candidates.length
-        touching = (last > 0.0) | (c.candidates.gap <= near)
-        multipliers = np.zeros((c.num_pairs, c.num_multipliers))
-        gap = c.evaluate(x, np.empty((c.num_pairs, 0)), multipliers).gap
-        multipliers[:, 0] = np.where(touching, -(last + near + np.maximum(gap, 0.0)), 0.0)
+        c, state = self.contacts[index], self.state
+        node = c.candidates.node
+        force, tangential = state.force[index][node], state.tangential[index][node]
+        multipliers = self.factor * c.multipliers(force, tangential) / c.scale[:, None]
+        if not self.integrator.inertia:
+            near = _TOUCHING * c.candidates.length
+            touching = (force > 0.0) | (c.candidates.gap <= near)
+            nothing = np.zeros_like(multipliers)
+            gap = c.evaluate(x, np.empty((c.num_pairs, 0)), nothing).gap
+            multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
         return multipliers
 
     # ---- iterates
