@@ -43,7 +43,7 @@ class EnergyMomentum:
 
     Attributes:
         stress: Discrete derivative of the strain energy, "gonzalez" (exact; for increments below
-            1 % by three-point quadrature, which only a very steep W notices) or "mean-value" (Gauss
+            1 % by five-point quadrature, exact to rounding for W as steep as exp(100 tr C)) or "mean-value" (Gauss
             points in time: exact for polynomial W such as StVenantKirchhoff, to quadrature error
             otherwise).
         contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit
