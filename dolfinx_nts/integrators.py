@@ -67,9 +67,9 @@ class EnergyMomentum(_InTime):
 
     Attributes:
         stress: Discrete derivative of the strain energy, "gonzalez" (exact; for increments below
-            1 % by three-point quadrature, which only a very steep W notices) or "mean-value" (Gauss
-            points in time: exact for polynomial W such as StVenantKirchhoff, to quadrature error
-            otherwise).
+            1 % by five-point quadrature, exact to rounding for W as steep as exp(100 tr C)) or
+            "mean-value" (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to
+            quadrature error otherwise).
         contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit
             independent) or "gonzalez" (the paper's (67), for comparison).
         quadrature_points: Gauss points in time of the mean-value stress, 1 to 7.

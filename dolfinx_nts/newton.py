@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,24 +11,14 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.assembly import StepMatrix
 from dolfinx_nts.contact import ContactStep, Contribution
+from dolfinx_nts.linear_solver import PRESETS, SolverOptions
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.validation import known_options
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
-
-#: Direct solve of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses.
-DEFAULT_PETSC_OPTIONS: Mapping[str, Any] = {
-    "snes_linesearch_type": "basic",
-    "ksp_type": "preonly",
-    "pc_type": "lu",
-    "pc_factor_mat_solver_type": "mumps",
-    "mat_mumps_icntl_14": 80,
-}
-_prefixes = itertools.count()
 
 
 @known_options
@@ -43,6 +32,10 @@ class Newton:
         max_retries: How often a dropped step may be halved before the run stops.
         condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies and
             lambda_N reach the linear solver; the same solution with a smaller factorisation.
+        linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
+            a Schur complement for contact), which is for large meshes: at 50,000 coordinates an
+            iteration costs a sixth. Its incomplete factors weaken as dt grows beyond the time a
+            wave needs through an element.
 
     Raises:
         ValueError: An argument is out of range.
@@ -52,6 +45,7 @@ class Newton:
     max_iterations: int = 25
     max_retries: int = 8
     condense: bool = False
+    linear_solver: str = "direct"
 
     def __post_init__(self) -> None:
         if not 0 < self.rtol < 1:
@@ -60,6 +54,9 @@ class Newton:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
         if self.max_retries < 0:
             raise ValueError(f"max_retries={self.max_retries!r}: must not be negative")
+        if self.linear_solver not in PRESETS:
+            known = ", ".join(map(repr, PRESETS))
+            raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
 
 
 class StepFailedError(RuntimeError):
@@ -72,7 +69,7 @@ class StepSolver:
     Args:
         problem: Equations; `problem.begin` comes before each `solve`.
         newton: Tolerances.
-        petsc_options: PETSc options of the SNES without prefix; they override the defaults.
+        petsc_options: PETSc options of the SNES without prefix; they override the preset.
 
     Attributes:
         matrix: Nested Jacobian and its AIJ form, after `assemble`.
@@ -83,9 +80,9 @@ class StepSolver:
         self, problem: StepProblem, newton: Newton, petsc_options: Mapping[str, Any] | None = None
     ) -> None:
         self.problem, self.newton = problem, newton
-        self._unchecked = set(petsc_options or {})
-        self._options = {**DEFAULT_PETSC_OPTIONS, **(petsc_options or {})}
-        self._keys: list[str] = []
+        self._options = SolverOptions(
+            problem.system.comm, newton.linear_solver, petsc_options or {}
+        )
         self._version = -1
         self._assembled: Evaluation | None = None
         self.matrix: StepMatrix | None = None
@@ -99,10 +96,12 @@ class StepSolver:
             ValueError: PETSc does not know an option or its value.
         """
         self.prepare()
+        assert self.matrix is not None
         for retry in (False, True):
             if retry:
                 self.problem.guess(flight=False)
             try:
+                self._options.check(self.snes, self.matrix.aij)
                 self.snes.solve(None, self.problem.x)
             except PETSc.Error as error:
                 # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
@@ -113,11 +112,9 @@ class StepSolver:
                     f"with error {error.ierr}; do two contacts, or a contact and a support, close "
                     "the same gap?"
                 ) from error
-            self._check_options()
             last = self._at(self.problem.x)
             # A line search of the user's may stop SNES by its own tests; ours decide.
-            solved = max(self.problem.ratios(last).values()) <= 1.0
-            if solved and self.snes.getConvergedReason() > 0:
+            if self._worst(last) <= 1.0 and self.snes.getConvergedReason() > 0:
                 return replace(last, iterations=self.snes.getIterationNumber())
         reason, iterations = self.snes.getConvergedReason(), self.snes.getIterationNumber()
         raise StepFailedError(self._diagnosis(last, reason, iterations))
@@ -144,48 +141,13 @@ class StepSolver:
     def _configure(self) -> None:
         assert self.matrix is not None
         self.snes = PETSc.SNES().create(self.problem.system.comm)
-        prefix = f"nts_{next(_prefixes)}_"
-        self.snes.setOptionsPrefix(prefix)
         self._f = self.problem.x.duplicate()
         self.snes.setFunction(self._function, self._f)
         self.snes.setJacobian(self._jacobian, self.matrix.aij, self.matrix.aij)
         self.snes.setConvergenceTest(self._converged)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
-        database = PETSc.Options()
-        for key, value in self._options.items():
-            database[prefix + key] = value
-            self._keys.append(prefix + key)
-        try:
-            self.snes.setFromOptions()
-        except PETSc.Error as error:
-            given = {k: self._options[k] for k in sorted(self._unchecked)}
-            why = str(error).splitlines()[-1].split("] ")[-1]
-            raise ValueError(f"petsc_options={given!r}: {why}; correct the value") from error
-        pc = self.snes.getKSP().getPC()
-        if pc.getType() == "fieldsplit" and self.problem.elements:
-            parts = self.matrix.field_sets(len(self.problem.system.bodies))
-            pc.setFieldSplitIS(*parts)
-            for _, index in parts:
-                index.destroy()
-
-    def _check_options(self) -> None:
-        """Raise if PETSc, having solved, never asked for one of the user's options.
-
-        Options of the splits wait for the first contact, without which there are none.
-        """
-        if not self.snes.getIterationNumber():  # nothing was solved for
-            return
-        contact = bool(self.problem.elements)
-        judged = {k for k in self._unchecked if contact or not k.startswith("fieldsplit_")}
-        self._unchecked -= judged
-        prefix = self.snes.getOptionsPrefix()
-        for key in sorted(judged):
-            used = compat.option_used(prefix + key)
-            if not self.problem.system.comm.allreduce(used, op=MPI.LOR):
-                raise ValueError(
-                    f"petsc_options[{key!r}]={self._options[key]!r}: not used by PETSc; "
-                    "correct its name or remove it"
-                )
+        contact = self.matrix if self.problem.elements else None
+        self._options.configure(self.snes, contact, len(self.problem.system.bodies))
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:
@@ -210,12 +172,15 @@ class StepSolver:
         if e is not self._assembled:
             self.assemble(e)
 
+    def _worst(self, e: Evaluation) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return max(self.problem.ratios(e).values())
+
     def _converged(self, _snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
         assert self._last is not None
         reasons = PETSc.SNES.ConvergedReason
         # After the Jacobian of the same iterate rounding may be known better than before.
-        with np.errstate(over="ignore", invalid="ignore"):
-            worst = max(self.problem.ratios(self._last).values())
+        worst = self._worst(self._last)
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
             return reasons.DIVERGED_FNORM_NAN
         if worst <= 1.0:
@@ -253,10 +218,7 @@ class StepSolver:
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
-        database = PETSc.Options()
-        for key in self._keys:
-            database.delValue(key)
-        self._keys.clear()
+        self._options.remove()
         if self.matrix is not None:
             self.matrix.destroy()
             self.matrix = None

@@ -461,6 +461,8 @@ def test_newton():
     pattern = r"^max_iterations=0: must be at least 1"
     raises(ValueError, pattern, lambda: nts.Newton(max_iterations=0))
     raises(ValueError, r"^max_retries=-1: must not be", lambda: nts.Newton(max_retries=-1))
+    pattern = r"^linear_solver='cg': choose one of 'direct', 'krylov'"
+    raises(ValueError, pattern, lambda: nts.Newton(linear_solver="cg"))
 
 
 def test_integrator():
@@ -478,16 +480,56 @@ def test_output():
     )
 
 
+FIELD_SPLIT = {
+    "ksp_type": "fgmres",
+    "pc_type": "fieldsplit",
+    "pc_fieldsplit_type": "schur",
+    "pc_fieldsplit_schur_precondition": "selfp",
+    "fieldsplit_bodies_ksp_type": "preonly",
+    "fieldsplit_bodies_pc_type": "gamg",
+    "fieldsplit_bodies_mg_levels_ksp_max_it": 3,
+    "fieldsplit_contact_ksp_type": "preonly",
+    "fieldsplit_contact_pc_type": "lu",
+    "fieldsplit_contact_pc_factor_mat_solver_type": "mumps",
+}
+
+
 def test_petsc_options():
-    """A misspelt option is found as soon as PETSc has solved once without asking for it."""
-    system = nts.System([continuum(velocity=lambda x: 0.1 * x[[1, 2, 0]])])
-    pattern = r"^petsc_options\['ksp_tpye'\]='gmres': not used by PETSc; correct its name or remove"
-    raises(ValueError, pattern, lambda: run(system, petsc_options={"ksp_tpye": "gmres"}))
+    """A misspelt option or value is found before the first solve, also one that needs contact."""
+    body = continuum(velocity=lambda x: 0.1 * x[[1, 2, 0]])
+    system = nts.System([body])
     pattern = r"^petsc_options={'pc_type': 'magic'}: .*PC type magic.*; correct the value"
     raises(ValueError, pattern, lambda: run(system, petsc_options={"pc_type": "magic"}))
+    pattern = r"^petsc_options={.*'sub_pc_type': 'magic'}: .*PC type magic.*; correct the value"
+    bad = {"pc_type": "bjacobi", "sub_pc_type": "magic"}
+    raises(ValueError, pattern, lambda: run(system, petsc_options=bad))
     raises(TypeError, r"^petsc_options='-help': pass a dict", lambda: run(petsc_options="-help"))
     good = {"ksp_type": "gmres", "pc_type": "bjacobi", "sub_pc_type": "ilu", "ksp_rtol": 1e-12}
-    assert run(system, petsc_options=good).status == "completed"
+    for options in (good, FIELD_SPLIT | {"snes_linesearch_type": "bt"}):
+        assert run(system, petsc_options=options).status == "completed"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "others"),
+    [
+        ("ksp_tpye", "gmres", {}),
+        ("snes_linesearch_tpye", "bt", {}),
+        ("sub_pc_tpye", "ilu", {"pc_type": "bjacobi", "ksp_type": "gmres"}),
+        ("fieldsplit_bodies_pc_tpye", "ilu", FIELD_SPLIT),
+        ("fieldsplit_contact_pc_tpye", "lu", FIELD_SPLIT),
+        ("fieldsplit_contact_pc_factor_mat_slover_type", "mumps", FIELD_SPLIT),
+    ],
+)
+def test_misspelt_petsc_options_are_found_before_the_first_step(name, value, others):
+    stepper = nts.Stepper(
+        nts.System([continuum(velocity=lambda x: 0.1 * x[[1, 2, 0]])]),
+        nts.EnergyMomentum(),
+        petsc_options={**others, name: value},
+    )
+    pattern = rf"^petsc_options\['{name}'\]='{value}': not used by PETSc; correct its name or rem"
+    raises(ValueError, pattern, lambda: stepper.advance(1e-3))
+    assert len(stepper.solution.rows) == 1
+    stepper.close()
 
 
 def test_material_written_by_the_user_is_accepted():

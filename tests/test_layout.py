@@ -29,7 +29,7 @@ LEVELS = [
         "integrators",
     },
     {"system", "balance"},
-    {"newton", "step", "assembly"},
+    {"newton", "step", "assembly", "linear_solver"},
     {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff"},
     {"__init__"},
 ]

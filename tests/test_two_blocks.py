@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import two_blocks
+import ufl
 from dolfinx.mesh import CellType
 from mpi4py import MPI
 
@@ -43,6 +44,18 @@ def test_demo_reaches_the_reference_figures():
     assert midpoint["ledger"] > 1e-6
 
 
+def fung(steepness):
+    """Rubber that stiffens exponentially, small strains as the neo-Hookean one's."""
+    mu, lam = 1e6 / 2.6, 1e6 * 0.3 / (1.3 * 0.4)
+
+    def energy(c):
+        volume = ufl.ln(ufl.det(c))
+        stretch = (ufl.exp(steepness * (ufl.tr(c) - 3)) - 1) / steepness
+        return mu / 2 * (stretch - volume) + lam / 8 * volume**2
+
+    return energy
+
+
 VARIANTS = {
     "gonzalez contact": (nts.EnergyMomentum(contact_gradient="gonzalez"), {}),
     "StVK": (ENERGY_MOMENTUM, {"material": nts.StVenantKirchhoff(young=1e6, poisson=0.3)}),
@@ -57,6 +70,14 @@ def test_ledger_closes_for(variant):
     result = two_blocks.figures(impact(integrator=integrator, **scene))
     assert_conserved(result)
     assert 0.04 < result["energy_lost"] < 0.06
+
+
+@pytest.mark.parametrize("steepness", [30.0, 100.0])
+def test_ledger_closes_for_a_steep_energy(steepness):
+    """Stiffening makes the impact harder, so activation costs more than in the variants above."""
+    result = two_blocks.figures(impact(material=fung(steepness)))
+    assert_conserved(result)
+    assert result["energy_lost"] > 0.06
 
 
 def test_tetrahedra_agree_with_hexahedra():
@@ -206,6 +227,48 @@ def test_field_split_finds_the_same_solution():
     assert run.status == "completed"
     energy = direct.balance["energy"]
     assert np.abs(run.balance["energy"] - energy).max() <= 1e-11 * energy[0]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("condense", [False, True])
+@pytest.mark.parametrize("integrator", [nts.Midpoint(), ENERGY_MOMENTUM])
+def test_krylov_follows_the_direct_solver(integrator, condense):
+    steppers = [
+        nts.Stepper(
+            two_blocks.scene(COMM),
+            integrator,
+            # What Newton's default tolerance leaves adds up to more than the difference sought.
+            newton=nts.Newton(rtol=1e-14, linear_solver=solver, condense=condense),
+        )
+        for solver in ("direct", "krylov")
+    ]
+    peak = {"u": 0.0, "v": 0.0, "force": 0.0}
+    for _ in range(40):
+        direct, krylov = (s.advance(2e-3) for s in steppers)
+        assert np.array_equal(direct.force[0] > 0, krylov.force[0] > 0)
+        for name in peak:
+            a, b = (np.concatenate(getattr(state, name)) for state in (direct, krylov))
+            peak[name] = max(peak[name], COMM.allreduce(np.abs(a).max(initial=0.0), op=MPI.MAX))
+            assert np.abs(a - b).max(initial=0.0) <= 1e-9 * peak[name], name
+    a, b = (s.solution.balance for s in steppers)
+    assert a["active"].max() == 25
+    assert np.array_equal(a["active"], b["active"])
+    if integrator is ENERGY_MOMENTUM:
+        assert np.abs(b["ledger_residual"]).max() <= 1e-11 * b["energy"][0]
+    for s in steppers:
+        s.close()
+
+
+@pytest.mark.mpi
+def test_krylov_in_metres_and_micrometres():
+    newton, runs = nts.Newton(linear_solver="krylov"), []
+    for m in (1.0, 1e6):
+        material = nts.NeoHookean(young=1e6 / m, poisson=0.3)
+        scene = {"metre": m, "density": 1e3 / m**3, "material": material}
+        runs.append(impact(t_end=0.08, newton=newton, **scene).balance)
+    assert np.array_equal(runs[0]["newton_iterations"], runs[1]["newton_iterations"])
+    assert np.array_equal(runs[0]["active"], runs[1]["active"])
+    assert np.allclose(runs[1]["energy"] / 1e12, runs[0]["energy"], rtol=1e-9, atol=0)
 
 
 if __name__ == "__main__":

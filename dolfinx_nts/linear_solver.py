@@ -1,0 +1,173 @@
+"""How the linear systems of a step are solved: presets, the user's PETSc options, their check."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.assembly import StepMatrix, model_problem
+
+_BODIES = "fieldsplit_bodies_"
+_CONTACT = "fieldsplit_contact_"
+#: Presets by `Newton.linear_solver`; a user's `petsc_options` override them one by one.
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses.
+    "direct": {
+        "snes_linesearch_type": "basic",
+        "ksp_type": "preonly",
+        "pc_type": "lu",
+        "pc_factor_mat_solver_type": "mumps",
+        "mat_mumps_icntl_14": 80,
+    },
+    # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good, and so is
+    # the Schur complement of the contact unknowns with the diagonal alone inverted.
+    "krylov": {
+        "snes_linesearch_type": "basic",
+        "ksp_type": "gmres",
+        "ksp_pc_side": "right",
+        # Looser costs Newton iterations, and their number then hangs on rounding and units.
+        "ksp_rtol": 1e-5,
+        "ksp_gmres_restart": 60,
+        "ksp_max_it": 300,
+        "pc_type": "fieldsplit",
+        "pc_fieldsplit_type": "schur",
+        "pc_fieldsplit_schur_fact_type": "upper",
+        "pc_fieldsplit_schur_precondition": "selfp",
+        _BODIES + "ksp_type": "preonly",
+        _BODIES + "pc_type": "bjacobi",
+        _BODIES + "sub_pc_type": "icc",
+        _CONTACT + "ksp_type": "preonly",
+        _CONTACT + "pc_type": "lu",
+        _CONTACT + "pc_factor_mat_solver_type": "mumps",
+    },
+}
+#: PETSc's errors "no support", "unknown type", "missing factor": an option has a wrong value.
+_WRONG_VALUE = (56, 86, 92)
+_prefixes = itertools.count()
+
+
+class SolverOptions:
+    """PETSc options of a step's SNES, and which of the user's PETSc has asked for.
+
+    Args:
+        comm: MPI communicator.
+        preset: Name of a preset.
+        given: The user's options without prefix; they override the preset.
+    """
+
+    def __init__(self, comm: Any, preset: str, given: Mapping[str, Any]) -> None:
+        self._comm, self._given = comm, dict(given)
+        self._all = {**PRESETS[preset], **given}
+        self._unchecked = set(given)
+        self._entered: dict[str, str] = {}
+
+    def configure(self, snes: Any, matrix: StepMatrix | None, num_bodies: int) -> None:
+        """Set a SNES up from the options.
+
+        Without contact unknowns a field split has one part only, so the bodies' options are used.
+
+        Args:
+            snes: The SNES.
+            matrix: Its matrix, if there are contact unknowns to split off.
+            num_bodies: Fields of the matrix that are bodies.
+
+        Raises:
+            ValueError: PETSc refuses a value.
+        """
+        options = {k: k for k in self._all}
+        if matrix is None and self._all["pc_type"] == "fieldsplit":
+            outer = {k: k for k in self._all if not k.startswith(("pc_", "fieldsplit_"))}
+            inner = [k for k in self._all if k.startswith(_BODIES)]
+            own = {k.removeprefix(_BODIES): k for k in inner if not k.startswith(_BODIES + "ksp_")}
+            options = outer | own
+        self._set(snes, options)
+        if matrix is not None and self._all["pc_type"] == "fieldsplit":
+            _split(snes, *matrix.field_sets(num_bodies))
+
+    def _set(self, snes: Any, options: Mapping[str, str]) -> None:
+        """Give a SNES options (name -> the user's name) under a new prefix."""
+        prefix = f"nts_{next(_prefixes)}_"
+        snes.setOptionsPrefix(prefix)
+        database = PETSc.Options()
+        for name, source in options.items():
+            database[prefix + name] = self._all[source]
+            self._entered[prefix + name] = source
+        try:
+            snes.setFromOptions()
+        except PETSc.Error as error:
+            raise self._refused(error) from error
+
+    def check(self, snes: Any, matrix: Any) -> None:
+        """Raise on every rank if PETSc asks for one of the user's options nowhere in a solve.
+
+        Nothing is solved yet: most options are asked for when the solver is set up. If some are
+        not, a small model problem with a constraint is solved, which asks for those of the solve
+        itself and of a field split that waits for contact.
+
+        Args:
+            snes: The configured SNES.
+            matrix: Its assembled AIJ matrix.
+
+        Raises:
+            ValueError: PETSc does not know an option or its value.
+        """
+        if not self._unchecked:
+            return
+        try:
+            ksp = snes.getKSP()
+            ksp.setOperators(matrix, matrix)
+            ksp.setUp()
+            ksp.setUpOnBlocks()
+            self._forget_used()
+            if self._unchecked:
+                self._solve_model()
+                self._forget_used()
+        except PETSc.Error as error:
+            if error.ierr in _WRONG_VALUE:
+                raise self._refused(error) from error
+            raise
+        for name in sorted(self._unchecked):
+            raise ValueError(
+                f"petsc_options[{name!r}]={self._given[name]!r}: not used by PETSc; "
+                "correct its name or remove it"
+            )
+
+    def _refused(self, error: Exception) -> ValueError:
+        given = {k: self._given[k] for k in sorted(self._unchecked)}
+        why = str(error).splitlines()[-1].split("] ")[-1]
+        return ValueError(f"petsc_options={given!r}: {why}; correct the value")
+
+    def _forget_used(self) -> None:
+        used = {name for key, name in self._entered.items() if compat.option_used(key)}
+        self._unchecked -= set().union(*self._comm.allgather(used))
+
+    def _solve_model(self) -> None:
+        split = self._all["pc_type"] == "fieldsplit"
+        matrix, parts = model_problem(self._comm, constraint=split)
+        snes = PETSc.SNES().create(self._comm)
+        x, f = matrix.createVecs()
+        snes.setFunction(lambda _snes, x, f: (matrix.mult(x, f), f.shift(-1.0)), f)
+        snes.setJacobian(lambda *_: None, matrix, matrix)
+        self._set(snes, {k: k for k in self._all})
+        if split:
+            _split(snes, *parts)
+        snes.solve(None, x)
+        for a in (snes, x, f, matrix):
+            a.destroy()
+
+    def remove(self) -> None:
+        """Take the options out of PETSc's global database."""
+        database = PETSc.Options()
+        for key in self._entered:
+            database.delValue(key)
+        self._entered.clear()
+
+
+def _split(snes: Any, *parts: tuple[str, Any]) -> None:
+    snes.getKSP().getPC().setFieldSplitIS(*parts)
+    for _, index in parts:
+        index.destroy()
