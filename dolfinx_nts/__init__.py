@@ -9,6 +9,7 @@ from dolfinx_nts.integrators import EnergyMomentum, Midpoint
 from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.newton import Newton, StepFailedError
+from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
 from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.system import State, System
@@ -18,6 +19,7 @@ __all__ = [
     "Body",
     "ContactPair",
     "Continuum",
+    "Cylinder",
     "Dirichlet",
     "EnergyMomentum",
     "Equilibrium",
@@ -25,7 +27,9 @@ __all__ = [
     "MooneyRivlin",
     "NeoHookean",
     "Newton",
+    "Plane",
     "Solution",
+    "Sphere",
     "StVenantKirchhoff",
     "State",
     "StepFailedError",

@@ -78,6 +78,7 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     for contact, part, multiplier in zip(
         problem.contacts, step.contacts, step.multipliers, strict=True
     ):
+        work += scale * contact.external_work(part)
         defect -= scale * float(multiplier[:, 0] @ contact.candidates.gap)
         if contact.num_tangential:
             slipping = part.active & ~part.stick

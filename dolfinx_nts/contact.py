@@ -8,6 +8,7 @@ energy-momentum scheme eleven (d, f and six multipliers). Friction adds two (lam
 from __future__ import annotations
 
 import numbers
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ import numpy.typing as npt
 
 from dolfinx_nts import facets, nts, search
 from dolfinx_nts.friction import return_map
+from dolfinx_nts.obstacles import Obstacle
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.validation import known_options
 
@@ -68,45 +70,76 @@ class ContactPair:
 
     Args:
         slave: Surface whose nodes are kept outside.
-        master: Surface whose facets keep them outside.
+        master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
         friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact never slip.
 
     Raises:
-        TypeError: An argument is not a Surface.
+        TypeError: `slave` is no Surface, or `master` neither that nor an obstacle.
         ValueError: friction is negative or no number, or the surfaces share nodes.
     """
 
-    def __init__(self, slave: Surface, master: Surface, *, friction: float = 0.0) -> None:
+    def __init__(
+        self, slave: Surface, master: Surface | Obstacle, *, friction: float = 0.0
+    ) -> None:
         _check_friction(friction)
-        for name, value in (("slave", slave), ("master", master)):
-            if not isinstance(value, Surface):
-                raise TypeError(f"{name}={value!r}: pass a Surface, e.g. body.surface(marker)")
+        if not isinstance(slave, Surface):
+            raise TypeError(f"slave={slave!r}: pass a Surface, e.g. body.surface(marker)")
+        self.slave, self.friction = slave, float(friction)
+        self.master: Any = master
+        if isinstance(master, Obstacle):
+            return
+        if not isinstance(master, Surface):
+            raise TypeError(
+                f"master={master!r}: pass a Surface, e.g. body.surface(marker), or a Plane, Sphere "
+                "or Cylinder"
+            )
         if slave.body is master.body and np.intersect1d(slave.points, master.points).size:
             raise ValueError(
                 f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
                 "choose disjoint markers"
             )
-        self.slave, self.master, self.friction = slave, master, float(friction)
         self._free_edges = master.boundary_edges
 
     @property
+    def rigid(self) -> bool:
+        """Whether the master is an obstacle, which has neither facets nor unknowns."""
+        return isinstance(self.master, Obstacle)
+
+    @property
+    def bodies(self) -> tuple[Any, ...]:
+        """The slave's and the master's body; the slave's alone before an obstacle."""
+        return (self.slave.body,) if self.rigid else (self.slave.body, self.master.body)
+
+    @property
     def name(self) -> str:
-        """Slave and master body, for messages and files."""
-        return f"{self.slave.body.name}-{self.master.body.name}"
+        """Slave body and master, for messages and files."""
+        master = self.master if self.rigid else self.master.body
+        return f"{self.slave.body.name}-{master.name}"
+
+    def is_like(self, other: ContactPair) -> bool:
+        """Whether both hold the same nodes of bodies of the same names out of the same master."""
+        if self.name != other.name or self.rigid != other.rigid:
+            return False
+        same_nodes = np.array_equal(self.slave.points, other.slave.points)
+        if self.rigid:
+            return same_nodes and bool(self.master == other.master)
+        return same_nodes and np.array_equal(self.master.facets, other.master.facets)
 
     def find(
-        self, slave_u: FloatArray, master_u: FloatArray, current: IntArray, reach: float
+        self, u: Sequence[FloatArray], current: IntArray, reach: float, time: float
     ) -> Candidates:
         """Search for this rank's candidates; every rank must call it.
 
         Args:
-            slave_u: Owned displacements of the slave body [m].
-            master_u: Owned displacements of the master body [m].
+            u: Owned displacements of each of `bodies` at t_n [m].
             current: Facet of each owned slave node in the last step or -1.
             reach: Bound on the relative motion of slave and master in the step [m].
+            time: t_n [s].
         """
-        corners = self.master.positions(master_u)[self.master.facets]
-        x = self.slave.positions(slave_u)[self.slave.owned]
+        if self.rigid:
+            return self._near_obstacle(u[0], reach, time)
+        corners = self.master.positions(u[1])[self.master.facets]
+        x = self.slave.positions(u[0])[self.slave.owned]
         size = facets.size(corners)
         radius = reach + _MARGIN * float(size.max())
         closest = search.closest_facets(x, corners, reach=radius, current=current)
@@ -123,9 +156,21 @@ class ContactPair:
             node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
         )
 
-    def cover(self, master_u: FloatArray, reach: float) -> float:
+    def _near_obstacle(self, u: FloatArray, reach: float, time: float) -> Candidates:
+        """Candidates of an obstacle. Nothing limits the depth: what is behind it is inside."""
+        slave = self.slave
+        x = slave.reference[slave.owned] + u[slave.rows] - self.master.displacement(time)
+        gap, length = self.master.gap(x), np.sqrt(slave.area[slave.owned])
+        movable = ~slave.fixed[slave.owned].all(axis=1)
+        node = np.flatnonzero(movable & (gap.value < reach + _MARGIN * length))
+        only, xi = np.zeros(len(node), dtype=np.int64), np.zeros((len(node), 2))
+        return Candidates(node, only, xi, gap.gradient[node, 0], gap.value[node], length[node])
+
+    def cover(self, u: Sequence[FloatArray], reach: float) -> float:
         """Relative motion [m] for which `find` with this reach misses no contact. Collective."""
-        corners = self.master.positions(master_u)[self.master.facets]
+        if self.rigid:
+            return reach + _MARGIN * float(np.sqrt(self.slave.area.min()))
+        corners = self.master.positions(u[1])[self.master.facets]
         return reach + _MARGIN * float(facets.size(corners).min())
 
     def _over_facet(self, facet: IntArray, xi: FloatArray, reach: FloatArray) -> BoolArray:
@@ -177,7 +222,7 @@ class Contribution(NamedTuple):
     tangential: FloatArray
 
 
-class _Slip(NamedTuple):
+class Slip(NamedTuple):
     """Slip and metric in facet sizes with their derivatives by the unknowns of the element."""
 
     value: FloatArray
@@ -257,7 +302,7 @@ class ContactStep:
         pattern[self._num_constraints :, self._num_constraints :] = True
         return pattern
 
-    def dofs(self) -> tuple[IntArray, IntArray]:
+    def dofs(self) -> tuple[IntArray, ...]:
         """Global coordinates of slaves (n, 3) and facets (n, 3 nc); -1 where prescribed."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
         points, corners = slave.owned[c.node], master.facets[c.facet]
@@ -265,7 +310,7 @@ class ContactStep:
         m = np.where(master.fixed, -1, master.dofs)[corners].reshape(-1, 3 * self.num_corners)
         return s, m
 
-    def points(self) -> tuple[IntArray, IntArray]:
+    def points(self) -> tuple[IntArray, ...]:
         """Global coordinates as in `dofs`, prescribed ones included."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
         corners = master.facets[c.facet]
@@ -279,12 +324,10 @@ class ContactStep:
 
         There the slip is prescribed, sticking is no equation, and lambda_T is set to zero.
         """
-        s, m = self.dofs()
-        free = np.concatenate([s, m], axis=1) >= 0
+        free = np.concatenate(self.dofs(), axis=1) >= 0
         out = np.zeros((self.num_pairs, 2, 2))
         some = np.flatnonzero(~free.all(axis=1))
-        x, xi = self.x0[some], self.candidates.xi[some]
-        gradient = nts.projection(x, xi, np.zeros_like(xi)).gradient
+        gradient = self._slip_gradient(some)
         whole = np.einsum("naz,nbz->nab", gradient, gradient)
         part = np.einsum("naz,nbz->nab", gradient * free[some, None], gradient)
         inverse = np.linalg.inv(np.linalg.cholesky(whole))
@@ -297,6 +340,11 @@ class ContactStep:
         out[both] = np.eye(2)
         return out
 
+    def _slip_gradient(self, some: IntArray) -> FloatArray:
+        """Derivative of the slip of some pairs by the positions, of any size, shape (m, 2, z)."""
+        x, xi = self.x0[some], self.candidates.xi[some]
+        return nts.projection(x, xi, np.zeros_like(xi)).gradient
+
     def reference(self) -> FloatArray:
         """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
@@ -308,6 +356,15 @@ class ContactStep:
         start = self.num_coordinates
         middle = start + self.num_augmented
         return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
+
+    @property
+    def extent(self) -> float:
+        """Length beyond the bodies' positions whose rounding enters the gaps [m]."""
+        return 0.0
+
+    def external_work(self, part: Contribution) -> float:
+        """Work that enters the bodies through the contact: none, as the master is one of them."""
+        return 0.0
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
@@ -346,12 +403,7 @@ class ContactStep:
         """
         scale = self.scale[:, None]
         multiplier = scale * multiplier
-        if self.rule == "direct":
-            residual, tangent, gap, slip = self._direct(x, multiplier)
-        elif self.condense:
-            residual, tangent, gap, slip = self._condensed(x, multiplier)
-        else:
-            residual, tangent, gap, slip = self._invariants(x, augmented, multiplier)
+        residual, tangent, gap, slip = self._element(x, augmented, multiplier)
         part = self._laws(residual, tangent, gap, slip, multiplier)
         if slip is not None:
             part.tangential[:] = self._tangential(x, -residual[:, :3])
@@ -362,10 +414,20 @@ class ContactStep:
         part.tangent[:, :, rows] *= scale[:, None]
         return part
 
+    def _element(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """Residual and tangent in [kg m] and [m], gap and slip, before the laws of contact."""
+        if self.rule == "direct":
+            return self._direct(x, multiplier)
+        if self.condense:
+            return self._condensed(x, multiplier)
+        return self._invariants(x, augmented, multiplier)
+
     def _direct(
         self, x: FloatArray, multiplier: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, _Slip | None]:
-        """Residual and tangent of (x, multipliers) in [kg m] and [m], gap and slip."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """`_element` of (x, multipliers)."""
         n, size, theta = self.num_pairs, self.num_coordinates, self.theta
         middle = self.x0 + theta * (x - self.x0)
         xi_middle, xi_end = self._projection(middle), self._projection(x)
@@ -406,10 +468,10 @@ class ContactStep:
         gradient: FloatArray,
         metric: FloatArray,
         metric_gradient: FloatArray,
-    ) -> _Slip:
+    ) -> Slip:
         """Slip [m] and its gradient as given, the metric per square of the facet size."""
         area = self.candidates.length[:, None, None] ** 2
-        return _Slip(value, gradient, metric / area, metric_gradient / area[..., None])
+        return Slip(value, gradient, metric / area, metric_gradient / area[..., None])
 
     def _projection(self, x: FloatArray) -> FloatArray:
         """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
@@ -419,7 +481,7 @@ class ContactStep:
 
     def _invariants(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, _Slip | None]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
         """Scaled residual and tangent of (x, d, f, multipliers), gap and slip."""
         c, n = self.candidates, self.num_pairs
         length = c.length[:, None]
@@ -461,7 +523,7 @@ class ContactStep:
 
     def _condensed(
         self, x: FloatArray, multiplier: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, _Slip | None]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
         """The element in (x, lambda_N, lambda_T): constraints fix d and f, whose rows fix the rest.
 
         At the projection of t_{n+1} the augmented constraints hold, and the rows of d and f are
@@ -497,7 +559,7 @@ class ContactStep:
         residual: FloatArray,
         tangent: FloatArray,
         gap: FloatArray,
-        slip: _Slip | None,
+        slip: Slip | None,
         multiplier: FloatArray,
     ) -> Contribution:
         """Semi-smooth laws of contact (theory section 9) and friction (section 6).
@@ -538,7 +600,7 @@ class ContactStep:
         self,
         residual: FloatArray,
         tangent: FloatArray,
-        slip: _Slip,
+        slip: Slip,
         multiplier: FloatArray,
         active: BoolArray,
     ) -> BoolArray:

@@ -102,12 +102,18 @@ class _LoadStepper(Stepper):
             forces[k][body.fixed] += t.residual[body.fixed]
             work += 0.5 * float((forces[k] + self._forces[k]) @ (state.u[k] - old.u[k]))
         self._forces = forces
+        resultants, before = self._resultants(step), self.solution.rows[-1]
         terms = balance.step_terms(self.problem, step)
         terms["external_work"] = self.system.comm.allreduce(work)
+        for k, pair in enumerate(self.system.contacts):
+            if pair.rigid:
+                mean = 0.5 * (before["contact_forces"][k] + resultants["contact_forces"][k])
+                path = pair.master.displacement(time) - pair.master.displacement(old.time)
+                terms["external_work"] += float(mean @ path)
         terms |= {"time": time, "newton_iterations": iterations, "contact_defect": 0.0}
         rows, measured = self.solution.rows, balance.measure(self.system, state)
         row = balance.next_row(rows[0], rows[-1], measured, terms)
-        rows.append(row | self._resultants(step))
+        rows.append(row | resultants)
         self._accept(state)
         self.solution.state = state
 

@@ -235,8 +235,8 @@ def _contact_note(c: ContactStep, k: Contribution, flips: IntArray) -> tuple[str
     weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips)
     i = int(np.argmax(weight))
     node = int(c.pair.slave.original[c.pair.slave.owned[c.candidates.node[i]]])
-    facet, count = int(c.candidates.facet[i]), int(flips[i])
-    text = f"contact {c.pair.name!r}: node {node} on facet {facet}, {count} active-set flips"
+    facet = "" if c.pair.rigid else f" on facet {int(c.candidates.facet[i])}"
+    text = f"contact {c.pair.name!r}: node {node}{facet}, {int(flips[i])} active-set flips"
     return c.pair.name, float(weight[i]), text
 
 

@@ -18,6 +18,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts.assembly import ElementBlocks, Layout
 from dolfinx_nts.contact import ContactStep, Contribution
+from dolfinx_nts.obstacle_contact import ObstacleStep
 from dolfinx_nts.system import State, System
 
 FloatArray = npt.NDArray[np.float64]
@@ -152,23 +153,34 @@ class StepProblem:
         stiffness[body.fixed] = 0.0
         return stiffness
 
+    def _path(self, index: int) -> FloatArray:
+        """Displacements of the obstacle of a contact at t_n and t_{n+1} [m], shape (2, 3)."""
+        times = (self.state.time, self.state.time + self.dt)
+        return np.stack([self.system.contacts[index].master.displacement(t) for t in times])
+
     def _reach(self, index: int, motion: FloatArray) -> float:
-        slave, master = self.system.contact_bodies[index]
-        return np.sqrt(3.0) * float(motion[slave] + motion[master])
+        reach = np.sqrt(3.0) * float(sum(motion[b] for b in self.system.contact_bodies[index]))
+        if self.system.contacts[index].rigid:
+            reach += float(np.linalg.norm(np.diff(self._path(index), axis=0)))
+        return reach
 
     def _contact_step(self, index: int) -> ContactStep:
         pair, state = self.system.contacts[index], self.state
-        slave, master = self.system.contact_bodies[index]
+        u = [state.u[b] for b in self.system.contact_bodies[index]]
         reach = self._reach(index, self._motion)
-        found = pair.find(state.u[slave], state.u[master], state.facets[index], reach)
-        corners = pair.master.positions(state.u[master])[pair.master.facets[found.facet]]
-        x = pair.slave.positions(state.u[slave])[pair.slave.owned[found.node]]
-        body = pair.slave.body
-        mass = body.nodal_mass if self.integrator.inertia else body.nodal_stiffness()
-        scale = mass[pair.slave.rows[found.node, 0]]
-        x0 = np.concatenate([x[:, None], corners], axis=1)
-        rule, theta = self.integrator.contact_gradient, self.integrator.theta
-        return ContactStep(pair, found, rule, self._condense, x0, scale, theta)
+        found = pair.find(u, state.facets[index], reach, state.time)
+        slave, rows = pair.slave, pair.slave.rows[found.node]
+        x0 = (slave.reference[slave.owned[found.node]] + u[0][rows])[:, None]
+        mass = slave.body.nodal_mass if self.integrator.inertia else slave.body.nodal_stiffness()
+        scale, theta = mass[rows[:, 0]], self.integrator.theta
+        rule, condense = self.integrator.contact_gradient, self._condense
+        if pair.rigid:
+            path = self._path(index)
+            x0 -= path[0]
+            return ObstacleStep(pair, found, rule, condense, x0, scale, theta, path)
+        corners = pair.master.positions(u[1])[pair.master.facets[found.facet]]
+        x0 = np.concatenate([x0, corners], axis=1)
+        return ContactStep(pair, found, rule, condense, x0, scale, theta)
 
     def _lay_out(self) -> None:
         """Layout, vectors and scatter; kept from step to step while no rank's candidates change."""
@@ -205,8 +217,8 @@ class StepProblem:
         offset = {name: self.layout.start(f) for name, f in self._fields.items()}
         for c, bodies in zip(self.contacts, self.system.contact_bodies, strict=True):
             own = {"augmented": c.num_augmented, "multipliers": c.num_multipliers}
-            widths = [3, 3 * c.num_corners] + [own[name] for name in self._fields]
             numbers = list(c.dofs())
+            widths = [n.shape[1] for n in numbers] + [own[name] for name in self._fields]
             for name in self._fields:
                 count = c.num_pairs * own[name]
                 new = offset[name] + np.arange(count)
@@ -366,8 +378,9 @@ class StepProblem:
     def covers(self, motion: FloatArray) -> bool:
         """Whether the step's candidates are all that may touch in such a motion. Collective."""
         reached = [
-            self._reach(k, motion) <= pair.cover(self.state.u[master], self._reach(k, self._motion))
-            for k, (pair, (_, master)) in enumerate(
+            self._reach(k, motion)
+            <= pair.cover([self.state.u[b] for b in bodies], self._reach(k, self._motion))
+            for k, (pair, bodies) in enumerate(
                 zip(self.system.contacts, self.system.contact_bodies, strict=True)
             )
         ]
@@ -410,13 +423,15 @@ class StepProblem:
         top = _global_max(self.system.comm, np.array(local))
         motion = max(top[0], float(self._motion.max()))
         length = self._rtol * motion + 8 * _EPS * float(self._extent.max())
-        ratio = {}
+        ratio: dict[str, float] = {}
         for c, (a, g, force, scale) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
             broken = np.inf if top[1] else 0.0
+            parts = {"constraints": _over(g, length + 8 * _EPS * c.extent)}
             if c.num_augmented:
-                limit = self._rtol * max(force, scale * motion)
-                ratio[f"{c.pair.name} (d, f)"] = max(_over(a, limit), broken)
-            ratio[f"{c.pair.name} constraints"] = max(_over(g, length), broken)
+                parts["(d, f)"] = _over(a, self._rtol * max(force, scale * motion))
+            for part, value in parts.items():  # several contacts of two bodies have one name
+                name = f"{c.pair.name} {part}"
+                ratio[name] = max(value, broken, ratio.get(name, 0.0))
         return ratio
 
     def destroy(self) -> None:

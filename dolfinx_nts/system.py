@@ -89,23 +89,19 @@ class System:
                     "make all meshes on one"
                 )
         for pair in self.contacts:
-            for role, surface in (("slave", pair.slave), ("master", pair.master)):
-                if not any(surface.body is b for b in self.bodies):
+            for role, body in zip(("slave", "master"), pair.bodies, strict=False):
+                if not any(body is b for b in self.bodies):
                     raise ValueError(
-                        f"contacts: the {role} body {surface.body.name!r} is not among "
+                        f"contacts: the {role} body {body.name!r} is not among "
                         f"bodies={names}; add it"
                     )
         index = {id(b): i for i, b in enumerate(self.bodies)}
-        self.contact_bodies = [
-            (index[id(c.slave.body)], index[id(c.master.body)]) for c in self.contacts
-        ]
+        self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
         self._check_overlap()
         start = self.initial_state()
         depths = self.penetration(start)
-        for k, (pair, (slave, master)) in enumerate(
-            zip(self.contacts, self.contact_bodies, strict=True)
-        ):
-            if slave != master:  # the search looks half a facet deep; this, the whole body
+        for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
+            if len(set(where)) == 2:  # the search looks half a facet deep; this, the whole body
                 depths[k] = np.maximum(depths[k], pair.master.depth(pair.slave.reference))
         self._check_penetration(depths)
 
@@ -151,14 +147,7 @@ class System:
         start = replace(found, time=state.time, u=u)
         for k, pair in enumerate(self.contacts):
             for j, known in enumerate(other.contacts):
-                same = pair.name == known.name and all(
-                    np.array_equal(a, b)
-                    for a, b in (
-                        (pair.slave.points, known.slave.points),
-                        (pair.master.facets, known.master.facets),
-                    )
-                )
-                if same:
+                if pair.is_like(known):
                     for name in ("facets", "force", "gap", "tangential", "stick", "slip"):
                         getattr(start, name)[k][:] = getattr(state, name)[j]
         self._check_penetration(self.penetration(start))
@@ -186,30 +175,37 @@ class System:
         return u
 
     def _check_overlap(self) -> None:
-        """Raise if two contacts hold the same nodes out of the same facets."""
+        """Raise if two contacts hold the same nodes out of the same facets or obstacle."""
         for i, a in enumerate(self.contacts):
             for b in self.contacts[:i]:
-                same = a.slave.body is b.slave.body and a.master.body is b.master.body
-                if same and np.intersect1d(a.slave.points, b.slave.points).size:
+                same = a.slave.body is b.slave.body and a.rigid == b.rigid
+                if not same or not np.intersect1d(a.slave.points, b.slave.points).size:
+                    continue
+                if a.rigid:
+                    overlap, what = a.master == b.master, f"the same {a.master.name}"
+                else:
                     facets = [{tuple(sorted(f)) for f in c.master.points[c.master.facets].tolist()}
                               for c in (a, b)]  # fmt: skip
-                    if facets[0] & facets[1]:
-                        raise ValueError(
-                            f"contacts: two of them hold the same nodes of {a.slave.body.name!r} "
-                            f"out of the same facets of {a.master.body.name!r}; drop one"
-                        )
+                    overlap = a.master.body is b.master.body and bool(facets[0] & facets[1])
+                    what = f"the same facets of {a.master.body.name!r}"
+                if overlap:
+                    raise ValueError(
+                        f"contacts: two of them hold the same nodes of {a.slave.body.name!r} "
+                        f"out of {what}; drop one"
+                    )
 
     def penetration(self, state: State) -> list[FloatArray]:
         """How deep the slaves of each contact lie behind their facets, in facet sizes. Collective.
 
         Returns:
-            Of each contact, shape (points,), the same on all ranks; 0 outside and deep inside.
+            Of each contact, shape (points,), the same on all ranks; 0 outside and, but for
+            obstacles, deep inside.
         """
         depths = []
-        for pair, (slave, master), facets in zip(
+        for pair, bodies, facets in zip(
             self.contacts, self.contact_bodies, state.facets, strict=True
         ):
-            found = pair.find(state.u[slave], state.u[master], facets, 0.0)
+            found = pair.find([state.u[b] for b in bodies], facets, 0.0, state.time)
             depth = np.zeros(len(pair.slave.points))
             depth[pair.slave.owned[found.node]] = np.maximum(-found.gap, 0.0) / found.length
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)

@@ -22,6 +22,8 @@ LEVELS = [
         "rigid",
         "joints",
         "contact",
+        "obstacles",
+        "obstacle_contact",
         "search",
         "surfaces",
         "materials",

@@ -1,0 +1,150 @@
+"""Contact of a surface with a rigid obstacle: the element of `contact` without a facet.
+
+Everything is relative to the obstacle's motion c(t), so that a moving obstacle is one at rest to
+the element; only the balance learns of its work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact import ContactStep, Contribution, Slip
+from dolfinx_nts.nts import Gap
+from dolfinx_nts.obstacles import inverse
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleStep(ContactStep):
+    """The candidates of a surface and an obstacle in one step.
+
+    lambda_N, and with friction lambda_T, are all its unknowns for both integrators: the discrete
+    gradient is in closed form.
+
+    Attributes:
+        x0: Slave at t_n relative to the obstacle's motion [m], shape (n, 1, 3).
+        displacement: c(t_n) and c(t_{n+1}) [m], shape (2, 3).
+    """
+
+    displacement: FloatArray
+
+    @property
+    def num_corners(self) -> int:
+        """None."""
+        return 0
+
+    @property
+    def _only_normal(self) -> bool:
+        return True
+
+    def dofs(self) -> tuple[IntArray, ...]:
+        """Global coordinates of slaves (n, 3); -1 where prescribed."""
+        slave = self.pair.slave
+        return (np.where(slave.fixed, -1, slave.dofs)[slave.owned[self.candidates.node]],)
+
+    def points(self) -> tuple[IntArray, ...]:
+        """Global coordinates as in `dofs`, prescribed ones included."""
+        slave = self.pair.slave
+        return (slave.dofs[slave.owned[self.candidates.node]],)
+
+    def reference(self) -> FloatArray:
+        """Reference positions of slaves [m], shape (n, 1, 3)."""
+        slave = self.pair.slave
+        x: FloatArray = slave.reference[slave.owned[self.candidates.node]][:, None]
+        return x
+
+    def evaluate(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> Contribution:
+        """Residual and tangent of the pairs; pure. Arguments as in `ContactStep`, x (n, 1, 3)."""
+        return super().evaluate(x - self.displacement[1], augmented, multiplier)
+
+    @property
+    def extent(self) -> float:
+        """Of the obstacle and its path [m]."""
+        extent: float = self.pair.master.extent
+        return extent + float(np.abs(self.displacement).max())
+
+    def external_work(self, part: Contribution) -> float:
+        """h^2/2 times the work of the contact forces on the obstacle's path [kg m^2]."""
+        path = self.displacement[1] - self.displacement[0]
+        return -float((part.residual[:, :3] @ path).sum())
+
+    @cached_property
+    def _basis(self) -> FloatArray:
+        """Orthonormal directions along the surface at t_n, shape (n, 2, 3)."""
+        normal = self.candidates.normal
+        first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+        first *= inverse(np.linalg.norm(first, axis=1))[:, None]
+        return np.stack([first, np.cross(normal, first)], axis=1)
+
+    def _slip_gradient(self, some: IntArray) -> FloatArray:
+        gradient: FloatArray = self._basis[some]
+        return gradient
+
+    def _middle(self, x: FloatArray) -> Gap:
+        """Gap and normal where the contact force acts."""
+        gap: Gap = self.pair.master.gap((self.x0 + self.theta * (x - self.x0))[:, 0])
+        return gap
+
+    def _tangential(self, x: FloatArray, force: FloatArray) -> FloatArray:
+        normal = self._middle(x).gradient[:, 0]
+        along: FloatArray = np.einsum("ni,ni->n", force, normal)
+        return force - along[:, None] * normal
+
+    def _element(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """Residual and tangent of (x, lambda_N, lambda_T) in [kg m] and [m], gap and slip."""
+        master, normal = self.pair.master, multiplier[:, :1]
+        end = master.gap(x[:, 0])
+        if self.rule == "direct":
+            middle = self._middle(x)
+            gradient, slope = middle.gradient[:, 0], self.theta * middle.hessian
+        else:
+            gradient, slope = master.discrete_gradient(self.x0[:, 0], x[:, 0])
+        residual = np.zeros((self.num_pairs, 3 + self.num_multipliers))
+        tangent = np.zeros((*residual.shape, residual.shape[1]))
+        residual[:, :3], residual[:, 3] = normal * gradient, end.value
+        tangent[:, :3, :3] = normal[:, :, None] * slope
+        tangent[:, :3, 3], tangent[:, 3, :3] = gradient, end.gradient[:, 0]
+        if not self.num_tangential:
+            return residual, tangent, end.value, None
+        return residual, tangent, end.value, self._add_friction(residual, tangent, x, multiplier)
+
+    def _add_friction(
+        self, residual: FloatArray, tangent: FloatArray, x: FloatArray, multiplier: FloatArray
+    ) -> Slip:
+        """Add lambda_T t^a to the rows of x; returns the slip Df^a = t^a . (x_1 - x_0).
+
+        t_a are the directions e_a of `_basis` less their part along the normal n where the force
+        acts. Dual to them are t^a = e_a - n_0 (n . e_a) / (n . n_0), which lie along the surface,
+        too, and t^a . t_b = t^a . e_b = 1 or 0, because n_0 . e_b = 0.
+        """
+        middle, motion, e = self._middle(x), (x - self.x0)[:, 0], self._basis
+        normal, n0, t = middle.gradient[:, 0], self.candidates.normal, multiplier[:, -2:]
+        part, turn = np.einsum("nai,ni->na", e, normal), self.theta * np.matmul(e, middle.hessian)
+        per_height = inverse(np.einsum("ni,ni->n", normal, n0))[:, None]
+        tilt = part * per_height
+        n0_turn = self.theta * np.einsum("ni,nij->nj", n0, middle.hessian)
+        tilt_gradient = (turn - tilt[:, :, None] * n0_turn[:, None]) * per_height[:, :, None]
+        dual = e - tilt[:, :, None] * n0[:, None]
+
+        residual[:, :3] += np.einsum("na,nai->ni", t, dual)
+        tangent[:, :3, :3] -= n0[:, :, None] * np.einsum("na,naj->nj", t, tilt_gradient)[:, None]
+        tangent[:, :3, -2:] = dual.transpose(0, 2, 1)
+        gradient = np.zeros((self.num_pairs, 2, residual.shape[1]))
+        rise = np.einsum("ni,ni->n", n0, motion)[:, None, None]
+        gradient[..., :3] = dual - rise * tilt_gradient
+        metric_gradient = np.zeros((self.num_pairs, 2, 2, residual.shape[1]))
+        half = -part[:, :, None, None] * turn[:, None]
+        metric_gradient[..., :3] = half + half.transpose(0, 2, 1, 3)
+        metric = np.eye(2) - part[:, :, None] * part[:, None]
+        return Slip(np.einsum("nai,ni->na", dual, motion), gradient, metric, metric_gradient)

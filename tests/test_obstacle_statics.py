@@ -1,0 +1,92 @@
+"""Equilibrium of bodies pressed by rigid planes and spheres without a mesh."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from test_equilibrium import YOUNG, at, cube, stress
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.mpi
+def test_a_plane_presses_like_a_prescribed_face():
+    """Laterally held: P = mu (s - 1/s) + lambda ln s / s, and the work of the mean force."""
+    held = nts.Dirichlet(lambda x: np.full(x.shape[1], True), components=(0, 1))
+    support = nts.Dirichlet(at(2, 0.0), components=(2,))
+    body = cube([held, support])
+    press = nts.Plane((0, 0, 1), (0, 0, -1), motion=lambda t: (0, 0, -0.3 * t))
+    pair = nts.ContactPair(body.surface(lambda x: x[2] > 1 - 1e-9), press)
+    run = nts.equilibrium(nts.System([body], contacts=[pair]), load_steps=4)
+    assert run.status == "completed"
+    stretch = 1 - 0.3 * run.balance["time"]
+    force = stress(stretch, np.log(stretch))
+    assert np.abs(run.contact_forces[:, 0, 2] - force).max() < 1e-11 * YOUNG
+    assert np.abs(run.reactions["cube"][:, -1, 2] + force).max() < 1e-11 * YOUNG
+    mean = 0.5 * (force[1:] + force[:-1]) * np.diff(stretch)
+    assert np.allclose(run.balance["external_work"][1:], np.cumsum(mean), rtol=1e-11)
+
+
+def on_floor(friction, shift):
+    mesh = create_box(
+        COMM, [[0, 0, 0], [1, 1, 0.5]], [3, 3, 2], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    top = nts.Dirichlet(lambda x: x[2] > 0.5 - 1e-9, value=lambda t: (shift * t, 0, -0.02 * t))
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e5, poisson=0.3), density=1e3, bcs=[top], name="block"
+    )
+    floor = nts.Plane((0, 0, 0), (0, 0, 1), name="floor")
+    face = body.surface(lambda x: x[2] < 1e-9)
+    return nts.System([body], contacts=[nts.ContactPair(face, floor, friction=friction)])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("shift", [0.002, 0.1])
+def test_friction_carries_the_shear(shift):
+    """Pressed down and dragged: sticking, or the whole face slides at mu times the pressure."""
+    mu = 0.3
+    run = nts.equilibrium(on_floor(mu, shift), load_steps=10)
+    assert run.status == "completed"
+    force = run.contact_forces[-1, 0]
+    top = run.reactions["block"][-1, 0]
+    assert np.abs(force + top).max() < 1e-9 * force[2]
+    if shift > 0.05:
+        assert run.balance["slip"][-1] == 16
+        assert force[0] == pytest.approx(-mu * force[2], rel=1e-2)
+    else:
+        assert run.balance["stick"][-1] > 0
+        assert -mu * force[2] < force[0] < 0
+
+
+def test_a_ball_is_pressed_into_a_block_and_let_go():
+    """Statics with a moving ball, then a dynamic run that starts there: the ledger closes."""
+    mesh = create_box(COMM, [[-1, -1, -1], [1, 1, 0]], [6, 6, 3], CellType.hexahedron)
+    hold = nts.Dirichlet(lambda x: x[2] < -1 + 1e-9)
+
+    def scene():
+        body = nts.Continuum(
+            mesh, nts.NeoHookean(young=1e4, poisson=0.3), density=1e3, bcs=[hold], name="block"
+        )
+        ball = nts.Sphere(
+            (0.02, 0.01, 1.0), 1.0, motion=lambda t: (0, 0, -0.1 * min(t, 2.0 - t)), name="ball"
+        )
+        face = body.surface(lambda x: x[2] > -1e-9)
+        return nts.System([body], contacts=[nts.ContactPair(face, ball, friction=0.2)])
+
+    pressed = nts.equilibrium(scene(), load_steps=5)
+    assert pressed.status == "completed"
+    force = pressed.contact_forces[-1, 0]
+    assert force[2] < 0
+    assert np.abs(force + pressed.reactions["block"][-1, 0]).max() < 1e-9 * np.abs(force[2])
+    assert pressed.balance["active"][-1] >= 4
+    run = nts.simulate(scene(), nts.EnergyMomentum(), dt=2e-2, t_end=1.6, start=pressed)
+    assert run.status == "completed"
+    table = run.balance
+    top = np.abs(table["energy"]).max()
+    assert table["active"][1] >= 4
+    assert np.abs(table["external_work"]).max() > 0.01 * top
+    assert np.abs(table["ledger_residual"]).max() < 1e-10 * top
+    assert (np.diff(table["friction_dissipation"]) >= -1e-12 * top).all()

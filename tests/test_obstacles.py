@@ -1,0 +1,501 @@
+"""Rigid planes, spheres and cylinders without a mesh, against closed forms and meshed walls."""
+
+import re
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from test_single_mass import INTEGRATORS, MASS, SPEED, STEP, PointMass, PointSurface, turn, wall
+
+import dolfinx_nts as nts
+from dolfinx_nts.output import Fields
+from dolfinx_nts.pictures import picture
+
+COMM = MPI.COMM_WORLD
+ACCELERATION = 9.81
+TURN = turn(1.1)
+CENTRE = np.array([0.4, -0.3, 0.2])
+OBSTACLES = {
+    "plane": nts.Plane(CENTRE, TURN[:, 2]),
+    "sphere": nts.Sphere(CENTRE, 1.3),
+    "bowl": nts.Sphere(CENTRE, 1.3, inside=True),
+    "cylinder": nts.Cylinder(CENTRE, TURN[:, 2], 0.9),
+    "bore": nts.Cylinder(CENTRE, TURN[:, 2], 0.9, inside=True),
+}
+#: Exact for polynomials up to degree 4.
+STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
+
+
+def changed(master, **changes):
+    """The same obstacle with other arguments."""
+    fields = {f: getattr(master, f) for f in master.__dataclass_fields__ if f != "_"}
+    return type(master)(**fields | changes)
+
+
+def point_on(master, position, velocity, gravity=(0.0, 0.0, 0.0), mass=MASS):
+    body = PointMass(COMM, mass, position, velocity)
+    pair = nts.ContactPair(PointSurface(body, position), master)
+    return nts.System([body], contacts=[pair], gravity=gravity)
+
+
+def advance(system, integrator, steps, dt=STEP, newton=None):
+    """Positions and velocities (steps + 1, 3) of the first body, a mass, and the balance."""
+    stepper = nts.Stepper(system, INTEGRATORS[integrator], newton=newton)
+    rows = []
+    for k in range(steps + 1):
+        if k:
+            stepper.advance(dt)
+        x = system.bodies[0].reference + stepper.state.u[0]
+        rows.append(COMM.bcast(np.concatenate([x, stepper.state.v[0]])))
+    stepper.close()
+    rows = np.array(rows)
+    return rows[:, :3], rows[:, 3:], stepper.solution.balance
+
+
+# ---- kernels
+def distance(name, x):
+    """The gaps again, from the definitions."""
+    axis = TURN[:, 2]
+    along = (x - CENTRE) @ axis
+    if name == "plane":
+        return along
+    if name in ("sphere", "bowl"):
+        r = np.sqrt(((x - CENTRE) ** 2).sum(axis=1)) - 1.3
+    else:
+        r = np.sqrt(((x - CENTRE - along[:, None] * axis) ** 2).sum(axis=1)) - 0.9
+    return -r if name in ("bowl", "bore") else r
+
+
+def cloud(seed, n=40):
+    rng = np.random.default_rng(seed)
+    return CENTRE + rng.uniform(-2, 2, (n, 3))
+
+
+def differences(f, x, step=1e-3):
+    """df/dx of a function of points (n, 3), the last axis being x's."""
+    parts = []
+    for i in range(3):
+        e = step * np.eye(3)[i]
+        parts.append(sum(w / step * f(x + k * e) for k, w in STENCIL))
+    return np.stack(parts, axis=-1)
+
+
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_gap_and_its_derivatives(name):
+    obstacle, x = OBSTACLES[name], cloud(0)
+    x = x[np.abs(distance("sphere", x) + 1.3) > 0.2]
+    gap = obstacle.gap(x)
+    np.testing.assert_allclose(gap.value, distance(name, x), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(gap.gradient, axis=2), 1.0, rtol=1e-14)
+    far = np.abs(distance("bore", x) - 0.9) > 0.1
+    expected = differences(lambda y: distance(name, y), x)
+    np.testing.assert_allclose(gap.gradient[far, 0], expected[far], atol=1e-8)
+    slope = differences(lambda y: obstacle.gap(y).gradient[:, 0], x)
+    np.testing.assert_allclose(gap.hessian[far], slope[far], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_discrete_gradient_is_directional_and_consistent(name):
+    obstacle, x0, x1 = OBSTACLES[name], cloud(1), cloud(2)
+    gradient, tangent = obstacle.discrete_gradient(x0, x1)
+    change = distance(name, x1) - distance(name, x0)
+    np.testing.assert_allclose(((x1 - x0) * gradient).sum(axis=1), change, rtol=0, atol=2e-15 * 4)
+    expected = differences(lambda y: obstacle.discrete_gradient(x0, y)[0], x1, 1e-4)
+    np.testing.assert_allclose(tangent, expected, atol=1e-9)
+    # Without motion it is the gradient, half of whose change is the Hessian's.
+    same, half = obstacle.discrete_gradient(x0, x0)
+    np.testing.assert_allclose(same, obstacle.gap(x0).gradient[:, 0], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(half, obstacle.gap(x0).hessian / 2, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["sphere", "bowl", "cylinder", "bore"])
+def test_the_centre_is_far_from_the_surface_and_harmless(name):
+    x = CENTRE[None]
+    gap, (gradient, tangent) = OBSTACLES[name].gap(x), OBSTACLES[name].discrete_gradient(x, x)
+    np.testing.assert_allclose(gap.value, distance(name, x), rtol=1e-15)
+    for array in (gap.gradient, gap.hessian, gradient, tangent):
+        assert np.isfinite(array).all()
+
+
+# ---- the equations of a step
+class Pair:
+    """Step equations of a mass near an obstacle, at chosen unknowns (x, lambda)."""
+
+    def __init__(self, name, integrator, motion=None, friction=0.0):
+        master, start = changed(OBSTACLES[name], motion=motion), self.start(name)
+        # Rank 0 owns the mass; a serial copy on every rank is all these tests need.
+        body = PointMass(MPI.COMM_SELF, MASS, start, (0.0, 0.0, 0.0))
+        pair = nts.ContactPair(PointSurface(body, start), master, friction=friction)
+        stepper = nts.Stepper(nts.System([body], contacts=[pair]), INTEGRATORS[integrator])
+        stepper.problem.begin(stepper.state, STEP)
+        (self.step,) = stepper.problem.contacts
+        stepper.close()
+        self.x = start + np.array([0.11, -0.07, 0.05])
+
+    @staticmethod
+    def start(name):
+        """A point 0.05 off the surface."""
+        direction = {"plane": TURN[:, 2]}.get(name, TURN @ [0.8, -0.6, 0.0])
+        radius = {"plane": 0.05, "sphere": 1.35, "bowl": 1.25, "cylinder": 0.95, "bore": 0.85}
+        return CENTRE + radius[name] * direction
+
+    def residual(self, unknowns):
+        return self.at(unknowns).residual
+
+    def at(self, unknowns):
+        x, multiplier = unknowns[None, None, :3], unknowns[None, 3:]
+        return self.step.evaluate(x, np.empty((1, 0)), multiplier)
+
+
+@pytest.mark.parametrize("active", [True, False])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_tangent_is_the_derivative_of_the_residual(name, integrator, active):
+    pair = Pair(name, integrator, motion=lambda t: (0.3 * t, -t, 2.0 * t))
+    gap = pair.at(np.append(pair.x, 0.0)).gap[0]
+    unknowns = np.append(pair.x, -gap + (-0.3 if active else 0.3))
+    part = pair.at(unknowns)
+    assert part.active.tolist() == [active]
+    step = 1e-3
+    expected = [
+        sum(w / step * pair.residual(unknowns + k * step * e)[0] for k, w in STENCIL)
+        for e in np.eye(4)
+    ]
+    np.testing.assert_allclose(part.tangent[0].T, expected, rtol=0, atol=1e-9 * MASS)
+
+
+@pytest.mark.parametrize("integrator", ["energy-momentum", "gonzalez"])
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_work_of_the_force_is_the_change_of_the_gap(name, integrator):
+    """Relative to a moving obstacle: f . (dx - dc) = -lambda (g_1 - g_0)."""
+    pair = Pair(name, integrator, motion=lambda t: (0.3 * t, -t, 2.0 * t))
+    part = pair.at(np.append(pair.x, -0.7))
+    dc = np.array([0.3, -1.0, 2.0]) * STEP
+    assert part.gap[0] == pytest.approx(distance(name, (pair.x - dc)[None])[0], abs=1e-15)
+    force, dx = -part.residual[0, :3], pair.x - Pair.start(name)
+    change = part.gap[0] - pair.step.candidates.gap[0]
+    assert force @ (dx - dc) == pytest.approx(0.7 * MASS * change, abs=1e-15)
+    assert pair.step.external_work(part) == pytest.approx(force @ dc, abs=1e-15)
+
+
+# ---- one mass
+@pytest.mark.mpi
+@pytest.mark.parametrize("theta", [0.0, 0.1, 0.49, 0.5, 0.51, 1.0])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_rebound_from_a_plane(integrator, theta):
+    """B6: the step that closes the gap leaves 2 theta - 1 of the speed."""
+    start = TURN @ [0.3, 0.2, theta * STEP * SPEED]
+    master = nts.Plane((0, 0, 0), 7.0 * TURN[:, 2])
+    _, v, rows = advance(point_on(master, start, -SPEED * TURN[:, 2]), integrator, 4)
+    expected = [-1.0, 1 - 2 * theta] + 3 * [abs(1 - 2 * theta)]
+    assert np.allclose(v @ TURN[:, 2] / SPEED, expected, rtol=0, atol=1e-12)
+    assert np.allclose(v @ TURN[:, :2], 0.0, rtol=0, atol=1e-12)
+    energy, lost = 0.5 * MASS * SPEED**2, 2 * MASS * SPEED**2 * theta * (1 - theta)
+    assert np.allclose(rows["contact_defect"][1:], lost, rtol=0, atol=1e-12 * energy)
+    assert np.abs(rows["ledger_residual"]).max() < 1e-12 * energy
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_plane_is_a_fixed_facet(integrator):
+    """Bouncing obliquely under gravity: the same path as on the face of a fixed hexahedron."""
+    start, velocity, gravity = np.array([0.3, 0.2, 0.04]), (0.4, -0.7, -SPEED), (0, 1.0, -30.0)
+    body, face, _ = wall()
+    mass = PointMass(COMM, MASS, start, velocity)
+    pair = nts.ContactPair(PointSurface(mass, start), face)
+    meshed = advance(
+        nts.System([mass, body], contacts=[pair], gravity=gravity), integrator, 20
+    )  # fmt: skip
+    plane = nts.Plane((5.0, -3.0, 0.0), (0.0, 0.0, 1.0))
+    analytic = advance(point_on(plane, start, velocity, gravity), integrator, 20)
+    assert analytic[2]["active"].sum() > 2
+    for a, b in zip(analytic[:2], meshed[:2], strict=True):
+        assert np.abs(a - b).max() < 1e-12 * SPEED
+    for name in ("energy", "external_work", "contact_defect", "active"):
+        assert np.abs(analytic[2][name] - meshed[2][name]).max() < 1e-12 * MASS * SPEED**2, name
+
+
+BOWLS = {
+    "sphere": nts.Sphere((0, 0, 0), 1.0, inside=True),
+    "cylinder": nts.Cylinder((0.3, 0, 0), (1, 0, 0), 1.0, inside=True),
+}
+
+
+@pytest.mark.parametrize("rule", ["mean-value", "gonzalez"])
+@pytest.mark.parametrize("bowl", BOWLS)
+def test_sliding_in_a_bowl_keeps_the_energy(bowl, rule):
+    """Round and round without friction, from contact: nothing is lost over many steps."""
+    start, velocity = np.array([0.0, 0.0, -1.0]), np.array([0.5, 8.0, 0.0])
+    system = point_on(BOWLS[bowl], start, velocity, (0.0, 0.0, -ACCELERATION))
+    integrator = {"mean-value": "energy-momentum"}.get(rule, rule)
+    # Newton's own tolerance would add up to 1e-12 of the work of the force in each step.
+    x, v, rows = advance(system, integrator, 400, newton=nts.Newton(rtol=1e-15))
+    kinetic = 0.5 * MASS * velocity @ velocity
+    energy = 0.5 * MASS * (v**2).sum(axis=1) + MASS * ACCELERATION * (x[:, 2] + 1)
+    assert rows["active"][1:].all()
+    assert np.abs(energy - kinetic).max() < 1e-12 * kinetic
+    assert np.abs(rows["ledger_residual"]).max() < 1e-12 * kinetic
+    assert np.abs(rows["min_gap"][1:]).max() < 1e-13
+    if bowl == "cylinder":  # along the axis nothing acts
+        assert np.allclose(v[:, 0], 0.5, rtol=0, atol=1e-12)
+    # Both went over the top.
+    assert x[:, 2].max() > 0.99
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_without_gravity_a_mass_in_a_sphere_follows_a_great_circle(integrator):
+    """A radial force has no moment: the plane of motion and the angular momentum stay."""
+    start, velocity = TURN @ [0.0, 0.0, -1.0], TURN @ [0.6, 0.8, 0.0]
+    system = point_on(BOWLS["sphere"], start, velocity)
+    x, v, rows = advance(system, integrator, 300)
+    momentum = MASS * np.cross(start, velocity)
+    assert np.allclose(rows["angular_momentum"], momentum, rtol=0, atol=1e-12 * MASS)
+    assert np.abs(x @ momentum).max() < 1e-12 * MASS
+    assert np.allclose(np.linalg.norm(x, axis=1), 1.0, rtol=0, atol=1e-12)
+    # Chords of equal length: half of each is sin(angle / 2).
+    angle = np.arcsin(np.linalg.norm(np.diff(x, axis=0), axis=1) / 2) * 2
+    assert np.ptp(angle) < 1e-10
+    assert angle[0] == pytest.approx(STEP, rel=STEP**2)
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+@pytest.mark.parametrize("bowl", BOWLS)
+def test_small_oscillations_have_the_period_of_a_pendulum(bowl, integrator):
+    """2 pi sqrt(R/g) (1 + A^2/16), at second order in the step."""
+    amplitude, errors = 0.02, []
+    exact = 2 * np.pi / np.sqrt(ACCELERATION) * (1 + amplitude**2 / 16)
+    for per_period in (25, 50, 100):
+        start = np.array([0.0, np.sin(amplitude), -np.cos(amplitude)])
+        system = point_on(BOWLS[bowl], start, (0, 0, 0), (0, 0, -ACCELERATION))
+        dt = exact / per_period
+        x, _, rows = advance(system, integrator, 5 * per_period // 2, dt)
+        assert rows["active"][1:].all()
+        t, y = dt * np.arange(len(x)), x[:, 1]
+        zeros = np.flatnonzero(y[:-1] * y[1:] < 0)
+        times = t[zeros] - y[zeros] * dt / (y[zeros + 1] - y[zeros])
+        errors.append(times[4] / (2.25 * exact) - 1.0)
+    rates = np.log2(np.abs(errors[:-1]) / np.abs(errors[1:]))
+    assert np.abs(rates - 2).max() < 0.1, (errors, rates)
+
+
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_units(name):
+    """Lengths in m, mm and um: the same iterations, as nothing is absolute."""
+    runs = []
+    for metre in (1.0, 1e3, 1e6):
+        lengths = {"point", "centre", "radius"} & set(OBSTACLES[name].__dataclass_fields__)
+        fields = {f: metre * np.asarray(getattr(OBSTACLES[name], f)) for f in lengths}
+        if "radius" in fields:
+            fields["radius"] = float(fields["radius"])
+        toward = CENTRE + TURN @ [0.3, 0.1, -0.2] - Pair.start(name)
+        if name in ("bowl", "bore"):
+            toward = np.cross(toward, TURN @ [0.5, 0.3, 0.4]) - 0.5 * toward
+        system = point_on(
+            changed(OBSTACLES[name], **fields), metre * Pair.start(name), 3.0 * metre * toward,
+            metre * np.array([0.0, 0.0, -ACCELERATION]),
+        )  # fmt: skip
+        system.contacts[0].slave.area *= metre**2
+        runs.append(advance(system, "energy-momentum", 60))
+    assert runs[0][2]["active"].any()
+    for (x, v, rows), metre in zip(runs[1:], (1e3, 1e6), strict=True):
+        assert np.array_equal(rows["newton_iterations"], runs[0][2]["newton_iterations"])
+        assert np.array_equal(rows["active"], runs[0][2]["active"])
+        assert np.allclose(x / metre, runs[0][0], rtol=0, atol=1e-9)
+        assert np.allclose(v / metre, runs[0][1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("far", [1e3, 1e6, 1e9])
+def test_far_away_obstacles(far):
+    """Their rounding is no failure: a huge ball, or a plane given by a far point, is a floor."""
+    normal = TURN @ [0.0, 0.0, 1.0]
+    masters = [
+        nts.Plane((0, 0, 0), normal),
+        nts.Plane(far * TURN[:, 0], normal),
+        nts.Sphere(-far * normal, far),
+        nts.Sphere(far * normal, far, inside=True),
+        nts.Cylinder(-far * normal, TURN[:, 1], far),
+    ]
+    speeds = []
+    for master in masters:
+        start, velocity, gravity = TURN @ [0.3, 0.2, 0.04], TURN @ [0, 0, -SPEED], -30 * normal
+        _, v, rows = advance(point_on(master, start, velocity, gravity), "energy-momentum", 12)
+        assert rows["active"].sum() > 1
+        speeds.append(v)
+    for v in speeds[1:]:
+        assert np.abs(v - speeds[0]).max() < 100 / far + 1e-14 * far / STEP
+
+
+# ---- obstacles that move
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", ["energy-momentum", "gonzalez"])
+def test_a_rising_floor_lifts_a_mass(integrator):
+    """The floor's work is the energy the mass gains, with gravity's."""
+    rise, start = 0.5, (0.3, -0.2, 0.0)
+    floor = nts.Plane((0, 0, 0), (0, 0, 1), motion=lambda t: (3.0 * t, 0, rise * t))
+    system = point_on(floor, start, (0, 0, rise), (0, 0, -ACCELERATION))
+    x, v, rows = advance(system, integrator, 20)
+    t = STEP * np.arange(21)
+    assert np.allclose(x[:, 2], rise * t, rtol=0, atol=1e-14)
+    assert np.allclose(x[:, :2], start[:2], rtol=0, atol=1e-14)
+    # Lifting at constant speed: the floor does what gravity takes.
+    assert np.allclose(rows["energy"], 0.5 * MASS * rise**2, rtol=0, atol=1e-13)
+    assert np.abs(rows["external_work"]).max() < 1e-13 * MASS * ACCELERATION
+    assert np.abs(rows["ledger_residual"]).max() < 1e-13
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_ledger_closes_with_a_shaking_obstacle(name):
+    """Hit, lifted and dropped by an obstacle that shakes: every loss is an activation."""
+    shaken = changed(
+        OBSTACLES[name], motion=lambda t: 0.2 * np.sin(15 * t) * np.array([1.0, -0.5, 0.7])
+    )
+    pull = -20 * TURN[:, 2] if name == "plane" else 20 * (CENTRE - Pair.start(name))
+    if name in ("bowl", "bore"):
+        pull = -pull
+    system = point_on(shaken, Pair.start(name), (0.2, -0.3, 0.1), pull)
+    _, v, rows = advance(system, "energy-momentum", 150)
+    top = rows["energy"].max()
+    assert rows["active"].sum() > 5
+    assert np.abs(np.diff(rows["external_work"])).max() > 0.01 * top
+    assert (np.diff(rows["contact_defect"]) >= -1e-13 * top).all()
+    assert np.abs(rows["ledger_residual"]).max() < 1e-12 * top
+    assert rows["min_gap"].min() > -1e-13
+
+
+def test_a_floor_that_flees_does_not_pull():
+    floor = nts.Plane((0, 0, 0), (0, 0, 1), motion=lambda t: (0, 0, -t))
+    x, _, rows = advance(point_on(floor, (0, 0, 0), (0.1, 0, 0)), "midpoint", 5)
+    assert not rows["active"].any()
+    assert np.allclose(x[:, 2], 0.0, rtol=0, atol=0)
+
+
+# ---- bodies
+def block(low=(0.1, 0.1, 0.005), size=0.8, n=2, velocity=(0.3, 0.0, -1.0), name="block"):
+    low = np.array(low)
+    mesh = create_box(
+        COMM, [low, low + size], [n, n, n], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
+    )
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e5, poisson=0.3), density=1e3, velocity=velocity, name=name
+    )
+    return body, body.surface(lambda x: x[2] < low[2] + 1e-9)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_block_falls_on_a_plane_as_on_a_plate(integrator):
+    gravity, tables, ends = (0.0, 0.0, -9.81), [], []
+    for meshed in (True, False):
+        body, face = block()
+        if meshed:
+            mesh = create_box(
+                COMM, [[-1, -1, -1], [2, 2, 0]], [3, 3, 1], CellType.hexahedron,
+                ghost_mode=GhostMode.shared_facet,
+            )  # fmt: skip
+            hold = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
+            plate = nts.Continuum(
+                mesh, nts.StVenantKirchhoff(1e5, 0.3), density=1e3, bcs=[hold], name="plate"
+            )
+            pair = nts.ContactPair(face, plate.surface(lambda x: x[2] > -1e-9))
+            system = nts.System([body, plate], contacts=[pair], gravity=gravity)
+        else:
+            pair = nts.ContactPair(face, nts.Plane((0, 0, 0), (0, 0, 1)))
+            system = nts.System([body], contacts=[pair], gravity=gravity)
+        stepper = nts.Stepper(system, INTEGRATORS[integrator])
+        for _ in range(40):
+            state = stepper.advance(2e-3)
+        tables.append(stepper.solution.balance)
+        ends.append(state.u[0])
+        stepper.close()
+    assert tables[0]["active"].max() == 9
+    assert np.array_equal(tables[0]["active"], tables[1]["active"])
+    assert np.abs(ends[0] - ends[1]).max(initial=0.0) < 1e-10
+    energy = tables[0]["energy"][0]
+    for name in ("energy", "external_work", "contact_defect", "ledger_residual"):
+        assert np.abs(tables[0][name] - tables[1][name]).max() < 1e-9 * energy, name
+    if integrator != "midpoint":
+        assert np.abs(tables[1]["ledger_residual"]).max() < 1e-11 * energy
+
+
+@pytest.mark.mpi
+def test_facets_and_obstacles_in_one_scene(mpi_tmp_path):
+    """A block on a block on a floor between two walls; fields and balance are written."""
+    low, low_face = block((0, 0, 0.002), 1.0, name="low", velocity=(0.4, 0, 0))
+    high, high_face = block((0.1, 0.1, 1.004), name="high")
+    floor = nts.Plane((0, 0, 0), (0, 0, 1), name="floor")
+    walls = [nts.Plane((x, 0, 0), (1 - 2 * x, 0, 0)) for x in (0, 1)]
+    sides = low.surface(lambda x: (x[0] < 1e-9)), low.surface(lambda x: x[0] > 1 - 1e-9)
+    contacts = [
+        nts.ContactPair(low_face, floor),
+        nts.ContactPair(high_face, low.surface(lambda x: x[2] > 1.002 - 1e-9)),
+        *(nts.ContactPair(side, w) for side, w in zip(sides, walls, strict=True)),
+    ]
+    system = nts.System([low, high], contacts=contacts, gravity=(0, 0, -9.81))
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=2e-3, t_end=0.03,
+        output=[Fields(mpi_tmp_path)],
+    )  # fmt: skip
+    assert run.status == "completed"
+    energy = np.abs(run.balance["energy"]).max()
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * energy
+    assert run.balance["active"].max() > 10
+    if COMM.rank == 0:
+        text = (mpi_tmp_path / "low.xdmf").read_text()
+        names = set(re.findall(r'Attribute Name="contact_force_([^"]*)"', text))
+        assert names == {"low-floor", "low-plane_2", "low-plane_3"}
+    picture(system.bodies, mpi_tmp_path / "scene.png")
+
+
+# ---- bad input
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: nts.Plane((0, 0), (0, 0, 1)), r"point=\(0, 0\): pass three finite"),
+        (lambda: nts.Plane((0, 0, 0), (0, 0, 0)), r"normal=\(0, 0, 0\): has no direction"),
+        (lambda: nts.Plane((0, 0, 0), (0, 0, np.nan)), "normal=.*three finite"),
+        (lambda: nts.Sphere((0, 0, 0), 0.0), "radius=0.0: must be positive"),
+        (lambda: nts.Sphere((0, 0, np.inf), 1.0), "centre=.*three finite"),
+        (lambda: nts.Sphere((0, 0, 0), 1.0, inside=3), "inside=3: pass True"),
+        (lambda: nts.Cylinder((0, 0, 0), (0, 0, 0), 1.0), "axis=.*no direction"),
+        (lambda: nts.Cylinder((0, 0, 0), (0, 0, 1), -1.0), "radius=-1.0"),
+        (lambda: nts.Plane((0, 0, 0), (0, 0, 1), motion=3.0), "motion=3.0: pass a function"),
+        (lambda: nts.Plane((0, 0, 0), (0, 0, 1), motion=lambda t: t), "motion of 'plane' at t=0"),
+        (lambda: nts.Plane((0, 0, 0), (0, 0, 1), motion=lambda t: (0, 0, 1 + t)), "start at zero"),
+        (lambda: nts.Plane((0, 0, 0), (0, 0, 1), speed=1), "speed=1: unknown option of Plane"),
+    ],
+)
+def test_bad_obstacles(make, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        make()
+
+
+@pytest.mark.mpi
+def test_bad_contacts():
+    body, face = block()
+    plane = nts.Plane((0, 0, 0), (0, 0, 1))
+    with pytest.raises(TypeError, match="master=3.0: pass a Surface.*Plane"):
+        nts.ContactPair(face, 3.0)
+    with pytest.raises(TypeError, match="slave=Plane"):
+        nts.ContactPair(plane, face)
+    other, _ = block(name="other")
+    with pytest.raises(ValueError, match="slave body 'block' is not among"):
+        nts.System([other], contacts=[nts.ContactPair(face, plane)])
+    twice = [nts.ContactPair(face, nts.Plane((0, 0, 0), (0, 0, s)), friction=0.0) for s in (1, 2)]
+    with pytest.raises(ValueError, match="same nodes of 'block' out of the same plane"):
+        nts.System([body], contacts=twice)
+    deep = nts.Plane((0, 0, 0.5), (0, 0, 1), name="floor")
+    with pytest.raises(ValueError, match="'block-floor': 9 slave nodes start inside the master"):
+        nts.System([body], contacts=[nts.ContactPair(face, deep)])
+
+
+@pytest.mark.mpi
+def test_a_motion_that_breaks_down_raises_on_all_ranks():
+    motion = {0.0: (0, 0, 0)}
+    floor = nts.Plane((0, 0, -1), (0, 0, 1), motion=lambda t: motion.get(t, (0, 0, np.nan)))
+    body, face = block()
+    system = nts.System([body], contacts=[nts.ContactPair(face, floor)])
+    with pytest.raises(ValueError, match=r"motion of 'plane' at t=0.001=.*three finite"):
+        nts.simulate(system, nts.Midpoint(), dt=1e-3, t_end=1e-3)
