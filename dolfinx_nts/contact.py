@@ -380,10 +380,14 @@ class ContactStep:
         out = np.zeros((self.num_pairs, self.num_multipliers))
         out[:, 0] = -normal
         if self.num_tangential:
-            _, tangents, _ = facets.frame(self.x0[:, 1:], self.candidates.xi)
-            out[:, -2:] = -np.einsum("nai,ni->na", tangents, tangential)
-            out[:, -2:] /= self.candidates.length[:, None]
+            out[:, -2:] = -np.einsum("nai,ni->na", self._tangents(), tangential)
         return out
+
+    def _tangents(self) -> FloatArray:
+        """Tangents a_a of the facets at t_n over their size [-], shape (n, 2, 3)."""
+        _, tangents, _ = facets.frame(self.x0[:, 1:], self.candidates.xi)
+        scaled: FloatArray = tangents / self.candidates.length[:, None, None]
+        return scaled
 
     def _augmented(self, x: FloatArray) -> FloatArray:
         xi = self._projection(x)

@@ -77,6 +77,10 @@ class ObstacleStep(ContactStep):
         path = self.displacement[1] - self.displacement[0]
         return -float((part.residual[:, :3] @ path).sum())
 
+    def _tangents(self) -> FloatArray:
+        tangents: FloatArray = self._basis
+        return tangents
+
     @cached_property
     def _basis(self) -> FloatArray:
         """Orthonormal directions along the surface at t_n, shape (n, 2, 3)."""

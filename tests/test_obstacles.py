@@ -361,7 +361,8 @@ def test_ledger_closes_with_a_shaking_obstacle(name):
     assert np.abs(np.diff(rows["external_work"])).max() > 0.01 * top
     assert (np.diff(rows["contact_defect"]) >= -1e-13 * top).all()
     assert np.abs(rows["ledger_residual"]).max() < 1e-12 * top
-    assert rows["min_gap"].min() > -1e-13
+    # Newton's tolerance is relative to the motion of a step, the mass' or the obstacle's.
+    assert rows["min_gap"].min() > -2e-12 * STEP * max(np.abs(v).max(), 0.2 * 15)
 
 
 def test_a_floor_that_flees_does_not_pull():
