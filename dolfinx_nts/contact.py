@@ -100,14 +100,15 @@ class ContactPair:
             current: Facet of each owned slave node in the last step or -1.
             reach: Bound on the relative motion of slave and master in the step [m].
         """
-        corners = self.master.positions(master_u)[self.master.facets]
+        master = self.master.positions(master_u)
+        corners = master[self.master.facets]
         x = self.slave.positions(slave_u)[self.slave.owned]
         size = facets.size(corners)
         radius = reach + _MARGIN * float(size.max())
         closest = search.closest_facets(x, corners, reach=radius, current=current)
         node = np.flatnonzero(closest.facet >= 0)
         facet = closest.facet[node]
-        pair = corners[facet]
+        pair = self.master.control_points(master, facet)
         xi, converged = facets.project(x[node], pair, closest.xi[node])
         foot, _, normal = facets.frame(pair, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
@@ -129,7 +130,7 @@ class ContactPair:
     def _movable(self, node: IntArray, facet: IntArray) -> BoolArray:
         """Whether any coordinate of a pair is free; without one there is nothing to solve for."""
         slave = self.slave.fixed[self.slave.owned[node]].all(axis=1)
-        master = self.master.fixed[self.master.facets[facet]].all(axis=(1, 2))
+        master = self.master.fixed[self.master.patches[facet]].all(axis=(1, 2))
         return ~(slave & master)
 
 
@@ -163,7 +164,7 @@ class ContactStep:
         candidates: This rank's slave nodes and their facets.
         rule: "direct" for the midpoint rule, else the discrete gradient.
         condense: Whether (d, f) and their multipliers are eliminated pair by pair.
-        x0: Slave and corners at t_n [m], shape (n, nc + 1, 3).
+        x0: Slave and corners, or control points of the patch, at t_n [m], shape (n, nc + 1, 3).
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
             nodal mass [kg] in dynamics; scales multipliers and the active set.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
@@ -184,8 +185,8 @@ class ContactStep:
 
     @property
     def num_corners(self) -> int:
-        """Corners of a master facet."""
-        return self.pair.master.facets.shape[1]
+        """Points that the master surface over a facet depends on: its corners, or its patch's."""
+        return self.pair.master.patches.shape[1]
 
     @property
     def num_coordinates(self) -> int:
@@ -209,7 +210,7 @@ class ContactStep:
     def dofs(self) -> tuple[IntArray, IntArray]:
         """Global coordinates of slaves (n, 3) and facets (n, 3 nc); -1 where prescribed."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
-        points, corners = slave.owned[c.node], master.facets[c.facet]
+        points, corners = slave.owned[c.node], master.patches[c.facet]
         s = np.where(slave.fixed, -1, slave.dofs)[points]
         m = np.where(master.fixed, -1, master.dofs)[corners].reshape(-1, 3 * self.num_corners)
         return s, m
@@ -217,7 +218,7 @@ class ContactStep:
     def points(self) -> tuple[IntArray, IntArray]:
         """Global coordinates as in `dofs`, prescribed ones included."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
-        corners = master.facets[c.facet]
+        corners = master.patches[c.facet]
         return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(
             -1, 3 * self.num_corners
         )
@@ -226,7 +227,7 @@ class ContactStep:
         """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
         nodes = slave.reference[slave.owned[c.node]]
-        return np.concatenate([nodes[:, None], master.reference[master.facets[c.facet]]], axis=1)
+        return np.concatenate([nodes[:, None], master.reference[master.patches[c.facet]]], axis=1)
 
     def rows(self, k: Contribution, name: str) -> FloatArray:
         """The residual's rows of "augmented" unknowns or "multipliers", shape (n, width)."""
@@ -236,7 +237,30 @@ class ContactStep:
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
-        return self._augmented(x) if self.num_augmented else np.empty((self.num_pairs, 0))
+        if not self.num_augmented:
+            return np.empty((self.num_pairs, 0))
+        return self._augmented(self._control(x))
+
+    def _control(self, x: FloatArray) -> FloatArray:
+        """Slave and control points from slave and points of the patch, both (n, nc + 1, 3)."""
+        control = self.pair.master.combine(x[:, 1:], self.candidates.facet)
+        return np.concatenate([x[:, :1], control], axis=1)
+
+    def _to_points(self, part: Contribution) -> None:
+        """The transpose of `_control`: forces and tangents of control points to their points."""
+        weights = self.pair.master.weights
+        if weights is None:
+            return
+        n, size = part.residual.shape
+        rows, middle = slice(3, self.num_coordinates), (self.num_corners, 3)
+        w = weights[self.candidates.facet].transpose(0, 2, 1)
+        part.residual[:, rows] = np.matmul(w, part.residual[:, rows].reshape(n, *middle)).reshape(
+            n, -1
+        )
+        columns = part.tangent[:, :, rows].reshape(n, size, *middle)
+        part.tangent[:, :, rows] = np.matmul(w[:, None], columns).reshape(n, size, -1)
+        lines = part.tangent[:, rows].reshape(n, self.num_corners, -1)
+        part.tangent[:, rows] = np.matmul(w, lines).reshape(n, -1, size)
 
     def _augmented(self, x: FloatArray) -> FloatArray:
         xi = self._projection(x)
@@ -255,7 +279,8 @@ class ContactStep:
                 (n, 1).
         """
         scale = self.scale[:, None]
-        part = self._evaluate(x, augmented, scale * multiplier)
+        part = self._evaluate(self._control(x), augmented, scale * multiplier)
+        self._to_points(part)
         # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
         rows = slice(part.residual.shape[1] - self.num_multipliers, None)
         part.residual[:, rows] *= scale

@@ -125,7 +125,7 @@ class StepProblem:
         slave, master = self.system.contact_bodies[index]
         reach = np.sqrt(3.0) * float(self._motion[slave] + self._motion[master])
         found = pair.find(state.u[slave], state.u[master], state.facets[index], reach)
-        corners = pair.master.positions(state.u[master])[pair.master.facets[found.facet]]
+        corners = pair.master.control_points(pair.master.positions(state.u[master]), found.facet)
         x = pair.slave.positions(state.u[slave])[pair.slave.owned[found.node]]
         scale = pair.slave.body.nodal_mass[pair.slave.rows[found.node, 0]]
         x0 = np.concatenate([x[:, None], corners], axis=1)
