@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts import facets, nts, search
+from dolfinx_nts import facets, nts, patches, search
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.validation import known_options
 
@@ -83,6 +83,7 @@ class ContactPair:
             )
         self.slave, self.master = slave, master
         self._free_edges = master.boundary_edges
+        self._joined = patches.neighbours(master.facets, master.reference[master.facets])
 
     @property
     def name(self) -> str:
@@ -90,7 +91,12 @@ class ContactPair:
         return f"{self.slave.body.name}-{self.master.body.name}"
 
     def find(
-        self, slave_u: FloatArray, master_u: FloatArray, current: IntArray, reach: float
+        self,
+        slave_u: FloatArray,
+        master_u: FloatArray,
+        current: IntArray,
+        reach: float,
+        ahead: tuple[FloatArray, FloatArray] | None = None,
     ) -> Candidates:
         """Search for this rank's candidates; every rank must call it.
 
@@ -99,25 +105,72 @@ class ContactPair:
             master_u: Owned displacements of the master body [m].
             current: Facet of each owned slave node in the last step or -1.
             reach: Bound on the relative motion of slave and master in the step [m].
+            ahead: Displacements of both bodies expected until the middle of the step [m].
         """
         master = self.master.positions(master_u)
         corners = master[self.master.facets]
         x = self.slave.positions(slave_u)[self.slave.owned]
-        size = facets.size(corners)
-        radius = reach + _MARGIN * float(size.max())
+        radius = reach + _MARGIN * float(facets.size(corners).max())
         closest = search.closest_facets(x, corners, reach=radius, current=current)
         node = np.flatnonzero(closest.facet >= 0)
-        facet = closest.facet[node]
+        found = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
+        if ahead is None:
+            return found
+        motion = self.slave.gather(ahead[0])[self.slave.owned], self.master.gather(ahead[1])
+        change, facet = self._crossings(found, master, *motion)
+        start, _ = facets.closest_point(x[found.node[change]], corners[facet])
+        other = self._measure(x, master, found.node[change], facet, start, reach)
+        stay = ~np.isin(found.node, other.node)
+        order = np.argsort(np.concatenate([found.node[stay], other.node]))
+        return Candidates(
+            *(np.concatenate([a[stay], b])[order] for a, b in zip(found, other, strict=True))
+        )
+
+    def _measure(
+        self,
+        x: FloatArray,
+        master: FloatArray,
+        node: IntArray,
+        facet: IntArray,
+        start: FloatArray,
+        reach: float,
+    ) -> Candidates:
+        """Those of the pairs (node, facet) that may touch; projected from `start`."""
         pair = self.master.control_points(master, facet)
-        xi, converged = facets.project(x[node], pair, closest.xi[node])
+        xi, converged = facets.project(x[node], pair, start)
         foot, _, normal = facets.frame(pair, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
-        length = size[facet]
+        length = facets.size(pair)
         legal = converged & self._over_facet(facet, xi, reach / length) & self._movable(node, facet)
         legal &= (gap > -_MARGIN * length) & (gap < reach + _MARGIN * length)
         return Candidates(
             node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
         )
+
+    def _crossings(
+        self, c: Candidates, master: FloatArray, slave_motion: FloatArray, master_motion: FloatArray
+    ) -> tuple[IntArray, IntArray]:
+        """Candidates that slide over an edge before the middle of the step, and their next facet.
+
+        A facet that holds the longer part of the path makes g_0 as often positive as negative, so
+        that what changes of facet cost and bring cancels in the long run.
+        """
+        nc = self.master.facets.shape[1]
+        pair = self.master.control_points(master, c.facet)
+        shape, _, _ = facets.shape(c.xi, pair.shape[1])
+        _, tangents, _ = facets.frame(pair, c.xi)
+        motion = slave_motion[c.node]
+        carried = self.master.control_points(master_motion, c.facet)
+        motion = motion - np.einsum("ni,nij->nj", shape, carried)
+        metric = np.einsum("naj,nbj->nab", tangents, tangents)
+        slide = _solve(metric, np.einsum("naj,nj->na", tangents, motion))
+        before, after = (facets.edge_excess(xi, nc) for xi in (c.xi, c.xi + slide))
+        edge = after.argmax(axis=1)
+        pairs = np.arange(len(edge))
+        joined = self._joined[c.facet, edge]
+        over = (before.max(axis=1) <= 0.0) & (after[pairs, edge] > search.PREFERENCE)
+        change = np.flatnonzero(over & (joined >= 0))
+        return change, joined[change] // nc
 
     def _over_facet(self, facet: IntArray, xi: FloatArray, reach: FloatArray) -> BoolArray:
         """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide."""

@@ -102,19 +102,27 @@ def along(xi: FloatArray, step: FloatArray) -> FloatArray:
     return out
 
 
-def _neighbours(facets: IntArray, normal: FloatArray) -> IntArray:
-    """Number 4 f + k of the edge that facet f's edge k (corner k to k + 1) is smoothly joined to.
+def neighbours(facets: IntArray, corners: FloatArray) -> IntArray:
+    """Number nc f + k of the edge that facet f's edge k (corner k to k + 1) is smoothly joined to.
+
+    Args:
+        facets: Points of each facet, cyclic, same orientation for all, shape (m, nc).
+        corners: Their positions in the reference configuration [m], shape (m, nc, 3).
 
     Returns:
-        Shape (m, 4); -1 at the end of the surface, at sharp edges and where it branches.
+        Shape (m, nc); -1 at the end of the surface, at sharp edges and where it branches.
     """
+    nc = facets.shape[1]
+    spans = corners - corners[:, :1]
+    normal = np.cross(spans, np.roll(spans, -1, axis=1)).sum(axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     start, end = facets.ravel(), np.roll(facets, -1, axis=1).ravel()
     order = np.lexsort((np.maximum(start, end), np.minimum(start, end)))
     key = np.sort(np.column_stack([start, end])[order], axis=1)
     first = np.flatnonzero(np.r_[True, (key[1:] != key[:-1]).any(axis=1)])
     count = np.diff(first, append=len(key))
     one, two = order[first[count == 2]], order[first[count == 2] + 1]
-    smooth = np.einsum("ni,ni->n", normal[one // 4], normal[two // 4]) >= _SHARP
+    smooth = np.einsum("ni,ni->n", normal[one // nc], normal[two // nc]) >= _SHARP
     smooth &= start[one] == end[two]
     across = np.full(len(start), -1)
     across[one[smooth]], across[two[smooth]] = two[smooth], one[smooth]
@@ -144,9 +152,7 @@ def control_net(facets: IntArray, corners: FloatArray) -> tuple[IntArray, FloatA
         control points, 16 points) [-]; and which facets have an irregular corner, shape (m,).
     """
     m = len(facets)
-    normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    edge = _neighbours(facets, normal)
+    edge = neighbours(facets, corners)
     # The same point as a corner of the next facet clockwise and counter-clockwise around it.
     a = np.roll(edge, 1, axis=1).ravel()
     b = np.where(edge >= 0, edge - edge % 4 + (edge + 1) % 4, -1).ravel()

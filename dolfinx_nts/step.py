@@ -124,7 +124,8 @@ class StepProblem:
         pair, state = self.system.contacts[index], self.state
         slave, master = self.system.contact_bodies[index]
         reach = np.sqrt(3.0) * float(self._motion[slave] + self._motion[master])
-        found = pair.find(state.u[slave], state.u[master], state.facets[index], reach)
+        ahead = tuple(0.5 * (self.first[b] - state.u[b]) for b in (slave, master))
+        found = pair.find(state.u[slave], state.u[master], state.facets[index], reach, ahead)
         corners = pair.master.control_points(pair.master.positions(state.u[master]), found.facet)
         x = pair.slave.positions(state.u[slave])[pair.slave.owned[found.node]]
         scale = pair.slave.body.nodal_mass[pair.slave.rows[found.node, 0]]

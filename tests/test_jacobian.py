@@ -8,7 +8,7 @@ from mpi4py import MPI
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-CELLS = {"hex": CellType.hexahedron, "tet": CellType.tetrahedron}
+CELLS = {"hex": CellType.hexahedron, "tet": CellType.tetrahedron, "smooth": CellType.hexahedron}
 RULES = {
     "midpoint": nts.Midpoint(),
     "energy-momentum": nts.EnergyMomentum(),
@@ -26,7 +26,7 @@ def box(low, high, n, cell):
 
 
 def two_blocks(cell, gap=0.0, speed=0.0, bcs=()):
-    """A small block above a larger one; its lower face is the slave."""
+    """A small block above a larger one; its lower face is the slave, the other may be smooth."""
     rubber = nts.NeoHookean(1e3, 0.3)
     upper = nts.Continuum(
         box([0.07, 0.12, 1 + gap], [0.87, 0.92, 1.8 + gap], 2, CELLS[cell]),
@@ -40,7 +40,7 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=()):
     )
     pair = nts.ContactPair(
         slave=upper.surface(lambda x: x[2] < 1 + gap + 1e-9),
-        master=lower.surface(lambda x: x[2] > 1 - 1e-9),
+        master=lower.surface(lambda x: x[2] > 1 - 1e-9, smoothing=cell == "smooth"),
     )
     return nts.System([upper, lower], contacts=[pair])
 
