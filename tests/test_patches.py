@@ -229,7 +229,7 @@ def test_patches_do_not_depend_on_the_numbering():
 
 
 def test_order_of_a_cylinder():
-    """Facets miss the circle by delta^2 / 8 of its radius; patches by O(delta^4), normals O(delta^3)."""
+    """Facets miss the circle by delta^2/8 of its radius, patches by O(delta^4)."""
     error = {}
     for n in (16, 32, 64):
         x, facets = sheet(n, 2)

@@ -9,9 +9,9 @@ from test_single_mass import PointMass, PointSurface
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-FACETS, RADIUS, SPEED, WEIGHT = 20, 1.0, 1.0, 1e3
+FACETS, RADIUS, SPEED, WEIGHT = 12, 1.0, 1.0, 1e3
 #: Half the length of the way and of the surface.
-WAY, END = 0.5, 0.6
+WAY, END = 0.3, 0.36
 VARIANTS = ("start", "middle", "smooth")
 BENT = {"convex": 1.0, "concave": -1.0, "flat": 0.0}
 
@@ -28,9 +28,9 @@ class Sledge(PointMass):
 
 
 def plate(shape, facets, uneven):
-    """Fixed facets along x, three of them side by side, bent to a cylinder."""
+    """Fixed facets in a row along x, bent to a cylinder."""
     mesh = create_box(
-        COMM, [[-END, -0.1, -0.1], [END, 0.1, 0.0]], [facets, 3, 1], CellType.hexahedron,
+        COMM, [[-END, -0.1, -0.1], [END, 0.1, 0.0]], [facets, 1, 1], CellType.hexahedron,
         ghost_mode=GhostMode.shared_facet,
     )  # fmt: skip
     top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
@@ -108,42 +108,44 @@ def assert_closed(table, changes, count):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
-    changes, others, table = slide("flat", variant, 0.2137, facets=60, uneven=0.25)
-    assert_closed(table, changes, 48)
+    changes, others, table = slide("flat", variant, 0.45, facets=64, uneven=0.25)
+    assert_closed(table, changes, 50)
     work = WEIGHT * 2 * WAY
     assert np.abs(changes).max() <= 1e-12 * work
     assert np.abs(others).max() <= 1e-12 * work
 
 
+@pytest.mark.parametrize("part", [0.2137, 0.1137])
 @pytest.mark.parametrize("shape", ["convex", "concave"])
-def test_what_a_change_of_facet_costs_on_a_cylinder(shape):
+def test_what_a_change_of_facet_costs_on_a_cylinder(shape, part):
+    """At a slope of the angle between facets, the way beyond an edge is a height."""
     angle = 2 * END / FACETS / RADIUS
+    step = WEIGHT * part * angle**2 * RADIUS
     mean, total = {}, {}
     for variant in VARIANTS:
-        for part in (0.2137, 0.1137):
-            changes, others, table = slide(shape, variant, part)
-            assert_closed(table, changes, 15)
-            assert np.abs(others).max() <= 1e-12 * WEIGHT
-            mean[variant, part] = np.abs(changes).mean()
-            total[variant, part] = changes.sum()
-            # The sledge passes an edge by up to a step: at a slope of the angle, a height.
-            step = part * angle * RADIUS
-            longest = step if variant == "start" else 0.5 * step
-            # The force is the weight and what kicks off the jump before.
-            if variant != "smooth":
-                assert np.abs(changes).max() <= 1.5 * WEIGHT * longest * angle
-    for part in (0.2137, 0.1137):
-        start = mean["start", part]
-        # Half a step on the average, always a loss on the outside, a gain on the inside.
-        expected = 0.5 * WEIGHT * part * angle**2 * RADIUS
-        assert 0.7 * expected < start < 1.4 * expected
-        assert abs(total["start", part]) == pytest.approx(
-            start * round(abs(total["start", part]) / start)
-        )
-        assert np.sign(total["start", part]) == BENT[shape]
-        assert mean["middle", part] < 0.55 * start
-        assert abs(total["middle", part]) < 0.1 * abs(total["start", part])
-        assert mean["smooth", part] < 1e-4 * start
+        changes, others, table = slide(shape, variant, part)
+        assert_closed(table, changes, 8)
+        assert np.abs(others).max() <= 1e-12 * WEIGHT
+        mean[variant], total[variant] = np.abs(changes).mean(), changes.sum()
+        if variant == "start":
+            # Always a loss on the outside and a gain on the inside, half a step on the average.
+            assert (np.sign(changes) == BENT[shape]).all()
+    assert 0.7 * step < 2 * mean["start"] < 1.4 * step
+    assert mean["middle"] < 0.65 * mean["start"]
+    # Nine changes between plus and minus half a step: a random walk of a fifth of a steady one.
+    assert abs(total["middle"]) < 0.5 * abs(total["start"])
+    assert mean["smooth"] < 1e-4 * mean["start"]
+
+
+@pytest.mark.parametrize("shape", ["convex", "concave"])
+def test_smoothing_of_uneven_facets(shape):
+    """Their patches have one normal but not one curvature along an edge."""
+    mean = {}
+    for variant in ("middle", "smooth"):
+        changes, _, table = slide(shape, variant, 0.1137, uneven=0.25)
+        assert_closed(table, changes, 8)
+        mean[variant] = np.abs(changes).mean()
+    assert mean["smooth"] < 0.05 * mean["middle"]
 
 
 def bumpy(comm, smoothing):
