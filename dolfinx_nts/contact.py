@@ -305,15 +305,15 @@ class ContactStep:
         if weights is None:
             return
         n, size = part.residual.shape
-        rows, middle = slice(3, self.num_coordinates), (self.num_corners, 3)
+        width, middle = self.num_coordinates - 3, (self.num_corners, 3)
+        rows = slice(3, self.num_coordinates)
         w = weights[self.candidates.facet].transpose(0, 2, 1)
-        part.residual[:, rows] = np.matmul(w, part.residual[:, rows].reshape(n, *middle)).reshape(
-            n, -1
-        )
+        force = np.matmul(w, part.residual[:, rows].reshape(n, *middle))
+        part.residual[:, rows] = force.reshape(n, width)
         columns = part.tangent[:, :, rows].reshape(n, size, *middle)
-        part.tangent[:, :, rows] = np.matmul(w[:, None], columns).reshape(n, size, -1)
-        lines = part.tangent[:, rows].reshape(n, self.num_corners, -1)
-        part.tangent[:, rows] = np.matmul(w, lines).reshape(n, -1, size)
+        part.tangent[:, :, rows] = np.matmul(w[:, None], columns).reshape(n, size, width)
+        lines = part.tangent[:, rows].reshape(n, self.num_corners, 3 * size)
+        part.tangent[:, rows] = np.matmul(w, lines).reshape(n, width, size)
 
     def _augmented(self, x: FloatArray) -> FloatArray:
         xi = self._projection(x)

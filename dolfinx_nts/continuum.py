@@ -234,14 +234,17 @@ class Continuum:
         bilinear facets of a master: bicubic patches of Overhauser's cubics (Catmull and Rom 1974),
         which are linear in the nodes, so momentum and energy are kept as without. The normal no
         longer jumps from facet to facet, and the energy lost or gained by changes of facet
-        (`contact_defect`) falls by orders of magnitude; see Wriggers, Krstulovic-Opara and Korelc
-        (2001) and Puso and Laursen (2002) for smoothing in contact. Limits:
+        (`contact_defect`) falls: more than 1e4 times on even facets, 20 to 100 times where they
+        differ by up to a half in size. For smoothing in contact see Wriggers, Krstulovic-Opara and
+        Korelc (2001) and Puso and Laursen (2002). Limits:
 
         - The surface must consist of quadrilaterals. Beyond its rim, at edges whose facets meet at
           more than 60 degrees, and where other than four facets meet, it is not smooth.
         - It bulges beyond the facets by what they cut off the curve, an eighth of the angle between
           neighbours times the size of a facet: gaps are measured from there.
-        - A pair costs some fifteen times as much. As a slave, a surface is not changed.
+        - Beyond its facet a patch goes on as a cubic, which is good for half a facet; let no slave
+          slide over more than a third of a facet in a step.
+        - A pair costs some twenty times as much. As a slave, a surface is not changed.
 
         Args:
             marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
