@@ -8,14 +8,24 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dolfinx_nts import facets, nts
+from dolfinx_nts import facets, nts, patches
 
 
-def pairs(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States at t_n and t_{n+1} and multipliers of n pairs on warped quadrilaterals."""
+def middle_patch() -> np.ndarray:
+    """Control points of the patch in the middle of 3 x 3 squares with edge 2, shape (16, 3)."""
+    line = np.arange(-3.0, 4.0, 2.0)
+    x = np.array([(s, t, 0.0) for s in line for t in line])
+    first = np.array([4 * i + j for i in range(3) for j in range(3)])
+    squares = first[:, None] + [0, 4, 5, 1]
+    points, _, _ = patches.control_net(squares, x[squares])
+    patch: np.ndarray = x[points[4]]
+    return patch
+
+
+def pairs(n: int, nc: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States at t_n and t_{n+1} and multipliers of n pairs on warped quadrilaterals or patches."""
     rng = np.random.default_rng(0)
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
-    corners = corners + 0.1 * rng.normal(size=(n, 4, 3))
+    corners = middle_patch()[:nc] + 0.1 * rng.normal(size=(n, nc, 3))
     slave = 0.2 * rng.normal(size=(n, 3))
     xi, _ = facets.project(slave, corners, np.zeros((n, 2)))
     normal = facets.frame(corners, xi)[2]
@@ -39,7 +49,9 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, nargs="+", default=[300, 3000, 30000])
     parser.add_argument("--seconds", type=float, default=1.0, help="time per figure")
     options = parser.parse_args()
-    print(f"{'pairs':>8}{'mean-value':>14}{'gonzalez':>14}{'midpoint':>14}   pairs/s")
+    print(
+        f"{'pairs':>8}{'mean-value':>14}{'gonzalez':>14}{'midpoint':>14}{'smoothing':>14}   pairs/s"
+    )
     for n in options.pairs:
         z0, z1, multiplier = pairs(n)
         x, xi = z1[:, :15].reshape(n, 5, 3), z0[:, -2:]
@@ -58,6 +70,8 @@ def main() -> None:
             rate(lambda r=r: element(r), n, options.seconds) for r in ("mean-value", "gonzalez")
         ]
         rates.append(rate(direct, n, options.seconds))
+        smooth = pairs(n, patches.NUM_POINTS)
+        rates.append(rate(lambda a=smooth: nts.element(*a, "mean-value"), n, options.seconds))
         print(f"{n:>8}" + "".join(f"{r:14.0f}" for r in rates), flush=True)
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts import facets, nts, search
+from dolfinx_nts import facets, nts, patches, search
 from dolfinx_nts.friction import return_map
 from dolfinx_nts.obstacles import Obstacle
 from dolfinx_nts.surfaces import Surface
@@ -99,6 +99,7 @@ class ContactPair:
                 "choose disjoint markers"
             )
         self._free_edges = master.boundary_edges
+        self._joined = patches.neighbours(master.facets, master.reference[master.facets])
 
     @property
     def rigid(self) -> bool:
@@ -126,7 +127,12 @@ class ContactPair:
         return same_nodes and np.array_equal(self.master.facets, other.master.facets)
 
     def find(
-        self, u: Sequence[FloatArray], current: IntArray, reach: float, time: float
+        self,
+        u: Sequence[FloatArray],
+        current: IntArray,
+        reach: float,
+        time: float,
+        ahead: Sequence[FloatArray] | None = None,
     ) -> Candidates:
         """Search for this rank's candidates; every rank must call it.
 
@@ -135,21 +141,44 @@ class ContactPair:
             current: Facet of each owned slave node in the last step or -1.
             reach: Bound on the relative motion of slave and master in the step [m].
             time: t_n [s].
+            ahead: Displacements of each of `bodies` expected until the middle of the step [m].
         """
         if self.rigid:
             return self._near_obstacle(u[0], reach, time)
-        corners = self.master.positions(u[1])[self.master.facets]
+        master = self.master.positions(u[1])
+        corners = master[self.master.facets]
         x = self.slave.positions(u[0])[self.slave.owned]
-        size = facets.size(corners)
-        radius = reach + _MARGIN * float(size.max())
+        radius = reach + _MARGIN * float(facets.size(corners).max())
         closest = search.closest_facets(x, corners, reach=radius, current=current)
         node = np.flatnonzero(closest.facet >= 0)
-        facet = closest.facet[node]
-        pair = corners[facet]
-        xi, converged = facets.project(x[node], pair, closest.xi[node])
+        found = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
+        if ahead is None:
+            return found
+        motion = self.slave.gather(ahead[0])[self.slave.owned], self.master.gather(ahead[1])
+        change, facet = self._crossings(found, master, *motion)
+        start, _ = facets.closest_point(x[found.node[change]], corners[facet])
+        other = self._measure(x, master, found.node[change], facet, start, reach)
+        stay = ~np.isin(found.node, other.node)
+        order = np.argsort(np.concatenate([found.node[stay], other.node]))
+        return Candidates(
+            *(np.concatenate([a[stay], b])[order] for a, b in zip(found, other, strict=True))
+        )
+
+    def _measure(
+        self,
+        x: FloatArray,
+        master: FloatArray,
+        node: IntArray,
+        facet: IntArray,
+        start: FloatArray,
+        reach: float,
+    ) -> Candidates:
+        """Those of the pairs (node, facet) that may touch; projected from `start`."""
+        pair = self.master.control_points(master, facet)
+        xi, converged = facets.project(x[node], pair, start)
         foot, _, normal = facets.frame(pair, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
-        length = size[facet]
+        length = facets.size(pair)
         legal = converged & self._over_facet(facet, xi, reach / length) & self._movable(node, facet)
         legal &= (gap > -_MARGIN * length) & (gap < reach + _MARGIN * length)
         return Candidates(
@@ -173,6 +202,31 @@ class ContactPair:
         corners = self.master.positions(u[1])[self.master.facets]
         return reach + _MARGIN * float(facets.size(corners).min())
 
+    def _crossings(
+        self, c: Candidates, master: FloatArray, slave_motion: FloatArray, master_motion: FloatArray
+    ) -> tuple[IntArray, IntArray]:
+        """Candidates that slide over an edge before the middle of the step, and their next facet.
+
+        A facet that holds the longer part of the path makes g_0 as often positive as negative, so
+        that what changes of facet cost and bring cancels in the long run.
+        """
+        nc = self.master.facets.shape[1]
+        pair = self.master.control_points(master, c.facet)
+        shape, _, _ = facets.shape(c.xi, pair.shape[1])
+        _, tangents, _ = facets.frame(pair, c.xi)
+        motion = slave_motion[c.node]
+        carried = self.master.control_points(master_motion, c.facet)
+        motion = motion - np.einsum("ni,nij->nj", shape, carried)
+        metric = np.einsum("naj,nbj->nab", tangents, tangents)
+        slide = _solve(metric, np.einsum("naj,nj->na", tangents, motion))
+        before, after = (facets.edge_excess(xi, nc) for xi in (c.xi, c.xi + slide))
+        edge = after.argmax(axis=1)
+        pairs = np.arange(len(edge))
+        joined = self._joined[c.facet, edge]
+        over = (before.max(axis=1) <= 0.0) & (after[pairs, edge] > search.PREFERENCE)
+        change = np.flatnonzero(over & (joined >= 0))
+        return change, joined[change] // nc
+
     def _over_facet(self, facet: IntArray, xi: FloatArray, reach: FloatArray) -> BoolArray:
         """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide."""
         beyond = facets.edge_excess(xi, self.master.facets.shape[1])
@@ -184,7 +238,7 @@ class ContactPair:
     def _movable(self, node: IntArray, facet: IntArray) -> BoolArray:
         """Whether any coordinate of a pair is free; without one there is nothing to solve for."""
         slave = self.slave.fixed[self.slave.owned[node]].all(axis=1)
-        master = self.master.fixed[self.master.facets[facet]].all(axis=(1, 2))
+        master = self.master.fixed[self.master.patches[facet]].all(axis=(1, 2))
         return ~(slave & master)
 
 
@@ -240,7 +294,7 @@ class ContactStep:
         candidates: This rank's slave nodes and their facets.
         rule: "direct" for the midpoint rule, else the discrete gradient.
         condense: Whether (d, f) and their multipliers are eliminated pair by pair.
-        x0: Slave and corners at t_n [m], shape (n, nc + 1, 3).
+        x0: Slave and corners, or control points of the patch, at t_n [m], shape (n, nc + 1, 3).
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
             nodal mass [kg] in dynamics; scales multipliers and the active set.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
@@ -261,8 +315,8 @@ class ContactStep:
 
     @property
     def num_corners(self) -> int:
-        """Corners of a master facet."""
-        return self.pair.master.facets.shape[1]
+        """Points that the master surface over a facet depends on: its corners, or its patch's."""
+        return self.pair.master.patches.shape[1]
 
     @property
     def num_coordinates(self) -> int:
@@ -305,7 +359,7 @@ class ContactStep:
     def dofs(self) -> tuple[IntArray, ...]:
         """Global coordinates of slaves (n, 3) and facets (n, 3 nc); -1 where prescribed."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
-        points, corners = slave.owned[c.node], master.facets[c.facet]
+        points, corners = slave.owned[c.node], master.patches[c.facet]
         s = np.where(slave.fixed, -1, slave.dofs)[points]
         m = np.where(master.fixed, -1, master.dofs)[corners].reshape(-1, 3 * self.num_corners)
         return s, m
@@ -313,7 +367,7 @@ class ContactStep:
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates as in `dofs`, prescribed ones included."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
-        corners = master.facets[c.facet]
+        corners = master.patches[c.facet]
         return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(
             -1, 3 * self.num_corners
         )
@@ -343,13 +397,18 @@ class ContactStep:
     def _slip_gradient(self, some: IntArray) -> FloatArray:
         """Derivative of the slip of some pairs by the positions, of any size, shape (m, 2, z)."""
         x, xi = self.x0[some], self.candidates.xi[some]
-        return nts.projection(x, xi, np.zeros_like(xi)).gradient
+        gradient, weights = nts.projection(x, xi, np.zeros_like(xi)).gradient, self._weights
+        if weights is not None:
+            width = (len(some), 2, self.num_corners, 3)
+            points = np.einsum("nkp,naki->napi", weights[some], gradient[..., 3:].reshape(width))
+            gradient[..., 3:] = points.reshape(gradient[..., 3:].shape)
+        return gradient
 
     def reference(self) -> FloatArray:
         """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
         nodes = slave.reference[slave.owned[c.node]]
-        return np.concatenate([nodes[:, None], master.reference[master.facets[c.facet]]], axis=1)
+        return np.concatenate([nodes[:, None], master.reference[master.patches[c.facet]]], axis=1)
 
     def rows(self, k: Contribution, name: str) -> FloatArray:
         """The residual's rows of "augmented" unknowns or "multipliers", shape (n, width)."""
@@ -368,7 +427,35 @@ class ContactStep:
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
-        return self._augmented(x) if self.num_augmented else np.empty((self.num_pairs, 0))
+        if not self.num_augmented:
+            return np.empty((self.num_pairs, 0))
+        return self._augmented(self._control(x))
+
+    def _control(self, x: FloatArray) -> FloatArray:
+        """Slave and control points from slave and points of the patch, both (n, nc + 1, 3)."""
+        control = self.pair.master.combine(x[:, 1:], self.candidates.facet)
+        return np.concatenate([x[:, :1], control], axis=1)
+
+    @property
+    def _weights(self) -> FloatArray | None:
+        """Weights of the points in the control points, shape (n, nc, nc), if they differ."""
+        weights = self.pair.master.weights
+        return None if weights is None else weights[self.candidates.facet]
+
+    def _to_points(self, part: Contribution) -> None:
+        """The transpose of `_control`: forces and tangents of control points to their points."""
+        if self._weights is None:
+            return
+        n, size = part.residual.shape
+        width, middle = self.num_coordinates - 3, (self.num_corners, 3)
+        rows = slice(3, self.num_coordinates)
+        w = self._weights.transpose(0, 2, 1)
+        force = np.matmul(w, part.residual[:, rows].reshape(n, *middle))
+        part.residual[:, rows] = force.reshape(n, width)
+        columns = part.tangent[:, :, rows].reshape(n, size, *middle)
+        part.tangent[:, :, rows] = np.matmul(w[:, None], columns).reshape(n, size, width)
+        lines = part.tangent[:, rows].reshape(n, self.num_corners, 3 * size)
+        part.tangent[:, rows] = np.matmul(w, lines).reshape(n, width, size)
 
     def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
         """Multipliers of given contact forces on the slaves [N], shape (n, multipliers).
@@ -407,10 +494,12 @@ class ContactStep:
         """
         scale = self.scale[:, None]
         multiplier = scale * multiplier
+        x = self._control(x)
         residual, tangent, gap, slip = self._element(x, augmented, multiplier)
         part = self._laws(residual, tangent, gap, slip, multiplier)
         if slip is not None:
             part.tangential[:] = self._tangential(x, -residual[:, :3])
+        self._to_points(part)
         # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
         rows = slice(part.residual.shape[1] - self.num_multipliers, None)
         part.residual[:, rows] *= scale

@@ -251,24 +251,43 @@ class Continuum:
         self._compiled: dict[Any, tuple[Any, Any, Any]] = {}
         self._stiffness: FloatArray | None = None
 
-    def surface(self, marker: Any, tag: int | None = None) -> Surface:
+    def surface(self, marker: Any, tag: int | None = None, *, smoothing: bool = False) -> Surface:
         """A part of the boundary for contact.
+
+        With smoothing, a slave touches a smooth surface through the nodes instead of the flat or
+        bilinear facets of a master: bicubic patches of Overhauser's cubics (Catmull and Rom 1974),
+        which are linear in the nodes, so momentum and energy are kept as without. The normal no
+        longer jumps from facet to facet, and the energy lost or gained by changes of facet
+        (`contact_defect`) falls: more than 1e4 times on even facets, 20 to 100 times where they
+        differ by up to a half in size. For smoothing in contact see Wriggers, Krstulovic-Opara and
+        Korelc (2001) and Puso and Laursen (2002). Limits:
+
+        - The surface must consist of quadrilaterals. Beyond its rim, at edges whose facets meet at
+          more than 60 degrees, and where other than four facets meet, it is not smooth.
+        - It bulges beyond the facets by what they cut off the curve, an eighth of the angle between
+          neighbours times the size of a facet: gaps are measured from there.
+        - Beyond its facet a patch goes on as a cubic, which is good for half a facet; let no slave
+          slide over more than a third of a facet in a step.
+        - A pair costs some twenty times as much. As a slave, a surface is not changed.
 
         Args:
             marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
                 meshtags.
             tag: Value in the meshtags.
+            smoothing: Whether slaves touch a smooth surface when this one is the master.
 
         Raises:
-            ValueError: Degree above 1, no facet, or interior facets.
+            TypeError: smoothing is no bool.
+            ValueError: Degree above 1, no facet, or interior facets; smoothing of triangles.
         """
+        if not isinstance(smoothing, bool):
+            raise TypeError(f"smoothing={smoothing!r}: pass True or False")
         if self.degree != 1:
             raise ValueError(
                 f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"
             )
-        return Surface(
-            self, locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
-        )
+        found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
+        return Surface(self, found, smoothing)
 
     # ---- set-up
     def _boundary_measure(self, degree: int) -> Any:

@@ -22,8 +22,6 @@ _GAUSS = {
     )
     for n in range(1, 8)
 }
-#: Exact for constraints of degree <= 4 in pi, whose gradient has degree 3.
-_CONTACT_POINTS = 2
 #: Relative strain increment below which W(C_1) - W(C_0) is taken from quadrature: there the
 #: five-point rule is exact to rounding (error ~ (b x)^11 for W ~ exp(b tr C)), while the plain
 #: difference would leave rounding noise ~ eps / x in the stress.
@@ -76,20 +74,22 @@ def mean_value(
     pi1: FloatArray,
     gradient: Callable[[FloatArray], FloatArray],
     curvature: Callable[[FloatArray], FloatArray],
+    points: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Two-point mean value of dg/dpi: exact for constraints of degree <= 4, unit independent.
+    """Mean value of dg/dpi by Gauss points: unit independent, exact up to degree 2 points.
 
     Args:
         pi0: Invariants at t_n, shape (n, p).
         pi1: Invariants at t_{n+1}, shape (n, p).
         gradient: dg/dpi.
         curvature: d2(lambda . g)/dpi2 in whatever (linear) storage the caller uses.
+        points: Gauss points; n of them are exact for constraints of degree <= 2 n in pi.
 
     Returns:
         The discrete gradient and d(discrete gradient^T lambda)/dpi_1 in the storage of `curvature`.
     """
     mean, tangent = None, None
-    for tau, weight in zip(*_GAUSS[_CONTACT_POINTS], strict=True):
+    for tau, weight in zip(*_GAUSS[points], strict=True):
         pi = pi0 + tau * (pi1 - pi0)
         g, k = weight * gradient(pi), weight * tau * curvature(pi)
         mean, tangent = (g, k) if mean is None else (mean + g, tangent + k)
@@ -103,6 +103,7 @@ def gonzalez(
     multiplier: FloatArray,
     gradient: Callable[[FloatArray], FloatArray],
     curvature: Callable[[FloatArray], FloatArray],
+    points: int,
 ) -> tuple[FloatArray, FloatArray]:
     """Gonzalez's discrete gradient (67) with the sign corrected, row by row, and its tangent.
 
@@ -115,6 +116,7 @@ def gonzalez(
         multiplier: lambda, shape (n, m).
         gradient: dg/dpi, shape (n, m, p).
         curvature: d2(lambda . g)/dpi2, shape (n, p, p).
+        points: Gauss points that make `mean_value` exact.
 
     Returns:
         The discrete gradient (n, m, p) and d(discrete gradient^T lambda)/dpi_1 (n, p, p).
@@ -126,7 +128,7 @@ def gonzalez(
     inverse = np.where(at_rest, 0.0, 1.0 / np.where(at_rest, 1.0, size))[:, None]
     # g(pi_1) - g(pi_0) by the exact mean value: the difference of values would leave rounding noise
     # ~ eps / |Dpi|^2 in the tangent.
-    mean, _ = mean_value(pi0, pi1, gradient, curvature)
+    mean, _ = mean_value(pi0, pi1, gradient, curvature, points)
     defect = np.einsum("nmp,np->nm", mean - middle, dpi)
     discrete = middle + (defect * inverse)[:, :, None] * dpi[:, None]
 

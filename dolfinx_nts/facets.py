@@ -7,6 +7,9 @@ from the number of corners `nc`:
   [-1, 1]^2, reference corners (-1, -1), (1, -1), (1, 1), (-1, 1);
 - `nc = 3`: linear, N = (1 - xi_1 - xi_2, xi_1, xi_2), `xi` in the unit triangle.
 
+`shape`, `frame`, `size` and `project` take the control points of a smooth patch as well (`nc = 16`,
+see `patches`), whose first four are the corners of its facet.
+
 Lengths may come in any unit: every test in this module is relative.
 """
 
@@ -14,6 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+
+from dolfinx_nts import patches
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
@@ -50,12 +55,14 @@ def shape(xi: FloatArray, nc: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 
     Args:
         xi: Convective coordinates [-], shape (n, 2).
-        nc: Number of corners, 3 or 4.
+        nc: Number of corners, 3 or 4, or of control points, 16.
 
     Returns:
         N [-], shape (n, nc); dN/dxi^a [-], shape (n, nc, 2); d2N/dxi^a dxi^b [-],
         shape (n, nc, 2, 2).
     """
+    if nc == patches.NUM_POINTS:
+        return patches.shape(xi)
     corner = _reference(nc)
     n = len(xi)
     if nc == 3:
@@ -96,6 +103,7 @@ def size(corners: FloatArray) -> FloatArray:
     Args:
         corners: Facet corners [m], shape (n, nc, 3).
     """
+    corners = corners[:, :4]
     edges = np.roll(corners, -1, axis=1) - corners
     return np.linalg.norm(edges, axis=2).mean(axis=1)
 
@@ -177,41 +185,48 @@ def _descent_step(
         xi: Convective coordinates [-], shape (n, 2).
 
     Returns:
-        Step [-], shape (n, 2), and the coefficients of t, t^2, t^3, t^4 [m^2] of the change after
-        t times the step, shape (n, 4).
+        Step [-], shape (n, 2), and the coefficients of t, t^2, ... [m^2] of the change after t
+        times the step, shape (n, 4), over a patch (n, 12).
     """
     values, first, second = shape(xi, spans.shape[1])
     offset = start + np.einsum("ni,nij->nj", values, spans)
     tangents = np.einsum("nia,nij->naj", first, spans)
-    twist = np.einsum("ni,nij->nj", second[..., 0, 1], spans)
     gradient = np.einsum("naj,nj->na", tangents, offset)
     metric = np.einsum("naj,nbj->nab", tangents, tangents)
-    hessian = metric.copy()
-    hessian[:, 0, 1] += np.einsum("nj,nj->n", twist, offset)
-    bound = np.sqrt(metric[:, 0, 0] * metric[:, 1, 1])
+    height = np.matmul(spans, offset[:, :, None])[:, :, 0]
+    hessian = metric + np.einsum("niab,ni->nab", second, height)
     # Beyond the centre of curvature Newton would climb to a saddle: descend on a definite matrix.
-    indefinite = np.abs(hessian[:, 0, 1]) >= bound * (1.0 - 1e-8)
-    hessian[indefinite, 0, 1] = (0.9 * np.sign(hessian[:, 0, 1]) * bound)[indefinite]
+    in_a, in_b, mixed = hessian[:, 0, 0], hessian[:, 1, 1], hessian[:, 0, 1]
+    bound = np.sqrt(np.maximum(in_a, 0.0) * np.maximum(in_b, 0.0))
+    bad = np.abs(mixed) >= bound * (1.0 - 1e-8)
+    limit = 0.9 * np.sqrt(metric[bad, 0, 0] * metric[bad, 1, 1])
+    hessian[bad, 0, 1] = np.clip(mixed[bad], -limit, limit)
+    hessian[bad, 0, 0], hessian[bad, 1, 1] = metric[bad, 0, 0], metric[bad, 1, 1]
     step = -_solve_2x2(hessian, gradient)
-    along = np.einsum("naj,na->nj", tangents, step)
-    bend = twist * (step[:, 0] * step[:, 1])[:, None]
     # Differences of distances would cancel near the solution; this polynomial does not.
-    change = [
-        np.einsum("na,na->n", gradient, step),
-        np.einsum("nj,nj->n", bend, offset) + 0.5 * np.einsum("nj,nj->n", along, along),
-        np.einsum("nj,nj->n", along, bend),
-        0.5 * np.einsum("nj,nj->n", bend, bend),
-    ]
-    return step, np.column_stack(change)
+    if spans.shape[1] == patches.NUM_POINTS:
+        powers = np.einsum("nip,nij->pnj", patches.along(xi, step)[:, :, 1:], spans)
+    else:
+        twist = np.einsum("ni,nij->nj", second[..., 0, 1], spans)
+        along = np.einsum("naj,na->nj", tangents, step)
+        powers = np.stack([along, twist * (step[:, 0] * step[:, 1])[:, None]])
+    change = np.zeros((len(xi), 2 * len(powers)))
+    change[:, : len(powers)] = np.einsum("pnj,nj->np", powers, offset)
+    change[:, 0] = np.einsum("na,na->n", gradient, step)
+    for i, one in enumerate(powers):
+        for j, two in enumerate(powers):
+            change[:, i + j + 1] += 0.5 * np.einsum("nj,nj->n", one, two)
+    return step, change
 
 
 def _step_length(change: FloatArray) -> FloatArray:
     """First of 1, 1/2, 1/4, ... with sufficient descent, shape (n,); 0 where there is none."""
     length = np.ones(len(change))
     for _ in range(_MAX_HALVINGS):
-        slope, square, cube, fourth = change.T
-        gain = slope + length * (square + length * (cube + length * fourth))
-        poor = ~(gain <= 1e-4 * slope)
+        gain = np.zeros(len(change))
+        for coefficient in change.T[::-1]:
+            gain = coefficient + length * gain
+        poor = ~(gain <= 1e-4 * change[:, 0])
         if not poor.any():
             return length
         length[poor] *= 0.5
@@ -259,7 +274,7 @@ def project(
 
     Args:
         points: Points x [m], shape (n, 3).
-        corners: Facet corners [m], shape (n, nc, 3).
+        corners: Facet corners or control points [m], shape (n, nc, 3).
         xi: Start [-], shape (n, 2).
 
     Returns:

@@ -1,6 +1,7 @@
 """Batched node-to-surface element: gap, invariants, constraints, gradients and exact tangents.
 
-Axis 0 of every array is the pair (one slave node, one master facet with nc corners). Two
+Axis 0 of every array is the pair (one slave node, one master facet with nc corners, or the smooth
+patch over it with nc = 16 control points, which take the place of the corners). Two
 descriptions of the same element: the direct one (projection and normal eliminated, for the midpoint
 rule, theory section 4) and the one in invariants (normal d and convective coordinates f as
 unknowns, for the energy-momentum scheme, sections 3 and 5). Nothing here knows about MPI, PETSc or
@@ -15,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts import discrete_gradient, facets
+from dolfinx_nts import discrete_gradient, facets, patches
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,6 +24,9 @@ FloatArray = npt.NDArray[np.float64]
 NUM_CONSTRAINTS = 6
 #: Augmented unknowns per pair: d in R^3 and f in R^2.
 NUM_AUGMENTED = 5
+#: Gauss points that make the mean value exact: the constraints have degree <= 4 in pi over a facet,
+#: 12 over a patch.
+_GAUSS_POINTS = {3: 2, 4: 2, patches.NUM_POINTS: 6}
 
 
 class Gap(NamedTuple):
@@ -142,6 +146,9 @@ def projection(x: FloatArray, xi: FloatArray, multiplier: FloatArray) -> Project
     mixed = mixed.reshape(n, size, 2)
     bent = np.einsum("na,naci,ndi->ncd", mu, bend, tangents)
     inner = -np.einsum("ncdi,nai,na->ncd", bend, tangents, mu) - bent - bent.transpose(0, 2, 1)
+    if nc == patches.NUM_POINTS:
+        along_offset = np.einsum("nki,ni->nk", x[:, 1:], offset)
+        inner += np.einsum("na,nkacd,nk->ncd", mu, patches.third(xi), along_offset)
     cross = np.matmul(mixed, gradient)
     hessian += cross + cross.transpose(0, 2, 1)
     hessian += np.matmul(gradient.transpose(0, 2, 1), np.matmul(inner, gradient))
@@ -198,11 +205,13 @@ def invariant_gradient(z: FloatArray, nc: int) -> FloatArray:
 
 
 def invariants(z: FloatArray, nc: int, gradient: FloatArray | None = None) -> FloatArray:
-    """The invariants pi(z) of theory section 3: 17 for a quadrilateral, 12 for a triangle.
+    """The invariants pi(z) of theory section 3: 17 of a quadrilateral, 12 of a triangle.
+
+    A patch has 155.
 
     Args:
         z: (x_s, x_1 .. x_nc, d, f), shape (n, 3 (nc + 2) + 2).
-        nc: Corners of a facet, 3 or 4.
+        nc: Corners of a facet or control points of a patch.
         gradient: D pi(z) where it is known already.
 
     Returns:
@@ -263,8 +272,7 @@ def constraint_curvature(pi: FloatArray, multiplier: FloatArray, nc: int) -> Flo
     """Columns of d2(lambda . g)/dpi2 that belong to f, shape (n, p, 2); all others vanish.
 
     The constraints are linear in the invariants of x and d once f is held, so the second derivative
-    is these columns, their transpose, and nothing else. Third derivatives of the shape functions
-    vanish for both facets.
+    is these columns, their transpose, and nothing else.
     """
     shape, dshape, ddshape = facets.shape(pi[:, -2:], nc)
     yy, yd, _ = _split(pi, nc)
@@ -281,6 +289,10 @@ def constraint_curvature(pi: FloatArray, multiplier: FloatArray, nc: int) -> Flo
     ff = -np.einsum("n,nibc,ni->nbc", normal, ddshape, yd)
     ff -= np.einsum("nibc,ni->nbc", ddshape, np.matmul(yy, slope[:, :, None])[:, :, 0])
     mixed = np.matmul(dshape.transpose(0, 2, 1), np.matmul(yy, bent))
+    if nc == patches.NUM_POINTS:
+        yn = np.matmul(yy, shape[:, :, None])
+        factor = yd[:, :, None] * tangent[:, None] - yn * projection[:, None]
+        ff += np.einsum("niabc,nia->nbc", patches.third(pi[:, -2:]), factor)
     out[:, -2:] = ff - mixed - mixed.transpose(0, 2, 1)
     return out
 
@@ -332,6 +344,7 @@ def element(z0: FloatArray, z1: FloatArray, multiplier: FloatArray, rule: str) -
             pi1,
             lambda pi: constraint_gradient(pi, nc),
             lambda pi: constraint_curvature(pi, multiplier, nc),
+            _GAUSS_POINTS[nc],
         )
         stiffness = _curvature_stiffness(dm, curvature, d1)
     else:
@@ -341,6 +354,7 @@ def element(z0: FloatArray, z1: FloatArray, multiplier: FloatArray, rule: str) -
             multiplier,
             lambda pi: constraint_gradient(pi, nc),
             lambda pi: _full_curvature(constraint_curvature(pi, multiplier, nc)),
+            _GAUSS_POINTS[nc],
         )
         stiffness = np.matmul(dm.transpose(0, 2, 1), np.matmul(rest, d1))
     work = np.matmul(multiplier[:, None], gradient)[:, 0]

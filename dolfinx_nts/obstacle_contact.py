@@ -60,11 +60,13 @@ class ObstacleStep(ContactStep):
         x: FloatArray = slave.reference[slave.owned[self.candidates.node]][:, None]
         return x
 
-    def evaluate(
-        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
-    ) -> Contribution:
-        """Residual and tangent of the pairs; pure. Arguments as in `ContactStep`, x (n, 1, 3)."""
-        return super().evaluate(x - self.displacement[1], augmented, multiplier)
+    def _control(self, x: FloatArray) -> FloatArray:
+        """Slave relative to the obstacle's motion."""
+        return x - self.displacement[1]
+
+    @property
+    def _weights(self) -> None:
+        return None
 
     @property
     def extent(self) -> float:

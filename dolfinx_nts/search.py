@@ -22,6 +22,9 @@ IntArray = npt.NDArray[np.int_]
 # point over a shared edge must not choose its facet by rounding noise.
 ROUNDING = 1e-12
 
+# Advantage of the current facet in facet sizes.
+PREFERENCE = 1e-6
+
 # Facets of one tree differ by less than this factor in size, or large ones would widen the search
 # among small ones.
 _SIZE_RATIO = 4.0
@@ -75,7 +78,7 @@ def closest_facets(
     *,
     reach: float | FloatArray,
     current: IntArray | None = None,
-    preference: float = 1e-6,
+    preference: float = PREFERENCE,
 ) -> Closest:
     """Closest facet of each point: exactly what a search through all facets would give.
 

@@ -168,7 +168,8 @@ class StepProblem:
         pair, state = self.system.contacts[index], self.state
         u = [state.u[b] for b in self.system.contact_bodies[index]]
         reach = self._reach(index, self._motion)
-        found = pair.find(u, state.facets[index], reach, state.time)
+        ahead = [0.5 * (self.first[b] - state.u[b]) for b in self.system.contact_bodies[index]]
+        found = pair.find(u, state.facets[index], reach, state.time, ahead)
         slave, rows = pair.slave, pair.slave.rows[found.node]
         x0 = (slave.reference[slave.owned[found.node]] + u[0][rows])[:, None]
         mass = slave.body.nodal_mass if self.integrator.inertia else slave.body.nodal_stiffness()
@@ -178,7 +179,7 @@ class StepProblem:
             path = self._path(index)
             x0 -= path[0]
             return ObstacleStep(pair, found, rule, condense, x0, scale, theta, path)
-        corners = pair.master.positions(u[1])[pair.master.facets[found.facet]]
+        corners = pair.master.control_points(pair.master.positions(u[1]), found.facet)
         x0 = np.concatenate([x0, corners], axis=1)
         return ContactStep(pair, found, rule, condense, x0, scale, theta)
 

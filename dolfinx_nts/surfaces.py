@@ -7,6 +7,7 @@ positions are gathered when a search needs them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -16,8 +17,10 @@ from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import facets as facet_math
-from dolfinx_nts import search
+from dolfinx_nts import patches, search
 from dolfinx_nts.validation import at_points
+
+logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -82,11 +85,20 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
 class Surface:
     """Oriented facets of a body's boundary. Create with `Continuum.surface`.
 
+    Args:
+        body: Its body.
+        local_facets: This rank's owned facets.
+        smoothing: Whether slaves touch the smooth patches over the facets.
+
     Attributes:
         body: The body it belongs to.
         points: Global node numbers of the corner points, sorted, shape (p,).
         facets: Corner points of the facets as positions in `points`, cyclic and counter-clockwise
             seen from outside, shape (m, nc); the order does not depend on the partition.
+        patches: Points that the surface over each facet depends on, the corners first: (m, nc), or
+            (m, 16) with smoothing.
+        weights: With smoothing, the patches' control points from these points, shape (m, 16, 16);
+            else None, as corners and control points are the same.
         original: Input numbers of the points, the same for every number of ranks, shape (p,).
         reference: Reference positions [m], shape (p, 3).
         area: Tributary area of each point [m^2], shape (p,).
@@ -95,7 +107,7 @@ class Surface:
         fixed: Which coordinates of the points are prescribed, shape (p, 3).
     """
 
-    def __init__(self, body: Any, local_facets: IntArray) -> None:
+    def __init__(self, body: Any, local_facets: IntArray, smoothing: bool = False) -> None:
         mesh, space = body.mesh, body.space
         self.body = body
         nodes = oriented_nodes(mesh, local_facets)
@@ -123,12 +135,48 @@ class Surface:
         self.original = table[..., 1].ravel()[at]
         self.reference = x.reshape(-1, 3)[at]
         self.area = facet_math.tributary_areas(self.facets, x, len(self.points))
+        self.patches: IntArray = self.facets
+        self.weights: FloatArray | None = None
+        if smoothing:
+            self._smooth(x)
         low, high = index_map.local_range
         self.owned = np.flatnonzero((self.points >= low) & (self.points < high))
         self.rows = 3 * (self.points[self.owned] - low)[:, None] + np.arange(3)
         prescribed = np.zeros(body.num_owned, dtype=bool)
         prescribed[body.fixed] = True
         self.fixed = self.gather(prescribed)
+
+    def _smooth(self, corners: FloatArray) -> None:
+        """Lay patches over the facets with reference corners (m, 4, 3)."""
+        nc = self.facets.shape[1]
+        if nc != 4:
+            raise ValueError(
+                f"smoothing=True: the surface of {self.body.name!r} has triangles; smoothing needs "
+                "quadrilaterals: mesh the body with hexahedra, or leave smoothing out"
+            )
+        self.patches, self.weights, irregular = patches.control_net(self.facets, corners)
+        if irregular.any() and self.body.comm.rank == 0:
+            logger.warning(
+                "surface of %r: %d of %d facets have a corner where other than four facets meet; "
+                "there smoothing leaves edges",
+                self.body.name, irregular.sum(), len(irregular),
+            )  # fmt: skip
+
+    def control_points(self, x: FloatArray, facet: IntArray) -> FloatArray:
+        """What the surface over given facets is interpolated from [m], shape (n, nc or 16, 3).
+
+        Args:
+            x: Positions of all points [m], shape (p, 3).
+            facet: Facets, shape (n,).
+        """
+        return self.combine(x[self.patches[facet]], facet)
+
+    def combine(self, x: FloatArray, facet: IntArray) -> FloatArray:
+        """Control points from the points of the facets' patches [m], both (n, nc or 16, 3)."""
+        if self.weights is None:
+            return x
+        result: FloatArray = np.matmul(self.weights[facet], x)
+        return result
 
     @property
     def dofs(self) -> IntArray:

@@ -342,6 +342,16 @@ def test_surface_of_a_quadratic_body():
     raises(ValueError, pattern, lambda: body.surface(top))
 
 
+def test_smoothing():
+    body = continuum(box(cell_type="tetrahedron"))
+    pattern = (
+        r"^smoothing=True: the surface of 'body' has triangles; .* mesh the body with hexahedra"
+    )
+    raises(ValueError, pattern, lambda: body.surface(top, smoothing=True))
+    pattern = r"^smoothing='yes': pass True or False"
+    raises(TypeError, pattern, lambda: continuum().surface(top, smoothing="yes"))
+
+
 # ---- contacts and systems
 def test_slave_is_master():
     body = continuum()

@@ -1,5 +1,6 @@
 """The Jacobian of a step against differences of its residual, and the convergence it gives."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ import dolfinx_nts as nts
 from dolfinx_nts.integrators import Static
 
 COMM = MPI.COMM_WORLD
-CELLS = {"hex": CellType.hexahedron, "tet": CellType.tetrahedron}
+CELLS = {"hex": CellType.hexahedron, "tet": CellType.tetrahedron, "smooth": CellType.hexahedron}
 RULES = {
     "midpoint": nts.Midpoint(),
     "energy-momentum": nts.EnergyMomentum(),
@@ -23,6 +24,13 @@ RULES = {
 EQUATIONS = RULES | {"static": Static()}
 ACTIVE = ("none", "all", "mixed")
 FRICTION = {"none": 0.0, "slip": 0.02, "mixed": 0.4, "stick": np.inf}
+#: Cell, friction and active set of the scenes whose whole Jacobian is tested.
+SCENES = [
+    *itertools.product(("hex", "tet"), ("none",), ACTIVE),
+    *itertools.product(("hex",), ("slip", "mixed", "stick"), ("all",)),
+    *itertools.product(("tet",), ("mixed",), ("mixed",)),
+    *itertools.product(("smooth",), ("none", "mixed"), ("mixed",)),
+]
 #: Exact for polynomials up to degree 4.
 STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 
@@ -32,7 +40,7 @@ def box(low, high, n, cell):
 
 
 def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
-    """A small block above a larger one; its lower face is the slave."""
+    """A small block above a larger one; its lower face is the slave, the other may be smooth."""
     rubber = nts.NeoHookean(1e3, 0.3)
     upper = nts.Continuum(
         box([0.07, 0.12, 1 + gap], [0.87, 0.92, 1.8 + gap], 2, CELLS[cell]),
@@ -46,7 +54,7 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
     )
     pair = nts.ContactPair(
         slave=upper.surface(lambda x: x[2] < 1 + gap + 1e-9),
-        master=lower.surface(lambda x: x[2] > 1 - 1e-9),
+        master=lower.surface(lambda x: x[2] > 1 - 1e-9, smoothing=cell == "smooth"),
         friction=friction,
     )
     return nts.System([upper, lower], contacts=[pair])
@@ -155,11 +163,9 @@ def block_errors(found, expected, blocks):
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
-@pytest.mark.parametrize("active", ACTIVE)
-@pytest.mark.parametrize("friction", FRICTION)
+@pytest.mark.parametrize(("cell", "friction", "active"), SCENES)
 @pytest.mark.parametrize("rule", EQUATIONS)
-@pytest.mark.parametrize("cell", CELLS)
-def test_jacobian_is_the_derivative_of_the_residual(cell, rule, friction, active):
+def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active):
     system = two_blocks(cell, friction=FRICTION[friction])
     at = Linearised(system, rule, active, rotated_state(system))
     assert at.candidates == 9

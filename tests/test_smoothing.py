@@ -1,0 +1,187 @@
+"""What a change of facet costs while a mass slides over a faceted cylinder or a flat plate."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from test_single_mass import PointMass, PointSurface
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+FACETS, RADIUS, SPEED, WEIGHT = 16, 1.0, 1.0, 1e3
+#: Half the length of the way and of the surface.
+WAY, END = 0.33, 0.48
+VARIANTS = ("start", "middle", "smooth")
+BENT = {"convex": 1.0, "concave": -1.0, "flat": 0.0}
+
+
+class Sledge(PointMass):
+    """A mass that is drawn along x; free to follow the surface in z."""
+
+    def __init__(self, position):
+        super().__init__(COMM, 1.0, position, (SPEED, 0.0, 0.0), name="sledge")
+        self.fixed = np.arange(self.num_owned)[:2]
+
+    def prescribed(self, time):
+        return np.array([SPEED * time, 0.0])[: len(self.fixed)]
+
+
+def plate(shape, facets, uneven):
+    """Fixed facets in a row along x, bent to a cylinder."""
+    mesh = create_box(
+        COMM, [[-END, -0.1, -0.1], [END, 0.1, 0.0]], [facets, 1, 1], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
+    tags = nts.continuum.dolfinx_mesh.meshtags(
+        mesh, 2, np.sort(top), np.full(len(top), 1, np.int32)
+    )
+    x, y, z = mesh.geometry.x.T
+    even = np.linspace(-END, END, facets + 1)
+    shift = uneven * np.random.default_rng(1).uniform(-1, 1, facets - 1) * (even[1] - even[0])
+    x = np.interp(x, even, even + np.concatenate([[0], shift, [0]]))
+    if BENT[shape]:
+        r = RADIUS + BENT[shape] * z
+        x, z = r * np.sin(x / RADIUS), BENT[shape] * (r * np.cos(x / RADIUS) - RADIUS)
+    mesh.geometry.x[:] = np.column_stack([x, y, z])
+    body = nts.Continuum(
+        mesh,
+        nts.StVenantKirchhoff(1.0, 0.3),
+        density=1.0,
+        name="plate",
+        bcs=[nts.Dirichlet(lambda x: np.full(x.shape[1], True))],
+    )
+    return body, tags
+
+
+def slide(shape, variant, part, integrator=None, facets=FACETS, uneven=0.0):
+    """Draw the sledge over the plate.
+
+    Args:
+        shape: A key of BENT.
+        variant: A key of VARIANTS.
+        part: Way of a step in facets.
+        integrator: Energy-momentum scheme if None.
+        facets: Facets of the plate along its length.
+        uneven: Random shift of the edges between facets in their width.
+
+    Returns:
+        Losses of the steps that begin on another facet than the last one [J], losses of all other
+        steps, and the balance table.
+    """
+    body, tags = plate(shape, facets, uneven)
+    master = body.surface(tags, 1, smoothing=variant == "smooth")
+    # A node is on facets and patches; a little lower, the weight has no way to fall in the first
+    # step.
+    x, _, z = np.unique(np.round(master.reference, 12), axis=0).T
+    begin = np.flatnonzero(x >= -WAY)[0]
+    start = np.array([x[begin], 0.01, z[begin] - 1e-9])
+    mass = Sledge(start)
+    pair = nts.ContactPair(PointSurface(mass, start), master)
+    pair.slave.fixed[:, :2] = True
+    if variant == "start":
+        pair._crossings = lambda *_: (np.empty(0, dtype=int), np.empty(0, dtype=int))
+    system = nts.System([mass, body], contacts=[pair], gravity=(0, 0, -WEIGHT))
+    newton = nts.Newton(rtol=1e-13)
+    stepper = nts.Stepper(system, integrator or nts.EnergyMomentum(), newton=newton)
+    dt = part * 2 * END / (facets * SPEED)
+    facet, changes, others, before = [], [], [], 0.0
+    for step in range(int(2 * WAY / (SPEED * dt)) - 1):
+        state = stepper.advance(dt)
+        facet.append(COMM.bcast(state.facets[0].copy())[0])
+        loss = stepper.solution.rows[-1]["contact_defect"]
+        if step > 3:
+            (others if facet[-1] == facet[-2] else changes).append(loss - before)
+        before = loss
+    table = stepper.solution.balance
+    stepper.close()
+    return np.array(changes), np.array(others), table
+
+
+def assert_closed(table, changes, count):
+    """The sledge was on the surface all the time, and the energy is where the table says."""
+    assert len(changes) >= count
+    assert (table["active"][4:] == 1).all()
+    scale = max(np.abs(table[k]).max() for k in ("energy", "external_work"))
+    assert np.abs(table["ledger_residual"]).max() <= 1e-11 * scale
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
+    changes, others, table = slide("flat", variant, 0.45, facets=80, uneven=0.25)
+    assert_closed(table, changes, 50)
+    work = WEIGHT * 2 * WAY
+    assert np.abs(changes).max() <= 1e-12 * work
+    assert np.abs(others).max() <= 1e-12 * work
+
+
+@pytest.mark.parametrize("part", [0.2137, 0.1137])
+@pytest.mark.parametrize("shape", ["convex", "concave"])
+def test_what_a_change_of_facet_costs_on_a_cylinder(shape, part):
+    """At a slope of the angle between facets, the way beyond an edge is a height."""
+    angle = 2 * END / FACETS / RADIUS
+    step = WEIGHT * part * angle**2 * RADIUS
+    mean, total = {}, {}
+    for variant in VARIANTS:
+        changes, others, table = slide(shape, variant, part)
+        assert_closed(table, changes, 8)
+        assert np.abs(others).max() <= 1e-12 * WEIGHT
+        mean[variant], total[variant] = np.abs(changes).mean(), changes.sum()
+        if variant == "start":
+            # Always a loss on the outside and a gain on the inside, half a step on the average.
+            assert (np.sign(changes) == BENT[shape]).all()
+    assert 0.7 * step < 2 * mean["start"] < 1.4 * step
+    assert mean["middle"] < 0.65 * mean["start"]
+    # Nine changes between plus and minus half a step: a random walk of a fifth of a steady one.
+    assert abs(total["middle"]) < 0.5 * abs(total["start"])
+    assert mean["smooth"] < 1e-4 * mean["start"]
+
+
+@pytest.mark.parametrize("shape", ["convex", "concave"])
+def test_smoothing_of_uneven_facets(shape):
+    """Their patches have one normal but not one curvature along an edge."""
+    mean = {}
+    for variant in ("middle", "smooth"):
+        changes, _, table = slide(shape, variant, 0.1137, uneven=0.25)
+        assert_closed(table, changes, 8)
+        mean[variant] = np.abs(changes).mean()
+    assert mean["smooth"] < 0.05 * mean["middle"]
+
+
+def bumpy(comm, smoothing):
+    """A block that slides over the waves of a plate; both are free."""
+    cells = {"cell_type": CellType.hexahedron, "ghost_mode": GhostMode.shared_facet}
+    mesh = create_box(comm, [[0, 0, 0], [1.2, 1, 0.3]], [6, 5, 1], **cells)
+    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > 0.3 - 1e-9, None, "top")
+    one = np.full(len(top), 1, np.int32)
+    tags = nts.continuum.dolfinx_mesh.meshtags(mesh, 2, np.sort(top), one)
+    x, y, z = mesh.geometry.x.T
+    mesh.geometry.x[:, 2] += 0.03 * np.sin(6 * x) * np.cos(4 * y) * z / 0.3
+    rubber = nts.NeoHookean(young=1e4, poisson=0.3)
+    plate = nts.Continuum(mesh, rubber, density=1e2, name="plate")
+    low = 0.335
+    mesh = create_box(comm, [[0.21, 0.23, low], [0.61, 0.63, low + 0.3]], [2, 2, 1], **cells)
+    block = nts.Continuum(mesh, rubber, density=1e2, velocity=(2.0, 0.7, -1.0), name="block")
+    slave = block.surface(lambda x: x[2] < low + 1e-9)
+    pair = nts.ContactPair(slave, plate.surface(tags, 1, smoothing=smoothing))
+    return nts.System([block, plate], contacts=[pair])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("smoothing", [False, True])
+def test_momentum_and_energy_on_any_number_of_ranks(smoothing):
+    tables = []
+    for comm in (COMM, MPI.COMM_SELF):
+        run = nts.simulate(bumpy(comm, smoothing), nts.EnergyMomentum(), dt=4e-3, t_end=0.08)
+        assert run.status == "completed" and run.retries == 0
+        tables.append(run.balance)
+    table, alone = tables
+    assert table["active"].max() >= 3
+    assert np.abs(table["ledger_residual"]).max() <= 1e-11 * table["energy"][0]
+    for name in ("linear_momentum", "angular_momentum"):
+        change = np.abs(table[name] - table[name][0]).max()
+        assert change <= 1e-12 * np.abs(table[name]).max()
+    for name in ("energy", "contact_defect", "linear_momentum", "angular_momentum", "active"):
+        scale = max(np.abs(alone[name]).max(), alone["energy"][0])
+        assert np.abs(table[name] - alone[name]).max() <= 1e-9 * scale
