@@ -677,7 +677,7 @@ class ContactStep:
             tangential=np.zeros((self.num_pairs, 3)),
         )
         if slip is not None:
-            part.stick[:] = self._coulomb(residual, tangent, slip, multiplier, active)
+            part.stick[:] = self._coulomb(residual, tangent, slip, multiplier, gap, active)
             square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
             part.distance[active] = np.sqrt(square[active])
         return part
@@ -695,22 +695,28 @@ class ContactStep:
         tangent: FloatArray,
         slip: Slip,
         multiplier: FloatArray,
+        gap: FloatArray,
         active: BoolArray,
     ) -> BoolArray:
-        """Write the rows of lambda_T [m]; returns which pairs stick."""
+        """Write the rows of lambda_T [m]; returns which pairs stick.
+
+        The pressure in Coulomb's bound is that which decides on the active set, so that it is
+        positive just where a pair is active; where solved, the gap in it is zero.
+        """
         mu, t, scale = self.pair.friction, multiplier[:, -2:], self.scale[:, None, None]
-        pressing = -multiplier[:, 0] > 0
-        rigid = np.isinf(mu)
-        pressure = np.inf if rigid else -mu * multiplier[:, 0]
-        bound = np.where(active & (pressing | rigid), pressure, 0.0)
+        normal = residual.shape[1] - self.num_multipliers
+        pressure = -multiplier[:, 0] - self.scale * gap
+        bound = np.zeros_like(gap)
+        bound[active] = np.inf if np.isinf(mu) else mu * pressure[active]
         law = return_map(t, slip.value, slip.metric, bound, TANGENTIAL_SCALE * self.scale)
         stick = law.stick & active
         rows = np.einsum("nab,nbz->naz", law.d_slip, slip.gradient)
         rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)
         rows[:, :, -2:] += law.d_multiplier
-        if not rigid:
-            normal = rows.shape[2] - self.num_multipliers
-            rows[:, :, normal] -= np.where(pressing, mu, 0.0)[:, None] * law.d_bound
+        if not np.isinf(mu):
+            d_pressure = -self.scale[:, None] * tangent[:, normal]
+            d_pressure[:, normal] -= 1.0
+            rows += mu * law.d_bound[:, :, None] * d_pressure[:, None]
         value = law.residual
         value[~active], rows[~active] = t[~active], 0.0
         rows[~active, :, -2:] = np.eye(2)
