@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,24 @@ COLUMNS = (
     "min_gap",
     "newton_iterations",
 )
+
+
+class Switch(NamedTuple):
+    """An active node that went over to another facet at the start of a step.
+
+    Attributes:
+        time: End of the step [s].
+        contact: Name of the contact.
+        node: Input number of the slave node.
+        facets: Numbers of the master's facets before and after.
+        defect: What the change adds to contact_defect [J]; negative where it brings energy.
+    """
+
+    time: float
+    contact: str
+    node: int
+    facets: tuple[int, int]
+    defect: float
 
 
 def measure(system: System, state: State) -> dict[str, Any]:
@@ -92,6 +110,29 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     return dict(zip(names, comm.allreduce(local).tolist(), strict=True)) | {
         "min_gap": float(comm.allreduce(smallest, op=MPI.MIN)),
     }
+
+
+def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch]:
+    """Changes of facet in an accepted step, the same on all ranks. Every rank must call it.
+
+    Args:
+        problem: Equations of the step.
+        step: Its solution.
+        time: End of the step [s].
+    """
+    if not problem.contacts:
+        return []
+    found, state = [], problem.state
+    for k, (contact, part) in enumerate(zip(problem.contacts, step.contacts, strict=True)):
+        c, slave = contact.candidates, contact.pair.slave
+        old, defect = state.facets[k][c.node], -step.multipliers[k][:, 0] * c.gap / problem.factor
+        stayed = (state.force[k][c.node] > 0.0) & part.active
+        for i in np.flatnonzero(stayed & (old >= 0) & (old != c.facet)):
+            node = int(slave.original[slave.owned[c.node[i]]])
+            facets = (int(old[i]), int(c.facet[i]))
+            found.append(Switch(time, contact.pair.name, node, facets, float(defect[i])))
+    gathered = problem.system.comm.allgather(found)
+    return sorted((s for part in gathered for s in part), key=lambda s: s[:3])
 
 
 def first_row(system: System, state: State) -> dict[str, Any]:

@@ -33,17 +33,43 @@ class Solution:
         status: "completed", or why the run stopped and what to do.
         rows: Balance table, one row for the start and one per accepted step.
         retries: How often a step was dropped and halved.
+        switches: Changes of facet of nodes in contact.
     """
 
     system: System
     status: str = "running"
     rows: list[dict[str, Any]] = field(default_factory=list)
     retries: int = 0
+    switches: list[balance.Switch] = field(default_factory=list)
 
     @property
     def balance(self) -> dict[str, npt.NDArray[np.float64]]:
         """Columns of the balance table, shape (rows,) or (rows, 3), identical on all ranks."""
         return {name: np.array([row[name] for row in self.rows]) for name in balance.COLUMNS}
+
+    @property
+    def summary(self) -> str:
+        """Some lines on how the run went: steps, energy, changes of facet; the same on all ranks."""
+        first, last = self.rows[0], self.rows[-1]
+        iterations = self.balance["newton_iterations"][1:]
+        lines = [
+            f"{self.status}: {len(iterations)} steps to t = {last['time']:.6g} s, {self.retries} "
+            f"retries, {iterations.mean() if len(iterations) else 0:.2f} Newton iterations per step",
+            f"energy {first['energy']:.6g} J + external work {last['external_work']:.6g} J - "
+            f"friction {last['friction_dissipation']:.6g} J - contact "
+            f"{last['contact_defect']:.6g} J = {last['energy']:.6g} J, "
+            f"but for {last['ledger_residual']:.2g} J",
+        ]
+        if self.switches:
+            defects = np.array([s.defect for s in self.switches])
+            worst = self.switches[int(np.abs(defects).argmax())]
+            lines.append(
+                f"{len(defects)} changes of facet: contact defect {defects.sum():.3g} J in all, "
+                f"{np.abs(defects).mean():.3g} J each; most {worst.defect:.3g} J at "
+                f"t = {worst.time:.6g} s ({worst.contact}, node {worst.node}, facet "
+                f"{worst.facets[0]} to {worst.facets[1]})"
+            )
+        return "\n".join(lines)
 
     def plot(self, path: str) -> None:
         """Write a picture of energies, ledger and momenta over time. Every rank must call it.
@@ -171,6 +197,7 @@ class Stepper:
         terms = balance.step_terms(self.problem, step)
         terms |= {"time": time, "newton_iterations": step.iterations}
         rows.append(balance.next_row(rows[0], rows[-1], balance.measure(self.system, state), terms))
+        self.solution.switches += balance.switches(self.problem, step, time)
         self._accept(state)
         gain = -terms["contact_defect"]
         if gain > _NOTABLE_GAIN * abs(rows[-1]["energy"]):
