@@ -12,7 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.assembly import StepMatrix
-from dolfinx_nts.contact import ContactStep, Contribution
+from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.linear_solver import PRESETS, SolverOptions
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.validation import known_options

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact import ContactStep, Contribution, Slip
+from dolfinx_nts.contact_step import ContactStep, Contribution, Slip
 from dolfinx_nts.nts import Gap
 from dolfinx_nts.obstacles import inverse
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import balance
-from dolfinx_nts.contact import ContactStep
+from dolfinx_nts.contact_step import ContactStep
 from dolfinx_nts.newton import Newton, StepFailedError, StepSolver
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.system import State, System
@@ -49,12 +49,13 @@ class Solution:
 
     @property
     def summary(self) -> str:
-        """Some lines on how the run went: steps, energy, changes of facet; the same on all ranks."""
+        """How the run went in a few lines: steps, energy, changes of facet; equal on all ranks."""
         first, last = self.rows[0], self.rows[-1]
-        iterations = self.balance["newton_iterations"][1:]
+        steps = len(self.rows) - 1
+        iterations = self.balance["newton_iterations"].sum() / max(steps, 1)
         lines = [
-            f"{self.status}: {len(iterations)} steps to t = {last['time']:.6g} s, {self.retries} "
-            f"retries, {iterations.mean() if len(iterations) else 0:.2f} Newton iterations per step",
+            f"{self.status}: {steps} steps to t = {last['time']:.6g} s, {self.retries} retries, "
+            f"{iterations:.2f} Newton iterations per step",
             f"energy {first['energy']:.6g} J + external work {last['external_work']:.6g} J - "
             f"friction {last['friction_dissipation']:.6g} J - contact "
             f"{last['contact_defect']:.6g} J = {last['energy']:.6g} J, "

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.assembly import ElementBlocks, Layout
-from dolfinx_nts.contact import ContactStep, Contribution
+from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.obstacle_contact import ObstacleStep
 from dolfinx_nts.system import State, System
 

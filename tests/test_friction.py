@@ -8,7 +8,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import contact, facets
+from dolfinx_nts import contact_step, facets
 from dolfinx_nts.friction import return_map
 from dolfinx_nts.nts import invariants, metric, projection
 
@@ -193,7 +193,7 @@ def test_result_does_not_depend_on_the_algorithmic_scale(integrator, factor, mon
     # A small c weighs the direction of the slip little, in the residual as in the iteration.
     newton = nts.Newton(rtol=1e-14, max_iterations=60)
     reference = run(rubbing_blocks(0.3), integrator, newton=newton).balance
-    monkeypatch.setattr(contact, "TANGENTIAL_SCALE", factor * contact.TANGENTIAL_SCALE)
+    monkeypatch.setattr(contact_step, "TANGENTIAL_SCALE", factor * contact_step.TANGENTIAL_SCALE)
     table = run(rubbing_blocks(0.3), integrator, newton=newton).balance
     assert difference(reference, table) < 1e-9
     assert np.array_equal(reference["stick"], table["stick"])

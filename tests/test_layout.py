@@ -22,6 +22,7 @@ LEVELS = [
         "rigid",
         "joints",
         "contact",
+        "contact_step",
         "obstacles",
         "obstacle_contact",
         "search",

@@ -1,0 +1,511 @@
+"""Equations of a contact in one step: what its candidates contribute to residual and tangent.
+
+Both integrators share them: the midpoint rule has one unknown per candidate (lambda_N), the
+energy-momentum scheme eleven (d, f and six multipliers). Friction adds two (lambda_T).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts import facets, nts
+from dolfinx_nts.contact import Candidates, ContactPair
+from dolfinx_nts.friction import return_map
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Algorithmic scale c of the return map over the scale of the active set. No result depends on it;
+#: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which
+#: with a consistent mass matrix is a small part of the nodal mass.
+TANGENTIAL_SCALE = 0.05
+#: Square of the part of a tangential direction's motion that counts as none.
+_IMMOVABLE = 1e-12
+
+
+class Contribution(NamedTuple):
+    """Step equations of the pairs at an iterate, all rows [kg m] for unknowns in [m].
+
+    Attributes:
+        residual: Shape (n, r), r = 3 (nc + 1) + augmented + multipliers.
+        tangent: Shape (n, r, r).
+        gap: g_N at t_{n+1} [m], shape (n,).
+        active: Active set of the iterate, shape (n,).
+        stick: Active pairs that stick, shape (n,).
+        slip: Facet size times f_1 - f_0 [m], shape (n, 2); (n, 0) without friction.
+        distance: Length of the slip in the metric [m], shape (n,); 0 where not active.
+        tangential: Contact force on the slave less its part along the normal [kg m], shape (n, 3).
+    """
+
+    residual: FloatArray
+    tangent: FloatArray
+    gap: FloatArray
+    active: BoolArray
+    stick: BoolArray
+    slip: FloatArray
+    distance: FloatArray
+    tangential: FloatArray
+
+
+class Slip(NamedTuple):
+    """Slip and metric in facet sizes with their derivatives by the unknowns of the element."""
+
+    value: FloatArray
+    gradient: FloatArray
+    metric: FloatArray
+    metric_gradient: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ContactStep:
+    """The candidates of one pair of surfaces in one step, with the rule of the integrator.
+
+    Attributes:
+        pair: Its surfaces.
+        candidates: This rank's slave nodes and their facets.
+        rule: "direct" for the midpoint rule, else the discrete gradient.
+        condense: Whether (d, f) and their multipliers are eliminated pair by pair.
+        x0: Slave and corners, or control points of the patch, at t_n [m], shape (n, nc + 1, 3).
+        scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
+            nodal mass [kg] in dynamics; scales multipliers and the active set.
+        theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
+    """
+
+    pair: ContactPair
+    candidates: Candidates
+    rule: str
+    condense: bool
+    x0: FloatArray
+    scale: FloatArray
+    theta: float
+
+    @property
+    def num_pairs(self) -> int:
+        """Candidates on this rank."""
+        return len(self.candidates.node)
+
+    @property
+    def num_corners(self) -> int:
+        """Points that the master surface over a facet depends on: its corners, or its patch's."""
+        return self.pair.master.patches.shape[1]
+
+    @property
+    def num_coordinates(self) -> int:
+        """Coordinates of the slave and the corners of a pair."""
+        return 3 * (self.num_corners + 1)
+
+    @property
+    def _only_normal(self) -> bool:
+        """Whether lambda_N is the only multiplier of a constraint."""
+        return self.condense or self.rule == "direct"
+
+    @property
+    def num_augmented(self) -> int:
+        """Unknowns d and f per pair."""
+        return 0 if self._only_normal else nts.NUM_AUGMENTED
+
+    @property
+    def num_tangential(self) -> int:
+        """Tangential multipliers per pair, the last ones."""
+        return 2 if self.pair.friction else 0
+
+    @property
+    def _num_constraints(self) -> int:
+        return 1 if self._only_normal else nts.NUM_CONSTRAINTS
+
+    @property
+    def num_multipliers(self) -> int:
+        """Multipliers per pair."""
+        return self._num_constraints + self.num_tangential
+
+    @property
+    def multiplier_pattern(self) -> BoolArray:
+        """Which multipliers stand in the rows of which multipliers, shape (m, m)."""
+        pattern = np.zeros((self.num_multipliers,) * 2, dtype=bool)
+        pattern[0, 0] = True
+        pattern[self._num_constraints :, 0] = True
+        pattern[self._num_constraints :, self._num_constraints :] = True
+        return pattern
+
+    def dofs(self) -> tuple[IntArray, ...]:
+        """Global coordinates of slaves (n, 3) and facets (n, 3 nc); -1 where prescribed."""
+        c, slave, master = self.candidates, self.pair.slave, self.pair.master
+        points, corners = slave.owned[c.node], master.patches[c.facet]
+        s = np.where(slave.fixed, -1, slave.dofs)[points]
+        m = np.where(master.fixed, -1, master.dofs)[corners].reshape(-1, 3 * self.num_corners)
+        return s, m
+
+    def points(self) -> tuple[IntArray, ...]:
+        """Global coordinates as in `dofs`, prescribed ones included."""
+        c, slave, master = self.candidates, self.pair.slave, self.pair.master
+        corners = master.patches[c.facet]
+        return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(
+            -1, 3 * self.num_corners
+        )
+
+    @cached_property
+    def blocked(self) -> FloatArray:
+        """Projector on the lambda_T that act on prescribed coordinates only, shape (n, 2, 2).
+
+        There the slip is prescribed, sticking is no equation, and lambda_T is set to zero.
+        """
+        free = np.concatenate(self.dofs(), axis=1) >= 0
+        out = np.zeros((self.num_pairs, 2, 2))
+        some = np.flatnonzero(~free.all(axis=1))
+        gradient = self._slip_gradient(some)
+        whole = np.einsum("naz,nbz->nab", gradient, gradient)
+        part = np.einsum("naz,nbz->nab", gradient * free[some, None], gradient)
+        inverse = np.linalg.inv(np.linalg.cholesky(whole))
+        movable, vector = np.linalg.eigh(inverse @ part @ inverse.transpose(0, 2, 1))
+        vector = np.matmul(inverse.transpose(0, 2, 1), vector)
+        vector /= np.linalg.norm(vector, axis=1, keepdims=True)
+        vector *= (movable < _IMMOVABLE)[:, None]
+        out[some] = np.matmul(vector, vector.transpose(0, 2, 1))
+        both = some[(movable < _IMMOVABLE).all(axis=1)]
+        out[both] = np.eye(2)
+        return out
+
+    def _slip_gradient(self, some: IntArray) -> FloatArray:
+        """Derivative of the slip of some pairs by the positions, of any size, shape (m, 2, z)."""
+        x, xi = self.x0[some], self.candidates.xi[some]
+        # As of a closed gap, where alone nodes stick: across an open one a turn of the facet, too,
+        # moves the projection.
+        x[:, 0] = facets.frame(x[:, 1:], xi)[0]
+        gradient, weights = nts.projection(x, xi, np.zeros_like(xi)).gradient, self._weights
+        if weights is not None:
+            width = (len(some), 2, self.num_corners, 3)
+            points = np.einsum("nkp,naki->napi", weights[some], gradient[..., 3:].reshape(width))
+            gradient[..., 3:] = points.reshape(gradient[..., 3:].shape)
+        return gradient
+
+    def reference(self) -> FloatArray:
+        """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
+        c, slave, master = self.candidates, self.pair.slave, self.pair.master
+        nodes = slave.reference[slave.owned[c.node]]
+        return np.concatenate([nodes[:, None], master.reference[master.patches[c.facet]]], axis=1)
+
+    def rows(self, k: Contribution, name: str) -> FloatArray:
+        """The residual's rows of "augmented" unknowns or "multipliers", shape (n, width)."""
+        start = self.num_coordinates
+        middle = start + self.num_augmented
+        return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
+
+    @property
+    def extent(self) -> float:
+        """Length beyond the bodies' positions whose rounding enters the gaps [m]."""
+        return 0.0
+
+    def external_work(self, part: Contribution) -> float:
+        """Work that enters the bodies through the contact: none, as the master is one of them."""
+        return 0.0
+
+    def initial_guess(self, x: FloatArray) -> FloatArray:
+        """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
+        if not self.num_augmented:
+            return np.empty((self.num_pairs, 0))
+        return self._augmented(self._control(x))
+
+    def _control(self, x: FloatArray) -> FloatArray:
+        """Slave and control points from slave and points of the patch, both (n, nc + 1, 3)."""
+        control = self.pair.master.combine(x[:, 1:], self.candidates.facet)
+        return np.concatenate([x[:, :1], control], axis=1)
+
+    @property
+    def _weights(self) -> FloatArray | None:
+        """Weights of the points in the control points, shape (n, nc, nc), if they differ."""
+        weights = self.pair.master.weights
+        return None if weights is None else weights[self.candidates.facet]
+
+    def _to_points(self, part: Contribution) -> None:
+        """The transpose of `_control`: forces and tangents of control points to their points."""
+        if self._weights is None:
+            return
+        n, size = part.residual.shape
+        width, middle = self.num_coordinates - 3, (self.num_corners, 3)
+        rows = slice(3, self.num_coordinates)
+        w = self._weights.transpose(0, 2, 1)
+        force = np.matmul(w, part.residual[:, rows].reshape(n, *middle))
+        part.residual[:, rows] = force.reshape(n, width)
+        columns = part.tangent[:, :, rows].reshape(n, size, *middle)
+        part.tangent[:, :, rows] = np.matmul(w[:, None], columns).reshape(n, size, width)
+        lines = part.tangent[:, rows].reshape(n, self.num_corners, 3 * size)
+        part.tangent[:, rows] = np.matmul(w, lines).reshape(n, width, size)
+
+    def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
+        """Multipliers of given contact forces on the slaves [N], shape (n, multipliers).
+
+        Args:
+            normal: p_N, shape (n,).
+            tangential: Friction, shape (n, 3).
+        """
+        out = np.zeros((self.num_pairs, self.num_multipliers))
+        out[:, 0] = -normal
+        if self.num_tangential:
+            out[:, -2:] = -np.einsum("nai,ni->na", self._tangents(), tangential)
+        return out
+
+    def _tangents(self) -> FloatArray:
+        """Tangents a_a of the facets at t_n over their size [-], shape (n, 2, 3)."""
+        _, tangents, _ = facets.frame(self.x0[:, 1:], self.candidates.xi)
+        scaled: FloatArray = tangents / self.candidates.length[:, None, None]
+        return scaled
+
+    def _augmented(self, x: FloatArray) -> FloatArray:
+        xi = self._projection(x)
+        _, _, normal = facets.frame(x[:, 1:], xi)
+        return np.column_stack([normal, xi]) * self.candidates.length[:, None]
+
+    def evaluate(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> Contribution:
+        """Residual and tangent of the pairs; pure.
+
+        Args:
+            x: Slave and corners at t_{n+1} [m], shape (n, nc + 1, 3).
+            augmented: Facet size times (d, f) [m], shape (n, 5) or (n, 0).
+            multiplier: h^2/2 lambda of the scaled constraints, and of lambda_T over the facet
+                size, over `scale` [m], shape (n, multipliers).
+        """
+        scale = self.scale[:, None]
+        multiplier = scale * multiplier
+        x = self._control(x)
+        residual, tangent, gap, slip = self._element(x, augmented, multiplier)
+        part = self._laws(residual, tangent, gap, slip, multiplier)
+        if slip is not None:
+            part.tangential[:] = self._tangential(x, -residual[:, :3])
+        self._to_points(part)
+        # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
+        rows = slice(part.residual.shape[1] - self.num_multipliers, None)
+        part.residual[:, rows] *= scale
+        part.tangent[:, rows] *= scale[:, None]
+        part.tangent[:, :, rows] *= scale[:, None]
+        return part
+
+    def _element(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """Residual and tangent in [kg m] and [m], gap and slip, before the laws of contact."""
+        if self.rule == "direct":
+            return self._direct(x, multiplier)
+        if self.condense:
+            return self._condensed(x, multiplier)
+        return self._invariants(x, augmented, multiplier)
+
+    def _direct(
+        self, x: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """`_element` of (x, multipliers)."""
+        n, size, theta = self.num_pairs, self.num_coordinates, self.theta
+        middle = self.x0 + theta * (x - self.x0)
+        xi_middle, xi_end = self._projection(middle), self._projection(x)
+        force, end = nts.gap(middle, xi_middle), nts.gap(x, xi_end)
+        gradient = force.gradient.reshape(n, size)
+        residual = np.zeros((n, size + self.num_multipliers))
+        tangent = np.zeros((*residual.shape, residual.shape[1]))
+        residual[:, :size] = multiplier[:, :1] * gradient
+        residual[:, size] = end.value
+        tangent[:, :size, :size] = theta * multiplier[:, :1, None] * force.hessian
+        tangent[:, :size, size] = gradient
+        tangent[:, size, :size] = end.gradient.reshape(n, size)
+        if not self.num_tangential:
+            return residual, tangent, end.value, None
+
+        length, t = self.candidates.length, multiplier[:, -2:]
+        middle_xi = nts.projection(middle, xi_middle, t)
+        end_xi = nts.projection(x, xi_end, np.zeros_like(t))
+        along = length[:, None, None] * middle_xi.gradient
+        residual[:, :size] += np.einsum("na,naz->nz", t, along)
+        tangent[:, :size, :size] += theta * length[:, None, None] * middle_xi.hessian
+        tangent[:, :size, -2:] = along.transpose(0, 2, 1)
+        value = length[:, None] * (xi_end - self.candidates.xi)
+        gradient = np.zeros((n, 2, residual.shape[1]))
+        gradient[..., :size] = length[:, None, None] * end_xi.gradient
+        metric_gradient = np.zeros((n, 2, 2, residual.shape[1]))
+        metric_gradient[..., :size] = theta * middle_xi.metric_gradient
+        return (
+            residual,
+            tangent,
+            end.value,
+            self._slip(value, gradient, middle_xi.metric, metric_gradient),
+        )
+
+    def _slip(
+        self,
+        value: FloatArray,
+        gradient: FloatArray,
+        metric: FloatArray,
+        metric_gradient: FloatArray,
+    ) -> Slip:
+        """Slip [m] and its gradient as given, the metric per square of the facet size."""
+        area = self.candidates.length[:, None, None] ** 2
+        return Slip(value, gradient, metric / area, metric_gradient / area[..., None])
+
+    def _projection(self, x: FloatArray) -> FloatArray:
+        """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
+        xi, converged = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
+        xi[~converged] = np.nan
+        return xi
+
+    def _invariants(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """Scaled residual and tangent of (x, d, f, multipliers), gap and slip."""
+        c, n = self.candidates, self.num_pairs
+        length = c.length[:, None]
+        positions = (n, self.num_coordinates)
+        z0 = np.concatenate([self.x0.reshape(positions), c.normal, c.xi], axis=1)
+        z1 = np.concatenate([x.reshape(positions), augmented / length], axis=1)
+        # One length per pair makes every unknown a length or a force, so blocks compare across
+        # units and scales.
+        row, one = 1.0 / length, np.ones_like(length)
+        scale_z = np.concatenate([np.ones(positions), np.tile(row, nts.NUM_AUGMENTED)], axis=1)
+        scale_g = np.concatenate([one, one, one, length, row, row], axis=1)
+        normal = multiplier[:, : nts.NUM_CONSTRAINTS]
+        e = nts.element(z0, z1, normal * scale_g, self.rule)
+        size = z1.shape[1]
+        stop = size + nts.NUM_CONSTRAINTS
+        residual = np.zeros((n, stop + self.num_tangential))
+        residual[:, :size], residual[:, size:stop] = e.force * scale_z, e.constraint * scale_g
+        tangent = np.zeros((*residual.shape, residual.shape[1]))
+        tangent[:, :size, :size] = e.stiffness * scale_z[:, :, None] * scale_z[:, None]
+        mixed = scale_g[:, :, None] * scale_z[:, None]
+        tangent[:, :size, size:stop] = (e.force_gradient * mixed).transpose(0, 2, 1)
+        tangent[:, size:stop, :size] = e.constraint_gradient * mixed
+        if not self.num_tangential:
+            return residual, tangent, e.constraint[:, 0], None
+
+        f = slice(size - 2, size)
+        residual[:, f] += multiplier[:, -2:]
+        tangent[:, f, -2:] = np.eye(2)
+        gradient = np.zeros((n, 2, residual.shape[1]))
+        gradient[:, :, f] = np.eye(2)
+        d1 = nts.invariant_gradient(z1, self.num_corners)
+        pi = 0.5 * (nts.invariants(z0, self.num_corners) + nts.invariants(z1, self.num_corners, d1))
+        metric, by_pi = nts.metric(pi, self.num_corners)
+        metric_gradient = np.zeros((n, 2, 2, residual.shape[1]))
+        by_z = np.matmul(by_pi.reshape(n, 4, -1), d1).reshape(n, 2, 2, size)
+        metric_gradient[..., :size] = 0.5 * by_z * scale_z[:, None, None]
+        slip = self._slip(augmented[:, 3:] - length * c.xi, gradient, metric, metric_gradient)
+        return residual, tangent, e.constraint[:, 0], slip
+
+    def _condensed(
+        self, x: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """The element in (x, lambda_N, lambda_T): constraints fix d and f, whose rows fix the rest.
+
+        At the projection of t_{n+1} the augmented constraints hold, and the rows of d and f are
+        linear in their multipliers; the Schur complement is then the exact tangent.
+        """
+        size = self.num_coordinates
+        normal, tangential = size + nts.NUM_AUGMENTED, multiplier[:, 1:]
+        augmented = self._augmented(x)
+        hidden = np.zeros((self.num_pairs, nts.NUM_AUGMENTED))
+        rows, columns = slice(size, normal), slice(normal + 1, normal + 1 + nts.NUM_AUGMENTED)
+        full = np.concatenate([multiplier[:, :1], hidden, tangential], axis=1)
+        residual, tangent, _, _ = self._invariants(x, augmented, full)
+        hidden = nts.solve(tangent[:, rows, columns], residual[:, rows, None])[:, :, 0]
+        full[:, 1 : 1 + nts.NUM_AUGMENTED] = -hidden
+        residual, tangent, gap, slip = self._invariants(x, augmented, full)
+        inner = np.r_[rows, columns]
+        outer = np.setdiff1d(np.arange(tangent.shape[1]), inner)
+        inside = nts.solve(tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer])
+
+        def reduce(a: FloatArray) -> FloatArray:
+            """Derivatives by the outer unknowns from those by all."""
+            reduced: FloatArray = a[..., outer] - np.matmul(a[..., inner], inside)
+            return reduced
+
+        tangent = reduce(tangent[:, outer])
+        if slip is not None:
+            n = self.num_pairs
+            by_metric = reduce(slip.metric_gradient.reshape(n, 4, -1)).reshape(n, 2, 2, -1)
+            slip = slip._replace(gradient=reduce(slip.gradient), metric_gradient=by_metric)
+        return residual[:, outer], tangent, gap, slip
+
+    def _laws(
+        self,
+        residual: FloatArray,
+        tangent: FloatArray,
+        gap: FloatArray,
+        slip: Slip | None,
+        multiplier: FloatArray,
+    ) -> Contribution:
+        """Semi-smooth laws of contact (theory section 9) and friction (section 6).
+
+        g_N = 0 where active, else lambda_N = 0; there Coulomb's law, else lambda_T = 0.
+        """
+        gap, force, scale = gap.copy(), multiplier[:, 0], self.scale
+        active = -force - scale * gap > 0
+        off = ~active
+        row = residual.shape[1] - self.num_multipliers
+        residual[off, row] = force[off] / scale[off]
+        tangent[off, row] = 0.0
+        tangent[off, row, row] = 1.0 / scale[off]
+        part = Contribution(
+            residual,
+            tangent,
+            gap,
+            active,
+            stick=np.zeros_like(active),
+            slip=np.empty((self.num_pairs, 0)) if slip is None else slip.value,
+            distance=np.zeros(self.num_pairs),
+            tangential=np.zeros((self.num_pairs, 3)),
+        )
+        if slip is not None:
+            part.stick[:] = self._coulomb(residual, tangent, slip, multiplier, gap, active)
+            square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
+            part.distance[active] = np.sqrt(square[active])
+        return part
+
+    def _tangential(self, x: FloatArray, force: FloatArray) -> FloatArray:
+        """Force (n, 3) less its part along the normal where the contact force acts."""
+        middle = self.x0 + self.theta * (x - self.x0)
+        _, _, normal = facets.frame(middle[:, 1:], self._projection(middle))
+        along: FloatArray = np.einsum("ni,ni->n", force, normal)
+        return force - along[:, None] * normal
+
+    def _coulomb(
+        self,
+        residual: FloatArray,
+        tangent: FloatArray,
+        slip: Slip,
+        multiplier: FloatArray,
+        gap: FloatArray,
+        active: BoolArray,
+    ) -> BoolArray:
+        """Write the rows of lambda_T [m]; returns which pairs stick.
+
+        The pressure in Coulomb's bound is that which decides on the active set, so that it is
+        positive just where a pair is active; where solved, the gap in it is zero.
+        """
+        mu, t, scale = self.pair.friction, multiplier[:, -2:], self.scale[:, None, None]
+        normal = residual.shape[1] - self.num_multipliers
+        pressure = -multiplier[:, 0] - self.scale * gap
+        bound = np.zeros_like(gap)
+        bound[active] = np.inf if np.isinf(mu) else mu * pressure[active]
+        law = return_map(t, slip.value, slip.metric, bound, TANGENTIAL_SCALE * self.scale)
+        stick = law.stick & active
+        rows = np.einsum("nab,nbz->naz", law.d_slip, slip.gradient)
+        rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)
+        rows[:, :, -2:] += law.d_multiplier
+        if not np.isinf(mu):
+            d_pressure = -self.scale[:, None] * tangent[:, normal]
+            d_pressure[:, normal] -= 1.0
+            rows += mu * law.d_bound[:, :, None] * d_pressure[:, None]
+        value = law.residual
+        value[~active], rows[~active] = t[~active], 0.0
+        rows[~active, :, -2:] = np.eye(2)
+        slipping = ~stick
+        value[slipping] /= scale[slipping, 0]
+        rows[slipping] /= scale[slipping]
+        blocked = self.blocked[stick] / scale[stick]
+        value[stick] += np.einsum("nab,nb->na", blocked, t[stick])
+        rows[stick, :, -2:] += blocked
+        residual[:, -2:], tangent[:, -2:] = value, rows
+        return stick
