@@ -69,10 +69,10 @@ class Clock:
         self._restore.append((owner, name, method))
         self.seconds[label] = 0.0
 
-        def timed(*arguments: Any) -> Any:
+        def timed(*arguments: Any, **options: Any) -> Any:
             begin = time.perf_counter()
             try:
-                return method(*arguments)
+                return method(*arguments, **options)
             finally:
                 self.seconds[label] += time.perf_counter() - begin
 

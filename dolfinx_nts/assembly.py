@@ -92,6 +92,7 @@ class StepMatrix:
         self, layout: Layout, bodies: Sequence[Any], elements: Sequence[ElementBlocks]
     ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
+        self._added: list[FloatArray] = []
         self._sources: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
         for e, element in enumerate(elements):
             for i, row in enumerate(element.fields):
@@ -132,8 +133,17 @@ class StepMatrix:
         compat.set_preallocation_coo(a, rows, cols)
         return a
 
-    def assemble(self, tangents: Sequence[FloatArray]) -> None:
-        """Add the contact tangents (n, r, r) to freshly assembled bodies; refresh nest and AIJ."""
+    def assemble(self, tangents: Sequence[FloatArray], *, fresh: bool = True) -> None:
+        """Add the contact tangents (n, r, r) to the bodies; refresh nest and AIJ.
+
+        Args:
+            tangents: Of each batch of elements.
+            fresh: The bodies' matrices are without contact, newly assembled; else they hold what
+                the last call added.
+        """
+        old = [] if fresh else self._added
+        change = [a - b for a, b in zip(tangents, old, strict=True)] if old else tangents
+        self._added = list(tangents)
         for key, sources in self._sources.items():
             if key in self._blocks:
                 values = [self._values(s, tangents) for s in sources]
@@ -141,7 +151,7 @@ class StepMatrix:
                     self._blocks[key], np.concatenate([v.ravel() for v in values])
                 )
             else:
-                self._add_to_body(self._bodies[key[0]], sources, tangents)
+                self._add_to_body(self._bodies[key[0]], sources, change)
         self.nest.assemble()
         if self.aij is None:
             self.aij = self.nest.convert(
@@ -149,6 +159,14 @@ class StepMatrix:
             )  # without `out` the nest itself is converted
         else:
             self.nest.convert("aij", out=self.aij)
+
+    def withdraw(self) -> None:
+        """Take the contact tangents out of the bodies' matrices, but for rounding."""
+        change = [-a for a in self._added]
+        for key, sources in self._sources.items():
+            if key not in self._blocks and change:
+                self._add_to_body(self._bodies[key[0]], sources, change)
+        self._added = []
 
     def _values(self, source: tuple[int, int, int], tangents: Sequence[FloatArray]) -> FloatArray:
         e, i, j = source

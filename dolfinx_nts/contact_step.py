@@ -355,7 +355,11 @@ class ContactStep:
     def _invariants(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
-        """Scaled residual and tangent of (x, d, f, multipliers), gap and slip."""
+        """Scaled residual and tangent of (x, d, f, all multipliers), gap and slip.
+
+        Condensed, the multipliers of the augmented constraints are those that hold the rows of d
+        and f, in which they are linear.
+        """
         c, n = self.candidates, self.num_pairs
         length = c.length[:, None]
         positions = (n, self.num_coordinates)
@@ -366,10 +370,19 @@ class ContactStep:
         row, one = 1.0 / length, np.ones_like(length)
         scale_z = np.concatenate([np.ones(positions), np.tile(row, nts.NUM_AUGMENTED)], axis=1)
         scale_g = np.concatenate([one, one, one, length, row, row], axis=1)
-        normal = multiplier[:, : nts.NUM_CONSTRAINTS]
-        e = nts.element(z0, z1, normal * scale_g, self.rule)
         size = z1.shape[1]
-        stop = size + nts.NUM_CONSTRAINTS
+        stop, hidden = size + nts.NUM_CONSTRAINTS, slice(size - nts.NUM_AUGMENTED, size)
+
+        def hold(gradient: FloatArray) -> FloatArray:
+            """All six multipliers from lambda_N and lambda_T."""
+            rows = gradient[:, :, hidden] * scale_z[:, None, hidden]
+            load = multiplier[:, :1] * rows[:, 0]
+            load[:, -2:] += multiplier[:, 1:] if self.num_tangential else 0.0
+            others = nts.solve(rows[:, 1:].transpose(0, 2, 1), -load[:, :, None])[:, :, 0]
+            return np.concatenate([multiplier[:, :1], others], axis=1)
+
+        given = multiplier[:, : nts.NUM_CONSTRAINTS] * scale_g if not self.condense else None
+        e = nts.element(z0, z1, hold if given is None else given, self.rule)
         residual = np.zeros((n, stop + self.num_tangential))
         residual[:, :size], residual[:, size:stop] = e.force * scale_z, e.constraint * scale_g
         tangent = np.zeros((*residual.shape, residual.shape[1]))
@@ -399,20 +412,13 @@ class ContactStep:
     ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
         """The element in (x, lambda_N, lambda_T): constraints fix d and f, whose rows fix the rest.
 
-        At the projection of t_{n+1} the augmented constraints hold, and the rows of d and f are
-        linear in their multipliers; the Schur complement is then the exact tangent.
+        At the projection of t_{n+1} the augmented constraints hold, so that the Schur complement
+        is the exact tangent.
         """
-        size = self.num_coordinates
-        normal, tangential = size + nts.NUM_AUGMENTED, multiplier[:, 1:]
-        augmented = self._augmented(x)
-        hidden = np.zeros((self.num_pairs, nts.NUM_AUGMENTED))
-        rows, columns = slice(size, normal), slice(normal + 1, normal + 1 + nts.NUM_AUGMENTED)
-        full = np.concatenate([multiplier[:, :1], hidden, tangential], axis=1)
-        residual, tangent, _, _ = self._invariants(x, augmented, full)
-        hidden = nts.solve(tangent[:, rows, columns], residual[:, rows, None])[:, :, 0]
-        full[:, 1 : 1 + nts.NUM_AUGMENTED] = -hidden
-        residual, tangent, gap, slip = self._invariants(x, augmented, full)
-        inner = np.r_[rows, columns]
+        residual, tangent, gap, slip = self._invariants(x, self._augmented(x), multiplier)
+        stop = self.num_coordinates + nts.NUM_AUGMENTED
+        hidden = [slice(self.num_coordinates, stop), slice(stop + 1, stop + nts.NUM_CONSTRAINTS)]
+        inner = np.r_[tuple(hidden)]
         outer = np.setdiff1d(np.arange(tangent.shape[1]), inner)
         inside = nts.solve(tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer])
 

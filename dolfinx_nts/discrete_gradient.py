@@ -70,45 +70,89 @@ def gonzalez_stress(energy: Callable[[Any], Any], c0: Any, c1: Any) -> Any:
 
 
 def mean_value(
-    pi0: FloatArray,
-    pi1: FloatArray,
-    gradient: Callable[[FloatArray], FloatArray],
-    curvature: Callable[[FloatArray], FloatArray],
-    points: int,
-) -> tuple[FloatArray, FloatArray]:
+    pi0: FloatArray, pi1: FloatArray, gradient: Callable[[FloatArray], FloatArray], points: int
+) -> FloatArray:
     """Mean value of dg/dpi by Gauss points: unit independent, exact up to degree 2 points.
 
     Args:
         pi0: Invariants at t_n, shape (n, p).
         pi1: Invariants at t_{n+1}, shape (n, p).
         gradient: dg/dpi.
-        curvature: d2(lambda . g)/dpi2 in whatever (linear) storage the caller uses.
         points: Gauss points; n of them are exact for constraints of degree <= 2 n in pi.
-
-    Returns:
-        The discrete gradient and d(discrete gradient^T lambda)/dpi_1 in the storage of `curvature`.
     """
-    mean, tangent = None, None
-    for tau, weight in zip(*_GAUSS[points], strict=True):
-        pi = pi0 + tau * (pi1 - pi0)
-        g, k = weight * gradient(pi), weight * tau * curvature(pi)
-        mean, tangent = (g, k) if mean is None else (mean + g, tangent + k)
-    assert mean is not None and tangent is not None
-    return mean, tangent
+    tau, weight = _GAUSS[points]
+    return _between(pi0, pi1, tau, weight, gradient)
+
+
+def mean_value_tangent(
+    pi0: FloatArray, pi1: FloatArray, curvature: Callable[[FloatArray], FloatArray], points: int
+) -> FloatArray:
+    """d(mean value^T lambda)/dpi_1 in whatever (linear) storage the caller uses.
+
+    Args:
+        pi0: Invariants at t_n, shape (n, p).
+        pi1: Invariants at t_{n+1}, shape (n, p).
+        curvature: d2(lambda . g)/dpi2 of m n invariants, n for each of m points.
+        points: Gauss points.
+    """
+    tau, weight = _GAUSS[points]
+    return _between(pi0, pi1, tau, weight * tau, curvature)
+
+
+def _between(
+    pi0: FloatArray,
+    pi1: FloatArray,
+    tau: FloatArray,
+    weight: FloatArray,
+    function: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Weighted sum of a function at points between; all in one batch, for few pairs cost calls."""
+    pi = pi0 + tau[:, None, None] * (pi1 - pi0)
+    values = function(pi.reshape(-1, pi.shape[2]))
+    total: FloatArray = np.tensordot(weight, values.reshape(*pi.shape[:2], *values.shape[1:]), 1)
+    return total
+
+
+def _gonzalez_increment(pi0: FloatArray, pi1: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Dpi, shape (n, p), and 1 / |Dpi|^2, shape (n, 1), zero at rest."""
+    dpi, pm = pi1 - pi0, 0.5 * (pi0 + pi1)
+    size = np.einsum("np,np->n", dpi, dpi)
+    at_rest = size <= (64 * np.finfo(float).eps) ** 2 * np.einsum("np,np->n", pm, pm)
+    return dpi, np.where(at_rest, 0.0, 1.0 / np.where(at_rest, 1.0, size))[:, None]
 
 
 def gonzalez(
+    pi0: FloatArray, pi1: FloatArray, gradient: Callable[[FloatArray], FloatArray], points: int
+) -> FloatArray:
+    """Gonzalez's discrete gradient (67) with the sign corrected, row by row, shape (n, m, p).
+
+    Mixes the units of the invariants and is 0/0 at rest, which is why the mean value is the
+    default.
+
+    Args:
+        pi0: Invariants at t_n, shape (n, p).
+        pi1: Invariants at t_{n+1}, shape (n, p).
+        gradient: dg/dpi, shape (n, m, p).
+        points: Gauss points that make `mean_value` exact.
+    """
+    dpi, inverse = _gonzalez_increment(pi0, pi1)
+    middle = gradient(0.5 * (pi0 + pi1))
+    # g(pi_1) - g(pi_0) by the exact mean value: the difference of values would leave rounding noise
+    # ~ eps / |Dpi|^2 in the tangent.
+    defect = np.einsum("nmp,np->nm", mean_value(pi0, pi1, gradient, points) - middle, dpi)
+    discrete: FloatArray = middle + (defect * inverse)[:, :, None] * dpi[:, None]
+    return discrete
+
+
+def gonzalez_tangent(
     pi0: FloatArray,
     pi1: FloatArray,
     multiplier: FloatArray,
     gradient: Callable[[FloatArray], FloatArray],
     curvature: Callable[[FloatArray], FloatArray],
     points: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Gonzalez's discrete gradient (67) with the sign corrected, row by row, and its tangent.
-
-    Mixes the units of the invariants and is 0/0 at rest, which is why the mean value is the
-    default.
+) -> FloatArray:
+    """d(Gonzalez's discrete gradient^T lambda)/dpi_1, shape (n, p, p).
 
     Args:
         pi0: Invariants at t_n, shape (n, p).
@@ -117,25 +161,15 @@ def gonzalez(
         gradient: dg/dpi, shape (n, m, p).
         curvature: d2(lambda . g)/dpi2, shape (n, p, p).
         points: Gauss points that make `mean_value` exact.
-
-    Returns:
-        The discrete gradient (n, m, p) and d(discrete gradient^T lambda)/dpi_1 (n, p, p).
     """
-    pm, dpi = 0.5 * (pi0 + pi1), pi1 - pi0
+    dpi, inverse = _gonzalez_increment(pi0, pi1)
+    pm = 0.5 * (pi0 + pi1)
     middle, hessian = gradient(pm), curvature(pm)
-    size = np.einsum("np,np->n", dpi, dpi)
-    at_rest = size <= (64 * np.finfo(float).eps) ** 2 * np.einsum("np,np->n", pm, pm)
-    inverse = np.where(at_rest, 0.0, 1.0 / np.where(at_rest, 1.0, size))[:, None]
-    # g(pi_1) - g(pi_0) by the exact mean value: the difference of values would leave rounding noise
-    # ~ eps / |Dpi|^2 in the tangent.
-    mean, _ = mean_value(pi0, pi1, gradient, curvature, points)
-    defect = np.einsum("nmp,np->nm", mean - middle, dpi)
-    discrete = middle + (defect * inverse)[:, :, None] * dpi[:, None]
-
-    rest = np.einsum("nm,nm->n", multiplier, defect)[:, None] * inverse
+    excess = mean_value(pi0, pi1, gradient, points) - middle
+    rest = np.einsum("nm,nmp,np->n", multiplier, excess, dpi)[:, None] * inverse
     change = np.einsum("nm,nmp->np", multiplier, gradient(pi1) - middle)
     change -= 0.5 * np.einsum("npq,nq->np", hessian, dpi)
     row = change * inverse - 2.0 * rest * inverse * dpi
-    tangent = 0.5 * hessian + dpi[:, :, None] * row[:, None]
+    tangent: FloatArray = 0.5 * hessian + dpi[:, :, None] * row[:, None]
     tangent += rest[:, :, None] * np.eye(dpi.shape[1])
-    return discrete, tangent
+    return tangent

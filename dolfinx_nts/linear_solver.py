@@ -45,6 +45,12 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         _CONTACT + "pc_factor_mat_solver_type": "mumps",
     },
 }
+#: In place of the preset's where the contact unknowns are condensed: without zeros on its diagonal
+#: their small block needs no pivoting, and starting MUMPS takes longer than all else.
+_CONDENSED: Mapping[str, Mapping[str, Any]] = {
+    "direct": {},
+    "krylov": {_CONTACT + "pc_type": "redundant"},
+}
 #: PETSc's errors "no support", "unknown type", "missing factor": an option has a wrong value.
 _WRONG_VALUE = (56, 86, 92)
 _prefixes = itertools.count()
@@ -56,12 +62,17 @@ class SolverOptions:
     Args:
         comm: MPI communicator.
         preset: Name of a preset.
+        condense: Whether the contact unknowns are condensed.
         given: The user's options without prefix; they override the preset.
     """
 
-    def __init__(self, comm: Any, preset: str, given: Mapping[str, Any]) -> None:
+    def __init__(self, comm: Any, preset: str, condense: bool, given: Mapping[str, Any]) -> None:
         self._comm, self._given = comm, dict(given)
-        self._all = {**PRESETS[preset], **given}
+        known = dict(PRESETS[preset])
+        if condense and _CONDENSED[preset]:
+            known = {k: v for k, v in known.items() if not k.startswith(_CONTACT + "pc_")}
+            known |= _CONDENSED[preset]
+        self._all = {**known, **given}
         self._unchecked = set(given)
         self._entered: dict[str, str] = {}
 
@@ -171,3 +182,15 @@ def _split(snes: Any, *parts: tuple[str, Any]) -> None:
     snes.getKSP().getPC().setFieldSplitIS(*parts)
     for _, index in parts:
         index.destroy()
+
+
+def keep_bodies(snes: Any, keep: bool) -> None:
+    """Whether a field split keeps the bodies' preconditioner when the matrix changes.
+
+    Args:
+        snes: Has solved a linear system before.
+        keep: Keep it, or make it anew from now on.
+    """
+    pc = snes.getKSP().getPC()
+    if pc.getType() == "fieldsplit":
+        pc.getFieldSplitSchurGetSubKSP()[0].getPC().setReusePreconditioner(keep)

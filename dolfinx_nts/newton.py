@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts.assembly import StepMatrix
 from dolfinx_nts.contact_step import ContactStep, Contribution
-from dolfinx_nts.linear_solver import PRESETS, SolverOptions
+from dolfinx_nts.linear_solver import PRESETS, SolverOptions, keep_bodies
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.validation import known_options
 
@@ -36,6 +36,8 @@ class Newton:
             a Schur complement for contact), which is for large meshes: at 50,000 coordinates an
             iteration costs a sixth. Its incomplete factors weaken as dt grows beyond the time a
             wave needs through an element.
+        reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
+            and steps for as long as Newton contracts well; contact is always linearised anew.
 
     Raises:
         ValueError: An argument is out of range.
@@ -46,6 +48,7 @@ class Newton:
     max_retries: int = 8
     condense: bool = False
     linear_solver: str = "direct"
+    reuse: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.rtol < 1:
@@ -57,6 +60,10 @@ class Newton:
         if self.linear_solver not in PRESETS:
             known = ", ".join(map(repr, PRESETS))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
+
+
+#: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
+_SLOW = 0.05
 
 
 class StepFailedError(RuntimeError):
@@ -81,9 +88,11 @@ class StepSolver:
     ) -> None:
         self.problem, self.newton = problem, newton
         self._options = SolverOptions(
-            problem.system.comm, newton.linear_solver, petsc_options or {}
+            problem.system.comm, newton.linear_solver, newton.condense, petsc_options or {}
         )
-        self._version = -1
+        self._version, self._factor = -1, 0.0
+        self._matrices_due, self._solved = True, False
+        self._bodies: list[Any] = []
         self._assembled: Evaluation | None = None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
@@ -99,6 +108,7 @@ class StepSolver:
         assert self.matrix is not None
         for retry in (False, True):
             if retry:
+                self._matrices_due = True
                 self.problem.guess(flight=False)
             try:
                 self._options.check(self.snes, self.matrix.aij)
@@ -116,6 +126,7 @@ class StepSolver:
             # A line search of the user's may stop SNES by its own tests; ours decide.
             if self._worst(last) <= 1.0 and self.snes.getConvergedReason() > 0:
                 return replace(last, iterations=self.snes.getIterationNumber())
+        self._matrices_due = True
         reason, iterations = self.snes.getConvergedReason(), self.snes.getIterationNumber()
         raise StepFailedError(self._diagnosis(last, reason, iterations))
 
@@ -123,6 +134,9 @@ class StepSolver:
         """Make SNES and matrices ready for the current step."""
         self._last: Evaluation | None = None
         self._flips = [np.zeros(c.num_pairs, dtype=int) for c in self.problem.contacts]
+        self._before = np.inf
+        self._matrices_due |= not self.newton.reuse or self.problem.factor != self._factor
+        self._factor = self.problem.factor
         if self._version != self.problem.version:
             self.destroy()
             self._version = self.problem.version
@@ -130,11 +144,21 @@ class StepSolver:
             self._configure()
 
     def assemble(self, e: Evaluation) -> StepMatrix:
-        """Nested Jacobian and its AIJ form at an iterate. Every rank must call it."""
-        bodies = self.problem.body_tangents(e)
+        """Nested Jacobian and its AIJ form at an iterate. Every rank must call it.
+
+        The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
+        """
+        fresh = self._matrices_due
+        if fresh:
+            self._bodies = self.problem.body_tangents(e)
+            self._matrices_due = not self.newton.reuse
         if self.matrix is None:
-            self.matrix = StepMatrix(self.problem.layout, bodies, self.problem.elements)
-        self.matrix.assemble([c.tangent for c in e.contacts] if self.problem.elements else [])
+            self.matrix = StepMatrix(self.problem.layout, self._bodies, self.problem.elements)
+        elif self._solved and self.newton.reuse and self.problem.elements:
+            keep_bodies(self.snes, not fresh)
+        if fresh or self.problem.elements:
+            tangents = [c.tangent for c in e.contacts] if self.problem.elements else []
+            self.matrix.assemble(tangents, fresh=fresh)
         self._assembled = e
         return self.matrix
 
@@ -147,6 +171,7 @@ class StepSolver:
         self.snes.setConvergenceTest(self._converged)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
         contact = self.matrix if self.problem.elements else None
+        self._solved = False
         self._options.configure(self.snes, contact, len(self.problem.system.bodies))
 
     # ---- SNES callbacks
@@ -157,9 +182,11 @@ class StepSolver:
             # A diverging iterate may overflow; the convergence test sees it.
             with np.errstate(over="ignore", invalid="ignore"):
                 new = self.problem.evaluate(x)
+            self._rests = True
             if self._last is not None:
                 for count, a, b in zip(self._flips, self._last.contacts, new.contacts, strict=True):
                     count += a.active != b.active
+                    self._rests &= bool((a.active == b.active).all() & (a.stick == b.stick).all())
             self._last = new
         assert self._last is not None
         return self._last
@@ -183,6 +210,10 @@ class StepSolver:
         worst = self._worst(self._last)
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
             return reasons.DIVERGED_FNORM_NAN
+        unchanged = self.problem.system.comm.allreduce(self._rests, op=MPI.LAND)
+        self._solved |= iteration > 0
+        self._matrices_due |= unchanged and worst > _SLOW * self._before
+        self._before = worst
         if worst <= 1.0:
             return reasons.CONVERGED_FNORM_RELATIVE
         if iteration >= self.newton.max_iterations:
@@ -220,6 +251,8 @@ class StepSolver:
         """Free the PETSc objects, which Python's collector does not."""
         self._options.remove()
         if self.matrix is not None:
+            if not self._matrices_due:
+                self.matrix.withdraw()
             self.matrix.destroy()
             self.matrix = None
         if self.snes is not None:

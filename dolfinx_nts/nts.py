@@ -10,6 +10,7 @@ bodies.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -320,52 +321,57 @@ def metric(pi: FloatArray, nc: int) -> tuple[FloatArray, FloatArray]:
     return value, gradient
 
 
-def element(z0: FloatArray, z1: FloatArray, multiplier: FloatArray, rule: str) -> Element:
+def element(
+    z0: FloatArray,
+    z1: FloatArray,
+    multiplier: FloatArray | Callable[[FloatArray], FloatArray],
+    rule: str,
+) -> Element:
     """Energy-momentum element in invariants with its exact tangent (63)-(66).
 
     Args:
         z0: (x_s, x_I, d, f) at t_n, shape (n, 3 (nc + 2) + 2).
         z1: The same at t_{n+1}.
-        multiplier: lambda, shape (n, 6).
+        multiplier: lambda, shape (n, 6), or what makes it of the `force_gradient`.
         rule: Discrete gradient in pi, "mean-value" or "gonzalez".
 
     Returns:
         Forces, constraints and tangents in z.
     """
     nc = (z0.shape[1] - 2) // 3 - 2
-    second = _invariant_maps(nc)[0]
+    points, second = _GAUSS_POINTS[nc], _invariant_maps(nc)[0]
     d0, d1 = invariant_gradient(z0, nc), invariant_gradient(z1, nc)
     pi0, pi1 = invariants(z0, nc, d0), invariants(z1, nc, d1)
     dm = 0.5 * (d0 + d1)
-    gradient1 = constraint_gradient(pi1, nc)
-    if rule == "mean-value":
-        gradient, curvature = discrete_gradient.mean_value(
-            pi0,
-            pi1,
-            lambda pi: constraint_gradient(pi, nc),
-            lambda pi: constraint_curvature(pi, multiplier, nc),
-            _GAUSS_POINTS[nc],
-        )
+
+    def slope(pi: FloatArray) -> FloatArray:
+        return constraint_gradient(pi, nc)
+
+    def bend(pi: FloatArray) -> FloatArray:
+        """With as many copies of the multipliers as there are points."""
+        return constraint_curvature(pi, np.resize(force, (len(pi), NUM_CONSTRAINTS)), nc)
+
+    mean = rule == "mean-value"
+    discrete = discrete_gradient.mean_value if mean else discrete_gradient.gonzalez
+    gradient = discrete(pi0, pi1, slope, points)
+    force_gradient = np.matmul(gradient, dm)
+    force = multiplier(force_gradient) if callable(multiplier) else multiplier
+    if mean:
+        curvature = discrete_gradient.mean_value_tangent(pi0, pi1, bend, points)
         stiffness = _curvature_stiffness(dm, curvature, d1)
     else:
-        gradient, rest = discrete_gradient.gonzalez(
-            pi0,
-            pi1,
-            multiplier,
-            lambda pi: constraint_gradient(pi, nc),
-            lambda pi: _full_curvature(constraint_curvature(pi, multiplier, nc)),
-            _GAUSS_POINTS[nc],
+        rest = discrete_gradient.gonzalez_tangent(
+            pi0, pi1, force, slope, lambda pi: _full_curvature(bend(pi)), points
         )
         stiffness = np.matmul(dm.transpose(0, 2, 1), np.matmul(rest, d1))
-    work = np.matmul(multiplier[:, None], gradient)[:, 0]
+    work = np.matmul(force[:, None], gradient)[:, 0]
     stiffness += 0.5 * (work @ second.reshape(len(second), -1)).reshape(stiffness.shape)
-    force = np.matmul(work[:, None], dm)[:, 0]
     return Element(
-        force,
+        np.matmul(work[:, None], dm)[:, 0],
         constraints(pi1, nc),
         stiffness,
-        np.matmul(gradient, dm),
-        np.matmul(gradient1, d1),
+        force_gradient,
+        np.matmul(slope(pi1), d1),
     )
 
 

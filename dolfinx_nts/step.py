@@ -97,6 +97,7 @@ class StepProblem:
         self._petsc: list[Any] = []
         self.version = 0
         self.stabilization = 0.0
+        self._diagonal = np.zeros(len(system.bodies))
 
     # ---- set-up of a step
     def begin(
@@ -131,7 +132,6 @@ class StepProblem:
         self._motion, self._extent = _global_max(system.comm, np.array(local)).T
         if motion is not None:
             self._motion = np.maximum(self._motion, motion)
-        self._rounding = np.zeros(len(system.bodies))
         if search:
             self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
         numbers = tuple(a for c in self.contacts for a in c.points())
@@ -363,14 +363,18 @@ class StepProblem:
                 a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
                 held.destroy()
         for k, a in enumerate(tangents):
-            if self._rounding[k] == 0.0:
-                diagonal = a.getDiagonal()
-                # Rounding of the forces: stiffness times position times machine precision.
-                self._rounding[k] = _EPS * diagonal.norm() * self._extent[k]
-                diagonal.destroy()
+            diagonal = a.getDiagonal()
+            self._diagonal[k] = diagonal.norm()
+            diagonal.destroy()
         return tangents
 
     # ---- convergence
+    @property
+    def _rounding(self) -> FloatArray:
+        """Of the forces on each body [kg m]: stiffness times position times machine precision."""
+        rounding: FloatArray = _EPS * self._diagonal * self._extent
+        return rounding
+
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
         local = [np.abs(b.du).max(initial=0.0) for b in e.bodies]

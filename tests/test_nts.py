@@ -332,12 +332,16 @@ def test_directionality(nc, rule, motion):
 def test_mean_value_is_the_integral_of_the_gradient(nc):
     z0, z1, multiplier = random_step(np.random.default_rng(12), 20, nc)
     pi0, pi1 = nts.invariants(z0, nc), nts.invariants(z1, nc)
-    found, tangent = discrete_gradient.mean_value(
+    number = nts._GAUSS_POINTS[nc]
+    found = discrete_gradient.mean_value(
+        pi0, pi1, lambda pi: nts.constraint_gradient(pi, nc), number
+    )
+    copies = np.tile(multiplier, (number, 1))
+    tangent = discrete_gradient.mean_value_tangent(
         pi0,
         pi1,
-        lambda pi: nts.constraint_gradient(pi, nc),
-        lambda pi: nts._full_curvature(nts.constraint_curvature(pi, multiplier, nc)),
-        nts._GAUSS_POINTS[nc],
+        lambda pi: nts._full_curvature(nts.constraint_curvature(pi, copies, nc)),
+        number,
     )
     points, weights = np.polynomial.legendre.leggauss(9)
     gradient, slope = 0.0, 0.0

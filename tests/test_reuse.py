@@ -1,0 +1,97 @@
+"""Matrices of earlier iterates: fewer of them, the same solution."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from test_friction import difference, rubbing_blocks
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
+
+
+def run(integrator, dt=2e-3, steps=30, system=None, **newton):
+    """Balance table of a collision, and how often the bodies' matrices were assembled."""
+    stepper = nts.Stepper(
+        system or rubbing_blocks(0.3), INTEGRATORS[integrator], newton=nts.Newton(**newton)
+    )
+    assembled, problem = [], stepper.problem
+    body_tangents = problem.body_tangents
+    problem.body_tangents = lambda e: assembled.append(1) or body_tangents(e)
+    for _ in range(steps):
+        stepper.advance(dt)
+    stepper.close()
+    return stepper.solution.balance, len(assembled)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("solver", ["direct", "krylov"])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_reuse_changes_no_solution(integrator, solver):
+    table, every = run(integrator, linear_solver=solver, condense=True)
+    again, some = run(integrator, linear_solver=solver, condense=True, reuse=True)
+    assert table["active"].max() >= 4
+    assert difference(table, again) < 1e-9
+    for name in ("active", "stick"):
+        assert np.array_equal(table[name], again[name])
+    if integrator == "energy-momentum":
+        assert np.abs(again["ledger_residual"]).max() < 1e-11 * again["energy"][0]
+    assert some < 0.5 * every
+    assert again["newton_iterations"].sum() < 2 * table["newton_iterations"].sum()
+
+
+@pytest.mark.mpi
+def test_without_condensing_too():
+    table, every = run("energy-momentum")
+    again, some = run("energy-momentum", reuse=True)
+    assert difference(table, again) < 1e-9
+    assert some < 0.5 * every
+
+
+@pytest.mark.parametrize("metre", [1e3, 1e6])
+def test_units_change_no_decision(metre):
+    table, some = run("energy-momentum", reuse=True, rtol=1e-9)
+    again, same = run(
+        "energy-momentum", reuse=True, rtol=1e-9, system=rubbing_blocks(0.3, metre=metre)
+    )
+    assert same == some
+    assert np.array_equal(table["newton_iterations"], again["newton_iterations"])
+
+
+def test_a_changed_step_makes_new_matrices():
+    """dt is in the matrices, so that one of another dt would contract badly or not at all."""
+    stepper = nts.Stepper(
+        rubbing_blocks(0.0), nts.EnergyMomentum(), newton=nts.Newton(reuse=True, rtol=1e-10)
+    )
+    for dt in (1e-4, 1e-2, 1e-4, 1e-2):
+        stepper.advance(dt)
+        assert stepper.solution.rows[-1]["newton_iterations"] <= 4
+    stepper.close()
+
+
+def test_a_failed_step_leaves_no_trace(monkeypatch):
+    """After a step that diverged to NaN the next one starts from matrices of its own."""
+    stepper = nts.Stepper(
+        rubbing_blocks(0.3), nts.EnergyMomentum(), newton=nts.Newton(reuse=True, condense=True)
+    )
+    for _ in range(30):
+        stepper.advance(1e-3)
+    state, problem = stepper.state, stepper.problem
+    evaluate = problem.evaluate
+
+    def broken(x):
+        e = evaluate(x)
+        for c in e.contacts:
+            c.tangent[:] = np.nan
+            c.residual[:] = np.nan
+        return e
+
+    monkeypatch.setattr(problem, "evaluate", broken)
+    with pytest.raises(nts.StepFailedError):
+        stepper.advance(1e-3)
+    monkeypatch.setattr(problem, "evaluate", evaluate)
+    assert stepper.state is state
+    stepper.advance(1e-3)
+    assert stepper.solution.rows[-1]["newton_iterations"] < 15
+    stepper.close()
