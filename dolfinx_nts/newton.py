@@ -62,6 +62,12 @@ class Newton:
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
 
 
+#: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
+ACCURACY: Mapping[str, Newton] = {
+    "exact": Newton(),
+    "balanced": Newton(rtol=1e-9, condense=True, linear_solver="krylov", reuse=True),
+    "fast": Newton(rtol=1e-6, condense=True, linear_solver="krylov", reuse=True),
+}
 #: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
 _SLOW = 0.05
 

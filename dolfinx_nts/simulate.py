@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
-from dolfinx_nts.newton import Newton, StepFailedError, StepSolver
+from dolfinx_nts.newton import ACCURACY, Newton, StepFailedError, StepSolver
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import items, known_options, require_positive
@@ -274,6 +274,7 @@ def simulate(
     output: Sequence[Any] = (),
     progress: bool = False,
     start: Solution | None = None,
+    accuracy: str | None = None,
 ) -> Solution:
     """Run a system from t = 0, or from where an equilibrium ended, to t_end.
 
@@ -289,6 +290,8 @@ def simulate(
             cadence asks for.
         progress: Show a progress line on rank 0.
         start: Result of `equilibrium` to start from; see there.
+        accuracy: In place of `newton`: "exact" closes the ledger to rounding; "balanced" to about
+            1e-8 and "fast" to about 1e-5 of the energy, with matrices kept over many steps.
 
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then.
@@ -299,6 +302,7 @@ def simulate(
     require_positive("dt", dt, "s")
     require_positive("t_end", t_end, "s")
     output = writers(output)
+    newton = _newton(newton, accuracy)
     stepper = Stepper(system, integrator, newton=newton, petsc_options=petsc_options, start=start)
     begin = stepper.state.time
     if not t_end > begin:
@@ -311,6 +315,17 @@ def simulate(
     times = [begin + (k + 1) * dt for k in range(steps)]
     remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
     return run(stepper, times, output, progress=progress, remedy=remedy)
+
+
+def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
+    if accuracy is None:
+        return newton
+    if newton is not None:
+        raise ValueError(f"accuracy={accuracy!r}, newton={newton!r}: pass one of them")
+    if accuracy not in ACCURACY:
+        known = ", ".join(map(repr, ACCURACY))
+        raise ValueError(f"accuracy={accuracy!r}: choose one of {known}")
+    return ACCURACY[accuracy]
 
 
 def run(

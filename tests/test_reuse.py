@@ -95,3 +95,28 @@ def test_a_failed_step_leaves_no_trace(monkeypatch):
     stepper.advance(1e-3)
     assert stepper.solution.rows[-1]["newton_iterations"] < 15
     stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("accuracy", "ledger"), [("exact", 1e-11), ("balanced", 1e-8), ("fast", 1e-5)]
+)
+def test_levels_of_accuracy_close_the_ledger_as_they_say(accuracy, ledger):
+    scene, rule = rubbing_blocks(0.3), nts.EnergyMomentum()
+    run = nts.simulate(scene, rule, dt=2e-3, t_end=0.08, accuracy=accuracy)
+    assert run.status == "completed" and run.retries == 0
+    energy = run.balance["energy"][0]
+    assert np.abs(run.balance["ledger_residual"]).max() <= ledger * energy
+    assert run.balance["friction_dissipation"][-1] > 0.005 * energy
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"accuracy": "perfect"}, "accuracy='perfect': choose one of 'exact', 'balanced', 'fast'"),
+        ({"accuracy": "fast", "newton": nts.Newton()}, "pass one of them"),
+    ],
+)
+def test_unknown_accuracy(options, message):
+    with pytest.raises(ValueError, match=message):
+        nts.simulate(rubbing_blocks(0.0), nts.Midpoint(), dt=1e-3, t_end=1.0, **options)

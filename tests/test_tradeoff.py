@@ -1,0 +1,119 @@
+"""The program that measures speed against accuracy, on a small script of a user's."""
+
+import csv
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dolfinx_nts import tradeoff
+from dolfinx_nts.newton import ACCURACY
+
+COMM = MPI.COMM_WORLD
+SCRIPT = """
+from dolfinx.mesh import create_box
+from mpi4py import MPI
+import dolfinx_nts as nts
+
+
+def main(cells=2, speed=1.0):
+    mesh = create_box(MPI.COMM_WORLD, [[0, 0, 0], [1, 1, 1]], [cells] * 3)
+    body = nts.Continuum(mesh, nts.NeoHookean(1e4, 0.3), density=1e2, name="cube",
+                         velocity=lambda x: speed * x[[1, 2, 0]])
+    nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=0.02, t_end=0.2)
+    raise AssertionError("only the first run counts")
+"""
+
+
+@pytest.fixture
+def script(tmp_path):
+    path = COMM.bcast(tmp_path / "scene.py")
+    if COMM.rank == 0:
+        path.write_text(SCRIPT)
+    COMM.Barrier()
+    return str(path)
+
+
+@pytest.mark.mpi
+def test_error_of_the_trajectory_is_of_second_order(script):
+    """Against a much finer step of the same run the errors of h and h/2 are as 4 to 1."""
+    reference = {"accuracy": "exact", "dt_factor": 1 / 16}
+    vary = {"accuracy": ["exact", "fast"], "dt_factor": [1.0, 0.5]}
+    rows = tradeoff.compare(script, vary, {}, reference, COMM)
+    assert [r["dt_factor"] for r in rows] == [1 / 16, 1.0, 0.5, 1.0, 0.5]
+    assert [r["dt [s]"] for r in rows[1:3]] == [0.02, 0.01]
+    first, *others = rows
+    assert all(first[name] == 0.0 for name in tradeoff.ERRORS if name != "ledger")
+    assert 3.7 < others[0]["trajectory"] / others[1]["trajectory"] < 4.3
+    for exact, fast in zip(others[:2], others[2:], strict=True):
+        assert exact["ledger"] < 1e-12 < fast["ledger"] < 1e-4
+        assert fast["trajectory"] == pytest.approx(exact["trajectory"], rel=1e-2)
+    assert tradeoff.recommend(rows)[0][1] in others
+
+
+def test_mesh_refinement_compares_with_another_mesh(script):
+    rows = tradeoff.compare(script, {"cells": [1, 2, 3]}, {"dt": 0.01}, {"cells": 6}, COMM)
+    errors = [r["trajectory"] for r in rows[1:]]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_affine_motion_has_a_closed_form(script):
+    """Shear u = a y e_x of a unit cube of size sqrt(3 / 12): a / 12 over the size."""
+    run = tradeoff.measure(script, {}, COMM)
+    body = run.solution.system.bodies[0]
+    u = np.zeros(body.num_owned)
+    u[0::3] = 0.2 + 0.3 * body.reference[1::3]
+    mean = COMM.allreduce(body.inertia(u) @ tradeoff._affine(body))
+    expected = np.zeros(12)
+    expected[0], expected[6] = 0.2 + 0.3 / 2, 0.3 / 12 / 0.5
+    assert np.abs(mean - expected).max() < 1e-14
+
+
+def test_a_run_that_fails_is_a_row_with_its_reason(script):
+    vary = {"max_iterations": [25, 1], "max_retries": [0]}
+    rows = tradeoff.compare(script, vary, {}, {"dt_factor": 0.5}, COMM)
+    assert rows[1]["status"] == "completed"
+    assert "not solved" in rows[2]["status"] and np.isnan(rows[2]["trajectory"])
+    assert tradeoff.recommend(rows)[0][1] is rows[1]
+    rows = tradeoff.compare(script, {"cells": [2, 0]}, {}, {}, COMM)
+    assert rows[2]["status"].startswith("RuntimeError") or "cells" in rows[2]["status"]
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        ({"colour": ["red"]}, "colour=.*neither an argument of main"),
+        ({"integrator": ["euler"]}, "integrator='euler': choose one of"),
+    ],
+)
+def test_unknown_choices(script, vary, message):
+    with pytest.raises(ValueError, match=message):
+        tradeoff.compare(script, vary, {}, {}, COMM)
+
+
+def test_unknown_scene(tmp_path):
+    with pytest.raises(ValueError, match="no such file"):
+        tradeoff.load("nowhere")
+    empty = tmp_path / "empty.py"
+    empty.write_text("")
+    with pytest.raises(ValueError, match="has no function main"):
+        tradeoff.load(str(empty))
+
+
+def test_command_line(script, tmp_path, capsys):
+    folder = tmp_path / "out"
+    rows = tradeoff.main(
+        [script, "--vary", "accuracy=fast,exact", "dt_factor=2,1", "--output", str(folder)]
+    )
+    lines = (folder / "tradeoff.csv").read_text().splitlines()
+    table = list(csv.DictReader(lines[1:]))
+    assert lines[0].startswith("# ") and "DOLFINx" in lines[0]
+    assert len(table) == len(rows) == 5
+    assert table[0]["dt_factor"] == "0.25"
+    assert (folder / "tradeoff.png").stat().st_size > 10_000
+    assert "trajectory within 0.01: accuracy=" in capsys.readouterr().out
+
+
+def test_levels_of_accuracy_are_ordered():
+    fast, balanced, exact = (ACCURACY[name].rtol for name in ("fast", "balanced", "exact"))
+    assert fast > balanced > exact
