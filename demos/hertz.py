@@ -1,0 +1,399 @@
+"""Hertz contact: pressure and friction between cylinders and spheres against the closed forms.
+
+Problems. Two neo-Hookean half cylinders or half spheres, flat faces outwards, touch at a point of
+their round sides and are pressed together.
+- cylinders: R = 8, E = 200, nu = 0.3, plane strain; a pressure of 0.625 on the upper flat face,
+  that is P = 10 per length.
+- friction (Cattaneo, Mindlin): the same with mu = 0.2; once they are pressed together, a plate
+  holds that face level, and a traction of 0.05851 on it, Q = 0.93616 per length, shears the
+  contact.
+- spheres: D = 12.2474, nu = 0.29, E = 1e6 of the upper and 1e8 of the lower one, F = 117808.79.
+
+Reference (Johnson 1985). With 1/R* the sum of both 1/R and 1/E* that of both (1 - nu^2)/E, the
+pressure is p0 sqrt(1 - x^2/a^2): between cylinders a^2 = 4 P R*/(pi E*), p0 = 2 P/(pi a); between
+spheres a^3 = 3 F R*/(4 E*), p0 = 3 F/(2 pi a^2). Sheared cylinders stick in |x| < c, c^2 = a^2
+(1 - Q/(mu P)), and slip outside. The traction is mu p there; inside it is less, by mu p0 (c/a)
+sqrt(1 - x^2/c^2). It is largest at c.
+
+Method. A structured mesh (meshes/half_round.py) is fine under the contact and grows from there.
+The bodies are mirror images, so that nodes meet nodes: one-pass node-to-surface contact fails the
+patch test on meshes that do not match, and its nodal pressures scatter there. Symmetry saves half
+of the cylinders, unless they are sheared, and three quarters of the spheres; cylinders are one cell
+long and held at both ends. Pressures and tractions are nodal forces over tributary areas, on the
+undeformed surface, as the linear theory has it. The figures come from them without the closed form:
+- p0 is the largest nodal pressure;
+- a follows from the second moment of the contact forces: the mean of x^2 is a^2/4 for cylinders
+  and 2 a^2/5 for spheres;
+- c follows in the same way from what friction has in reserve, mu p less the traction, which is a
+  pressure of Hertz on the part that sticks; q_max is mu times the pressure at c, between the nodes.
+
+What to see. As prescribed (scale 1), p0/E is 5 % for the cylinders and 14 % for the spheres:
+strains that the linear theory leaves out. p0 misses it by 1 % and 4 %, on any mesh. Under loads
+that make a and the strains a hundredth (scale 0.01), a, p0, c and q_max are within 0.6 % of the
+closed form on these meshes; half as many cells (`--refinement 0.5`) give 2 to 5 %. The traction
+converges slowest, at its kink.
+
+Pressing takes several load steps where there is friction. A node that closes its gap within a load
+step counts its whole way along the facet in that step as slip, although it touches only at the
+end; the traction that this leaves behind, seen at scale 1, shrinks with the step.
+
+    mpirun -n 2 python demos/hertz.py --output out/hertz
+"""
+
+import argparse
+import runpy
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+from dolfinx_nts.dolfinx_compat import create_mesh
+
+MESHES = runpy.run_path(str(Path(__file__).resolve().parents[1] / "meshes" / "half_round.py"))
+#: Size of the finely meshed block over the half-width of contact.
+BLOCK = 1.3
+PRESSING, SHEARING = 8, 4
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Two bodies of equal radius, and their closed form.
+
+    Attributes:
+        radius: Of both [m].
+        young: Of the upper and the lower one [Pa]; nodes of the upper, softer one are slaves.
+        poisson: Of both.
+        force: What presses them together [N], of cylinders per length [N/m].
+        cells: From the middle of the contact to the side of the finely meshed block.
+        spheres: Or cylinders.
+        shear: Tangential force [N/m].
+        friction: Coulomb's coefficient.
+    """
+
+    radius: float
+    young: tuple[float, float]
+    poisson: float
+    force: float
+    cells: int
+    spheres: bool = False
+    shear: float = 0.0
+    friction: float = 0.0
+
+    def scaled(self, scale):
+        """The same under a load that makes contact and strains `scale` times as large."""
+        load = scale**3 if self.spheres else scale**2
+        return replace(self, force=load * self.force, shear=load * self.shear)
+
+    @property
+    def modulus(self):
+        """E* [Pa]."""
+        return 1 / sum((1 - self.poisson**2) / young for young in self.young)
+
+    @property
+    def half_width(self):
+        """Half-width or radius of the contact [m]."""
+        if self.spheres:
+            return (0.375 * self.force * self.radius / self.modulus) ** (1 / 3)
+        return (2 * self.force * self.radius / np.pi / self.modulus) ** 0.5
+
+    @property
+    def peak(self):
+        """Largest pressure [Pa]."""
+        a = self.half_width
+        return 1.5 * self.force / np.pi / a**2 if self.spheres else 2 * self.force / np.pi / a
+
+    @property
+    def stick(self):
+        """Half-width of the part that sticks [m]."""
+        return self.half_width * (1 - self.shear / self.friction / self.force) ** 0.5
+
+    @property
+    def block(self):
+        """Size of the finely meshed block [m]."""
+        return BLOCK * self.half_width
+
+    def pressure(self, x):
+        """At a distance from the middle [Pa]."""
+        return self.peak * half_ellipse(x / self.half_width)
+
+    def traction(self, x):
+        """Of friction, at a distance from the middle [Pa]."""
+        a, c = self.half_width, self.stick
+        return self.friction * (self.pressure(x) - self.peak * c / a * half_ellipse(x / c))
+
+
+def half_ellipse(x):
+    return np.sqrt(np.maximum(0.0, 1.0 - x**2))
+
+
+CYLINDERS = Problem(8.0, (200.0, 200.0), 0.3, force=16 * 0.625, cells=8)
+PROBLEMS = {
+    "cylinders": CYLINDERS,
+    "friction": replace(CYLINDERS, shear=16 * 0.05851, friction=0.2),
+    "spheres": Problem(12.2474 / 2, (1e6, 1e8), 0.29, force=117808.79, cells=6, spheres=True),
+}
+
+
+def half_round(comm, problem, *, lower, whole):
+    """Mesh of one body; the lower one is the mirror image of the upper one."""
+    points, cells = np.empty((0, 3)), np.empty((0, 8), np.int64)
+    if comm.rank == 0:
+        n, size = problem.cells, (problem.radius, problem.block)
+        if problem.spheres:
+            cells, points = MESHES["half_sphere"](n, *size)
+        else:
+            cells, points = MESHES["half_cylinder"](n, *size, whole=whole)
+        if lower:
+            points[:, 2] *= -1
+            cells = np.roll(cells, 4, axis=1)
+    return create_mesh(comm, cells, points, "hexahedron")
+
+
+def plane(problem, axis, value):
+    """Marker of a plane across an axis."""
+    return lambda x: np.abs(x[axis] - value) < 1e-9 * problem.radius
+
+
+def scene(comm, problem, *, held=(), loads=(), whole=False, friction=0.0):
+    """Both bodies; `held` and `loads` are conditions and tractions of the upper one.
+
+    `whole` cylinders instead of the half x >= 0.
+    """
+    r, block = problem.radius, problem.block
+    sides = [] if whole else [nts.Dirichlet(plane(problem, 0, 0.0), components=(0,))]
+    for y in (0.0,) if problem.spheres else (0.0, block / problem.cells):
+        sides.append(nts.Dirichlet(plane(problem, 1, y), components=(1,)))
+    foot = nts.Dirichlet(plane(problem, 2, -r), components=(0, 2))
+
+    def body(name, young, *, lower, bcs, traction=()):
+        mesh = half_round(comm, problem, lower=lower, whole=whole)
+        material = nts.NeoHookean(young, problem.poisson)
+        bcs = [*sides, *bcs]
+        return nts.Continuum(mesh, material, density=1.0, bcs=bcs, traction=traction, name=name)
+
+    def under_the_block(centre):
+        across = 1 if problem.spheres else 0
+
+        def marker(x):
+            square = x[0] ** 2 + across * x[1] ** 2
+            on_surface = np.abs(np.sqrt(square + (x[2] - centre) ** 2) - r) < 1e-9 * r
+            near = np.maximum(np.abs(x[0]), across * np.abs(x[1])) < 1.001 * block
+            return on_surface & near
+
+        return marker
+
+    upper = body("upper", problem.young[0], lower=False, bcs=held, traction=loads)
+    lower = body("lower", problem.young[1], lower=True, bcs=[foot])
+    pair = nts.ContactPair(
+        slave=upper.surface(under_the_block(r)),
+        master=lower.surface(under_the_block(-r)),
+        friction=friction,
+    )
+    return nts.System([upper, lower], contacts=[pair])
+
+
+def press(comm, problem):
+    """Equilibrium under an even pressure on the flat face."""
+    r, n = problem.radius, problem.cells
+    rim = np.sin(np.diff(np.arctan(np.arange(n + 1) / n)))  # the face of a sphere is a polygon
+    area = 4 * r**2 * rim.sum() if problem.spheres else 2 * r
+    load = nts.Traction(plane(problem, 2, r), (0.0, 0.0, -problem.force / area))
+    return nts.equilibrium(scene(comm, problem, loads=[load]), load_steps=2)
+
+
+def depth(comm, problem):
+    """How far a plate on the flat face goes down under the force [m], without friction."""
+    top = plane(problem, 2, problem.radius)
+    a, per_modulus = problem.half_width, problem.force / np.pi / problem.modulus
+    most = 1.2 * per_modulus * (2 * np.log(4 * problem.radius / a) - 1)
+    down = nts.Dirichlet(top, value=lambda t: (0, 0, -most * t), components=(2,))
+    parts = np.array([0.7, 0.8, 0.9, 1.0])
+    run = nts.equilibrium(scene(comm, problem, held=[down]), load_steps=parts)
+    force = pressing_force(problem, run, parts=2)[1:]
+    return most * np.polyval(np.polyfit(force / problem.force, parts, 3), 1.0)
+
+
+def press_and_shear(comm, problem):
+    """Equilibrium after pressing, until t = 1, and shearing, until t = 2.
+
+    The plate keeps the face level, which a dead load would not: it would roll off.
+    """
+    top, deepest = plane(problem, 2, problem.radius), depth(comm, problem)
+    down = nts.Dirichlet(top, value=lambda t: (0, 0, -deepest * min(t, 1.0)), components=(2,))
+    most = problem.shear / (2 * problem.radius)
+    shear = nts.Traction(top, lambda t: (most * max(t - 1.0, 0.0), 0, 0))
+    steps = [*np.linspace(0, 1, PRESSING + 1)[1:], *np.linspace(1, 2, SHEARING + 1)[1:]]
+    system = scene(comm, problem, held=[down], loads=[shear], whole=True, friction=problem.friction)
+    return nts.equilibrium(system, load_steps=steps)
+
+
+def pressing_force(problem, run, *, parts):
+    """Contact force of each load step [N] or [N/m]; the model is one of so many equal parts."""
+    length = 1.0 if problem.spheres else problem.block / problem.cells
+    return parts * run.contact_forces[:, 0, 2] / length
+
+
+def nodes_in_contact(problem, run):
+    """x, y [m], tributary area [m^2], normal and tangential force [N], the same on all ranks.
+
+    Friction counts against the direction of the shear. Cylinders: those of one end.
+    """
+    state, slave = run.state, run.system.contacts[0].slave
+    x, area = slave.reference[slave.owned], slave.area[slave.owned]
+    rows = np.column_stack([x[:, :2], area, state.force[0], -state.tangential[0][:, 0]])
+    rows = np.concatenate(run.system.comm.allgather(rows))
+    if not problem.spheres:
+        rows = rows[np.abs(rows[:, 1]) < 1e-9 * problem.radius]
+    rows = rows[rows[:, 3] > 0.0]
+    return rows[np.lexsort(rows[:, 1::-1].T)].T
+
+
+def half_width(problem, x, force):
+    """Half-width [m] of a pressure of Hertz with the second moment of these forces."""
+    return np.sqrt((2.5 if problem.spheres else 4.0) * (force * x**2).sum() / force.sum())
+
+
+def difference(area, values, exact):
+    """Root of the mean square over that of the exact values."""
+    return float(np.sqrt((area * (values - exact) ** 2).sum() / (area * exact**2).sum()))
+
+
+def figures(problem, run):
+    """What is to be compared, beside the closed form, and the profiles; the same on all ranks."""
+    x, y, area, normal, tangential = nodes_in_contact(problem, run)
+    sheared = problem.shear > 0
+    if sheared:
+        x = x - (normal * x).sum() / normal.sum()
+    distance = np.hypot(x, y) if problem.spheres else np.abs(x)
+    pressure, a = normal / area, half_width(problem, distance, normal)
+    parts = 4 if problem.spheres else 1 if sheared else 2
+    force = pressing_force(problem, run, parts=parts)[-1]
+    table = {
+        "force": (force, problem.force),
+        "a": (a, problem.half_width),
+        "p0": (pressure.max(), problem.peak),
+    }
+    columns = {
+        "position": distance if problem.spheres else x,
+        "pressure": pressure,
+        "exact_pressure": problem.pressure(distance),
+    }
+    if sheared:
+        mu, order = problem.friction, np.argsort(distance)
+        c = half_width(problem, distance, mu * normal - tangential)
+        at_c = np.interp(c**2, distance[order] ** 2, pressure[order] ** 2) ** 0.5
+        table["c"] = (c, problem.stick)
+        table["q_max"] = (mu * at_c, mu * problem.pressure(problem.stick))
+        columns["traction"] = tangential / area
+        columns["exact_traction"] = problem.traction(distance)
+    names = ("pressure", "traction") if sheared else ("pressure",)
+    return {
+        "computed": {name: float(values[0]) for name, values in table.items()},
+        "exact": {name: float(values[1]) for name, values in table.items()},
+        "error": {name: float(values[0] / values[1] - 1) for name, values in table.items()},
+        "difference": {n: difference(area, columns[n], columns["exact_" + n]) for n in names},
+        "profile": columns,
+        "status": run.status,
+        "load_steps": len(run.rows) - 1,
+        "newton_iterations": int(run.balance["newton_iterations"].sum()),
+        "retries": run.retries,
+    }
+
+
+def report(problem, name, scale, result):
+    print(
+        f"{name}, {problem.cells} cells, scale {scale:g}: {result['status']}, "
+        f"{result['load_steps']} load steps, {result['newton_iterations']} iterations, "
+        f"{result['retries']} retries, {result['seconds']:.1f} s"
+    )
+    for key, error in result["error"].items():
+        exact, computed = result["exact"][key], result["computed"][key]
+        print(f"  {key:10}{exact:14.7g}{computed:14.7g}{error:+10.2%}")
+    for key, value in result["difference"].items():
+        print(f"  {key} of the nodes, root mean square difference {value:.2%}")
+
+
+def write(results, folder):
+    """A CSV file of each profile, and a picture of all, in units of the closed form."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    folder.mkdir(parents=True, exist_ok=True)
+    size = (7, 3 * len(results))
+    figure, axes = plt.subplots(len(results), figsize=size, layout="constrained", squeeze=False)
+    for (name, runs), axis in zip(results.items(), axes[:, 0], strict=True):
+        problem = PROBLEMS[name]
+        x = np.linspace(-1.0 if problem.shear > 0 else 0.0, 1.0, 1001)
+        at = x * problem.half_width
+        axis.plot(x, problem.pressure(at) / problem.peak, "k-", lw=1, label="p / p0, closed form")
+        if problem.shear > 0:
+            peak = problem.friction * problem.peak
+            axis.plot(x, problem.traction(at) / peak, "k--", lw=1, label="q / (mu p0), closed form")
+        for number, (scale, result) in enumerate(runs.items()):
+            table, exact = result["profile"], result["exact"]
+            path = folder / f"{name}_{scale:g}.csv"
+            columns = np.column_stack(list(table.values()))
+            np.savetxt(path, columns, delimiter=",", header=",".join(table), comments="")
+            look = {"color": f"C{number}", "mfc": "none", "ls": "none"}
+            at = table["position"] / exact["a"]
+            p = table["pressure"] / exact["p0"]
+            axis.plot(at, p, marker="ox"[number % 2], label=f"p / p0, scale {scale:g}", **look)
+            if "traction" in table:
+                q = table["traction"] / exact["p0"] / problem.friction
+                axis.plot(at, q, marker="s+"[number % 2], label=f"q / (mu p0), {scale:g}", **look)
+        axis.set(title=name, xlabel="x / a")
+        axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.savefig(folder / "hertz.png", dpi=150)
+    plt.close(figure)
+
+
+def main(
+    *,
+    comm=MPI.COMM_WORLD,
+    output=None,
+    problems=tuple(PROBLEMS),
+    scales=(1.0, 0.01),
+    refinement=1.0,
+):
+    """Solve the problems.
+
+    Args:
+        comm: MPI communicator.
+        output: Folder for profiles (CSV) and a picture, or None.
+        problems: Which of "cylinders", "friction", "spheres".
+        scales: Sizes of contact and strains over those of the problem as prescribed.
+        refinement: Cells across the contact over those of the demo's mesh.
+
+    Returns:
+        {problem: {scale: figures}}; see `figures`.
+    """
+    results = {}
+    for name in problems:
+        results[name] = {}
+        for scale in scales:
+            clock = time.perf_counter()
+            problem = PROBLEMS[name].scaled(scale)
+            problem = replace(problem, cells=round(refinement * problem.cells))
+            solve = press_and_shear if problem.shear > 0 else press
+            result = figures(problem, solve(comm, problem))
+            result["seconds"] = time.perf_counter() - clock
+            results[name][scale] = result
+            if comm.rank == 0:
+                report(problem, name, scale, result)
+    if output is not None and comm.rank == 0:
+        write(results, Path(output))
+    return results
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--output", help="folder for profiles and a picture")
+    parser.add_argument("--problems", nargs="+", choices=PROBLEMS, default=tuple(PROBLEMS))
+    parser.add_argument("--scales", nargs="+", type=float, default=(1.0, 0.01))
+    parser.add_argument("--refinement", type=float, default=1.0)
+    main(**vars(parser.parse_args()))

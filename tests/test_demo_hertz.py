@@ -1,0 +1,133 @@
+"""Cylinders and spheres against Hertz, Cattaneo and Mindlin, and the mesh they are made of."""
+
+import half_round
+import hertz as demo
+import numpy as np
+import pytest
+
+#: Published figures of the problems as prescribed.
+REFERENCE = {
+    "cylinders": {"force": 10, "half_width": 0.680778, "peak": 9.351351},
+    "friction": {"force": 10, "half_width": 0.680778, "shear": 0.93616, "stick": 0.496511},
+    "spheres": {"force": 117808.79, "half_width": 0.630179, "peak": 1.416416e5},
+}
+
+
+# ---- closed form
+@pytest.mark.parametrize("name", REFERENCE)
+def test_closed_form_gives_the_published_figures(name):
+    problem = demo.PROBLEMS[name]
+    for figure, value in REFERENCE[name].items():
+        assert getattr(problem, figure) == pytest.approx(value, rel=2e-6)
+    if problem.shear:
+        assert problem.traction(problem.stick) == pytest.approx(1.279571, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", REFERENCE)
+def test_closed_form_carries_the_load_at_any_scale(name):
+    problem, whole = demo.PROBLEMS[name].scaled(0.1), demo.PROBLEMS[name]
+    assert problem.half_width == pytest.approx(0.1 * whole.half_width, rel=1e-12)
+    assert problem.peak == pytest.approx(0.1 * whole.peak, rel=1e-12)
+    x = (np.arange(10000) + 0.5) * problem.half_width / 10000
+    around = 2 * np.pi * x if problem.spheres else 2.0
+    step = problem.half_width / 10000
+    assert (around * problem.pressure(x)).sum() * step == pytest.approx(problem.force, rel=1e-5)
+    if problem.shear:
+        assert 2 * problem.traction(x).sum() * step == pytest.approx(problem.shear, rel=1e-5)
+
+
+# ---- mesh
+def edges(cells, points):
+    """The three edges at each corner of each cell, shape (8, m, 3, 3)."""
+    bits = half_round.CORNERS @ [1, 2, 4]
+    assert bits.tolist() == list(range(8))
+    return np.array(
+        [
+            np.stack([points[cells[:, v | b]] - points[cells[:, v & ~b]] for b in (1, 2, 4)], 1)
+            for v in range(8)
+        ]
+    )
+
+
+@pytest.mark.parametrize("n", [4, 16])
+@pytest.mark.parametrize("block", [0.1, 0.001])
+@pytest.mark.parametrize("shape", ["whole", "half", "sphere"])
+def test_mesh_is_upright_and_fills_the_body(shape, block, n):
+    if shape == "sphere":
+        cells, x = half_round.half_sphere(n, 1.0, block)
+        volume, radii = np.pi / 6, np.linalg.norm(x - [0, 0, 1], axis=1)
+    else:
+        cells, x = half_round.half_cylinder(n, 1.0, block, whole=shape == "whole")
+        volume, radii = np.pi / 4 * block / n, np.hypot(x[:, 0], x[:, 2] - 1)
+        volume *= 2 if shape == "whole" else 1
+        assert np.allclose(np.unique(x[:, 1]), [0, block / n], rtol=0, atol=1e-15)
+    around = edges(cells, x)
+    jacobian = np.linalg.det(around)
+    assert (jacobian / np.linalg.norm(around, axis=-1).prod(axis=-1)).min() > 0.3
+    assert jacobian.mean(axis=0).sum() == pytest.approx(volume, rel=2.5 / n**2)
+    assert radii.max() == pytest.approx(1.0, abs=1e-12)
+    assert (x[:, 2].min(), x[:, 2].max()) == pytest.approx((0.0, 1.0), abs=1e-12)
+    assert len(np.unique(np.round(x / (block / n), 6), axis=0)) == len(x) == cells.max() + 1
+
+
+# ---- contact
+def check(result, tolerance):
+    assert result["status"] == "completed" and result["retries"] == 0
+    for name, error in result["error"].items():
+        assert abs(error) < tolerance, name
+    table = result["profile"]
+    if "traction" in table:
+        bound = 0.2 * table["pressure"]
+        assert (np.abs(table["traction"]) <= bound * (1 + 1e-6)).all()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", REFERENCE)
+def test_coarse_mesh_meets_the_closed_form(name):
+    result = demo.main(problems=(name,), scales=(0.01,), refinement=0.8)[name][0.01]
+    check(result, 0.02)
+    assert abs(result["error"]["force"]) < 1e-3
+
+
+def test_what_the_prescribed_load_misses_is_strain():
+    runs = demo.main(problems=("spheres",), scales=(1.0, 0.5, 0.01), refinement=0.5)["spheres"]
+    whole, half, none = (run["error"]["p0"] for run in runs.values())
+    # Half the strain, half of it: more at a half would be of another kind.
+    assert -0.05 < whole - none < -0.01
+    assert abs(half - none) < 0.65 * abs(whole - none)
+
+
+def test_profiles_and_picture_are_written(tmp_path):
+    demo.main(problems=("cylinders", "friction"), scales=(1.0,), refinement=0.5, output=tmp_path)
+    assert (tmp_path / "hertz.png").stat().st_size > 10_000
+    for name, columns in (("cylinders", 3), ("friction", 5)):
+        table = np.genfromtxt(tmp_path / f"{name}_1.csv", delimiter=",", names=True)
+        assert len(table.dtype.names) == columns
+        assert np.allclose(table["pressure"], table["exact_pressure"], rtol=0, atol=0.5)
+
+
+@pytest.mark.slow
+def test_the_mesh_of_the_demo_meets_the_closed_form():
+    results = demo.main()
+    for runs in results.values():
+        check(runs[0.01], 0.01)
+    for name in ("cylinders", "friction"):
+        check(results[name][1.0], 0.02)
+    # An eighth of Young's modulus is no small strain: see the demo.
+    error = results["spheres"][1.0]["error"]
+    assert abs(error["a"]) < 0.02 and -0.05 < error["p0"] < 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REFERENCE)
+def test_figures_converge(name):
+    refinements = (0.5, 1.0) if name == "spheres" else (0.5, 1.0, 2.0)
+    runs = [
+        demo.main(problems=(name,), scales=(0.01,), refinement=r)[name][0.01] for r in refinements
+    ]
+    width = [abs(run["error"]["a"]) for run in runs]
+    assert all(fine < 0.5 * coarse for coarse, fine in zip(width, width[1:], strict=False))
+    if name == "friction":
+        traction = [run["difference"]["traction"] for run in runs]
+        assert all(f < 0.7 * c for c, f in zip(traction, traction[1:], strict=False))
+        assert abs(runs[-1]["error"]["q_max"]) < 0.5 * abs(runs[0]["error"]["q_max"])
