@@ -1,4 +1,4 @@
-"""The PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> AIJ.
+"""The PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> solvers.
 
 No other file creates any. Fields of the step problem are the bodies, then (with the energy-momentum
 scheme) the augmented unknowns (d, f), then the multipliers. A rank's unknowns are contiguous: its
@@ -80,16 +80,27 @@ class ElementBlocks(NamedTuple):
 
 
 class StepMatrix:
-    """Nested Jacobian of the step problem and the AIJ matrix the solvers see.
+    """Nested Jacobian of the step problem, and the form of it that the solvers see.
 
     Args:
         layout: Fields of the problem.
         bodies: PETSc matrices of the body fields; contact adds to them in place.
         elements: Unknowns of each batch of contact elements.
+        split: Whether solvers see a nest of two fields, "bodies" and "contact", from which a field
+            split takes its blocks without a copy; else one AIJ matrix.
+
+    Attributes:
+        nest: Blocks of all fields.
+        operator: What the solvers see, after `assemble`.
     """
 
     def __init__(
-        self, layout: Layout, bodies: Sequence[Any], elements: Sequence[ElementBlocks]
+        self,
+        layout: Layout,
+        bodies: Sequence[Any],
+        elements: Sequence[ElementBlocks],
+        *,
+        split: bool = False,
     ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
         self._added: list[FloatArray] = []
@@ -99,6 +110,7 @@ class StepMatrix:
                 for j, col in enumerate(element.fields):
                     self._sources.setdefault((row, col), []).append((e, i, j))
         fields = range(layout.counts.shape[1])
+        self._split = split and len(fields) > len(bodies)
         self._blocks = {
             key: self._new_block(*key)
             for key in self._sources
@@ -106,7 +118,13 @@ class StepMatrix:
         }
         grid = [[self._block(i, j) for j in fields] for i in fields]
         self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
-        self.aij: Any = None
+        self._parts = [self.nest]
+        if self._split:
+            halves = (slice(len(bodies)), slice(len(bodies), None))
+            quarters = [[row[half] for row in grid[rows]] for rows in halves for half in halves]
+            self._parts = [PETSc.Mat().createNest(q, comm=layout.comm) for q in quarters]
+        self._converted: list[Any] = []
+        self.operator: Any = None
 
     def _block(self, i: int, j: int) -> Any:
         if i == j and i < len(self._bodies):
@@ -152,13 +170,19 @@ class StepMatrix:
                 )
             else:
                 self._add_to_body(self._bodies[key[0]], sources, change)
-        self.nest.assemble()
-        if self.aij is None:
-            self.aij = self.nest.convert(
-                "aij", out=PETSc.Mat()
-            )  # without `out` the nest itself is converted
+        for part in (self.nest, *self._parts):
+            part.assemble()
+        if self._converted:
+            for part, a in zip(self._parts, self._converted, strict=True):
+                part.convert("aij", out=a)
         else:
-            self.nest.convert("aij", out=self.aij)
+            # Without `out` the nest itself is converted.
+            self._converted = [part.convert("aij", out=PETSc.Mat()) for part in self._parts]
+            self.operator = self._converted[0]
+            if self._split:
+                grid = [self._converted[:2], self._converted[2:]]
+                self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
+        self.operator.assemble()
 
     def withdraw(self) -> None:
         """Take the contact tangents out of the bodies' matrices, but for rounding."""
@@ -213,9 +237,10 @@ class StepMatrix:
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
-        for a in (self.nest, self.aij, *self._blocks.values()):
-            if a is not None:
-                a.destroy()
+        operator = [self.operator] if self._split and self.operator else []
+        nests = [self.nest, *(self._parts if self._split else [])]
+        for a in (*operator, *self._converted, *nests, *self._blocks.values()):
+            a.destroy()
 
 
 def model_problem(

@@ -76,6 +76,11 @@ class SolverOptions:
         self._unchecked = set(given)
         self._entered: dict[str, str] = {}
 
+    @property
+    def split(self) -> bool:
+        """Whether the preconditioner is a field split, which takes the blocks of a nest."""
+        return bool(self._all["pc_type"] == "fieldsplit")
+
     def configure(self, snes: Any, matrix: StepMatrix | None, num_bodies: int) -> None:
         """Set a SNES up from the options.
 
@@ -90,13 +95,13 @@ class SolverOptions:
             ValueError: PETSc refuses a value.
         """
         options = {k: k for k in self._all}
-        if matrix is None and self._all["pc_type"] == "fieldsplit":
+        if matrix is None and self.split:
             outer = {k: k for k in self._all if not k.startswith(("pc_", "fieldsplit_"))}
             inner = [k for k in self._all if k.startswith(_BODIES)]
             own = {k.removeprefix(_BODIES): k for k in inner if not k.startswith(_BODIES + "ksp_")}
             options = outer | own
         self._set(snes, options)
-        if matrix is not None and self._all["pc_type"] == "fieldsplit":
+        if matrix is not None and self.split:
             _split(snes, *matrix.field_sets(num_bodies))
 
     def _set(self, snes: Any, options: Mapping[str, str]) -> None:
@@ -121,7 +126,7 @@ class SolverOptions:
 
         Args:
             snes: The configured SNES.
-            matrix: Its assembled AIJ matrix.
+            matrix: Its assembled matrix.
 
         Raises:
             ValueError: PETSc does not know an option or its value.
@@ -157,7 +162,7 @@ class SolverOptions:
         self._unchecked -= set().union(*self._comm.allgather(used))
 
     def _solve_model(self) -> None:
-        split = self._all["pc_type"] == "fieldsplit"
+        split = self.split
         matrix, parts = model_problem(self._comm, constraint=split)
         snes = PETSc.SNES().create(self._comm)
         x, f = matrix.createVecs()

@@ -85,7 +85,7 @@ class StepSolver:
         petsc_options: PETSc options of the SNES without prefix; they override the preset.
 
     Attributes:
-        matrix: Nested Jacobian and its AIJ form, after `assemble`.
+        matrix: Nested Jacobian and the form of it that SNES sees, after `assemble`.
         snes: The PETSc SNES, after `prepare`.
     """
 
@@ -117,7 +117,7 @@ class StepSolver:
                 self._matrices_due = True
                 self.problem.guess(flight=False)
             try:
-                self._options.check(self.snes, self.matrix.aij)
+                self._options.check(self.snes, self.matrix.operator)
                 self.snes.solve(None, self.problem.x)
             except PETSc.Error as error:
                 # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
@@ -150,7 +150,7 @@ class StepSolver:
             self._configure()
 
     def assemble(self, e: Evaluation) -> StepMatrix:
-        """Nested Jacobian and its AIJ form at an iterate. Every rank must call it.
+        """Nested Jacobian at an iterate, and what SNES sees of it. Every rank must call it.
 
         The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
         """
@@ -159,7 +159,12 @@ class StepSolver:
             self._bodies = self.problem.body_tangents(e)
             self._matrices_due = not self.newton.reuse
         if self.matrix is None:
-            self.matrix = StepMatrix(self.problem.layout, self._bodies, self.problem.elements)
+            self.matrix = StepMatrix(
+                self.problem.layout,
+                self._bodies,
+                self.problem.elements,
+                split=self._options.split,
+            )
         elif self._solved and self.newton.reuse and self.problem.elements:
             keep_bodies(self.snes, not fresh)
         if fresh or self.problem.elements:
@@ -173,7 +178,7 @@ class StepSolver:
         self.snes = PETSc.SNES().create(self.problem.system.comm)
         self._f = self.problem.x.duplicate()
         self.snes.setFunction(self._function, self._f)
-        self.snes.setJacobian(self._jacobian, self.matrix.aij, self.matrix.aij)
+        self.snes.setJacobian(self._jacobian, self.matrix.operator, self.matrix.operator)
         self.snes.setConvergenceTest(self._converged)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
         contact = self.matrix if self.problem.elements else None

@@ -180,7 +180,7 @@ def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active
             other = x.copy()
             other[j] += k * step
             expected[:, j] += weight / step * at.residual(other)
-    errors = block_errors(dense(at.solver.matrix.aij), expected, at.blocks())
+    errors = block_errors(dense(at.solver.matrix.operator), expected, at.blocks())
     at.close()
     assert max(errors.values()) < 1e-8, errors
 
@@ -194,7 +194,7 @@ def test_prescribed_coordinates_hold_only_a_diagonal(rule):
     offset = at.problem.layout.owned(1).start
     fixed = offset + system.bodies[1].fixed
     assert len(fixed) == 18
-    matrix, x, step = dense(at.solver.matrix.aij), at.problem.x.array_r.copy(), 1e-4
+    matrix, x, step = dense(at.solver.matrix.operator), at.problem.x.array_r.copy(), 1e-4
     off = matrix.copy()
     off[fixed, fixed] = 0.0
     assert (matrix[fixed, fixed] > 0).all()
@@ -219,7 +219,7 @@ def test_nest_and_aij_are_the_same_matrix(rule):
     system = two_blocks("hex")
     at = Linearised(system, rule, "mixed", rotated_state(system))
     for _ in range(2):
-        nest, whole, blocks = at.solver.matrix.nest, dense(at.solver.matrix.aij), at.blocks()
+        nest, whole, blocks = at.solver.matrix.nest, dense(at.solver.matrix.operator), at.blocks()
         for i, rows in enumerate(blocks):
             for j, cols in enumerate(blocks):
                 part = nest.getNestSubMatrix(i, j)
@@ -229,7 +229,7 @@ def test_nest_and_aij_are_the_same_matrix(rule):
         with at.problem.x as x:
             x[:] *= 1.01
         at.solver.assemble(at.problem.evaluate(at.problem.x))
-        assert not np.array_equal(dense(at.solver.matrix.aij), whole)
+        assert not np.array_equal(dense(at.solver.matrix.operator), whole)
     at.close()
 
 
@@ -250,7 +250,7 @@ def test_jacobian_along_directions(cell, rule):
         p[here] = rng.uniform(-1, 1, here.stop - here.start)
         direction.array_w[:] = p
         expected = sum(w / step * at.residual(x + k * step * p) for k, w in STENCIL)
-        for matrix in (at.solver.matrix.aij, at.solver.matrix.nest):
+        for matrix in (at.solver.matrix.operator, at.solver.matrix.nest):
             matrix.mult(direction, product)
             for rows in at.blocks():
                 error = np.abs(product.array_r[rows] - expected[rows]).max(initial=0.0)
