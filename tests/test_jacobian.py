@@ -24,12 +24,12 @@ RULES = {
 EQUATIONS = RULES | {"static": Static()}
 ACTIVE = ("none", "all", "mixed")
 FRICTION = {"none": 0.0, "slip": 0.02, "mixed": 0.4, "stick": np.inf}
-#: Cell, friction and active set of the scenes whose whole Jacobian is tested.
+#: Cell, friction and active set of the scenes whose whole Jacobian is tested; of smooth patches,
+#: which take longest, directions are.
 SCENES = [
-    *itertools.product(("hex", "tet"), ("none",), ACTIVE),
+    *itertools.product(("hex",), ("none",), ACTIVE),
     *itertools.product(("hex",), ("slip", "mixed", "stick"), ("all",)),
-    *itertools.product(("tet",), ("mixed",), ("mixed",)),
-    *itertools.product(("smooth",), ("none", "mixed"), ("mixed",)),
+    *itertools.product(("tet",), ("none", "mixed"), ("mixed",)),
 ]
 #: Exact for polynomials up to degree 4.
 STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
@@ -235,10 +235,11 @@ def test_nest_and_aij_are_the_same_matrix(rule):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", EQUATIONS)
+@pytest.mark.parametrize("friction", ["none", "mixed"])
 @pytest.mark.parametrize("cell", CELLS)
-def test_jacobian_along_directions(cell, rule):
+def test_jacobian_along_directions(cell, friction, rule):
     """As above on any number of ranks: matrix times direction, through AIJ and nest."""
-    system = two_blocks(cell)
+    system = two_blocks(cell, friction=FRICTION[friction])
     at = Linearised(system, rule, "mixed", rotated_state(system))
     assert COMM.allreduce(at.candidates) == 9
     x, step = at.problem.x.array_r.copy(), 1e-5
