@@ -175,6 +175,110 @@ def test_zero_gap_without_force_is_without_friction(integrator, velocity, fricti
     assert not h.table["friction_dissipation"].any()
 
 
+# ---- a curved surface
+def saddle(height):
+    """Facets on z = height x y, which bilinear ones hold exactly."""
+    mesh = create_box(
+        COMM, [[-1, -1, -0.5], [1, 1, 0]], [4, 4, 1], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
+    one = np.full(len(top), 1, np.int32)
+    tags = nts.continuum.dolfinx_mesh.meshtags(mesh, 2, np.sort(top), one)
+    x, y, _ = mesh.geometry.x.T
+    mesh.geometry.x[:, 2] += height * x * y
+    everywhere = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
+    body = nts.Continuum(
+        mesh, nts.StVenantKirchhoff(1.0, 0.3), density=1.0, bcs=[everywhere], name="saddle"
+    )
+    return body, body.surface(tags, 1)
+
+
+def on_saddle(height, place, velocity, end):
+    """Place and velocity (x, y, v_x, v_y) of a mass that slides with friction on a saddle."""
+
+    def rate(t, y):
+        v = np.array([y[2], y[3], height * (y[2] * y[1] + y[0] * y[3])])
+        upward = np.array([-height * y[1], -height * y[0], 1.0])
+        normal = upward / np.linalg.norm(upward)
+        pressure = 2 * height * y[2] * y[3] / np.linalg.norm(upward) - normal @ DOWN
+        return [*y[2:], *(DOWN + pressure * (normal - MU * v / np.linalg.norm(v)))[:2]]
+
+    return solve_ivp(rate, (0, end), [*place, *velocity], rtol=1e-12, atol=1e-13).y[:, -1]
+
+
+@pytest.mark.parametrize("integrator", ALL)
+def test_sliding_over_a_saddle_is_of_second_order(integrator):
+    """Against the equations of motion on the surface, solved without this package."""
+    height, (x, y), (vx, vy), end, errors = 0.25, (-0.6, -0.5), (1.5, 0.9), 0.6, []
+    exact = on_saddle(height, (x, y), (vx, vy), end)
+    for steps in (15, 30, 60):
+        start, velocity = (x, y, height * x * y), (vx, vy, height * (vx * y + x * vy))
+        h = follow(scene(start, velocity, saddle(height)), integrator, steps, end / steps)
+        errors.append(np.abs(np.concatenate([h.x[-1, :2], h.v[-1, :2]]) - exact))
+        assert len(np.unique(h.facet[1:])) >= 3 and not h.stick.any()
+        assert (np.diff(h.table["friction_dissipation"]) > 0).all()
+        energy = h.table["energy"][0]
+        assert np.abs(h.table["contact_defect"]).max() < 1e-12 * energy
+        if integrator != "midpoint":
+            assert np.abs(h.table["ledger_residual"]).max() < 1e-11 * energy
+    rates = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.abs(rates - 2).max() < 0.1, (errors, rates)
+
+
+# ---- a block over many facets
+def settled_block(facets, friction):
+    """A small block thrown over a long plate that it rests on, and the state it starts from."""
+    mesh = create_box(
+        COMM, [[0, 0, 0], [0.1, 0.1, 0.05]], [2, 2, 1], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+
+    def on_plate(held):
+        block = nts.Continuum(
+            mesh, nts.StVenantKirchhoff(1e7, 0.0), density=1e3, velocity=(3.4, 0.3, 0),
+            bcs=[nts.Dirichlet(lambda x, k=k: x[k] < 1e-9, components=(k,)) for k in held],
+            name="block",
+        )  # fmt: skip
+        body, face = plate(facets, (-0.3, -0.3), (1.8, 0.5), n=(90, 2))
+        below = block.surface(lambda x: x[2] < 1e-9)
+        pair = nts.ContactPair(below, face, friction=0.0 if held else friction)
+        return nts.System([block, body], contacts=[pair], gravity=DOWN)
+
+    return on_plate(()), nts.equilibrium(on_plate((0, 1)))
+
+
+@pytest.mark.parametrize(
+    ("integrator", "facets", "friction"),
+    [
+        ("energy-momentum", "parallelograms", 0.0),
+        ("energy-momentum", "parallelograms", 0.1),
+        ("midpoint", "parallelograms", 0.1),
+        ("energy-momentum", "triangles", 0.1),
+    ],
+)
+def test_a_block_over_fifty_facets_has_no_switch_defect(integrator, facets, friction):
+    system, settled = settled_block(facets, friction)
+    stepper, dt = nts.Stepper(system, INTEGRATORS[integrator], start=settled), 4e-3
+    passed = []
+    for _ in range(100):
+        stepper.advance(dt)
+        passed.append(stepper.state.facets[0].copy())
+    table = stepper.solution.balance
+    stepper.close()
+    changes = (np.diff(passed, axis=0) != 0).sum(axis=0)
+    assert changes.min() >= 50
+    energy, weight = table["energy"][0], 0.5 * GRAVITY
+    assert (table["active"][1:] == 9).all()
+    assert np.abs(table["contact_defect"]).max() < 1e-12 * energy
+    # The momentum along the way falls by mu m g t, as a rigid block's.
+    momentum = np.linalg.norm(table["linear_momentum"][:, :2], axis=1)
+    expected = momentum[0] - friction * weight * (table["time"] - table["time"][0])
+    np.testing.assert_allclose(momentum, expected, rtol=1e-12 + 1e-3 * friction)
+    if integrator == "energy-momentum":
+        assert np.abs(table["ledger_residual"]).max() < 1e-11 * energy
+
+
 # ---- off the surface
 def assert_coulomb(h, acceleration, mu=MU):
     """In each step the momentum changes by gravity and contact; friction is mu p against slip."""
