@@ -402,7 +402,7 @@ class ContactStep:
         pi = 0.5 * (nts.invariants(z0, self.num_corners) + nts.invariants(z1, self.num_corners, d1))
         metric, by_pi = nts.metric(pi, self.num_corners)
         metric_gradient = np.zeros((n, 2, 2, residual.shape[1]))
-        by_z = np.matmul(by_pi.reshape(n, 4, -1), d1).reshape(n, 2, 2, size)
+        by_z = np.matmul(by_pi.reshape(n, 4, d1.shape[1]), d1).reshape(n, 2, 2, size)
         metric_gradient[..., :size] = 0.5 * by_z * scale_z[:, None, None]
         slip = self._slip(augmented[:, 3:] - length * c.xi, gradient, metric, metric_gradient)
         return residual, tangent, e.constraint[:, 0], slip
@@ -430,7 +430,8 @@ class ContactStep:
         tangent = reduce(tangent[:, outer])
         if slip is not None:
             n = self.num_pairs
-            by_metric = reduce(slip.metric_gradient.reshape(n, 4, -1)).reshape(n, 2, 2, -1)
+            by_metric = reduce(slip.metric_gradient.reshape(n, 4, slip.gradient.shape[-1]))
+            by_metric = by_metric.reshape(n, 2, 2, len(outer))
             slip = slip._replace(gradient=reduce(slip.gradient), metric_gradient=by_metric)
         return residual[:, outer], tangent, gap, slip
 

@@ -264,22 +264,32 @@ def test_jacobian_along_directions(cell, friction, rule):
 
 
 def convergence(system, rule, state, dt):
-    """Residual norm and active set of every iterate of a step."""
+    """Of every iterate of a step: residual norm, unknowns, and 0, 1 or 2 for off, slip, stick."""
     stepper = stepper_of(system, rule)
     problem = stepper.problem
     problem.begin(state, dt)
     solver = stepper.solver
     solver.prepare()
-    norms, sets = [], []
+    norms, iterates, sets = [], [], []
 
     def record(snes, iteration, norm):
         norms.append(norm)
-        sets.append([c.active.copy() for c in solver._last.contacts])
+        iterates.append(snes.getSolution().array_r.copy())
+        sets.append([c.active.astype(int) + c.stick for c in solver._last.contacts])
 
     solver.snes.setMonitor(record)
     solver.solve()
     stepper.close()
-    return np.array(norms), sets
+    return np.array(norms), iterates, sets
+
+
+def last_change(sets):
+    """The iterate from which on the sets stay as they are."""
+    last = 0
+    for k, (a, b) in enumerate(zip(sets[:-1], sets[1:], strict=True), start=1):
+        changed = any(not np.array_equal(*pair) for pair in zip(a, b, strict=True))
+        last = k if COMM.allreduce(changed, op=MPI.LOR) else last
+    return last
 
 
 @pytest.mark.parametrize("turned", [False, pytest.param(True, marks=pytest.mark.mpi)])
@@ -289,18 +299,38 @@ def test_newton_converges_quadratically(cell, rule, turned):
     """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""
     system = two_blocks(cell, gap=0.02, speed=6.0)
     state = rotated_state(system) if turned else system.initial_state()
-    norms, sets = convergence(system, rule, state, 0.02)
+    norms, _, sets = convergence(system, rule, state, 0.02)
     assert COMM.allreduce(int(sum(s.sum() for s in sets[-1]))) >= 3
-    last = 0
-    for k, (a, b) in enumerate(zip(sets[:-1], sets[1:], strict=True), start=1):
-        changed = any(not np.array_equal(*pair) for pair in zip(a, b, strict=True))
-        last = k if COMM.allreduce(changed, op=MPI.LOR) else last
-    r = norms[last:] / norms.max()
+    r = norms[last_change(sets) :] / norms.max()
     # Rounding of masses times positions ends the sequence a little below this.
     floor = 1e-13
     near = np.flatnonzero((r[:-1] < 0.3) & (r[:-1] > floor))
     assert len(near) >= 3
     assert (r[near + 1] < 5 * r[near] ** 2 + floor).all(), r
+
+
+@pytest.mark.parametrize(
+    ("friction", "changes", "reached"),
+    [(np.inf, False, {2}), (0.02, False, {1}), (0.1, True, {1}), (0.4, True, {1, 2})],
+    ids=["stick", "slip", "stick to slip", "both"],
+)
+@pytest.mark.parametrize("rule", ["midpoint", "energy-momentum", "condensed"])
+@pytest.mark.parametrize("cell", CELLS)
+def test_newton_converges_quadratically_with_friction(cell, rule, friction, changes, reached):
+    """An oblique impact: once stick and slip rest, the distance to the solution is squared."""
+    system = two_blocks(cell, gap=0.02, speed=6.0, friction=friction)
+    state = system.initial_state()
+    thrown = state.v[0] + np.tile([3.0, 1.2, 0.0], len(state.v[0]) // 3)
+    state = replace(state, v=(thrown, state.v[1]))
+    _, iterates, sets = convergence(system, rule, state, 0.02)
+    assert set(sets[-1][0]) == reached
+    last = last_change(sets)
+    assert (last > 0) == changes
+    moves = np.linalg.norm(np.diff(iterates[last:], axis=0), axis=1)
+    # A direction of slip turns by its error over the slip, which is some 0.02 here.
+    near, bend = moves[:-1] < 0.1, 80.0
+    assert near.sum() >= 2 and moves[-1] < 1e-6
+    assert (moves[1:] < bend * moves[:-1] ** 2)[near].all(), moves
 
 
 @pytest.mark.mpi

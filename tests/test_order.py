@@ -71,7 +71,7 @@ def test_free_flight(integrator):
         assert np.abs(order - 2.0).max() < 0.1, (order, errors)
 
 
-def sliding_block():
+def sliding_block(friction=0.0):
     """A block pressed harder and harder onto a soft one that it slides over, within one facet.
 
     The load starts from zero as t^2 does, so the four slave nodes carry from the first step on
@@ -96,6 +96,7 @@ def sliding_block():
     pair = nts.ContactPair(
         slave=upper.surface(lambda x: x[2] < 1 + 1e-9),
         master=lower.surface(lambda x: x[2] > 1 - 1e-9),
+        friction=friction,
     )
     return nts.System([upper, lower], contacts=[pair])
 
@@ -108,6 +109,23 @@ def test_persistent_contact(integrator):
         u, v, stepper = run(sliding_block, integrator, 0.5, n)
         assert (stepper.solution.balance["active"][1:] == 4).all()
         results.append((u, v))
+    for values in zip(*results, strict=True):
+        order, errors = rates(values)
+        assert np.abs(order - 2.0).max() < 0.1, (order, errors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+def test_sliding_with_friction(integrator):
+    results = []
+    for n in (40, 80, 160):
+        u, v, stepper = run(lambda: sliding_block(0.1), integrator, 0.5, n)
+        table = stepper.solution.balance
+        assert (table["slip"][1:] == 4).all()
+        assert np.diff(table["friction_dissipation"]).min() > 0
+        results.append((u, v))
+    # A third of the energy is gone.
+    assert table["friction_dissipation"][-1] > 0.3 * table["energy"][0]
     for values in zip(*results, strict=True):
         order, errors = rates(values)
         assert np.abs(order - 2.0).max() < 0.1, (order, errors)

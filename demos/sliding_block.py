@@ -1,0 +1,416 @@
+"""A block slides to rest, down a slope, and in jerks behind a spring, as Coulomb says.
+
+A stiff block (0.2 x 0.2 x 0.05 m, 2 kg) settles on a floor under its weight and is let go. The
+floor is a rigid plane without a mesh, a plate of hexahedra that does not move, or ("elastic") a
+plate ten times as soft as the block, held at its bottom. For a rigid block the answers are closed:
+
+- level ground, mu = 0.2, thrown with 1 m/s: at rest after v0/(mu g) = 0.509684 s and
+  v0^2/(2 mu g) = 0.254842 m, friction dissipates all of m v0^2/2;
+- slope of 30 degrees, mu = 0.3: acceleration g (sin 30 - mu cos 30) = 2.356287 m/s^2, so 1.178144 m
+  in the first second, and 3.002750 J per kg dissipated;
+- same slope, settled with friction: the block stays where it is if mu is a thousandth above
+  tan 30 = 0.577350, and slides with g sin(30)/1000 if it is a thousandth below;
+- stick-slip: a soft spring (angular frequency w of block and spring) whose end moves to and fro
+  with V = 0.1 m/s pulls the block. It sticks until the spring carries mu m g, then slips with
+  V (1 - cos w t) through 2 pi V/w, where the end turns; it sticks while the spring is unloaded and
+  loaded the other way, and slips back.
+
+What to see. The block comes to rest at most mu g h^2/8 short of the closed form, because one that
+is slower than mu g h/2 sticks; the rest of a difference is its elasticity: it stops shaking.
+Friction never gives energy back, and the ledger of the energy-momentum scheme closes.
+
+Run it with `python demos/sliding_block.py`, or unchanged on two ranks with
+`mpirun -n 2 python demos/sliding_block.py --output out/sliding_block`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import ufl
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+from dolfinx_nts.output import BalanceCSV, on_root
+
+GRAVITY = 9.81
+SIZE, HEIGHT, DENSITY = 0.2, 0.05, 1000.0
+MASS = DENSITY * SIZE**2 * HEIGHT
+YOUNG = 5e7
+STEP = 2e-3
+#: Thrown on level ground: friction and speed; what rest takes.
+ROUGH, SPEED = 0.2, 1.0
+STOP = SPEED / (ROUGH * GRAVITY)
+#: On the slope.
+ANGLE, SLIPPERY = math.radians(30), 0.3
+ACCELERATION = GRAVITY * (math.sin(ANGLE) - SLIPPERY * math.cos(ANGLE))
+#: Coefficient over tan(ANGLE) that holds the block and that does not; how long it is watched.
+STICKY, LOOSE, WATCHED = 1.001, 0.999, 0.2
+#: Pulled by a spring: friction, angular frequency [1/s], speed of the spring's end, slips.
+PULLED, FREQUENCY, PULL, SLIPS = 0.3, 20.0, 0.1, 3
+#: Times until the spring at rest holds the block no longer, and of a slip; the way of a slip.
+LOADING, SLIPPING = PULLED * GRAVITY / FREQUENCY**2 / PULL, 2 * math.pi / FREQUENCY
+JERK = PULL * SLIPPING
+Options = dict[str, Any]
+FLOORS = ("plane", "mesh", "elastic")
+INTEGRATORS = {"energy-momentum": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}
+CLOSED_FORM = {
+    "level: time [s]": STOP,
+    "level: way [m]": SPEED * STOP / 2,
+    "level: dissipation [J/kg]": SPEED**2 / 2,
+    "slope: way [m]": ACCELERATION / 2,
+    "slope: dissipation [J/kg]": SLIPPERY * GRAVITY * math.cos(ANGLE) * ACCELERATION / 2,
+    "mu = 1.001 tan: way [m]": 0.0,
+    "mu = 0.999 tan: way [m]": (1 - LOOSE) * GRAVITY * math.sin(ANGLE) * WATCHED**2 / 2,
+    "stick-slip: jerk [m]": JERK,
+    "stick-slip: dissipation [J/kg]": PULLED * GRAVITY * SLIPS * JERK,
+}
+
+
+# ---- the scene
+def block_mesh(comm: MPI.Comm, cells: tuple[int, int, int]) -> Any:
+    """The block, its lower face at z = 0."""
+    return _box(comm, [0.0, 0.0, 0.0], [SIZE, SIZE, HEIGHT], cells)
+
+
+def _box(comm: MPI.Comm, low: list[float], high: list[float], cells: tuple[int, int, int]) -> Any:
+    kind, ghosts = CellType.hexahedron, GhostMode.shared_facet
+    return create_box(comm, [low, high], list(cells), kind, ghost_mode=ghosts)
+
+
+def system(
+    mesh: Any,
+    *,
+    friction: float,
+    floor: str = "plane",
+    facets: int = 9,
+    angle: float = 0.0,
+    speed: float = 0.0,
+    held: bool = False,
+    spring: bool = False,
+    young: float = YOUNG,
+) -> nts.System:
+    """The block on its floor.
+
+    Args:
+        mesh: Mesh of the block, the same for settling and sliding.
+        friction: Coulomb's coefficient [-].
+        floor: One of FLOORS.
+        facets: Facets of a meshed floor along the way.
+        angle: Slope of the floor along x [rad]; it is gravity that turns.
+        speed: Initial speed along x [m/s].
+        held: Hold the block against sliding, without friction, to let it settle.
+        spring: Pull at the block by the spring, whose end starts to move at t = 1.
+        young: Of the block [Pa].
+    """
+    upstairs = nts.Dirichlet(lambda x: np.isclose(x[0], 0.0), components=(0,))
+    aside = nts.Dirichlet(lambda x: np.isclose(x[1], 0.0), components=(1,))
+    pulled: dict[str, Any] = {}
+    if spring:
+        stiffness = DENSITY * FREQUENCY**2
+        pulled["body_force"] = lambda t: (stiffness * spring_end(t - 1.0), 0.0, 0.0)
+        pulled["extra_form"] = lambda u, v, w: stiffness * u[0] * w[0] * ufl.dx
+    block = nts.Continuum(
+        mesh,
+        nts.StVenantKirchhoff(young=young, poisson=0.0),
+        density=DENSITY,
+        velocity=(speed, 0, 0),
+        bcs=[upstairs, aside] if held else [],
+        name="block",
+        **pulled,
+    )
+    bodies = [block]
+    master: Any = nts.Plane(point=(0, 0, 0), normal=(0, 0, 1))
+    if floor != "plane":
+        low, high = [-SIZE, -SIZE / 2, -0.1], [8 * SIZE, 1.5 * SIZE, 0.0]
+        held_at = (lambda x: np.isclose(x[2], -0.1)) if floor == "elastic" else everywhere
+        plate = nts.Continuum(
+            _box(mesh.comm, low, high, (facets, 1, 1)),
+            nts.StVenantKirchhoff(young=0.1 * YOUNG, poisson=0.0),
+            density=DENSITY,
+            bcs=[nts.Dirichlet(held_at)],
+            name="floor",
+        )
+        bodies.append(plate)
+        master = plate.surface(lambda x: np.isclose(x[2], 0.0))
+    pair = nts.ContactPair(
+        slave=block.surface(lambda x: np.isclose(x[2], 0.0)),
+        master=master,
+        friction=0.0 if held else friction,
+    )
+    # The supports that hold the block would take the pull along the slope, and so they get none.
+    along = 0.0 if held else math.sin(angle)
+    gravity = GRAVITY * np.array([along, 0.0, -math.cos(angle)])
+    return nts.System(bodies, contacts=[pair], gravity=gravity)
+
+
+def everywhere(x: np.ndarray) -> np.ndarray:
+    return np.full(x.shape[1], True)
+
+
+def spring_end(t: float) -> float:
+    """Where the far end of the spring is [m]: to and fro, turning when a slip is over."""
+    stroke = 2 * LOADING + SLIPPING
+    number, part = divmod(t + LOADING, stroke)
+    return PULL * ((part if number % 2 == 0 else stroke - part) - LOADING)
+
+
+def jerky_way(t: np.ndarray) -> np.ndarray:
+    """Way of a rigid block behind the spring [m], shape (n,)."""
+    number, part = np.divmod(t + LOADING, 2 * LOADING + SLIPPING)
+    slip = np.maximum(part - 2 * LOADING, 0.0)
+    way = PULL * (slip - np.sin(FREQUENCY * slip) / FREQUENCY)
+    return np.where(number % 2 == 0, way, JERK - way)
+
+
+# ---- runs
+class Centre:
+    """A writer that records how the block's centre of mass moves along x."""
+
+    def start(self, stepper: nts.Stepper) -> None:
+        """Begin anew."""
+        self.rows: list[tuple[float, float, float]] = []
+        self.write(stepper)
+
+    def write(self, stepper: nts.Stepper, *, last: bool = False) -> None:
+        """Add the accepted state."""
+        body, state = stepper.system.bodies[0], stepper.state
+        local = [body.linear_momentum(body.inertia(a[0]))[0] / MASS for a in (state.u, state.v)]
+        way, speed = stepper.system.comm.allreduce(np.array(local))
+        self.rows.append((state.time, way, speed))
+
+    def close(self, stepper: nts.Stepper) -> None:
+        """Nothing to close."""
+
+
+class Motion(NamedTuple):
+    """The block's centre since it was let go, shape (steps + 1,), and the run it comes from."""
+
+    time: np.ndarray
+    way: np.ndarray
+    speed: np.ndarray
+    run: nts.Solution
+
+    @property
+    def dissipation(self) -> np.ndarray:
+        """Energy that friction has dissipated [J/kg]."""
+        return self.run.balance["friction_dissipation"] / MASS
+
+
+def slide(
+    mesh: Any,
+    settled: nts.Solution,
+    *,
+    t_end: float,
+    dt: float = STEP,
+    integrator: str = "energy-momentum",
+    csv: Path | None = None,
+    **scene: Any,
+) -> Motion:
+    """Let the settled block go.
+
+    Args:
+        mesh: Mesh of the block.
+        settled: Equilibrium it starts from.
+        t_end: How long to watch it [s].
+        dt: Step [s].
+        integrator: One of INTEGRATORS.
+        csv: File for the balance table.
+        scene: Arguments of `system`.
+    """
+    centre = Centre()
+    run = nts.simulate(
+        system(mesh, **scene),
+        INTEGRATORS[integrator],
+        dt=dt,
+        t_end=1.0 + t_end,
+        start=settled,
+        output=[centre, *([BalanceCSV(csv)] if csv else [])],
+    )
+    time, way, speed = np.array(centre.rows).T
+    return Motion(time - time[0], way - way[0], speed, run)
+
+
+def level(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
+    """B4: time and way to rest and dissipation on level ground; the motion."""
+    scene = {"friction": ROUGH} | floor
+    settled = nts.equilibrium(system(mesh, held=True, **scene))
+    motion = slide(mesh, settled, speed=SPEED, t_end=1.2 * STOP, **scene, **run)
+    # Shaking hides when it stops: the mean deceleration between 80 and 20 % of the speed tells.
+    part = (motion.time > 0.2 * STOP) & (motion.time < 0.8 * STOP)
+    slope, start = np.polyfit(motion.time[part], motion.speed[part], 1)
+    return {
+        "level: time [s]": -start / slope,
+        "level: way [m]": motion.way[motion.time > 1.1 * STOP].mean(),
+        "level: dissipation [J/kg]": motion.dissipation[-1],
+    }, motion
+
+
+def slope(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
+    """B5: way and dissipation in a second on the slope; the motion."""
+    scene = {"friction": SLIPPERY, "angle": ANGLE} | floor
+    settled = nts.equilibrium(system(mesh, held=True, **scene))
+    motion = slide(mesh, settled, t_end=1.0, **scene, **run)
+    return {
+        "slope: way [m]": motion.way[-1],
+        "slope: dissipation [J/kg]": motion.dissipation[-1],
+    }, motion
+
+
+def verge(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
+    """Ways on the slope with friction a little above and below tan(ANGLE); the latter's motion."""
+    sticky, loose = (
+        {"friction": part * math.tan(ANGLE), "angle": ANGLE} | floor for part in (STICKY, LOOSE)
+    )
+    # Settled without friction it would start with a jerk, and shaking loosens a block on the verge.
+    settled = nts.equilibrium(system(mesh, **sticky))
+    stays = slide(mesh, settled, t_end=WATCHED, **sticky, **run)
+    motion = slide(mesh, settled, t_end=WATCHED, **loose, **run)
+    return {
+        "mu = 1.001 tan: way [m]": np.abs(stays.way).max(),
+        "mu = 0.999 tan: way [m]": motion.way[-1],
+    }, motion
+
+
+def stick_slip(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
+    """Way of the last slip, dissipation of all; the motion."""
+    scene = {"friction": PULLED} | floor
+    settled = nts.equilibrium(system(mesh, held=True, **scene))
+    end = SLIPS * (2 * LOADING + SLIPPING) - LOADING
+    motion = slide(mesh, settled, spring=True, t_end=end, **scene, **run)
+    before = np.searchsorted(motion.time, end - SLIPPING - LOADING)
+    return {
+        "stick-slip: jerk [m]": abs(motion.way[-1] - motion.way[before]),
+        "stick-slip: dissipation [J/kg]": motion.dissipation[-1],
+    }, motion
+
+
+PARTS = {"level": level, "slope": slope, "verge": verge, "stick-slip": stick_slip}
+
+
+def main(
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    *,
+    floors: tuple[str, ...] = ("plane", "mesh"),
+    integrators: tuple[str, ...] = tuple(INTEGRATORS),
+    parts: tuple[str, ...] = tuple(PARTS),
+    dt: float = STEP,
+    cells: tuple[int, int, int] = (4, 4, 1),
+    facets: int = 9,
+    output: str | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Run the parts on each floor with each integrator, and print what came beside closed forms.
+
+    Args:
+        comm: MPI communicator.
+        floors: Some of FLOORS.
+        integrators: Some of INTEGRATORS.
+        parts: Some of PARTS.
+        dt: Step [s].
+        cells: Hexahedra of the block.
+        facets: Facets of a meshed floor along its 1.8 m.
+        output: Folder for tables and pictures.
+
+    Returns:
+        {"floor, integrator": figures}: those of CLOSED_FORM, and `health` of the runs.
+    """
+    mesh = block_mesh(comm, cells)
+    results: dict[str, dict[str, Any]] = {}
+    motions: dict[str, dict[str, Motion]] = {part: {} for part in parts}
+    for floor in floors:
+        for name in integrators:
+            label, found = f"{floor}, {name}", []
+            results[label] = {}
+            for part in parts:
+                csv = Path(output) / f"{part}_{floor}_{name}.csv" if output else None
+                ground = {"floor": floor, "facets": facets}
+                figures, motion = PARTS[part](mesh, ground, dt=dt, integrator=name, csv=csv)
+                results[label] |= figures
+                motions[part][label] = motion
+                found.append(motion.run)
+            results[label] |= health(found)
+    if comm.rank == 0:
+        report(results)
+    if output:
+        folder = Path(output)
+        on_root(comm, f"output={output!r}", lambda: plot(motions, folder / "sliding_block.png"))
+    return results
+
+
+def health(runs: list[nts.Solution]) -> dict[str, Any]:
+    """What all runs must have: worst ledger and dissipation, over the energy that was turned."""
+    worst = {"ledger": 0.0, "least_dissipation": math.inf}
+    for run in runs:
+        table = run.balance
+        turned = np.abs(table["external_work"]).max() + table["energy"][0]
+        residual = np.abs(table["ledger_residual"]).max() / turned
+        step = np.diff(table["friction_dissipation"]).min() / turned
+        worst["ledger"] = max(worst["ledger"], float(residual))
+        worst["least_dissipation"] = min(worst["least_dissipation"], float(step))
+    iterations = np.concatenate([run.balance["newton_iterations"][1:] for run in runs])
+    return worst | {
+        "iterations": float(iterations.mean()),
+        "retries": sum(run.retries for run in runs),
+        "status": next((r.status for r in runs if r.status != "completed"), "completed"),
+    }
+
+
+def report(results: dict[str, dict[str, Any]]) -> None:
+    labels = list(results)
+    print(f"{'':30}{'closed form':>14}" + "".join(f"{label:>26}" for label in labels))
+    for row in results[labels[0]]:
+        exact = CLOSED_FORM.get(row)
+        values = [results[label][row] for label in labels]
+        text = [f"{v:26.10g}" if exact is not None else f"{v!s:>26.26}" for v in values]
+        print(f"{row:30}" + (f"{'':14}" if exact is None else f"{exact:14.6g}") + "".join(text))
+
+
+def plot(motions: dict[str, dict[str, Motion]], path: Path) -> None:
+    """Ways, speeds and dissipation over time beside the closed forms."""
+    from matplotlib.figure import Figure
+
+    exact = {
+        "level": lambda t: SPEED * np.minimum(t, STOP)
+        - ROUGH * GRAVITY * np.minimum(t, STOP) ** 2 / 2,
+        "slope": lambda t: ACCELERATION * t**2 / 2,
+        "verge": lambda t: (1 - LOOSE) * GRAVITY * math.sin(ANGLE) * t**2 / 2,
+        "stick-slip": jerky_way,
+    }
+    figure = Figure(figsize=(3.4 * len(motions), 7.0), constrained_layout=True)
+    grid = figure.subplots(3, len(motions), sharex="col", squeeze=False)
+    for column, (part, runs) in zip(grid.T, motions.items(), strict=True):
+        column[0].set_title(part)
+        for k, (label, motion) in enumerate(runs.items()):
+            look = {"linewidth": 1 + 0.8 * (len(runs) - k), "label": label}
+            for axes, values in zip(column, motion[1:3] + (motion.dissipation,), strict=True):
+                axes.plot(motion.time, values, **look)
+        t = np.linspace(0, motion.time[-1], 1001)
+        way = exact[part](t)
+        column[0].plot(t, way, "k--", linewidth=1, label="rigid block")
+        column[1].plot(t, np.gradient(way, t), "k--", linewidth=1)
+        column[2].set_xlabel("time [s]")
+    for axes, text in zip(
+        grid[:, 0], ("way [m]", "speed [m/s]", "dissipation [J/kg]"), strict=True
+    ):
+        axes.set_ylabel(text)
+    grid[0, 0].legend(fontsize=7, frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--output", help="folder for tables and pictures")
+    parser.add_argument("--floors", nargs="+", choices=FLOORS, default=("plane", "mesh"))
+    parser.add_argument("--integrators", nargs="+", choices=INTEGRATORS, default=tuple(INTEGRATORS))
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=tuple(PARTS))
+    parser.add_argument("--dt", type=float, default=STEP, help="step [s]")
+    parser.add_argument("--facets", type=int, default=9, help="facets of a meshed floor")
+    main(
+        **{k: tuple(v) if isinstance(v, list) else v for k, v in vars(parser.parse_args()).items()}
+    )

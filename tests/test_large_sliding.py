@@ -1,0 +1,434 @@
+"""Friction over many facets, edges and corners, off the surface and back, against closed forms."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from scipy.integrate import solve_ivp
+from test_single_mass import INTEGRATORS as ALL
+from test_single_mass import MASS, PointMass, PointSurface
+from test_smoothing import SPEED, Sledge
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+INTEGRATORS = {name: ALL[name] for name in ("midpoint", "energy-momentum")}
+GRAVITY, MU, STEP = 9.81, 0.2, 0.01
+DOWN = np.array([0.0, 0.0, -GRAVITY])
+#: Newton down to rounding, so that nothing but the scheme differs from the closed form.
+FLOOR = nts.Newton(rtol=1e-13)
+
+
+def bend(x, y):
+    """Makes general quadrilaterals and triangles of squares, in their plane."""
+    return x + 0.04 * np.sin(7 * y + 3 * x), y + 0.05 * np.cos(5 * x - 4 * y)
+
+
+def shear(x, y):
+    """Makes parallelograms of different widths of squares."""
+    return x + 0.05 * np.sin(3 * x) + 0.3 * y, y + 0.06 * np.sin(4 * y)
+
+
+#: Cells of the plate and the map of its plane; facets of "quads" alone have a varying metric.
+FACETS = {
+    "squares": (CellType.hexahedron, lambda x, y: (x, y)),
+    "diagonals": (CellType.tetrahedron, lambda x, y: (x, y)),
+    "parallelograms": (CellType.hexahedron, shear),
+    "triangles": (CellType.tetrahedron, bend),
+    "quads": (CellType.hexahedron, bend),
+}
+
+
+def plate(facets="squares", low=(-1.0, -1.0), high=(1.0, 1.0), top=0.0, n=(8, 8), name="plate"):
+    """A plate that does not move, and its upper face."""
+    cell, shape = FACETS[facets]
+    mesh = create_box(
+        COMM, [[*low, top - 0.2], [*high, top]], [*n, 1], cell, ghost_mode=GhostMode.shared_facet
+    )
+    x, y, _ = mesh.geometry.x.T
+    mesh.geometry.x[:, 0], mesh.geometry.x[:, 1] = shape(x, y)
+    everywhere = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
+    body = nts.Continuum(
+        mesh, nts.StVenantKirchhoff(1.0, 0.3), density=1.0, bcs=[everywhere], name=name
+    )
+    return body, body.surface(lambda x: x[2] > top - 1e-9)
+
+
+def renumbered(surface):
+    """The same facets start at another corner and come in another order."""
+    turned = np.array([np.roll(f, k) for k, f in enumerate(surface.facets)])[::-1].copy()
+    surface.facets = surface.patches = turned
+    return surface
+
+
+class History(NamedTuple):
+    """What a mass did, shape (steps + 1, 3) or (steps + 1,); forces [N] act on it."""
+
+    x: np.ndarray
+    v: np.ndarray
+    normal: np.ndarray
+    tangential: np.ndarray
+    stick: np.ndarray
+    facet: np.ndarray
+    table: dict
+
+
+def scene(start, velocity, *masters, friction=MU, gravity=DOWN):
+    """A mass before some surfaces of plates; (body, surface) each."""
+    mass = PointMass(COMM, MASS, start, velocity)
+    pairs = [nts.ContactPair(PointSurface(mass, start), m, friction=friction) for _, m in masters]
+    return nts.System([mass, *(b for b, _ in masters)], contacts=pairs, gravity=gravity)
+
+
+def follow(system, integrator, steps, dt=STEP):
+    """Advance and record; of several masters, the forces are added up."""
+    stepper = nts.Stepper(system, ALL[integrator], newton=FLOOR)
+    rows = []
+    for k in range(steps + 1):
+        if k:
+            stepper.advance(dt)
+        s, count = stepper.state, len(system.contacts)
+        row = [system.bodies[0].reference + s.u[0], s.v[0]]
+        row.append(sum(np.concatenate([s.force[c], s.tangential[c].ravel()]) for c in range(count)))
+        row.append(sum(s.stick[c] for c in range(count)))
+        row.append(np.max([s.facets[c] for c in range(count)], axis=0))
+        rows.append(COMM.bcast(np.concatenate(row)))
+    stepper.close()
+    assert stepper.solution.retries == 0
+    x, v, normal, tangential, stick, facet = np.split(np.array(rows), [3, 6, 7, 10, 11], axis=1)
+    return History(
+        x, v, normal[:, 0], tangential, stick[:, 0], facet[:, 0], stepper.solution.balance
+    )
+
+
+def assert_slides_straight(h, velocity, tolerance, mu=MU):
+    """The parabola of a mass that friction slows down, and its constant traction."""
+    velocity = np.asarray(velocity)
+    speed, t = np.linalg.norm(velocity), h.table["time"]
+    unit = velocity / speed
+    way = speed * t - mu * GRAVITY * t**2 / 2
+    np.testing.assert_allclose(h.x - h.x[0], way[:, None] * unit, rtol=0, atol=tolerance)
+    weight = MASS * GRAVITY
+    np.testing.assert_allclose(h.normal[1:], weight, rtol=tolerance)
+    traction = np.tile(-mu * weight * unit, (len(t) - 1, 1))
+    np.testing.assert_allclose(h.tangential[1:], traction, rtol=0, atol=10 * tolerance * weight)
+    assert not h.stick.any()
+    energy = h.table["energy"][0]
+    loss = mu * weight * way
+    np.testing.assert_allclose(
+        h.table["friction_dissipation"], loss, rtol=0, atol=10 * tolerance * energy
+    )
+    assert np.abs(h.table["contact_defect"]).max() <= 1e-12 * energy
+
+
+# ---- over facets
+@pytest.mark.parametrize("facets", FACETS)
+@pytest.mark.parametrize("integrator", ALL)
+def test_slip_and_traction_survive_changes_of_facet(integrator, facets):
+    """Every facet starts at another corner than its neighbour."""
+    body, face = plate(facets)
+    velocity = (2.3, 1.4, 0.0)
+    h = follow(scene((-0.81, -0.53, 0.0), velocity, (body, renumbered(face))), integrator, 55)
+    assert len(np.unique(h.facet)) >= 7
+    # Where the metric varies, only the exact gradient makes a straight slip of a straight way.
+    exact = facets != "quads" or integrator == "energy-momentum"
+    assert_slides_straight(h, velocity, 1e-12 if exact else 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("start", "velocity"),
+    [((-0.9, 0.25), (2.0, 0.0)), ((-0.75, -0.75), (1.5, 1.5)), ((-0.5, 0.75), (1.5, -1.5))],
+    ids=["along edges", "along diagonals and over corners", "over corners"],
+)
+@pytest.mark.parametrize("facets", ["squares", "diagonals"])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_along_edges_and_over_corners(integrator, facets, start, velocity):
+    """Two to six facets are equally near all the time, or again and again."""
+    h = follow(scene((*start, 0.0), (*velocity, 0.0), plate(facets)), integrator, 40)
+    assert_slides_straight(h, (*velocity, 0.0), 1e-12)
+
+
+@pytest.mark.parametrize("place", [(0.1, 0.1), (0.25, 0.1), (0.25, 0.25)])
+@pytest.mark.parametrize("facets", ["squares", "diagonals"])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_stuck_inside_on_an_edge_and_on_a_corner(integrator, facets, place):
+    """Pulled aside with 0.99 mu m g it stays; of the plate it takes all of the pull."""
+    pull = 0.99 * MU * GRAVITY * np.array([0.6, -0.8, 0.0])
+    system = scene((*place, 0.0), (0, 0, 0), plate(facets), gravity=DOWN + pull)
+    h = follow(system, integrator, 10)
+    assert h.stick[1:].all()
+    assert np.abs(h.x - h.x[0]).max() < 1e-14
+    np.testing.assert_allclose(h.tangential[1:], np.tile(-MASS * pull, (10, 1)), atol=1e-12)
+    assert not h.table["friction_dissipation"].any()
+
+
+@pytest.mark.parametrize("friction", [MU, np.inf])
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.0), (1.5, 0.7, 0.0)])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_zero_gap_without_force_is_without_friction(integrator, velocity, friction):
+    system = scene((-0.5, 0.25, 0.0), velocity, plate(), friction=friction, gravity=(0, 0, 0))
+    h = follow(system, integrator, 10)
+    np.testing.assert_allclose(h.v, np.tile(velocity, (11, 1)), rtol=0, atol=1e-14)
+    assert not h.normal.any() and not h.tangential.any()
+    assert not h.table["friction_dissipation"].any()
+
+
+# ---- a curved surface
+def saddle(height):
+    """Facets on z = height x y, which bilinear ones hold exactly."""
+    mesh = create_box(
+        COMM, [[-1, -1, -0.5], [1, 1, 0]], [4, 4, 1], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
+    one = np.full(len(top), 1, np.int32)
+    tags = nts.continuum.dolfinx_mesh.meshtags(mesh, 2, np.sort(top), one)
+    x, y, _ = mesh.geometry.x.T
+    mesh.geometry.x[:, 2] += height * x * y
+    everywhere = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
+    body = nts.Continuum(
+        mesh, nts.StVenantKirchhoff(1.0, 0.3), density=1.0, bcs=[everywhere], name="saddle"
+    )
+    return body, body.surface(tags, 1)
+
+
+def on_saddle(height, place, velocity, end):
+    """Place and velocity (x, y, v_x, v_y) of a mass that slides with friction on a saddle."""
+
+    def rate(t, y):
+        v = np.array([y[2], y[3], height * (y[2] * y[1] + y[0] * y[3])])
+        upward = np.array([-height * y[1], -height * y[0], 1.0])
+        normal = upward / np.linalg.norm(upward)
+        pressure = 2 * height * y[2] * y[3] / np.linalg.norm(upward) - normal @ DOWN
+        return [*y[2:], *(DOWN + pressure * (normal - MU * v / np.linalg.norm(v)))[:2]]
+
+    return solve_ivp(rate, (0, end), [*place, *velocity], rtol=1e-12, atol=1e-13).y[:, -1]
+
+
+@pytest.mark.parametrize("integrator", ALL)
+def test_sliding_over_a_saddle_is_of_second_order(integrator):
+    """Against the equations of motion on the surface, solved without this package."""
+    height, (x, y), (vx, vy), end, errors = 0.25, (-0.6, -0.5), (1.5, 0.9), 0.6, []
+    exact = on_saddle(height, (x, y), (vx, vy), end)
+    for steps in (15, 30, 60):
+        start, velocity = (x, y, height * x * y), (vx, vy, height * (vx * y + x * vy))
+        h = follow(scene(start, velocity, saddle(height)), integrator, steps, end / steps)
+        errors.append(np.abs(np.concatenate([h.x[-1, :2], h.v[-1, :2]]) - exact))
+        assert len(np.unique(h.facet[1:])) >= 3 and not h.stick.any()
+        assert (np.diff(h.table["friction_dissipation"]) > 0).all()
+        energy = h.table["energy"][0]
+        assert np.abs(h.table["contact_defect"]).max() < 1e-12 * energy
+        if integrator != "midpoint":
+            assert np.abs(h.table["ledger_residual"]).max() < 1e-11 * energy
+    rates = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.abs(rates - 2).max() < 0.1, (errors, rates)
+
+
+# ---- a block over many facets
+def settled_block(facets, friction):
+    """A small block thrown over a long plate that it rests on, and the state it starts from."""
+    mesh = create_box(
+        COMM, [[0, 0, 0], [0.1, 0.1, 0.05]], [2, 2, 1], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+
+    def on_plate(held):
+        block = nts.Continuum(
+            mesh, nts.StVenantKirchhoff(1e7, 0.0), density=1e3, velocity=(3.4, 0.3, 0),
+            bcs=[nts.Dirichlet(lambda x, k=k: x[k] < 1e-9, components=(k,)) for k in held],
+            name="block",
+        )  # fmt: skip
+        body, face = plate(facets, (-0.3, -0.3), (1.8, 0.5), n=(90, 2))
+        below = block.surface(lambda x: x[2] < 1e-9)
+        pair = nts.ContactPair(below, face, friction=0.0 if held else friction)
+        return nts.System([block, body], contacts=[pair], gravity=DOWN)
+
+    return on_plate(()), nts.equilibrium(on_plate((0, 1)))
+
+
+@pytest.mark.parametrize(
+    ("integrator", "facets", "friction"),
+    [
+        ("energy-momentum", "parallelograms", 0.0),
+        ("energy-momentum", "parallelograms", 0.1),
+        ("midpoint", "parallelograms", 0.1),
+        ("energy-momentum", "triangles", 0.1),
+    ],
+)
+def test_a_block_over_fifty_facets_has_no_switch_defect(integrator, facets, friction):
+    system, settled = settled_block(facets, friction)
+    stepper, dt = nts.Stepper(system, INTEGRATORS[integrator], start=settled), 4e-3
+    passed = []
+    for _ in range(100):
+        stepper.advance(dt)
+        passed.append(stepper.state.facets[0].copy())
+    table = stepper.solution.balance
+    stepper.close()
+    changes = (np.diff(passed, axis=0) != 0).sum(axis=0)
+    assert changes.min() >= 50
+    energy, weight = table["energy"][0], 0.5 * GRAVITY
+    assert (table["active"][1:] == 9).all()
+    assert np.abs(table["contact_defect"]).max() < 1e-12 * energy
+    # The momentum along the way falls by mu m g t, as a rigid block's.
+    momentum = np.linalg.norm(table["linear_momentum"][:, :2], axis=1)
+    expected = momentum[0] - friction * weight * (table["time"] - table["time"][0])
+    np.testing.assert_allclose(momentum, expected, rtol=1e-12 + 1e-3 * friction)
+    if integrator == "energy-momentum":
+        assert np.abs(table["ledger_residual"]).max() < 1e-11 * energy
+
+
+# ---- off the surface
+def assert_coulomb(h, acceleration, mu=MU):
+    """In each step the momentum changes by gravity and contact; friction is mu p against slip."""
+    force = np.column_stack([np.zeros((len(h.x), 2)), h.normal]) + h.tangential
+    change = MASS * (np.diff(h.v, axis=0) / STEP - acceleration)
+    top = h.normal.max()
+    np.testing.assert_allclose(change, force[1:], rtol=0, atol=1e-10 * top)
+    way = np.diff(h.x, axis=0)[:, :2]
+    slipping = (h.normal[1:] > 0) & (h.stick[1:] == 0)
+    unit = way[slipping] / np.linalg.norm(way[slipping], axis=1)[:, None]
+    expected = -mu * h.normal[1:][slipping, None] * unit
+    friction = h.tangential[1:, :2]
+    np.testing.assert_allclose(friction[slipping], expected, rtol=0, atol=1e-10 * top)
+    assert np.abs(h.tangential[h.normal == 0]).max() < 1e-14 * top
+    assert (np.diff(h.table["friction_dissipation"]) >= 0).all()
+
+
+@pytest.mark.parametrize("facets", ["squares", "triangles"])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_slides_off_and_lands_on_another_plate(integrator, facets):
+    """Two masters, one lower and beside the other: slide, flight, bounces, slide."""
+    upper = plate(facets, (-1, -1), (0, 1), 0.0, (4, 8), "upper")
+    lower = plate(facets, (0.1, -1), (2.1, 1), -0.05, (8, 8), "lower")
+    h = follow(scene((-0.51, -0.13, 0.0), (3.0, 0.8, 0.0), upper, lower), integrator, 70)
+    assert_coulomb(h, DOWN)
+    up = h.normal > 0
+    leaves = int(np.argmin(up[1:])) + 1
+    assert up[1:leaves].all() and 0.0 < h.x[leaves - 1, 0] < 0.1
+    lands = leaves + int(np.argmax(up[leaves:]))
+    flight = STEP * (lands - leaves)
+    # A parabola from the last point of contact, whose speed is that of the slide.
+    assert -0.05 < h.x[lands - 1, 2] == pytest.approx(-GRAVITY * flight**2 / 2, abs=1e-13)
+    assert h.x[lands, 2] == pytest.approx(-0.05, abs=1e-14)
+    assert up[lands:].sum() >= 4
+    assert np.abs(h.table["ledger_residual"]).max() < 1e-12 * h.table["energy"][0]
+
+
+@pytest.mark.parametrize("start", [-0.505, -0.5, -0.49])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_two_masters_side_by_side_are_one(integrator, start):
+    """Over their seam the gap is closed twice, and carries once."""
+    plates = [plate("squares", (k - 1, -1), (k, 1), n=(4, 8), name=f"plate{k}") for k in (0, 1)]
+    velocity = (2.0, 0.3, 0.0)
+    h = follow(scene((start, -0.13, 0.0), velocity, *plates), integrator, 40)
+    assert h.x[-1, 0] > 0.1
+    assert_slides_straight(h, velocity, 1e-12)
+
+
+class Crane(PointMass):
+    """A mass that is lifted, drawn back and let down; nothing else pulls at it."""
+
+    @staticmethod
+    def acceleration(time):
+        phases = ((0.1, (0, 0, -GRAVITY)), (0.2, (0, 0, 15)), (9, (-40, 0, -15)))
+        return np.array(next(a for end, a in phases if time < end), dtype=float)
+
+    def begin_step(self, integrator, u0, v0, time, dt):
+        self.now = self.acceleration(time + 0.5 * dt)[: self.num_owned]
+
+    def external(self, u1, gravity):
+        return self.mass * self.now
+
+
+@pytest.mark.parametrize("facets", ["squares", "triangles"])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_leaves_the_surface_beyond_its_rim_and_comes_back(integrator, facets):
+    body, face = plate(facets)
+    start = (0.3, 0.17, 0.0)
+    mass = Crane(COMM, MASS, start, (3.5, -0.4, 0.0))
+    pair = nts.ContactPair(PointSurface(mass, start), face, friction=MU)
+    h = follow(nts.System([mass, body], contacts=[pair]), integrator, 60)
+    t = h.table["time"]
+    assert_coulomb(h, [Crane.acceleration(x + 0.5 * STEP) for x in t[:-1]])
+    up = h.normal > 0
+    assert up[1:11].all() and not up[11:45].any() and up[45:].any()
+    assert h.x[11:45, 0].max() > 1.05 and (h.x[45:, 0] < 1).all()
+    # It went out and comes in.
+    assert (h.tangential[1:11, 0] < 0).all() and h.tangential[45, 0] > 0
+
+
+# ---- prescribed coordinates
+class Drawn(Sledge):
+    """A mass drawn along x over a plate; free across, where friction slows it down."""
+
+    def __init__(self, across, position):
+        super().__init__(position)
+        self.fixed = self.fixed[:1]
+        self.initial_velocity = np.array([SPEED, across, 0.0])[: self.num_owned]
+
+    def prescribed(self, time):
+        return np.array([SPEED * time])[: len(self.fixed)]
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_friction_does_the_work_of_drawing(integrator):
+    """Both directions of slip are prescribed: mu m g times the way goes in and is dissipated."""
+    start = (-0.8, 0.13, 0.0)
+    mass, (body, face) = Sledge(start), plate()
+    pair = nts.ContactPair(PointSurface(mass, start), face, friction=MU)
+    pair.slave.fixed[:, :2] = True
+    h = follow(nts.System([mass, body], contacts=[pair], gravity=DOWN), integrator, 20)
+    work = MU * mass.mass * GRAVITY * SPEED * h.table["time"]
+    np.testing.assert_allclose(h.table["friction_dissipation"], work, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(h.table["external_work"], work, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(h.tangential[1:, 0], -MU * mass.mass * GRAVITY, rtol=1e-12)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_drawn_along_it_loses_its_motion_across(integrator):
+    """v_y' = -mu g v_y / |v| with v_x prescribed, at second order; one direction of slip is."""
+    across, end, errors = 0.7, 0.4, []
+    exact = solve_ivp(
+        lambda t, y: [y[1], -MU * GRAVITY * y[1] / np.hypot(SPEED, y[1])],
+        (0, end), [0.0, across], rtol=1e-12, atol=1e-13,
+    ).y[0, -1]  # fmt: skip
+    for steps in (10, 20, 40):
+        start = (-0.8, 0.13, 0.0)
+        mass, (body, face) = Drawn(across, start), plate("parallelograms")
+        pair = nts.ContactPair(PointSurface(mass, start), face, friction=MU)
+        pair.slave.fixed[:, 0] = True
+        system = nts.System([mass, body], contacts=[pair], gravity=DOWN)
+        h = follow(system, integrator, steps, end / steps)
+        errors.append(h.x[-1, 1] - 0.13 - exact)
+    rates = np.log2(np.abs(errors[:-1]) / np.abs(errors[1:]))
+    assert np.abs(rates - 2).max() < 0.1, (errors, rates)
+
+
+# ---- ranks and contacts without candidates
+@pytest.mark.mpi
+@pytest.mark.parametrize("condense", [False, True])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_far_away_and_on_ranks_without_facets(integrator, condense):
+    """A plate of one cell, which one rank owns, and another that nothing comes near."""
+    near = plate(n=(1, 1), name="near")
+    far = plate(low=(5.0, 5.0), high=(6.0, 6.0), n=(1, 1), name="far")
+    owned = COMM.allgather(len(near[1].owned))
+    assert COMM.size == 1 or min(owned) == 0
+    start, velocity = (-0.5, 0.1, 0.03), np.array([1.5, 0.4, 0.0])
+    system = scene(start, velocity, near, far)
+    stepper = nts.Stepper(
+        system, INTEGRATORS[integrator], newton=nts.Newton(rtol=1e-13, condense=condense)
+    )
+    for _ in range(20):
+        stepper.advance(STEP)
+    table = stepper.solution.balance
+    stepper.close()
+    assert table["active"][1] == 0 and table["active"].max() == 1
+    # Friction takes the part mu of the momentum that the plate gives.
+    momentum = table["linear_momentum"] - MASS * DOWN * table["time"][:, None]
+    given, unit = momentum[:, 2] - momentum[0, 2], velocity / np.linalg.norm(velocity)
+    taken = momentum @ unit - momentum[0] @ unit
+    np.testing.assert_allclose(taken, -MU * given, rtol=0, atol=1e-12 * MASS)
+    assert given[-1] > 0
