@@ -25,8 +25,10 @@ BoolArray = npt.NDArray[np.bool_]
 #: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which
 #: with a consistent mass matrix is a small part of the nodal mass.
 TANGENTIAL_SCALE = 0.05
-#: Square of the part of a tangential direction's motion that counts as none.
+#: Square of the part of a motion that counts as none.
 _IMMOVABLE = 1e-12
+#: Prescribed slip over the size of the facet that counts as none.
+_STILL = 1e-10
 
 
 class Contribution(NamedTuple):
@@ -150,39 +152,71 @@ class ContactStep:
         )
 
     @cached_property
-    def blocked(self) -> FloatArray:
-        """Projector on the lambda_T that act on prescribed coordinates only, shape (n, 2, 2).
+    def _prescribed(self) -> BoolArray:
+        """Axes along which slave and foot move as prescribed, shape (n, 3)."""
+        shape, n = self._shape(), self.num_pairs
+        if self._weights is not None:
+            shape = np.einsum("nk,nkp->np", shape, self._weights)
+        square = np.column_stack([np.ones(n), shape]) ** 2
+        free = np.concatenate(self.dofs(), axis=1).reshape(n, self.num_corners + 1, 3) >= 0
+        part = np.einsum("nk,nki->ni", square, free)
+        still: BoolArray = part <= _IMMOVABLE * square.sum(axis=1)[:, None]
+        return still
 
-        There the slip is prescribed, sticking is no equation, and lambda_T is set to zero.
+    @cached_property
+    def _blocked(self) -> FloatArray:
+        """Projector on the tangential parts of the prescribed axes, shape (n, 3, 3).
+
+        Forces there act on prescribed coordinates or along the normal: where the gap is closed, the
+        slip there is prescribed.
         """
-        free = np.concatenate(self.dofs(), axis=1) >= 0
-        out = np.zeros((self.num_pairs, 2, 2))
-        some = np.flatnonzero(~free.all(axis=1))
-        gradient = self._slip_gradient(some)
-        whole = np.einsum("naz,nbz->nab", gradient, gradient)
-        part = np.einsum("naz,nbz->nab", gradient * free[some, None], gradient)
-        inverse = np.linalg.inv(np.linalg.cholesky(whole))
-        movable, vector = np.linalg.eigh(inverse @ part @ inverse.transpose(0, 2, 1))
-        vector = np.matmul(inverse.transpose(0, 2, 1), vector)
-        vector /= np.linalg.norm(vector, axis=1, keepdims=True)
-        vector *= (movable < _IMMOVABLE)[:, None]
-        out[some] = np.matmul(vector, vector.transpose(0, 2, 1))
-        both = some[(movable < _IMMOVABLE).all(axis=1)]
-        out[both] = np.eye(2)
-        return out
+        normal = self.candidates.normal
+        along = np.eye(3) - normal[:, :, None] * normal[:, None]
+        part, vector = np.linalg.eigh(np.matmul(along * self._prescribed[:, None], along))
+        vector *= (part > _IMMOVABLE)[:, None]
+        projector: FloatArray = np.matmul(vector, vector.transpose(0, 2, 1))
+        return projector
 
-    def _slip_gradient(self, some: IntArray) -> FloatArray:
-        """Derivative of the slip of some pairs by the positions, of any size, shape (m, 2, z)."""
-        x, xi = self.x0[some], self.candidates.xi[some]
-        # As of a closed gap, where alone nodes stick: across an open one a turn of the facet, too,
-        # moves the projection.
-        x[:, 0] = facets.frame(x[:, 1:], xi)[0]
-        gradient, weights = nts.projection(x, xi, np.zeros_like(xi)).gradient, self._weights
-        if weights is not None:
-            width = (len(some), 2, self.num_corners, 3)
-            points = np.einsum("nkp,naki->napi", weights[some], gradient[..., 3:].reshape(width))
-            gradient[..., 3:] = points.reshape(gradient[..., 3:].shape)
-        return gradient
+    @cached_property
+    def blocked(self) -> FloatArray:
+        """Projector on the lambda_T that no free coordinate can tell from zero, shape (n, 2, 2).
+
+        Sticking is no equation there, and lambda_T is set to zero.
+        """
+        tangents = self._tangents()
+        metric = np.matmul(tangents, tangents.transpose(0, 2, 1))
+        dual = nts.solve(metric, tangents)
+        projector: FloatArray = np.matmul(
+            np.matmul(tangents, self._blocked), dual.transpose(0, 2, 1)
+        )
+        return projector
+
+    def _held(self, x: FloatArray) -> FloatArray:
+        """`blocked` where the slip prescribed there is zero, else zero, shape (n, 2, 2).
+
+        Nodes that slip leave this part of lambda_T out of the trial, too: Coulomb's law says
+        nothing about it, and at the edge of sticking the rows would be singular in it.
+        """
+        motion = x - self.x0
+        motion = motion[:, 0] - np.einsum("nk,nki->ni", self._shape(), motion[:, 1:])
+        slip = np.einsum("nij,nj->ni", self._blocked, motion * self._prescribed)
+        held: FloatArray = self.blocked.copy()
+        held[np.abs(slip).max(axis=1) > _STILL * self.candidates.length] = 0.0
+        return held
+
+    def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
+        """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
+        c = TANGENTIAL_SCALE * self.scale
+        moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2)) & np.isfinite(bound)
+        s = slip.value[moved]
+        length = np.sqrt(np.einsum("na,nab,nb->n", s, slip.metric[moved], s))
+        # Where solved, trial and slip are parallel, whatever c: the tangent needs no slope of c.
+        c[moved] = np.maximum(c[moved], 2.0 * bound[moved] / length)
+        return c
+
+    def _shape(self) -> FloatArray:
+        """Weights of the control points in the foot at t_n, shape (n, nc)."""
+        return facets.shape(self.candidates.xi, self.num_corners)[0]
 
     def reference(self) -> FloatArray:
         """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
@@ -276,7 +310,7 @@ class ContactStep:
         multiplier = scale * multiplier
         x = self._control(x)
         residual, tangent, gap, slip = self._element(x, augmented, multiplier)
-        part = self._laws(residual, tangent, gap, slip, multiplier)
+        part = self._laws(x, residual, tangent, gap, slip, multiplier)
         if slip is not None:
             part.tangential[:] = self._tangential(x, -residual[:, :3])
         self._to_points(part)
@@ -437,6 +471,7 @@ class ContactStep:
 
     def _laws(
         self,
+        x: FloatArray,
         residual: FloatArray,
         tangent: FloatArray,
         gap: FloatArray,
@@ -465,7 +500,7 @@ class ContactStep:
             tangential=np.zeros((self.num_pairs, 3)),
         )
         if slip is not None:
-            part.stick[:] = self._coulomb(residual, tangent, slip, multiplier, gap, active)
+            part.stick[:] = self._coulomb(x, residual, tangent, slip, multiplier, gap, active)
             square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
             part.distance[active] = np.sqrt(square[active])
         return part
@@ -479,6 +514,7 @@ class ContactStep:
 
     def _coulomb(
         self,
+        x: FloatArray,
         residual: FloatArray,
         tangent: FloatArray,
         slip: Slip,
@@ -496,23 +532,25 @@ class ContactStep:
         pressure = -multiplier[:, 0] - self.scale * gap
         bound = np.zeros_like(gap)
         bound[active] = np.inf if np.isinf(mu) else mu * pressure[active]
-        law = return_map(t, slip.value, slip.metric, bound, TANGENTIAL_SCALE * self.scale)
+        held = self._held(x)
+        loose = np.eye(2) - held
+        trial = np.einsum("nab,nb->na", loose, t)
+        law = return_map(trial, slip.value, slip.metric, bound, self._c(slip, bound, held))
         stick = law.stick & active
         rows = np.einsum("nab,nbz->naz", law.d_slip, slip.gradient)
         rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)
-        rows[:, :, -2:] += law.d_multiplier
+        rows[:, :, -2:] += np.matmul(law.d_multiplier, loose)
         if not np.isinf(mu):
             d_pressure = -self.scale[:, None] * tangent[:, normal]
             d_pressure[:, normal] -= 1.0
             rows += mu * law.d_bound[:, :, None] * d_pressure[:, None]
-        value = law.residual
-        value[~active], rows[~active] = t[~active], 0.0
-        rows[~active, :, -2:] = np.eye(2)
-        slipping = ~stick
+        value, slipping = law.residual, ~stick
         value[slipping] /= scale[slipping, 0]
         rows[slipping] /= scale[slipping]
-        blocked = self.blocked[stick] / scale[stick]
-        value[stick] += np.einsum("nab,nb->na", blocked, t[stick])
-        rows[stick, :, -2:] += blocked
+        unsaid = np.where(stick[:, None, None], self.blocked, held) / scale
+        value += np.einsum("nab,nb->na", unsaid, t)
+        rows[:, :, -2:] += unsaid
+        value[~active], rows[~active] = t[~active] / scale[~active, 0], 0.0
+        rows[~active, :, -2:] = np.eye(2) / scale[~active]
         residual[:, -2:], tangent[:, -2:] = value, rows
         return stick

@@ -91,9 +91,8 @@ class ObstacleStep(ContactStep):
         first *= inverse(np.linalg.norm(first, axis=1))[:, None]
         return np.stack([first, np.cross(normal, first)], axis=1)
 
-    def _slip_gradient(self, some: IntArray) -> FloatArray:
-        gradient: FloatArray = self._basis[some]
-        return gradient
+    def _shape(self) -> FloatArray:
+        return np.empty((self.num_pairs, 0))
 
     def _middle(self, x: FloatArray) -> Gap:
         """Gap and normal where the contact force acts."""
