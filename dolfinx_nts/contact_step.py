@@ -500,7 +500,7 @@ class ContactStep:
             tangential=np.zeros((self.num_pairs, 3)),
         )
         if slip is not None:
-            part.stick[:] = self._coulomb(x, residual, tangent, slip, multiplier, gap, active)
+            part.stick[:] = self._coulomb(x, residual, tangent, slip, multiplier, active)
             square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
             part.distance[active] = np.sqrt(square[active])
         return part
@@ -519,19 +519,17 @@ class ContactStep:
         tangent: FloatArray,
         slip: Slip,
         multiplier: FloatArray,
-        gap: FloatArray,
         active: BoolArray,
     ) -> BoolArray:
         """Write the rows of lambda_T [m]; returns which pairs stick.
 
-        The pressure in Coulomb's bound is that which decides on the active set, so that it is
-        positive just where a pair is active; where solved, the gap in it is zero.
+        The slope of Coulomb's bound over lambda_N is mu for all active pairs, also at the kink where
+        lambda_N = 0: of a pair that has just become active rounding has the sign.
         """
         mu, t, scale = self.pair.friction, multiplier[:, -2:], self.scale[:, None, None]
         normal = residual.shape[1] - self.num_multipliers
-        pressure = -multiplier[:, 0] - self.scale * gap
-        bound = np.zeros_like(gap)
-        bound[active] = np.inf if np.isinf(mu) else mu * pressure[active]
+        bound = np.zeros_like(self.scale)
+        bound[active] = np.inf if np.isinf(mu) else mu * np.maximum(-multiplier[active, 0], 0.0)
         held = self._held(x)
         loose = np.eye(2) - held
         trial = np.einsum("nab,nb->na", loose, t)
@@ -541,9 +539,7 @@ class ContactStep:
         rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)
         rows[:, :, -2:] += np.matmul(law.d_multiplier, loose)
         if not np.isinf(mu):
-            d_pressure = -self.scale[:, None] * tangent[:, normal]
-            d_pressure[:, normal] -= 1.0
-            rows += mu * law.d_bound[:, :, None] * d_pressure[:, None]
+            rows[:, :, normal] -= mu * law.d_bound
         value, slipping = law.residual, ~stick
         value[slipping] /= scale[slipping, 0]
         rows[slipping] /= scale[slipping]
