@@ -120,6 +120,10 @@ class StepMatrix:
         self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
         self._parts = [self.nest]
         if self._split:
+            for k in range(len(bodies)):
+                for key in ((k, len(bodies)), (len(bodies), k)):
+                    if key not in self._blocks:
+                        grid[key[0]][key[1]] = self._blocks[key] = self._zero_block(*key)
             halves = (slice(len(bodies)), slice(len(bodies), None))
             quarters = [[row[half] for row in grid[rows]] for rows in halves for half in halves]
             self._parts = [PETSc.Mat().createNest(q, comm=layout.comm) for q in quarters]
@@ -139,6 +143,14 @@ class StepMatrix:
         element = self._elements[e]
         rows, cols = np.nonzero(element.pattern[element.columns[i], element.columns[j]])
         return rows, cols, element.numbers[i][:, rows], element.numbers[j][:, cols]
+
+    def _zero_block(self, row: int, col: int) -> Any:
+        """A body without contact still has its place in the nest of a split."""
+        local = self._layout.counts[self._layout.comm.rank]
+        sizes = ((int(local[row]), None), (int(local[col]), None))
+        a = PETSc.Mat().createAIJ(sizes, nnz=0, comm=self._layout.comm)
+        a.assemble()
+        return a
 
     def _new_block(self, row: int, col: int) -> Any:
         parts = [self._entries(s)[2:] for s in self._sources[row, col]]

@@ -523,8 +523,8 @@ class ContactStep:
     ) -> BoolArray:
         """Write the rows of lambda_T [m]; returns which pairs stick.
 
-        The slope of Coulomb's bound over lambda_N is mu for all active pairs, also at the kink where
-        lambda_N = 0: of a pair that has just become active rounding has the sign.
+        The slope of Coulomb's bound over lambda_N is mu for all active pairs, also at the kink: of
+        a pair that has just become active lambda_N is zero, and rounding has the sign.
         """
         mu, t, scale = self.pair.friction, multiplier[:, -2:], self.scale[:, None, None]
         normal = residual.shape[1] - self.num_multipliers

@@ -48,8 +48,9 @@ class Equilibrium(Solution):
 
     `balance` has one row per accepted load step: "time" is the pseudo time, "potential" and
     "energy" the strain energy, "external_work" that of loads and prescribed motion (of the mean of
-    the forces at both ends of each step), "ledger_residual" what the two differ by; "kinetic" and
-    the momenta are 0.
+    the forces at both ends of each step), "ledger_residual" what energy and
+    friction_dissipation miss of it; "kinetic" and the momenta are 0, and changes of facet, which
+    cost nothing, are not listed.
 
     Attributes:
         state: Last accepted state: displacements u, and of each contact force and gap of its slave
@@ -94,7 +95,7 @@ class _LoadStepper(Stepper):
 
     def _step(self, dt: float, time: float) -> None:
         old = self.state
-        step, state, iterations = self._relax(dt, time)
+        step, state, iterations, lost = self._relax(dt, time)
         self._rates = [(a - b) / dt for a, b in zip(state.u, old.u, strict=True)]
         forces = [t.external.copy() for t in step.bodies]
         work = 0.0
@@ -105,6 +106,7 @@ class _LoadStepper(Stepper):
         resultants, before = self._resultants(step), self.solution.rows[-1]
         terms = balance.step_terms(self.problem, step)
         terms["external_work"] = self.system.comm.allreduce(work)
+        terms["friction_dissipation"] += lost
         for k, pair in enumerate(self.system.contacts):
             if pair.rigid:
                 mean = 0.5 * (before["contact_forces"][k] + resultants["contact_forces"][k])
@@ -117,14 +119,14 @@ class _LoadStepper(Stepper):
         self._accept(state)
         self.solution.state = state
 
-    def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int]:
-        """Solution of a load step, its state, and the Newton iterations.
+    def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, float]:
+        """Solution of a load step, its state, Newton iterations, earlier relaxations' dissipation.
 
         Each relaxation starts where the last one ended and is held there a little by the
         stabilization: a proximal-point iteration, whose limit knows nothing of it.
         """
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
-        search = True
+        search, lost, since, slipped = True, 0.0, 0.0, self.state.slip
         problem.stabilization = self._stabilization
         state = replace(kept, v=tuple(self._rates))
         try:
@@ -132,6 +134,11 @@ class _LoadStepper(Stepper):
                 try:
                     step = self._solve(state, dt, search)
                     reached = self._accepted(step, dt, time)
+                    if search:  # else slip still counts from the last search
+                        lost, slipped = lost + since, state.slip
+                    moved = (b - a for a, b in zip(kept.slip, reached.slip, strict=True))
+                    total = tuple(a + b for a, b in zip(slipped, moved, strict=True))
+                    reached = replace(reached, slip=total)
                     self._check_inverted(reached)
                     self._check_missed(reached)
                 except StepFailedError:
@@ -141,10 +148,11 @@ class _LoadStepper(Stepper):
                     problem.stabilization /= _RELIEF
                     continue
                 iterations += step.iterations
+                since = balance.step_terms(problem, step)["friction_dissipation"]
                 state, dt = reached, 0.0
                 unrest = problem.unrest(step)
                 if unrest <= 1.0:
-                    return step, state, iterations
+                    return step, state, iterations, lost
                 if unrest < _RELIEVED * last:
                     problem.stabilization *= _RELIEF
                 last = unrest

@@ -40,6 +40,7 @@ class Newton:
             and steps for as long as Newton contracts well; contact is always linearised anew.
 
     Raises:
+        TypeError: An argument is of another type.
         ValueError: An argument is out of range.
     """
 
@@ -53,6 +54,13 @@ class Newton:
     def __post_init__(self) -> None:
         if not 0 < self.rtol < 1:
             raise ValueError(f"rtol={self.rtol!r}: must lie in (0, 1)")
+        for name in ("max_iterations", "max_retries"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool):
+                raise TypeError(f"{name}={value!r}: pass a whole number")
+        for name in ("condense", "reuse"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name}={getattr(self, name)!r}: pass True or False")
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
         if self.max_retries < 0:
@@ -121,6 +129,7 @@ class StepSolver:
                 self.snes.solve(None, self.problem.x)
             except PETSc.Error as error:
                 # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
+                self._matrices_due = True
                 self.destroy()
                 state = self.problem.state
                 raise StepFailedError(
@@ -134,14 +143,20 @@ class StepSolver:
                 return replace(last, iterations=self.snes.getIterationNumber())
         self._matrices_due = True
         reason, iterations = self.snes.getConvergedReason(), self.snes.getIterationNumber()
-        raise StepFailedError(self._diagnosis(last, reason, iterations))
+        message = self._diagnosis(last, reason, iterations)
+        if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+            # A factorisation that met a NaN fails from then on.
+            self.destroy()
+        raise StepFailedError(message)
 
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
         self._last: Evaluation | None = None
         self._flips = [np.zeros(c.num_pairs, dtype=int) for c in self.problem.contacts]
         self._before = np.inf
-        self._matrices_due |= not self.newton.reuse or self.problem.factor != self._factor
+        changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
+        # Equal steps differ by rounding.
+        self._matrices_due |= not self.newton.reuse or changed > 1e-6
         self._factor = self.problem.factor
         if self._version != self.problem.version:
             self.destroy()

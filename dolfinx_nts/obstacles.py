@@ -113,7 +113,8 @@ class Plane(Obstacle):
     point: Vector
     normal: Vector
     _: KW_ONLY
-    motion: Motion | None = None
+    # Two functions of one motion are not equal, and where obstacles stand tells them apart.
+    motion: Motion | None = field(default=None, compare=False)
     name: str = field(default="plane", compare=False)
 
     def __post_init__(self) -> None:
@@ -221,7 +222,8 @@ class Sphere(_Round):
     radius: float
     _: KW_ONLY
     inside: bool = False
-    motion: Motion | None = None
+    # Two functions of one motion are not equal, and where obstacles stand tells them apart.
+    motion: Motion | None = field(default=None, compare=False)
     name: str = field(default="sphere", compare=False)
 
     def __post_init__(self) -> None:
@@ -258,7 +260,8 @@ class Cylinder(_Round):
     radius: float
     _: KW_ONLY
     inside: bool = False
-    motion: Motion | None = None
+    # Two functions of one motion are not equal, and where obstacles stand tells them apart.
+    motion: Motion | None = field(default=None, compare=False)
     name: str = field(default="cylinder", compare=False)
 
     def __post_init__(self) -> None:

@@ -65,6 +65,7 @@ class Motion:
         times: [s].
         motion: The means at each time [m], shape (12 bodies,).
         impulse: Of all normal contact forces [N s].
+        mass: Of all bodies [kg].
     """
 
     def start(self, stepper: nts.Stepper) -> None:
@@ -72,7 +73,11 @@ class Motion:
         self.times: list[float] = []
         self.motion: list[FloatArray] = []
         self.impulse = 0.0
-        self._tests = [_affine(body) for body in stepper.system.bodies]
+        bodies = stepper.system.bodies
+        self._tests = [_affine(body) for body in bodies]
+        ones = [np.resize([1.0, 0.0, 0.0], body.num_owned) for body in bodies]
+        masses = (float(a @ body.inertia(a)) for a, body in zip(ones, bodies, strict=True))
+        self.mass = stepper.system.comm.allreduce(sum(masses))
         self.write(stepper)
 
     def write(self, stepper: nts.Stepper, *, last: bool = False) -> None:
@@ -134,9 +139,9 @@ class Run:
         at = np.column_stack(
             [np.interp(self.path.times, reference.path.times, column) for column in exact.T]
         )
-        scale = np.abs(exact - exact[0]).max()
+        scale = np.abs(exact - exact[0]).max() or np.finfo(float).tiny
         energy = max(np.abs(other[k]).max() for k in ("energy", "external_work"))
-        momentum = np.abs(other["linear_momentum"]).max()
+        momentum = np.sqrt(2.0 * reference.path.mass * energy)
         lost = [t["friction_dissipation"][-1] + t["contact_defect"][-1] for t in (mine, other)]
         return {
             "trajectory": float(np.sqrt(((np.array(self.path.motion) - at) ** 2).mean()) / scale),
@@ -223,6 +228,8 @@ def check(scene: str, choices: Mapping[str, Sequence[Any]]) -> None:
     known = {"integrator", "stress", "contact_gradient", "dt", "dt_factor", "accuracy"}
     known |= {f.name for f in dataclasses.fields(nts.Newton)}
     taken = set(inspect.signature(load(scene).main).parameters)
+    if {"dt", "dt_factor"} <= choices.keys():
+        raise ValueError("dt, dt_factor: choose one of them")
     for name, values in choices.items():
         if name not in taken | known:
             raise ValueError(
@@ -411,13 +418,16 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     )  # fmt: skip
     parser.add_argument("--output", default="out/tradeoff", help="folder for table and plot")
     options = parser.parse_args(arguments)
-    vary: dict[str, list[Any]] = dict(options.vary) or dict(DEFAULT)
     fixed = {name: values[0] for name, values in options.set}
+    steps = fixed.keys() & {"dt", "dt_factor"}
+    vary: dict[str, list[Any]] = dict(options.vary) or {
+        k: v for k, v in DEFAULT.items() if k != "dt_factor" or not steps
+    }
     reference: dict[str, Any] = {"accuracy": "exact"}
     for name in ("dt", "dt_factor"):
-        if name in vary:
-            reference[name] = min(vary[name]) / 4
-    if not reference.keys() & {"dt", "dt_factor"} and not fixed.keys() & {"dt", "dt_factor"}:
+        if name in vary or name in fixed:
+            reference[name] = min(vary.get(name, [fixed.get(name)])) / 4
+    if not reference.keys() & {"dt", "dt_factor"}:
         reference["dt_factor"] = 0.25
     reference |= {name: values[0] for name, values in options.reference}
     comm = MPI.COMM_WORLD

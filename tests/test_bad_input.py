@@ -473,6 +473,10 @@ def test_newton():
     raises(ValueError, r"^max_retries=-1: must not be", lambda: nts.Newton(max_retries=-1))
     pattern = r"^linear_solver='cg': choose one of 'direct', 'krylov'"
     raises(ValueError, pattern, lambda: nts.Newton(linear_solver="cg"))
+    raises(TypeError, r"^reuse='no': pass True or False", lambda: nts.Newton(reuse="no"))
+    raises(TypeError, r"^condense=1: pass True or False", lambda: nts.Newton(condense=1))
+    pattern = r"^max_iterations=2.5: pass a whole number"
+    raises(TypeError, pattern, lambda: nts.Newton(max_iterations=2.5))
 
 
 def test_integrator():

@@ -192,7 +192,8 @@ def test_extra_form_is_at_the_end_and_at_rest():
     run = nts.equilibrium(nts.System([body]), load_steps=2)
     assert run.status == "completed"
     assert np.abs(run.state.u[0].reshape(-1, 3) - load / stiffness).max() < 1e-13
-    assert run.balance["potential"][-1] < 1e-20 * YOUNG
+    # Rounding of the energy itself, whose terms are of the size of the modulus.
+    assert run.balance["potential"][-1] < 1e-16 * YOUNG
 
 
 # ---- B7: contact patch test

@@ -90,3 +90,24 @@ def test_a_ball_is_pressed_into_a_block_and_let_go():
     assert np.abs(table["external_work"]).max() > 0.01 * top
     assert np.abs(table["ledger_residual"]).max() < 1e-10 * top
     assert (np.diff(table["friction_dissipation"]) >= -1e-12 * top).all()
+
+
+def test_relaxations_lose_no_slip_and_no_dissipation():
+    """A stabilized load step gets there in several parts, each with a slip of its own."""
+    plain, stabilized = (
+        nts.equilibrium(on_floor(0.3, 0.05), load_steps=10, stabilization=value)
+        for value in (None, 0.1)
+    )
+    for run in (plain, stabilized):
+        assert run.status == "completed" and run.balance["slip"].any()
+    a, b = (r.balance["friction_dissipation"][-1] for r in (plain, stabilized))
+    assert b == pytest.approx(a, rel=5e-3)
+    assert stabilized.state.slip[0] == pytest.approx(plain.state.slip[0], rel=5e-3)
+
+
+def test_obstacles_of_two_scenes_are_alike_though_their_motions_are_two_functions():
+    def floor():
+        return nts.Plane((0, 0, 0), (0, 0, 1), motion=lambda t: (0, 0, t))
+
+    assert floor() == floor()
+    assert floor() != nts.Plane((0, 0, 1), (0, 0, 1))

@@ -84,6 +84,7 @@ def test_a_run_that_fails_is_a_row_with_its_reason(script):
     [
         ({"colour": ["red"]}, "colour=.*neither an argument of main"),
         ({"integrator": ["euler"]}, "integrator='euler': choose one of"),
+        ({"dt": [0.1], "dt_factor": [1.0]}, "dt, dt_factor: choose one of them"),
     ],
 )
 def test_unknown_choices(script, vary, message):
@@ -112,6 +113,12 @@ def test_command_line(script, tmp_path, capsys):
     assert table[0]["dt_factor"] == "0.25"
     assert (folder / "tradeoff.png").stat().st_size > 10_000
     assert "trajectory within 0.01: accuracy=" in capsys.readouterr().out
+
+
+def test_the_reference_takes_a_quarter_of_a_step_that_is_set(script, tmp_path):
+    rows = tradeoff.main([script, "--set", "dt=0.04", "--output", str(tmp_path)])
+    assert [r["dt [s]"] for r in rows] == [0.01, 0.04, 0.04, 0.04]
+    assert all(0 < r["trajectory"] < 0.1 for r in rows[1:])
 
 
 def test_levels_of_accuracy_are_ordered():
