@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numbers
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -298,6 +298,7 @@ class ContactStep:
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
             nodal mass [kg] in dynamics; scales multipliers and the active set.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
+        boldness: Factor of the return map's algorithmic scale.
     """
 
     pair: ContactPair
@@ -307,6 +308,7 @@ class ContactStep:
     x0: FloatArray
     scale: FloatArray
     theta: float
+    boldness: float = field(default=1.0, kw_only=True)
 
     @property
     def num_pairs(self) -> int:
@@ -709,7 +711,8 @@ class ContactStep:
         pressure = -multiplier[:, 0] - self.scale * gap
         bound = np.zeros_like(gap)
         bound[active] = np.inf if np.isinf(mu) else mu * pressure[active]
-        law = return_map(t, slip.value, slip.metric, bound, TANGENTIAL_SCALE * self.scale)
+        c = self.boldness * TANGENTIAL_SCALE * self.scale
+        law = return_map(t, slip.value, slip.metric, bound, c)
         stick = law.stick & active
         rows = np.einsum("nab,nbz->naz", law.d_slip, slip.gradient)
         rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)

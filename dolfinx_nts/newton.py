@@ -97,9 +97,11 @@ class StepSolver:
         """
         self.prepare()
         assert self.matrix is not None
+        iterations = 0
         for retry in (False, True):
             if retry:
-                self.problem.guess(flight=False)
+                self.problem.try_otherwise()
+                self._last = None
             try:
                 self._options.check(self.snes, self.matrix.aij)
                 self.snes.solve(None, self.problem.x)
@@ -113,11 +115,11 @@ class StepSolver:
                     "the same gap?"
                 ) from error
             last = self._at(self.problem.x)
+            iterations += self.snes.getIterationNumber()
             # A line search of the user's may stop SNES by its own tests; ours decide.
             if self._worst(last) <= 1.0 and self.snes.getConvergedReason() > 0:
-                return replace(last, iterations=self.snes.getIterationNumber())
-        reason, iterations = self.snes.getConvergedReason(), self.snes.getIterationNumber()
-        raise StepFailedError(self._diagnosis(last, reason, iterations))
+                return replace(last, iterations=iterations)
+        raise StepFailedError(self._diagnosis(last, self.snes.getConvergedReason(), iterations))
 
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
