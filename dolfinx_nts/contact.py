@@ -53,6 +53,10 @@ class Candidates(NamedTuple):
     gap: FloatArray
     length: FloatArray
 
+    def part(self, chosen: IntArray | BoolArray) -> Candidates:
+        """Some of them, by number or by a mask."""
+        return Candidates._make(a[chosen] for a in self)
+
 
 @known_options
 class ContactPair:

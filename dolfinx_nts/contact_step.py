@@ -6,7 +6,7 @@ energy-momentum scheme eleven (d, f and six multipliers). Friction adds two (lam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -77,6 +77,7 @@ class ContactStep:
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
             nodal mass [kg] in dynamics; scales multipliers and the active set.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
+        boldness: Factor of the return map's algorithmic scale.
     """
 
     pair: ContactPair
@@ -86,11 +87,23 @@ class ContactStep:
     x0: FloatArray
     scale: FloatArray
     theta: float
+    boldness: float = field(default=1.0, kw_only=True)
 
     @property
     def num_pairs(self) -> int:
         """Candidates on this rank."""
         return len(self.candidates.node)
+
+    def part(self, chosen: BoolArray) -> ContactStep:
+        """Some of the pairs, shape (n,)."""
+        found = self.candidates.part(chosen)
+        return replace(self, candidates=found, x0=self.x0[chosen], scale=self.scale[chosen])
+
+    @property
+    def immovable(self) -> BoolArray:
+        """Whether all coordinates of the pairs' masters are prescribed, shape (n,)."""
+        fixed: BoolArray = (np.concatenate([*self.dofs()[1:]], axis=1) < 0).all(axis=1)
+        return fixed
 
     @property
     def num_corners(self) -> int:
@@ -206,7 +219,7 @@ class ContactStep:
 
     def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
         """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
-        c = TANGENTIAL_SCALE * self.scale
+        c = self.boldness * TANGENTIAL_SCALE * self.scale
         moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2)) & np.isfinite(bound)
         s = slip.value[moved]
         length = np.sqrt(np.einsum("na,nab,nb->n", s, slip.metric[moved], s))

@@ -108,6 +108,7 @@ class StepSolver:
         self._matrices_due, self._solved = True, False
         self._bodies: list[Any] = []
         self._assembled: Evaluation | None = None
+        self._last: Evaluation | None = None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
 
@@ -120,10 +121,12 @@ class StepSolver:
         """
         self.prepare()
         assert self.matrix is not None
+        iterations = 0
         for retry in (False, True):
             if retry:
                 self._matrices_due = True
-                self.problem.guess(flight=False)
+                self.problem.try_otherwise()
+                self._last = None
             try:
                 self._options.check(self.snes, self.matrix.operator)
                 self.snes.solve(None, self.problem.x)
@@ -138,11 +141,12 @@ class StepSolver:
                     "the same gap?"
                 ) from error
             last = self._at(self.problem.x)
+            iterations += self.snes.getIterationNumber()
             # A line search of the user's may stop SNES by its own tests; ours decide.
             if self._worst(last) <= 1.0 and self.snes.getConvergedReason() > 0:
-                return replace(last, iterations=self.snes.getIterationNumber())
+                return replace(last, iterations=iterations)
         self._matrices_due = True
-        reason, iterations = self.snes.getConvergedReason(), self.snes.getIterationNumber()
+        reason = self.snes.getConvergedReason()
         message = self._diagnosis(last, reason, iterations)
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
             # A factorisation that met a NaN fails from then on.
@@ -151,7 +155,7 @@ class StepSolver:
 
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
-        self._last: Evaluation | None = None
+        self._last = None
         self._flips = [np.zeros(c.num_pairs, dtype=int) for c in self.problem.contacts]
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf

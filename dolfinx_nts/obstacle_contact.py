@@ -19,6 +19,7 @@ from dolfinx_nts.obstacles import inverse
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,11 @@ class ObstacleStep(ContactStep):
     def num_corners(self) -> int:
         """None."""
         return 0
+
+    @property
+    def immovable(self) -> BoolArray:
+        """All are."""
+        return np.ones(self.num_pairs, dtype=bool)
 
     @property
     def _only_normal(self) -> bool:

@@ -8,7 +8,8 @@ pure: nothing here changes a State, and history changes only when a step is acce
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,10 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
+#: Factor of the return map's algorithmic scale in the second attempt at a step.
+_BOLDNESS = 10.0
+#: Difference of two normals, or of two gaps over the facet's size, that counts as none.
+_ONE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +139,7 @@ class StepProblem:
             self._motion = np.maximum(self._motion, motion)
         if search:
             self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
+            self._drop_doubles()
         numbers = tuple(a for c in self.contacts for a in c.points())
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
             self._lay_out()
@@ -182,6 +188,27 @@ class StepProblem:
         corners = pair.master.control_points(pair.master.positions(u[1]), found.facet)
         x0 = np.concatenate([x0, corners], axis=1)
         return ContactStep(pair, found, rule, condense, x0, scale, theta)
+
+    def _drop_doubles(self) -> None:
+        """Of two pairs that keep a node out of the same fixed surface, leave one.
+
+        Two constraints on one gap are one too many where no master can yield, as over the seam of
+        two plates. A node stays with the one that carried it.
+        """
+        for i, j in itertools.combinations(range(len(self.contacts)), 2):
+            a, b = self.contacts[i], self.contacts[j]
+            if a.pair.slave.body is not b.pair.slave.body:
+                continue
+            one, two = (c.pair.slave.points[c.pair.slave.owned[c.candidates.node]] for c in (a, b))
+            _, ia, ib = np.intersect1d(one, two, return_indices=True)
+            ca, cb = a.candidates.part(ia), b.candidates.part(ib)
+            double = np.einsum("ni,ni->n", ca.normal, cb.normal) > 1.0 - _ONE
+            double &= np.abs(ca.gap - cb.gap) < _ONE * np.minimum(ca.length, cb.length)
+            double &= a.immovable[ia] & b.immovable[ib]
+            stay = self.state.force[i][ca.node] >= self.state.force[j][cb.node]
+            for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
+                if len(there):
+                    self.contacts[k] = c.part(~np.isin(np.arange(c.num_pairs), there))
 
     def _lay_out(self) -> None:
         """Layout, vectors and scatter; kept from step to step while no rank's candidates change."""
@@ -260,6 +287,15 @@ class StepProblem:
             ]
             with self.x as x:
                 x[self.layout.owned(self._fields["augmented"])] = np.concatenate(guess)
+
+    def try_otherwise(self) -> None:
+        """Make ready for a second attempt at a step: another first guess, larger trials of slip.
+
+        A node that neither sticks nor lifts off but slips may be tried as one and the other for
+        ever, with the trial of slip too small between them.
+        """
+        self.contacts = [replace(c, boldness=_BOLDNESS) for c in self.contacts]
+        self.guess(flight=False)
 
     def _forces_as_before(self, index: int, x: FloatArray) -> FloatArray:
         """Multipliers of the contact forces of the last step, shape (n, multipliers).

@@ -12,6 +12,8 @@ from test_single_mass import MASS, PointMass, PointSurface
 from test_smoothing import SPEED, Sledge
 
 import dolfinx_nts as nts
+from dolfinx_nts import step
+from dolfinx_nts.newton import StepFailedError
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {name: ALL[name] for name in ("midpoint", "energy-momentum")}
@@ -432,3 +434,51 @@ def test_far_away_and_on_ranks_without_facets(integrator, condense):
     taken = momentum @ unit - momentum[0] @ unit
     np.testing.assert_allclose(taken, -MU * given, rtol=0, atol=1e-12 * MASS)
     assert given[-1] > 0
+
+
+# ---- Newton's iteration
+def falling_cube(tilt, velocity):
+    """A stiff cube whose lower edge touches a plane; velocity: v, and its slopes in z, z, x, y."""
+    mesh = create_box(
+        COMM, [[0, 0, 0], [0.2] * 3], [1, 1, 1], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    x, y, z = mesh.geometry.x.T
+    x, z = np.cos(tilt) * x + np.sin(tilt) * z, np.cos(tilt) * z - np.sin(tilt) * x
+    mesh.geometry.x[:] = np.column_stack([x, y, z + np.sin(tilt) * 0.2])
+    a, b, c, d, e, f, g = velocity
+    cube = nts.Continuum(
+        mesh, nts.StVenantKirchhoff(2e7, 0.3), density=1e3, name="cube",
+        velocity=lambda x: np.array([a + d * x[2], b + e * x[2], c + f * x[0] + g * x[1]]),
+    )  # fmt: skip
+    faces = cube.surface(lambda x: np.full(x.shape[1], True))
+    pair = nts.ContactPair(faces, nts.Plane((0, 0, 0), (0, 0, 1)), friction=0.3)
+    return nts.System([cube], contacts=[pair], gravity=DOWN)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("tilt", "velocity"),
+    [
+        (0.191, (-0.81, 0.941, 0.334, 2.258, 0.632, -4.296, 3.419)),
+        (0.104, (-0.526, 0.092, 0.755, 1.575, 1.073, -4.682, -0.02)),
+        (0.182, (-0.837, -0.083, -0.379, -4.963, 0.169, -1.27, 3.831)),
+        (0.832, (0.945, -0.749, 0.72, 2.205, 2.502, -1.122, -4.424)),
+    ],
+)
+def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(
+    tilt, velocity, monkeypatch
+):
+    """Stuck it would be drawn down, free it would pass the plane, and Newton flips between them."""
+    newton = nts.Newton(max_retries=0)
+    stepper = nts.Stepper(falling_cube(tilt, velocity), nts.EnergyMomentum(), newton=newton)
+    stepper.advance(2e-3)
+    row = stepper.solution.rows[-1]
+    assert row["slip"] >= 1 and row["friction_dissipation"] > 0
+    assert row["newton_iterations"] > newton.max_iterations
+    stepper.close()
+    monkeypatch.setattr(step, "_BOLDNESS", 1.0)
+    stepper = nts.Stepper(falling_cube(tilt, velocity), nts.EnergyMomentum(), newton=newton)
+    with pytest.raises(StepFailedError, match="active-set flips"):
+        stepper.advance(2e-3)
+    stepper.close()
