@@ -85,6 +85,7 @@ class StepSolver:
         )
         self._version = -1
         self._assembled: Evaluation | None = None
+        self._last: Evaluation | None = None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
 
@@ -123,7 +124,7 @@ class StepSolver:
 
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
-        self._last: Evaluation | None = None
+        self._last = None
         self._flips = [np.zeros(c.num_pairs, dtype=int) for c in self.problem.contacts]
         if self._version != self.problem.version:
             self.destroy()
