@@ -284,6 +284,15 @@ def test_ranks_change_nothing(integrator):
         assert np.array_equal(alone[name], together[name])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [3, 4])
+def test_more_ranks_change_nothing(on_ranks, ranks):
+    on_ranks(
+        ranks, "-m", "pytest", "-q", "-p", "no:cacheprovider",
+        f"{__file__}::test_ranks_change_nothing[energy-momentum]",
+    )  # fmt: skip
+
+
 # ---- prescribed coordinates and nodal results
 def plane_strain_slider(friction, integrator, speed=0.0):
     """A block pressed on a plate, both held across: the slip has one free direction only."""

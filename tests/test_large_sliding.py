@@ -482,3 +482,35 @@ def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(
     with pytest.raises(StepFailedError, match="active-set flips"):
         stepper.advance(2e-3)
     stepper.close()
+
+
+@pytest.mark.slow
+def test_a_cube_is_thrown_tumbles_and_slides_for_2000_steps():
+    """It bounces off an elastic plate on corners and edges and ends sliding and sticking."""
+    kind = {"cell_type": CellType.hexahedron, "ghost_mode": GhostMode.shared_facet}
+    small = create_box(COMM, [[0, 0, 0.05], [0.2, 0.2, 0.25]], [1, 1, 1], **kind)
+    large = create_box(COMM, [[-0.6, -0.6, -0.2], [2.4, 0.8, 0.0]], [4, 2, 1], **kind)
+
+    def throw(x):
+        arm = x - np.array([[0.1], [0.1], [0.15]])
+        return np.array([[1.5], [0.3], [-1.0]]) + np.cross([2.0, 5.0, 1.0], arm.T).T
+
+    rubber = nts.NeoHookean(2e6, 0.3)
+    cube = nts.Continuum(small, rubber, density=1e3, velocity=throw, name="cube")
+    below = nts.Dirichlet(lambda x: x[2] < -0.2 + 1e-9)
+    floor = nts.Continuum(large, rubber, density=1e3, bcs=[below], name="floor")
+    faces = cube.surface(lambda x: np.full(x.shape[1], True))
+    pair = nts.ContactPair(faces, floor.surface(lambda x: x[2] > -1e-9), friction=0.3)
+    system = nts.System([cube, floor], contacts=[pair], gravity=DOWN)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1.5e-3, t_end=3.0)
+    assert run.status == "completed"
+    table, energy = run.balance, run.balance["energy"][0]
+    assert len(table["time"]) >= 2001
+    assert table["newton_iterations"][1:].mean() <= 6
+    assert np.abs(np.diff(table["ledger_residual"])).max() <= 1e-11 * energy
+    assert np.abs(table["ledger_residual"]).max() <= 1e-10 * energy
+    assert np.diff(table["friction_dissipation"]).min() >= -1e-15 * energy
+    assert table["friction_dissipation"][-1] > 0.5 * energy
+    touches = np.diff((table["active"] > 0).astype(int))
+    assert (touches == 1).sum() > 20
+    assert ((table["stick"] > 0) & (table["slip"] > 0)).sum() > 100
