@@ -12,8 +12,8 @@ the readings of the published data (mm or m; N/m^2 or N/mm^2) this one alone, E 
 689.6 N/mm, gives the published hundreds of newtons. Contact is between the die's arc, not its sides,
 and the top of the block.
 
-Reference. Published curves differ by mesh and contact method; their band at time 1.0 is 268 to 332 N
-vertical and 55 to 71 N horizontal, at 1.5 it is 337 to 421 N and 102 to 189 N.
+Reference. Published curves differ by mesh and contact method; their band at time 1.0 is 268 to
+332 N vertical and 55 to 71 N horizontal, at 1.5 it is 337 to 421 N and 102 to 189 N.
 
 What to see. Pressing in, the die is pushed aside because it stands near the free end; most nodes
 stick. As soon as it is drawn all of them slip, and the forces stay constant until it comes to the
@@ -46,7 +46,7 @@ WIDTH, RADIUS, SAGITTA, SIDE = 1.2 * MM, 0.75 * MM, 0.3 * MM, 0.9 * MM
 OFFSET, GAP = 0.2 * MM, 0.2 * MM
 YOUNG, STIFFER, POISSON, FRICTION = 68.96e7, 10.0, 0.32, 0.3
 DOWN, ALONG = 1 * MM, 10 * MM
-#: Of the layer of elements, and that of which forces are given. In a thin layer both sides do alike.
+#: Of the layer of elements, and that of which forces are given. A thin layer's sides do alike.
 LAYER, THICKNESS = 0.2 * MM, 1 * MM
 #: Time: published band of the vertical and of the horizontal force [N].
 BAND = {1.0: ((268.0, 332.0), (55.0, 71.0)), 1.5: ((337.0, 421.0), (102.0, 189.0))}
