@@ -9,8 +9,8 @@ Assumptions. Both bodies are neo-Hookean with Poisson's ratio 0.32; E is 68.96e7
 and ten times as much for the die. Plane strain is one layer of hexahedra whose nodes do not move
 across. Forces are those of a layer 1 mm thick: force goes with E, length and thickness, so that of
 the readings of the published data (mm or m; N/m^2 or N/mm^2) this one alone, E times thickness =
-689.6 N/mm, gives the published hundreds of newtons. Contact is between the die's arc, not its sides,
-and the top of the block.
+689.6 N/mm, gives the published hundreds of newtons. Contact is between the die's arc, not its
+sides, and the top of the block.
 
 Reference. Published curves differ by mesh and contact method; their band at time 1.0 is 268 to
 332 N vertical and 55 to 71 N horizontal, at 1.5 it is 337 to 421 N and 102 to 189 N.
