@@ -1,8 +1,9 @@
 """What contact costs: a Newton iteration with about 300 active pairs against one without.
 
 Two elastic blocks of about 50k coordinates collide face to face. The same steps are run with and
-without the contact pair, with both linear solvers, or as `accuracy="balanced"` does; printed are seconds per Newton iteration, their
-ratio, and what an iteration is made of. Run it on 1 and 2 ranks for the speed-up.
+without the contact pair, with both linear solvers, or as `accuracy="balanced"` does; printed are
+seconds per Newton iteration, their ratio, and what an iteration is made of. Run it on 1 and 2 ranks
+for the speed-up.
 """
 
 from __future__ import annotations
