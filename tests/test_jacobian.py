@@ -264,7 +264,7 @@ def test_jacobian_along_directions(cell, friction, rule):
 
 
 def convergence(system, rule, state, dt):
-    """Of every iterate of a step: residual norm, unknowns, and 0, 1 or 2 for off, slip, stick."""
+    """Of every iterate: residual norm, unknowns, 0, 1 or 2 for off, slip, stick; least slip [m]."""
     stepper = stepper_of(system, rule)
     problem = stepper.problem
     problem.begin(state, dt)
@@ -278,9 +278,10 @@ def convergence(system, rule, state, dt):
         sets.append([c.active.astype(int) + c.stick for c in solver._last.contacts])
 
     solver.snes.setMonitor(record)
-    solver.solve()
+    (last,) = solver.solve().contacts
+    slips = last.distance[last.active & ~last.stick]
     stepper.close()
-    return np.array(norms), iterates, sets
+    return np.array(norms), iterates, sets, slips.min(initial=np.inf)
 
 
 def last_change(sets):
@@ -299,7 +300,7 @@ def test_newton_converges_quadratically(cell, rule, turned):
     """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""
     system = two_blocks(cell, gap=0.02, speed=6.0)
     state = rotated_state(system) if turned else system.initial_state()
-    norms, _, sets = convergence(system, rule, state, 0.02)
+    norms, _, sets, _ = convergence(system, rule, state, 0.02)
     assert COMM.allreduce(int(sum(s.sum() for s in sets[-1]))) >= 3
     r = norms[last_change(sets) :] / norms.max()
     # Rounding of masses times positions ends the sequence a little below this.
@@ -311,8 +312,8 @@ def test_newton_converges_quadratically(cell, rule, turned):
 
 @pytest.mark.parametrize(
     ("friction", "changes", "reached"),
-    [(np.inf, False, {2}), (0.02, False, {1}), (0.1, True, {1}), (0.4, True, {1, 2})],
-    ids=["stick", "slip", "stick to slip", "both"],
+    [(np.inf, False, {2}), (0.02, False, {1}), (0.4, True, {1, 2})],
+    ids=["stick", "slip", "both"],
 )
 @pytest.mark.parametrize("rule", ["midpoint", "energy-momentum", "condensed"])
 @pytest.mark.parametrize("cell", CELLS)
@@ -322,13 +323,13 @@ def test_newton_converges_quadratically_with_friction(cell, rule, friction, chan
     state = system.initial_state()
     thrown = state.v[0] + np.tile([3.0, 1.2, 0.0], len(state.v[0]) // 3)
     state = replace(state, v=(thrown, state.v[1]))
-    _, iterates, sets = convergence(system, rule, state, 0.02)
+    _, iterates, sets, slip = convergence(system, rule, state, 0.02)
     assert set(sets[-1][0]) == reached
     last = last_change(sets)
     assert (last > 0) == changes
     moves = np.linalg.norm(np.diff(iterates[last:], axis=0), axis=1)
-    # A direction of slip turns by its error over the slip, which is some 0.02 here.
-    near, bend = moves[:-1] < 0.1, 80.0
+    # A direction of slip turns by its error over the slip.
+    near, bend = moves[:-1] < 0.1, 5.0 * max(1.0, 1.0 / slip)
     assert near.sum() >= 2 and moves[-1] < 1e-6
     assert (moves[1:] < bend * moves[:-1] ** 2)[near].all(), moves
 

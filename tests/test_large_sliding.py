@@ -12,8 +12,6 @@ from test_single_mass import MASS, PointMass, PointSurface
 from test_smoothing import SPEED, Sledge
 
 import dolfinx_nts as nts
-from dolfinx_nts import step
-from dolfinx_nts.newton import StepFailedError
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {name: ALL[name] for name in ("midpoint", "energy-momentum")}
@@ -466,21 +464,14 @@ def falling_cube(tilt, velocity):
         (0.832, (0.945, -0.749, 0.72, 2.205, 2.502, -1.122, -4.424)),
     ],
 )
-def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(
-    tilt, velocity, monkeypatch
-):
+def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(tilt, velocity):
     """Stuck it would be drawn down, free it would pass the plane, and Newton flips between them."""
     newton = nts.Newton(max_retries=0)
     stepper = nts.Stepper(falling_cube(tilt, velocity), nts.EnergyMomentum(), newton=newton)
     stepper.advance(2e-3)
     row = stepper.solution.rows[-1]
     assert row["slip"] >= 1 and row["friction_dissipation"] > 0
-    assert row["newton_iterations"] > newton.max_iterations
-    stepper.close()
-    monkeypatch.setattr(step, "_BOLDNESS", 1.0)
-    stepper = nts.Stepper(falling_cube(tilt, velocity), nts.EnergyMomentum(), newton=newton)
-    with pytest.raises(StepFailedError, match="active-set flips"):
-        stepper.advance(2e-3)
+    assert row["newton_iterations"] <= newton.max_iterations
     stepper.close()
 
 
