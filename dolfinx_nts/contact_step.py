@@ -6,7 +6,7 @@ energy-momentum scheme eleven (d, f and six multipliers). Friction adds two (lam
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -77,7 +77,6 @@ class ContactStep:
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
             nodal mass [kg] in dynamics; scales multipliers and the active set.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
-        boldness: Factor of the return map's algorithmic scale.
     """
 
     pair: ContactPair
@@ -87,7 +86,6 @@ class ContactStep:
     x0: FloatArray
     scale: FloatArray
     theta: float
-    boldness: float = field(default=1.0, kw_only=True)
 
     @property
     def num_pairs(self) -> int:
@@ -167,7 +165,7 @@ class ContactStep:
     @cached_property
     def _prescribed(self) -> BoolArray:
         """Axes along which slave and foot move as prescribed, shape (n, 3)."""
-        shape, n = self._shape(), self.num_pairs
+        shape, n = self._shape, self.num_pairs
         if self._weights is not None:
             shape = np.einsum("nk,nkp->np", shape, self._weights)
         square = np.column_stack([np.ones(n), shape]) ** 2
@@ -183,6 +181,8 @@ class ContactStep:
         Forces there act on prescribed coordinates or along the normal: where the gap is closed, the
         slip there is prescribed.
         """
+        if not self._prescribed.any():
+            return np.zeros((self.num_pairs, 3, 3))
         normal = self.candidates.normal
         along = np.eye(3) - normal[:, :, None] * normal[:, None]
         part, vector = np.linalg.eigh(np.matmul(along * self._prescribed[:, None], along))
@@ -210,8 +210,10 @@ class ContactStep:
         Nodes that slip leave this part of lambda_T out of the trial, too: Coulomb's law says
         nothing about it, and at the edge of sticking the rows would be singular in it.
         """
+        if not self._prescribed.any():
+            return self.blocked
         motion = x - self.x0
-        motion = motion[:, 0] - np.einsum("nk,nki->ni", self._shape(), motion[:, 1:])
+        motion = motion[:, 0] - np.einsum("nk,nki->ni", self._shape, motion[:, 1:])
         slip = np.einsum("nij,nj->ni", self._blocked, motion * self._prescribed)
         held: FloatArray = self.blocked.copy()
         held[np.abs(slip).max(axis=1) > _STILL * self.candidates.length] = 0.0
@@ -219,7 +221,7 @@ class ContactStep:
 
     def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
         """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
-        c = self.boldness * TANGENTIAL_SCALE * self.scale
+        c = TANGENTIAL_SCALE * self.scale
         moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2)) & np.isfinite(bound)
         s = slip.value[moved]
         length = np.sqrt(np.einsum("na,nab,nb->n", s, slip.metric[moved], s))
@@ -227,6 +229,7 @@ class ContactStep:
         c[moved] = np.maximum(c[moved], 2.0 * bound[moved] / length)
         return c
 
+    @cached_property
     def _shape(self) -> FloatArray:
         """Weights of the control points in the foot at t_n, shape (n, nc)."""
         return facets.shape(self.candidates.xi, self.num_corners)[0]
@@ -263,7 +266,7 @@ class ContactStep:
         control = self.pair.master.combine(x[:, 1:], self.candidates.facet)
         return np.concatenate([x[:, :1], control], axis=1)
 
-    @property
+    @cached_property
     def _weights(self) -> FloatArray | None:
         """Weights of the points in the control points, shape (n, nc, nc), if they differ."""
         weights = self.pair.master.weights
@@ -445,12 +448,10 @@ class ContactStep:
         tangent[:, f, -2:] = np.eye(2)
         gradient = np.zeros((n, 2, residual.shape[1]))
         gradient[:, :, f] = np.eye(2)
-        d1 = nts.invariant_gradient(z1, self.num_corners)
-        pi = 0.5 * (nts.invariants(z0, self.num_corners) + nts.invariants(z1, self.num_corners, d1))
-        metric, by_pi = nts.metric(pi, self.num_corners)
+        metric, by_pi = nts.metric(e.invariants, self.num_corners)
         metric_gradient = np.zeros((n, 2, 2, residual.shape[1]))
-        by_z = np.matmul(by_pi.reshape(n, 4, d1.shape[1]), d1).reshape(n, 2, 2, size)
-        metric_gradient[..., :size] = 0.5 * by_z * scale_z[:, None, None]
+        by_z = np.matmul(by_pi.reshape(n, 4, by_pi.shape[-1]), e.invariant_gradient)
+        metric_gradient[..., :size] = by_z.reshape(n, 2, 2, size) * scale_z[:, None, None]
         slip = self._slip(augmented[:, 3:] - length * c.xi, gradient, metric, metric_gradient)
         return residual, tangent, e.constraint[:, 0], slip
 

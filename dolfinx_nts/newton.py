@@ -125,8 +125,7 @@ class StepSolver:
         for retry in (False, True):
             if retry:
                 self._matrices_due = True
-                self.problem.try_otherwise()
-                self._last = None
+                self.problem.guess(flight=False)
             try:
                 self._options.check(self.snes, self.matrix.operator)
                 self.snes.solve(None, self.problem.x)

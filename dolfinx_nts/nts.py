@@ -53,6 +53,8 @@ class Element(NamedTuple):
         stiffness: d force / d z_1, shape (n, z, z).
         force_gradient: d force / d lambda transposed, shape (n, 6, z).
         constraint_gradient: d constraint / d z_1, shape (n, 6, z).
+        invariants: Mean of pi_0 and pi_1, shape (n, p).
+        invariant_gradient: d invariants / d z_1, shape (n, p, z).
     """
 
     force: FloatArray
@@ -60,6 +62,8 @@ class Element(NamedTuple):
     stiffness: FloatArray
     force_gradient: FloatArray
     constraint_gradient: FloatArray
+    invariants: FloatArray
+    invariant_gradient: FloatArray
 
 
 def gap(x: FloatArray, xi: FloatArray) -> Gap:
@@ -372,6 +376,8 @@ def element(
         stiffness,
         force_gradient,
         np.matmul(slope(pi1), d1),
+        0.5 * (pi0 + pi1),
+        0.5 * d1,
     )
 
 

@@ -97,6 +97,7 @@ class ObstacleStep(ContactStep):
         first *= inverse(np.linalg.norm(first, axis=1))[:, None]
         return np.stack([first, np.cross(normal, first)], axis=1)
 
+    @cached_property
     def _shape(self) -> FloatArray:
         return np.empty((self.num_pairs, 0))
 

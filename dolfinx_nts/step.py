@@ -9,7 +9,7 @@ pure: nothing here changes a State, and history changes only when a step is acce
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,8 +28,6 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
-#: Factor of the return map's algorithmic scale in the second attempt at a step.
-_BOLDNESS = 10.0
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
 _ONE = 1e-6
 
@@ -287,15 +285,6 @@ class StepProblem:
             ]
             with self.x as x:
                 x[self.layout.owned(self._fields["augmented"])] = np.concatenate(guess)
-
-    def try_otherwise(self) -> None:
-        """Make ready for a second attempt at a step: another first guess, larger trials of slip.
-
-        A node that neither sticks nor lifts off but slips may be tried as one and the other for
-        ever, with the trial of slip too small between them.
-        """
-        self.contacts = [replace(c, boldness=_BOLDNESS) for c in self.contacts]
-        self.guess(flight=False)
 
     def _forces_as_before(self, index: int, x: FloatArray) -> FloatArray:
         """Multipliers of the contact forces of the last step, shape (n, multipliers).
