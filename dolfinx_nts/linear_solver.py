@@ -198,4 +198,4 @@ def keep_bodies(snes: Any, keep: bool) -> None:
     """
     pc = snes.getKSP().getPC()
     if pc.getType() == "fieldsplit":
-        pc.getFieldSplitSchurGetSubKSP()[0].getPC().setReusePreconditioner(keep)
+        pc.getFieldSplitSubKSP()[0].getPC().setReusePreconditioner(keep)

@@ -30,11 +30,11 @@ class Newton:
         rtol: Largest residual of a block relative to the forces (or motions) of the step, > 0.
         max_iterations: Newton iterations before a step is dropped.
         max_retries: How often a dropped step may be halved before the run stops.
-        condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies and
-            lambda_N reach the linear solver; the same solution with a smaller factorisation.
+        condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
+            lambda_N and lambda_T reach the linear solver; the same solution, smaller factors.
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
             a Schur complement for contact), which is for large meshes: at 50,000 coordinates an
-            iteration costs a sixth. Its incomplete factors weaken as dt grows beyond the time a
+            iteration costs a fifth. Its incomplete factors weaken as dt grows beyond the time a
             wave needs through an element.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew.

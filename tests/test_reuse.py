@@ -71,6 +71,29 @@ def test_a_changed_step_makes_new_matrices():
     stepper.close()
 
 
+def test_reuse_with_a_split_of_another_kind():
+    """A user's own field split need not be a Schur complement."""
+    options = {
+        "ksp_type": "gmres",
+        "ksp_rtol": 1e-8,
+        "ksp_max_it": 500,
+        "pc_type": "fieldsplit",
+        "pc_fieldsplit_type": "multiplicative",
+        "fieldsplit_bodies_pc_type": "bjacobi",
+        "fieldsplit_contact_pc_type": "jacobi",
+    }
+    runs = [
+        nts.simulate(
+            rubbing_blocks(0.3), nts.EnergyMomentum(), dt=2e-3, t_end=0.04,
+            newton=nts.Newton(condense=True, reuse=reuse), petsc_options=options if reuse else None,
+        )
+        for reuse in (False, True)
+    ]  # fmt: skip
+    assert all(run.status == "completed" for run in runs)
+    a, b = (run.balance for run in runs)
+    assert a["active"].max() >= 4 and difference(a, b) < 1e-8
+
+
 def test_steps_that_differ_by_rounding_share_their_matrices():
     mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron)
     body = nts.Continuum(
