@@ -19,6 +19,7 @@ RUBBER = nts.NeoHookean(young=1e5, poisson=0.3)
 PLACES = {"inside": (0.2, 0.3), "edge": (0.5, 0.3), "corner": (0.5, 0.5), "across": (0.25, 0.25)}
 
 pytestmark = pytest.mark.mpi
+rubbing = pytest.mark.parametrize("friction", [0.0, 0.3])
 
 
 @pytest.fixture(params=INTEGRATORS)
@@ -40,6 +41,7 @@ def scene(
     cells=2,
     gravity=(0.0, 0.0, 0.0),
     plate_velocity=(0.0, 0.0, 0.0),
+    friction=0.0,
 ):
     """Cube over plate; `cube` and `plate` are their Dirichlet conditions."""
 
@@ -54,7 +56,7 @@ def scene(
     plate_mesh = box((0.0, 0.0, -0.5), (1.0, 1.0, 0.0), (cells, cells, 1))
     plate = nts.Continuum(plate_mesh, velocity=plate_velocity, bcs=plate, name="plate", **options)
     slave = cube.surface(lambda x: x[2] < gap + 1e-9)
-    pair = nts.ContactPair(slave, plate.surface(lambda x: x[2] > -1e-9))
+    pair = nts.ContactPair(slave, plate.surface(lambda x: x[2] > -1e-9), friction=friction)
     return nts.System([cube, plate], contacts=[pair], gravity=gravity)
 
 
@@ -112,49 +114,55 @@ def test_pressed_from_zero_gap(place, integrator):
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_falls_onto_edges_and_corners(place, integrator):
-    table = run(scene(place, gap=0.003, velocity=(0.0, 0.0, -1.0)), integrator)
+@rubbing
+def test_falls_onto_edges_and_corners(place, integrator, friction):
+    table = run(scene(place, gap=0.003, velocity=(0.0, 0.0, -1.0), friction=friction), integrator)
     assert table["active"].max() == 4
     assert table["energy"][-1] <= table["energy"][0] * (1 + 1e-3)
 
 
-def test_slides_off_the_end_of_the_plate(integrator):
+@rubbing
+def test_slides_off_the_end_of_the_plate(integrator, friction):
     """Slaves leave over the free edge while in contact; no facet is there to hold them."""
-    system = scene("corner", velocity=(2.0, 0.0, -0.2))
+    system = scene("corner", velocity=(2.0, 0.0, -0.2), friction=friction)
     table = run(system, integrator, dt=1e-2, steps=30)
     assert table["active"][1:5].max() >= 2
     assert table["active"][-1] == 0
 
 
 @pytest.mark.parametrize("master", ["free", "driven"])
-def test_slaves_that_cannot_move(master, integrator):
+@rubbing
+def test_slaves_that_cannot_move(master, integrator, friction):
     """A wholly prescribed cube: the plate that comes up must give way."""
     below = nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9, lambda t: (0.0, 0.0, 0.5 * t))
     plate = {"plate_velocity": (0.0, 0.0, 0.5)} if master == "free" else {"plate": [below]}
-    system = scene(gap=0.001, cube=[nts.Dirichlet(everywhere)], **plate)
+    system = scene(gap=0.001, cube=[nts.Dirichlet(everywhere)], **plate, friction=friction)
     table = run(system, integrator, dt=4e-3, steps=20)
     assert table["active"].max() == 4
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.001])
-def test_nothing_can_move(gap, integrator):
+@rubbing
+def test_nothing_can_move(gap, integrator, friction):
     held = [nts.Dirichlet(everywhere)]
-    table = run(scene(gap=gap, cube=held, plate=held), integrator)
+    table = run(scene(gap=gap, cube=held, plate=held, friction=friction), integrator)
     assert not table["active"].any() and not table["energy"].any()
 
 
-def test_prescribed_slave_bottom_of_a_free_cube(integrator):
+@rubbing
+def test_prescribed_slave_bottom_of_a_free_cube(integrator, friction):
     """Slave nodes held, the rest of their body free, the plate comes up against them."""
     held = [nts.Dirichlet(lambda x: x[2] < 0.001 + 1e-9)]
-    system = scene(gap=0.001, cube=held, plate_velocity=(0.0, 0.0, 1.0))
+    system = scene(gap=0.001, cube=held, plate_velocity=(0.0, 0.0, 1.0), friction=friction)
     table = run(system, integrator)
     assert table["active"].max() == 4
 
 
 @pytest.mark.parametrize("components", [(2,), (0, 1)])
-def test_slaves_held_in_some_components(components, integrator):
+@rubbing
+def test_slaves_held_in_some_components(components, integrator, friction):
     held = [nts.Dirichlet(lambda x: x[2] < 0.001 + 1e-9, components=components)]
-    system = scene(gap=0.001, cube=held, plate_velocity=(0.1, 0.0, 1.0))
+    system = scene(gap=0.001, cube=held, plate_velocity=(0.1, 0.0, 1.0), friction=friction)
     table = run(system, integrator)
     assert table["active"].max() == 4
 
@@ -169,10 +177,13 @@ def test_held_slaves_driven_against_a_held_master_have_nothing_to_solve(integrat
 
 
 @pytest.mark.parametrize("place", ["inside", "corner"])
-def test_contact_comes_and_goes(place, integrator):
+@rubbing
+def test_contact_comes_and_goes(place, integrator, friction):
     """Two bounces under gravity on a plate that is held below."""
     held = [nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)]
-    system = scene(place, gap=0.01, velocity=(0, 0, -1), plate=held, gravity=(0, 0, -20))
+    system = scene(
+        place, gap=0.01, velocity=(0, 0, -1), plate=held, gravity=(0, 0, -20), friction=friction
+    )
     table = run(system, integrator, dt=4e-3, steps=90)
     touches = table["active"] > 0
     assert np.count_nonzero(np.diff(touches.astype(int)) == 1) >= 2
@@ -180,9 +191,10 @@ def test_contact_comes_and_goes(place, integrator):
     assert np.ptp(table["potential"]) > 0
 
 
-def test_one_facet_and_one_slave_cell(integrator):
+@rubbing
+def test_one_facet_and_one_slave_cell(integrator, friction):
     """One cell each: every further rank owns neither facet nor slave."""
-    system = scene(gap=0.002, velocity=(0.0, 0.0, -1.0), cells=1)
+    system = scene(gap=0.002, velocity=(0.0, 0.0, -1.0), cells=1, friction=friction)
     owned = np.array(COMM.allgather([len(c.slave.owned) for c in system.contacts]))
     assert owned.sum() == 4
     assert COMM.size == 1 or owned.min() == 0
