@@ -272,6 +272,8 @@ class ContactStep:
             multiplier: h^2/2 lambda of the scaled constraints, and of lambda_T over the facet
                 size, over `scale` [m], shape (n, multipliers).
         """
+        if not self.num_pairs:
+            return self._nothing()
         scale = self.scale[:, None]
         multiplier = scale * multiplier
         x = self._control(x)
@@ -286,6 +288,16 @@ class ContactStep:
         part.tangent[:, rows] *= scale[:, None]
         part.tangent[:, :, rows] *= scale[:, None]
         return part
+
+    def _nothing(self) -> Contribution:
+        """Of no pairs."""
+        size = self.num_coordinates + self.num_augmented + self.num_multipliers
+        none, slip = np.zeros(0), np.zeros((0, self.num_tangential))
+        off = none.astype(bool)
+        return Contribution(
+            np.zeros((0, size)), np.zeros((0, size, size)), none, off, off, slip, none,
+            tangential=np.zeros((0, 3)),
+        )  # fmt: skip
 
     def _element(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
