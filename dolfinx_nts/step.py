@@ -309,13 +309,13 @@ class StepProblem:
         values = x.array_r.copy()
         multipliers = self._unknowns(values, "multipliers")
         augmented = self._unknowns(values, "augmented")
+        positions = self._positions(x) if self._fields else [np.empty(0)] * len(self.contacts)
         contacts = tuple(
             c.evaluate(*arguments)
-            for c, *arguments in zip(
-                self.contacts, self._positions(x), augmented, multipliers, strict=True
-            )
+            for c, *arguments in zip(self.contacts, positions, augmented, multipliers, strict=True)
         )
-        force = self._contact_forces(contacts)
+        none = np.zeros(len(values))
+        force = self._contact_forces(contacts) if self._fields else none
         bodies = []
         for k, (body, u0) in enumerate(zip(self.system.bodies, self.state.u, strict=True)):
             here = self.layout.owned(k)
