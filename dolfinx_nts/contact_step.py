@@ -6,7 +6,7 @@ energy-momentum scheme eleven (d, f and six multipliers). Friction adds two (lam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -183,6 +183,15 @@ class ContactStep:
             points = np.einsum("nkp,naki->napi", weights[some], gradient[..., 3:].reshape(width))
             gradient[..., 3:] = points.reshape(gradient[..., 3:].shape)
         return gradient
+
+    def part(self, chosen: BoolArray) -> ContactStep:
+        """Some of the pairs, shape (n,)."""
+        found = Candidates(*(a[chosen] for a in self.candidates))
+        return replace(self, candidates=found, x0=self.x0[chosen], scale=self.scale[chosen])
+
+    def gap(self, x: FloatArray) -> FloatArray:
+        """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""
+        return nts.gap(x, self._projection(x)).value
 
     def reference(self) -> FloatArray:
         """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
