@@ -53,6 +53,11 @@ class Candidates(NamedTuple):
     gap: FloatArray
     length: FloatArray
 
+    def part(self, chosen: IntArray | BoolArray) -> Candidates:
+        """Some of the pairs."""
+        arrays: list[Any] = [a[chosen] for a in self]
+        return Candidates(*arrays)
+
 
 _NO_CANDIDATES = Candidates(
     np.empty(0, np.int64), np.empty(0, np.int64),

@@ -186,8 +186,8 @@ class ContactStep:
 
     def part(self, chosen: BoolArray) -> ContactStep:
         """Some of the pairs, shape (n,)."""
-        found = Candidates(*(a[chosen] for a in self.candidates))
-        return replace(self, candidates=found, x0=self.x0[chosen], scale=self.scale[chosen])
+        some = self.candidates.part(chosen)
+        return replace(self, candidates=some, x0=self.x0[chosen], scale=self.scale[chosen])
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""

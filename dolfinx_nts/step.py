@@ -233,8 +233,9 @@ class StepProblem:
     def _points(self, index: int, found: Candidates, u: Sequence[FloatArray]) -> FloatArray:
         """Slave and control points of pairs [m], (n, nc + 1, 3), from all bodies' displacements."""
         pair, bodies = self.system.contacts[index], self.system.contact_bodies[index]
-        slave = pair.slave
-        x = (slave.reference[slave.owned[found.node]] + u[bodies[0]][slave.rows[found.node]])[:, None]
+        slave, node = pair.slave, found.node
+        x = slave.reference[slave.owned[node]] + u[bodies[0]][slave.rows[node]]
+        x = x[:, None]
         if pair.rigid:
             return x
         corners = pair.master.control_points(pair.master.positions(u[bodies[1]]), found.facet)
