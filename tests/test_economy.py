@@ -32,6 +32,15 @@ def all_awake(monkeypatch):
     monkeypatch.setattr(StepProblem, "_may_touch", everyone)
 
 
+def displacements(s):
+    return np.concatenate(s.state.u)
+
+
+def same(a, b):
+    """To the bit; on several ranks MUMPS adds up in the order in which messages arrive."""
+    return np.abs(a - b).max() <= (0.0 if COMM.size == 1 else 1e-13 * np.abs(b).max())
+
+
 def factor_entries(s):
     return s.solver.snes.getKSP().getPC().getFactorMatrix().getMumpsInfog(9)
 
@@ -84,7 +93,7 @@ def test_without_its_ledger_a_run_is_the_same():
                 s.advance(scenes.dt)
             s.close()
         assert (s.solution.rows[-1]["energy"] > 0) == on
-        final.append(np.concatenate(s.state.u))
+        final.append(displacements(s))
     assert np.array_equal(*final)
 
 
@@ -107,13 +116,13 @@ def test_far_bodies_have_neither_search_nor_contact_unknowns(monkeypatch, integr
         far.advance(scenes.dt)
     assert far.problem.version == version
     assert far.problem.layout.counts.shape[1] == 2 and not far.problem.elements
-    row, u = far.solution.rows[-1], np.concatenate(far.state.u)
+    row, u = far.solution.rows[-1], displacements(far)
     far.close()
     alone = stepper(scenes.system(FEATURE["contact not declared"]), integrator)
     for _ in range(4):
         alone.advance(scenes.dt)
-    assert np.array_equal(u, np.concatenate(alone.state.u))
-    assert row["energy"] == alone.solution.rows[-1]["energy"] and row["min_gap"] == np.inf
+    assert same(u, displacements(alone)) and row["min_gap"] == np.inf
+    assert same(row["energy"], alone.solution.rows[-1]["energy"])
     alone.close()
 
 
@@ -154,7 +163,7 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
         none.advance(scenes.dt)
         awake.advance(scenes.dt)
     assert fill == factor_entries(none) < factor_entries(awake)
-    assert np.array_equal(np.concatenate(near.state.u), np.concatenate(none.state.u))
+    assert same(displacements(near), displacements(none))
     assert np.array_equal(near.state.facets[0], awake.state.facets[0])
     assert near.state.gap[0] == pytest.approx(awake.state.gap[0], rel=1e-12, abs=1e-13)
     assert near_row["min_gap"] == pytest.approx(awake.solution.rows[-1]["min_gap"], rel=1e-12)
@@ -219,7 +228,7 @@ def test_idle_candidates_wake_in_the_step_that_closes_their_gap(
         s.advance(dt)
         assert s.solution.rows[-1]["active"] > 0
         assert s.solution.rows[-1]["min_gap"] > -1e-10
-        states.append(np.concatenate(s.state.u))
+        states.append(displacements(s))
         s.close()
         all_awake(monkeypatch)
     assert states[0] == 9 and states[2] == 0
