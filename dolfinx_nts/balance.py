@@ -104,6 +104,7 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
             counts[1:] += part.stick.sum(), slipping.sum()
         counts[0] += part.active.sum()
         smallest = min(smallest, float(part.gap.min(initial=np.inf)))
+    smallest = min([smallest, *(float(gap.min(initial=np.inf)) for gap in step.idle_gaps)])
     comm = problem.system.comm
     local = np.array([work, dissipation, defect, *counts])
     names = ("external_work", "friction_dissipation", "contact_defect", "active", "stick", "slip")

@@ -58,6 +58,12 @@ class Candidates(NamedTuple):
         return Candidates._make(a[chosen] for a in self)
 
 
+_NO_CANDIDATES = Candidates(
+    np.empty(0, np.int64), np.empty(0, np.int64),
+    np.empty((0, 2)), np.empty((0, 3)), np.empty(0), np.empty(0),
+)  # fmt: skip
+
+
 @known_options
 class ContactPair:
     """Slave nodes of one surface must not penetrate the facets of another (19)-(21).
@@ -141,8 +147,12 @@ class ContactPair:
             return self._near_obstacle(u[0], reach, time)
         master = self.master.positions(u[1])
         corners = master[self.master.facets]
-        x = self.slave.positions(u[0])[self.slave.owned]
+        slaves = self.slave.positions(u[0])
         radius = reach + _MARGIN * float(facets.size(corners).max())
+        # Positions of all points are known everywhere, so all ranks leave here or none.
+        if search.apart(slaves, corners, radius):
+            return _NO_CANDIDATES
+        x = slaves[self.slave.owned]
         closest = search.closest_facets(x, corners, reach=radius, current=current)
         node = np.flatnonzero(closest.facet >= 0)
         found = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)

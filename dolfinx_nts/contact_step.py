@@ -234,6 +234,10 @@ class ContactStep:
         """Weights of the control points in the foot at t_n, shape (n, nc)."""
         return facets.shape(self.candidates.xi, self.num_corners)[0]
 
+    def gap(self, x: FloatArray) -> FloatArray:
+        """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""
+        return nts.gap(x, self._projection(x)).value
+
     def reference(self) -> FloatArray:
         """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
@@ -322,6 +326,8 @@ class ContactStep:
             multiplier: h^2/2 lambda of the scaled constraints, and of lambda_T over the facet
                 size, over `scale` [m], shape (n, multipliers).
         """
+        if not self.num_pairs:
+            return self._nothing()
         scale = self.scale[:, None]
         multiplier = scale * multiplier
         x = self._control(x)
@@ -336,6 +342,16 @@ class ContactStep:
         part.tangent[:, rows] *= scale[:, None]
         part.tangent[:, :, rows] *= scale[:, None]
         return part
+
+    def _nothing(self) -> Contribution:
+        """Of no pairs."""
+        size = self.num_coordinates + self.num_augmented + self.num_multipliers
+        none, slip = np.zeros(0), np.zeros((0, self.num_tangential))
+        off = none.astype(bool)
+        return Contribution(
+            np.zeros((0, size)), np.zeros((0, size, size)), none, off, off, slip, none,
+            tangential=np.zeros((0, 3)),
+        )  # fmt: skip
 
     def _element(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray

@@ -371,8 +371,12 @@ class Continuum:
                 inside_out * self._dx,
             ]
         )
-        self._mass = compat.create_matrix(mass)
-        compat.assemble_matrix(self._mass, mass, (), 0.0)
+        full = compat.create_matrix(mass)
+        compat.assemble_matrix(full, mass, (), 0.0)
+        # Directions do not mix: two of three entries of the blocks are zero.
+        self._mass = compat.without_zeros(full)
+        full.destroy()
+        self._load, self._assembled_loads = np.zeros(self.num_owned), np.zeros(3 * len(self._loads))
         self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
         self.nodal_mass = self.inertia(np.ones(self.num_owned))
 
@@ -416,12 +420,14 @@ class Continuum:
         self._factor.value = integrator.factor(dt)
         self._rate.value = 1.0 / dt if integrator.inertia else 0.0
         when = time + integrator.theta * dt
-        loads = [("body_force", self.body_force, "N/m^3")]
-        loads += [("Traction.value", traction.value, "Pa") for traction in self._traction]
-        for constant, (name, value, unit) in zip(self._loads, loads, strict=True):
+        given = [("body_force", self.body_force, "N/m^3")]
+        given += [("Traction.value", traction.value, "Pa") for traction in self._traction]
+        for constant, (name, value, unit) in zip(self._loads, given, strict=True):
             part = 1.0 if callable(value) else integrator.ramp(when)
             constant.value[:] = part * _at(name, value, when, unit)
-        self._load = self._assemble(self._load_form)
+        loads = np.concatenate([constant.value for constant in self._loads])
+        if not np.array_equal(loads, self._assembled_loads):
+            self._load, self._assembled_loads = self._assemble(self._load_form), loads
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]."""
@@ -436,7 +442,9 @@ class Continuum:
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
         """Body force, traction and gravity, less the extra work [N]."""
-        force = self._load + self.nodal_mass * np.tile(gravity, self.num_owned // 3)
+        force = self._load.copy()
+        if gravity.any():
+            force += self.nodal_mass * np.tile(gravity, self.num_owned // 3)
         if self._forms[2] is not None:
             self._fill(self._u1, u1)
             force -= self._assemble(self._forms[2])
@@ -498,9 +506,8 @@ class Continuum:
 
     def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum x cross p about the origin [kg m^2/s]."""
-        x = (self.reference + u).reshape(-1, 3)
-        total: FloatArray = np.cross(x, momentum.reshape(-1, 3)).sum(axis=0)
-        return total
+        moment = (self.reference + u).reshape(-1, 3).T @ momentum.reshape(-1, 3)
+        return np.array([moment[i, j] - moment[j, i] for i, j in ((1, 2), (2, 0), (0, 1))])
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Write the accepted state into the dolfinx Functions u and v."""

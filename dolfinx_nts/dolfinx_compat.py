@@ -200,6 +200,15 @@ def create_matrix(form: Any) -> Any:
     return fem_petsc.create_matrix(form)
 
 
+def without_zeros(a: Any) -> Any:
+    """Copy of an assembled matrix without the zeros stored in it; MatFilter only since 3.20."""
+    rows, cols, values = a.getValuesCSR()
+    kept = values != 0.0
+    start = np.concatenate([[0], np.cumsum(kept)])[rows].astype(PETSc.IntType)
+    csr = (start, cols[kept], values[kept])
+    return PETSc.Mat().createAIJ(a.getSizes(), csr=csr, comm=a.comm)
+
+
 def assemble_matrix(a: Any, form: Any, bcs: Sequence[Any], diagonal: float) -> None:
     """Assemble a bilinear form; rows and columns of bcs hold only the given diagonal."""
     a.zeroEntries()

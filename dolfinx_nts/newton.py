@@ -119,6 +119,16 @@ class StepSolver:
             StepFailedError: Not converged; names the worst block, node, facet and flips.
             ValueError: PETSc does not know an option or its value.
         """
+        iterations = 0
+        while True:
+            last = self._attempt()
+            iterations += last.iterations
+            solved = self.problem.wake(last)
+            if solved is not None:
+                return replace(solved, iterations=iterations)
+
+    def _attempt(self) -> Evaluation:
+        """Solve the step with the candidates that have unknowns."""
         self.prepare()
         assert self.matrix is not None
         iterations = 0

@@ -60,6 +60,11 @@ class ObstacleStep(ContactStep):
         slave = self.pair.slave
         return (slave.dofs[slave.owned[self.candidates.node]],)
 
+    def gap(self, x: FloatArray) -> FloatArray:
+        """Gap [m] of slaves at t_{n+1}, shape (n, 1, 3)."""
+        value: FloatArray = self.pair.master.gap(self._control(x)[:, 0]).value
+        return value
+
     def reference(self) -> FloatArray:
         """Reference positions of slaves [m], shape (n, 1, 3)."""
         slave = self.pair.slave

@@ -114,6 +114,23 @@ def closest_facets(
     return result
 
 
+def apart(points: FloatArray, corners: FloatArray, reach: float) -> bool:
+    """Whether the boxes around points and facets are farther apart than the reach.
+
+    Then `closest_facets` would find nothing.
+
+    Args:
+        points: Points [m], shape (n, 3).
+        corners: Facet corners [m], shape (m, nc, 3).
+        reach: Largest distance of interest [m].
+    """
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    first, last = points.min(axis=0), points.max(axis=0)
+    outside = float(np.maximum(0.0, np.maximum(low - last, first - high)).max())
+    magnitude = max(float(np.abs(a).max()) for a in (low, high, first, last))
+    return outside > reach + ROUNDING * (magnitude + outside)
+
+
 def _nothing(n: int) -> Closest:
     """The result for n points without a facet."""
     return Closest(np.full(n, -1), np.full((n, 2), np.nan), np.full(n, np.inf))

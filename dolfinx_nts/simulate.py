@@ -223,6 +223,9 @@ class Stepper:
                 self.problem.contacts, step.contacts, step.multipliers, old.slip, strict=True
             )
         ]
+        for values, c, gap in zip(contact, self.problem.idle, step.idle_gaps, strict=True):
+            values["facets"][c.candidates.node] = c.candidates.facet
+            values["gap"][c.candidates.node] = gap
         names = ("facets", "force", "gap", "tangential", "stick", "slip")
         return State(
             time=time,

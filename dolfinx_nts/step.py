@@ -9,7 +9,8 @@ pure: nothing here changes a State, and history changes only when a step is acce
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,14 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.assembly import ElementBlocks, Layout
+from dolfinx_nts.contact import Candidates
 from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.obstacle_contact import ObstacleStep
 from dolfinx_nts.system import State, System
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
 
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
@@ -64,6 +67,7 @@ class Evaluation:
         contacts: Contribution of each contact.
         multipliers: Multipliers of each contact [kg m], shape (n, multipliers).
         iterations: Newton iterations it took.
+        idle_gaps: Gaps [m] of the idle candidates of each contact, once solved.
     """
 
     x: FloatArray
@@ -71,6 +75,7 @@ class Evaluation:
     contacts: tuple[Contribution, ...]
     multipliers: tuple[FloatArray, ...]
     iterations: int = 0
+    idle_gaps: tuple[FloatArray, ...] = ()
 
 
 class StepProblem:
@@ -84,7 +89,8 @@ class StepProblem:
         condense: Eliminate (d, f) and their multipliers pair by pair.
 
     Attributes:
-        contacts: Candidates of each contact in this step.
+        contacts: Candidates of each contact that have unknowns in this step.
+        idle: The others, which the step's motion does not bring to their facets.
         layout: Fields of the unknowns.
         elements: Unknowns of the contact elements; empty without candidates.
         x: PETSc vector of the unknowns, holding the first guess after `begin`.
@@ -97,6 +103,7 @@ class StepProblem:
         self.system, self.integrator = system, integrator
         self._rtol, self._condense = rtol, condense
         self._numbers: tuple[Any, ...] | None = None
+        self.contacts: list[ContactStep] = []
         self._petsc: list[Any] = []
         self.version = 0
         self.stabilization = 0.0
@@ -136,8 +143,50 @@ class StepProblem:
         if motion is not None:
             self._motion = np.maximum(self._motion, motion)
         if search:
-            self.contacts = [self._contact_step(k) for k in range(len(system.contacts))]
+            self._found = [self._contact_step(k) for k in range(len(system.contacts))]
             self._drop_doubles()
+            self._awake = [self._may_touch(k, c) for k, c in enumerate(self._found)]
+        self._choose()
+
+    def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
+        """Which candidates need unknowns: all within reach, and who had them in the last step.
+
+        In statics, where no motion bounds the next one, all do.
+        """
+        if not self.integrator.inertia:
+            return np.ones(c.num_pairs, dtype=bool)
+        node, reach = c.candidates.node, self._reach(index, self._motion)
+        # What goes to and fro at the limit would change the layout in every step.
+        had = np.isin(node, self.contacts[index].candidates.node) if self.contacts else False
+        awake: BoolArray = had | (c.candidates.gap < reach) | (self.state.force[index][node] > 0.0)
+        return awake
+
+    def wake(self, e: Evaluation) -> Evaluation | None:
+        """A solved step with the gaps of the idle candidates, if none of them is closed.
+
+        Else these get unknowns, and the step is to be solved again. Every rank must call it.
+
+        Args:
+            e: Solution of the step without them.
+        """
+        if not self._watching:
+            return replace(e, idle_gaps=tuple(np.empty(0) for _ in self.idle))
+        u = [b.u1 for b in e.bodies]
+        gaps = tuple(c.gap(self._points(k, c.candidates, u)) for k, c in enumerate(self.idle))
+        closed = [~(gap >= 0.0) for gap in gaps]
+        if not self.system.comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
+            return replace(e, idle_gaps=gaps)
+        for awake, late in zip(self._awake, closed, strict=True):
+            awake[np.flatnonzero(~awake)[late]] = True
+        self._choose()
+        return None
+
+    def _choose(self) -> None:
+        """Give unknowns to the candidates that are awake."""
+        both = list(zip(self._found, self._awake, strict=True))
+        self.contacts, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
+        system, watching = self.system, any(c.num_pairs for c in self.idle)
+        self._watching = system.comm.allreduce(watching, op=MPI.LOR)
         numbers = tuple(a for c in self.contacts for a in c.points())
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
             self._lay_out()
@@ -174,17 +223,15 @@ class StepProblem:
         reach = self._reach(index, self._motion)
         ahead = [0.5 * (self.first[b] - state.u[b]) for b in self.system.contact_bodies[index]]
         found = pair.find(u, state.facets[index], reach, state.time, ahead)
-        slave, rows = pair.slave, pair.slave.rows[found.node]
-        x0 = (slave.reference[slave.owned[found.node]] + u[0][rows])[:, None]
+        slave = pair.slave
+        rows = slave.rows[found.node]
+        x0 = self._points(index, found, state.u)
         mass = slave.body.nodal_mass if self.integrator.inertia else slave.body.nodal_stiffness()
         scale, theta = mass[rows[:, 0]], self.integrator.theta
         rule, condense = self.integrator.contact_gradient, self._condense
         if pair.rigid:
             path = self._path(index)
-            x0 -= path[0]
-            return ObstacleStep(pair, found, rule, condense, x0, scale, theta, path)
-        corners = pair.master.control_points(pair.master.positions(u[1]), found.facet)
-        x0 = np.concatenate([x0, corners], axis=1)
+            return ObstacleStep(pair, found, rule, condense, x0 - path[0], scale, theta, path)
         return ContactStep(pair, found, rule, condense, x0, scale, theta)
 
     def _drop_doubles(self) -> None:
@@ -193,8 +240,8 @@ class StepProblem:
         Two constraints on one gap are one too many where no master can yield, as over the seam of
         two plates. A node stays with the one that carried it.
         """
-        for i, j in itertools.combinations(range(len(self.contacts)), 2):
-            a, b = self.contacts[i], self.contacts[j]
+        for i, j in itertools.combinations(range(len(self._found)), 2):
+            a, b = self._found[i], self._found[j]
             if a.pair.slave.body is not b.pair.slave.body:
                 continue
             one, two = (c.pair.slave.points[c.pair.slave.owned[c.candidates.node]] for c in (a, b))
@@ -206,7 +253,18 @@ class StepProblem:
             stay = self.state.force[i][ca.node] >= self.state.force[j][cb.node]
             for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
                 if len(there):
-                    self.contacts[k] = c.part(~np.isin(np.arange(c.num_pairs), there))
+                    self._found[k] = c.part(~np.isin(np.arange(c.num_pairs), there))
+
+    def _points(self, index: int, found: Candidates, u: Sequence[FloatArray]) -> FloatArray:
+        """Slave and control points of pairs [m], (n, nc + 1, 3), from all bodies' displacements."""
+        pair, bodies = self.system.contacts[index], self.system.contact_bodies[index]
+        slave, node = pair.slave, found.node
+        x = slave.reference[slave.owned[node]] + u[bodies[0]][slave.rows[node]]
+        x = x[:, None]
+        if pair.rigid:
+            return x
+        corners = pair.master.control_points(pair.master.positions(u[bodies[1]]), found.facet)
+        return np.concatenate([x, corners], axis=1)
 
     def _lay_out(self) -> None:
         """Layout, vectors and scatter; kept from step to step while no rank's candidates change."""
@@ -334,13 +392,13 @@ class StepProblem:
         values = x.array_r.copy()
         multipliers = self._unknowns(values, "multipliers")
         augmented = self._unknowns(values, "augmented")
+        positions = self._positions(x) if self._fields else [np.empty(0)] * len(self.contacts)
         contacts = tuple(
             c.evaluate(*arguments)
-            for c, *arguments in zip(
-                self.contacts, self._positions(x), augmented, multipliers, strict=True
-            )
+            for c, *arguments in zip(self.contacts, positions, augmented, multipliers, strict=True)
         )
-        force = self._contact_forces(contacts)
+        none = np.zeros(len(values))
+        force = self._contact_forces(contacts) if self._fields else none
         bodies = []
         for k, (body, u0) in enumerate(zip(self.system.bodies, self.state.u, strict=True)):
             here = self.layout.owned(k)

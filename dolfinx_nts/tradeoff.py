@@ -2,6 +2,7 @@
 
     python -m dolfinx_nts.tradeoff two_blocks --vary accuracy=fast,balanced,exact dt_factor=4,2,1
     python -m dolfinx_nts.tradeoff my_scene.py --set cells=8 --vary linear_solver=direct,krylov
+    python -m dolfinx_nts.tradeoff economy --set cells=8
 
 The scene is a Python file with a function `main`, or the name of one in `demos/`. Measured is the
 first run that `main` starts with `simulate`; what a choice names is an argument of `main` if it has
@@ -9,7 +10,7 @@ one of that name, else an option of that run: `integrator` (energy-momentum or m
 `contact_gradient`, `dt`, `dt_factor` (of the script's own step), `accuracy`, or a field of `Newton`
 (`rtol`, `condense`, `linear_solver`, `reuse`, ...). Written are a table of all runs, a
 work-precision plot and what is cheapest for a given error. A run that fails is a row with its
-reason.
+reason. The scene `economy` is the cost table of the features, see `dolfinx_nts.economy`.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from petsc4py import PETSc
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import economy
 from dolfinx_nts.newton import ACCURACY
 
 FloatArray = npt.NDArray[np.float64]
@@ -419,6 +421,12 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--output", default="out/tradeoff", help="folder for table and plot")
     options = parser.parse_args(arguments)
     fixed = {name: values[0] for name, values in options.set}
+    comm = MPI.COMM_WORLD
+    if options.scene == "economy":
+        rows, title = economy.table(comm, **fixed), provenance(options.scene, comm)
+        if comm.rank == 0:
+            economy.write(rows, Path(options.output), title)
+        return rows
     steps = fixed.keys() & {"dt", "dt_factor"}
     vary: dict[str, list[Any]] = dict(options.vary) or {
         k: v for k, v in DEFAULT.items() if k != "dt_factor" or not steps
@@ -430,7 +438,6 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     if not reference.keys() & {"dt", "dt_factor"}:
         reference["dt_factor"] = 0.25
     reference |= {name: values[0] for name, values in options.reference}
-    comm = MPI.COMM_WORLD
     rows = compare(options.scene, vary, fixed, reference, comm)
     title = provenance(options.scene, comm)
     if comm.rank == 0:

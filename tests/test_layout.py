@@ -33,7 +33,7 @@ LEVELS = [
     },
     {"system", "balance"},
     {"newton", "step", "assembly", "linear_solver"},
-    {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff"},
+    {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]
 LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}

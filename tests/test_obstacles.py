@@ -131,7 +131,8 @@ class Pair:
         pair = nts.ContactPair(PointSurface(body, start), master, friction=friction)
         stepper = nts.Stepper(nts.System([body], contacts=[pair]), INTEGRATORS[integrator])
         stepper.problem.begin(stepper.state, STEP)
-        (self.step,) = stepper.problem.contacts
+        problem = stepper.problem
+        (self.step,) = (c for c in (*problem.contacts, *problem.idle) if c.num_pairs)
         stepper.close()
         self.x = start + np.array([0.11, -0.07, 0.05])
 
