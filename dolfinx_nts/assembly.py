@@ -90,7 +90,7 @@ class StepMatrix:
             split takes its blocks without a copy; else one AIJ matrix.
 
     Attributes:
-        nest: Blocks of all fields.
+        nest: Blocks of all fields, as of the last fresh assembly.
         operator: What the solvers see, after `assemble`.
     """
 
@@ -103,7 +103,8 @@ class StepMatrix:
         split: bool = False,
     ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
-        self._added: list[FloatArray] = []
+        self._in_bodies: list[FloatArray] = []
+        self._in_operator: list[FloatArray] = []
         self._sources: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
         for e, element in enumerate(elements):
             for i, row in enumerate(element.fields):
@@ -119,14 +120,17 @@ class StepMatrix:
         grid = [[self._block(i, j) for j in fields] for i in fields]
         self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
         self._parts = [self.nest]
+        halves = [list(fields)]
         if self._split:
             for k in range(len(bodies)):
                 for key in ((k, len(bodies)), (len(bodies), k)):
                     if key not in self._blocks:
                         grid[key[0]][key[1]] = self._blocks[key] = self._zero_block(*key)
-            halves = (slice(len(bodies)), slice(len(bodies), None))
-            quarters = [[row[half] for row in grid[rows]] for rows in halves for half in halves]
+            halves = [list(fields[: len(bodies)]), list(fields[len(bodies) :])]
+            quarters = [[[grid[i][j] for j in b] for i in a] for a in halves for b in halves]
             self._parts = [PETSc.Mat().createNest(q, comm=layout.comm) for q in quarters]
+        numbers = [self._numbers(half) for half in halves]
+        self._part_numbers = [(a, b) for a in numbers for b in numbers]
         self._converted: list[Any] = []
         self.operator: Any = None
 
@@ -164,16 +168,17 @@ class StepMatrix:
         return a
 
     def assemble(self, tangents: Sequence[FloatArray], *, fresh: bool = True) -> None:
-        """Add the contact tangents (n, r, r) to the bodies; refresh nest and AIJ.
+        """Add the contact tangents (n, r, r) to the bodies; refresh nest and operator.
 
         Args:
             tangents: Of each batch of elements.
-            fresh: The bodies' matrices are without contact, newly assembled; else they hold what
-                the last call added.
+            fresh: The bodies' matrices are without contact, newly assembled; else they are as the
+                last call left them, and only the operator is changed.
         """
-        old = [] if fresh else self._added
-        change = [a - b for a, b in zip(tangents, old, strict=True)] if old else tangents
-        self._added = list(tangents)
+        if self._converted and not fresh:
+            self._change_operator(tangents)
+            return
+        self._in_bodies = self._in_operator = list(tangents)
         for key, sources in self._sources.items():
             if key in self._blocks:
                 values = [self._values(s, tangents) for s in sources]
@@ -181,7 +186,7 @@ class StepMatrix:
                     self._blocks[key], np.concatenate([v.ravel() for v in values])
                 )
             else:
-                self._add_to_body(self._bodies[key[0]], sources, change)
+                self._add_to_body(self._bodies[key[0]], sources, tangents)
         for part in (self.nest, *self._parts):
             part.assemble()
         if self._converted:
@@ -196,13 +201,25 @@ class StepMatrix:
                 self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
         self.operator.assemble()
 
+    def _change_operator(self, tangents: Sequence[FloatArray]) -> None:
+        """Put other contact tangents into the operator; on several ranks converting is slow."""
+        change = [a - b for a, b in zip(tangents, self._in_operator, strict=True)]
+        self._in_operator = list(tangents)
+        for a, (rows, cols) in zip(self._converted, self._part_numbers, strict=True):
+            # Outside the pattern of an element its tangent is zero.
+            a.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
+            for (i, row), (j, col), values in zip(rows, cols, change, strict=True):
+                _add(a, row, col, values[:, i][:, :, j])
+            a.assemble()
+        self.operator.assemble()
+
     def withdraw(self) -> None:
         """Take the contact tangents out of the bodies' matrices, but for rounding."""
-        change = [-a for a in self._added]
+        change = [-a for a in self._in_bodies]
         for key, sources in self._sources.items():
             if key not in self._blocks and change:
                 self._add_to_body(self._bodies[key[0]], sources, change)
-        self._added = []
+        self._in_bodies = []
 
     def _values(self, source: tuple[int, int, int], tangents: Sequence[FloatArray]) -> FloatArray:
         e, i, j = source
@@ -211,24 +228,30 @@ class StepMatrix:
         values: FloatArray = tangents[e][:, columns[i], columns[j]][:, rows, cols]
         return values
 
+    def _numbers(self, fields: Sequence[int]) -> list[tuple[IntArray, IntArray]]:
+        """Each batch's columns in some fields, and their numbers in the layout of these alone."""
+        layout = self._layout
+        counts = layout.counts[layout.comm.rank, fields].tolist()
+        own = layout if len(fields) == layout.counts.shape[1] else Layout(layout.comm, counts)
+        result = []
+        for element in self._elements:
+            columns, numbers = [np.empty(0, np.int64)], [np.empty((element.numbers[0].shape[0], 0))]
+            for field, where, number in zip(*element[:3], strict=True):
+                if field in fields:
+                    columns.append(np.arange(where.start, where.stop))
+                    moved = own.to_system(fields.index(field), number)
+                    numbers.append(np.where(number < 0, -1, moved))
+            result.append((np.concatenate(columns), np.concatenate(numbers, axis=1).astype(int)))
+        return result
+
     def _add_to_body(
         self, a: Any, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]
     ) -> None:
         a.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         for e, i, j in sources:
             element = self._elements[e]
-            rows, cols = element.numbers[i], element.numbers[j]
-            (n, num_rows), num_cols = rows.shape, cols.shape[1]
-            pointer = np.arange(n * num_rows + 1, dtype=PETSc.IntType) * num_cols
-            index = np.repeat(cols, num_rows, axis=0).ravel().astype(PETSc.IntType)
-            values = np.ascontiguousarray(tangents[e][:, element.columns[i], element.columns[j]])
-            a.setValuesIJV(
-                pointer,
-                index,
-                values.ravel(),
-                addv=PETSc.InsertMode.ADD_VALUES,
-                rowmap=rows.ravel().astype(PETSc.IntType),
-            )
+            values = tangents[e][:, element.columns[i], element.columns[j]]
+            _add(a, element.numbers[i], element.numbers[j], values)
         a.assemble()
 
     def field_sets(self, num_bodies: int) -> tuple[tuple[str, Any], tuple[str, Any]]:
@@ -253,6 +276,18 @@ class StepMatrix:
         nests = [self.nest, *(self._parts if self._split else [])]
         for a in (*operator, *self._converted, *nests, *self._blocks.values()):
             a.destroy()
+
+
+def _add(a: Any, rows: IntArray, cols: IntArray, values: FloatArray) -> None:
+    """Add blocks (n, r, c) at rows (n, r) and columns (n, c); negative numbers are left out."""
+    (n, num_rows), num_cols = rows.shape, cols.shape[1]
+    a.setValuesIJV(
+        np.arange(n * num_rows + 1, dtype=PETSc.IntType) * num_cols,
+        np.repeat(cols, num_rows, axis=0).ravel().astype(PETSc.IntType),
+        np.ascontiguousarray(values).ravel(),
+        addv=PETSc.InsertMode.ADD_VALUES,
+        rowmap=rows.ravel().astype(PETSc.IntType),
+    )
 
 
 def model_problem(
