@@ -234,6 +234,35 @@ def test_nest_and_aij_are_the_same_matrix(rule):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("solver", ["direct", "krylov"])
+@pytest.mark.parametrize("rule", ["midpoint", "energy-momentum", "condensed"])
+def test_contact_changes_beside_matrices_that_are_kept(rule, solver):
+    """Tangents exchanged in the solvers' matrix, against the matrix assembled with them."""
+    system = two_blocks("hex", friction=0.4)
+    newton = nts.Newton(condense=rule == "condensed", linear_solver=solver, reuse=True)
+    stepper = nts.Stepper(system, RULES[rule], newton=newton)
+    problem, solver = stepper.problem, stepper.solver
+    problem.begin(rotated_state(system), 0.02)
+    first = problem.evaluate(problem.x)
+    matrix = solver.assemble(first)
+    with problem.x as x:
+        rng = np.random.default_rng(COMM.rank)
+        x[:] += 0.01 * rng.uniform(-1, 1, len(x))
+    other = problem.evaluate(problem.x)
+    vectors = [problem.x.duplicate() for _ in range(3)]
+    vectors[0].array_w[:] = rng.uniform(-1, 1, len(problem.x.array_r))
+    solver.assemble(other)
+    matrix.operator.mult(vectors[0], vectors[1])
+    problem.body_tangents(first)
+    matrix.assemble([c.tangent for c in other.contacts])
+    matrix.operator.mult(vectors[0], vectors[2])
+    kept, fresh = vectors[1].array_r, vectors[2].array_r
+    top = COMM.allreduce(np.abs(fresh).max(initial=0.0), op=MPI.MAX)
+    np.testing.assert_allclose(kept, fresh, rtol=0, atol=1e-13 * top)
+    stepper.close()
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("rule", EQUATIONS)
 @pytest.mark.parametrize("friction", ["none", "mixed"])
 @pytest.mark.parametrize("cell", CELLS)
