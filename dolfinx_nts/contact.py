@@ -160,6 +160,8 @@ class ContactPair:
             return found
         motion = self.slave.gather(ahead[0])[self.slave.owned], self.master.gather(ahead[1])
         change, facet = self._crossings(found, master, *motion)
+        if not len(change):
+            return found
         start, _ = facets.closest_point(x[found.node[change]], corners[facet])
         other = self._measure(x, master, found.node[change], facet, start, reach)
         stay = ~np.isin(found.node, other.node)

@@ -308,7 +308,8 @@ def closest_point(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, 
         convex = _is_convex(gram)
         xi = np.empty((len(points), 2))
         xi[convex] = _closest_convex(gram[:, :, convex])
-        xi[~convex] = _closest_warped(start[~convex], spans[~convex])
+        if not convex.all():
+            xi[~convex] = _closest_warped(start[~convex], spans[~convex])
     return xi, _distance(start, spans, xi)
 
 

@@ -107,8 +107,10 @@ def closest_facets(
     scene = _Scene(points, corners, fc.size(corners))
     kept, near = _current(scene, limit, current), _near_box(scene, limit)
     classes = _size_classes(corners)
-    bound = _upper_bounds(scene, near, classes, np.minimum(limit, kept.distance)[near])
-    for point, facet in _candidates(scene, near, classes, bound):
+    new = near[kept.facet[near] < 0]
+    bound = kept.distance.copy()
+    bound[new] = _upper_bounds(scene, new, classes, limit[new])
+    for point, facet in _candidates(scene, near, classes, bound[near]):
         _choose(scene, limit, point, facet, result)
     _prefer(scene, kept, preference, result)
     return result
