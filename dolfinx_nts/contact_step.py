@@ -481,9 +481,9 @@ class ContactStep:
         """
         residual, tangent, gap, slip = self._invariants(x, self._augmented(x), multiplier)
         stop = self.num_coordinates + nts.NUM_AUGMENTED
-        hidden = [slice(self.num_coordinates, stop), slice(stop + 1, stop + nts.NUM_CONSTRAINTS)]
-        inner = np.r_[tuple(hidden)]
-        outer = np.setdiff1d(np.arange(tangent.shape[1]), inner)
+        middle = stop + nts.NUM_CONSTRAINTS
+        inner = np.r_[self.num_coordinates : stop, stop + 1 : middle]
+        outer = np.r_[: self.num_coordinates, stop, middle : tangent.shape[1]]
         inside = nts.solve(tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer])
 
         def reduce(a: FloatArray) -> FloatArray:
