@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,9 +14,17 @@ from petsc4py import PETSc
 
 from dolfinx_nts.assembly import StepMatrix
 from dolfinx_nts.contact_step import ContactStep, Contribution
-from dolfinx_nts.linear_solver import PRESETS, SolverOptions, keep_bodies
+from dolfinx_nts.linear_solver import (
+    PRESETS,
+    SolverOptions,
+    choose,
+    keep_bodies,
+    most_iterations,
+)
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.validation import known_options
+
+logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -33,9 +42,11 @@ class Newton:
         condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
             lambda_N and lambda_T reach the linear solver; the same solution, smaller factors.
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
-            a Schur complement for contact), which is for large meshes: at 50,000 coordinates an
-            iteration costs a fifth. Its incomplete factors weaken as dt grows beyond the time a
-            wave needs through an element.
+            a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
+            incomplete factors weaken as dt grows beyond the time a wave needs through an element.
+            "auto" takes "krylov" while that is the faster one: not for few coordinates, nor in
+            statics, nor with `petsc_options`, nor for the next steps after a solve that needed
+            more iterations than MUMPS is worth.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew.
 
@@ -48,7 +59,7 @@ class Newton:
     max_iterations: int = 25
     max_retries: int = 8
     condense: bool = False
-    linear_solver: str = "direct"
+    linear_solver: str = "auto"
     reuse: bool = False
 
     def __post_init__(self) -> None:
@@ -65,19 +76,21 @@ class Newton:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
         if self.max_retries < 0:
             raise ValueError(f"max_retries={self.max_retries!r}: must not be negative")
-        if self.linear_solver not in PRESETS:
-            known = ", ".join(map(repr, PRESETS))
+        if self.linear_solver not in ("auto", *PRESETS):
+            known = ", ".join(map(repr, ("auto", *PRESETS)))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
 ACCURACY: Mapping[str, Newton] = {
     "exact": Newton(),
-    "balanced": Newton(rtol=1e-9, condense=True, linear_solver="krylov", reuse=True),
-    "fast": Newton(rtol=1e-6, condense=True, linear_solver="krylov", reuse=True),
+    "balanced": Newton(rtol=1e-9, condense=True, reuse=True),
+    "fast": Newton(rtol=1e-6, condense=True, reuse=True),
 }
 #: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
 _SLOW = 0.05
+#: Steps with MUMPS before "auto" tries Krylov's method again, at the price of about one of them.
+_PATIENCE = 10
 
 
 class StepFailedError(RuntimeError):
@@ -100,10 +113,15 @@ class StepSolver:
     def __init__(
         self, problem: StepProblem, newton: Newton, petsc_options: Mapping[str, Any] | None = None
     ) -> None:
-        self.problem, self.newton = problem, newton
-        self._options = SolverOptions(
-            problem.system.comm, newton.linear_solver, newton.condense, petsc_options or {}
-        )
+        self.problem, self.newton, self._given = problem, newton, petsc_options or {}
+        system = problem.system
+        self._size = system.comm.allreduce(sum(b.num_owned for b in system.bodies))
+        self._chosen = newton.linear_solver
+        if newton.linear_solver == "auto":
+            self._chosen = choose(self._size, problem.integrator.inertia, self._given)
+        self._automatic = self._chosen != newton.linear_solver and self._chosen == "krylov"
+        self._patience = 0
+        self._options = self._solver_options(self._chosen)
         self._version, self._factor = -1, 0.0
         self._matrices_due, self._solved = True, False
         self._bodies: list[Any] = []
@@ -111,6 +129,16 @@ class StepSolver:
         self._last: Evaluation | None = None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
+
+    def _solver_options(self, preset: str) -> SolverOptions:
+        limit = most_iterations(self._size) if self._automatic else None
+        comm = self.problem.system.comm
+        return SolverOptions(comm, preset, self.newton.condense, self._given, limit)
+
+    def _take(self, preset: str) -> None:
+        """Solve with another preset from now on."""
+        self.destroy()
+        self._chosen, self._options = preset, self._solver_options(preset)
 
     def solve(self) -> Evaluation:
         """Solve the step that `problem.begin` fixed.
@@ -120,6 +148,10 @@ class StepSolver:
             ValueError: PETSc does not know an option or its value.
         """
         iterations = 0
+        if self._automatic and self._chosen == "direct":
+            self._patience -= 1
+            if self._patience < 0:
+                self._take("krylov")
         while True:
             last = self._attempt()
             iterations += last.iterations
@@ -143,6 +175,8 @@ class StepSolver:
                 # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
                 self._matrices_due = True
                 self.destroy()
+                if self._automatic and self._chosen == "krylov":
+                    return self._attempt_with_mumps(iterations)
                 state = self.problem.state
                 raise StepFailedError(
                     f"step from t={state.time:.6g} with dt={self.problem.dt:.3g}: PETSc stopped "
@@ -154,13 +188,25 @@ class StepSolver:
             # A line search of the user's may stop SNES by its own tests; ours decide.
             if self._worst(last) <= 1.0 and self.snes.getConvergedReason() > 0:
                 return replace(last, iterations=iterations)
+            reason = self.snes.getConvergedReason()
+            unsolved = reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
+            if unsolved and self._automatic and self._chosen == "krylov":
+                return self._attempt_with_mumps(iterations)
         self._matrices_due = True
-        reason = self.snes.getConvergedReason()
         message = self._diagnosis(last, reason, iterations)
-        if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+        if unsolved:
             # A factorisation that met a NaN fails from then on.
             self.destroy()
         raise StepFailedError(message)
+
+    def _attempt_with_mumps(self, iterations: int) -> Evaluation:
+        """Solve the step after Krylov's method took more iterations than it is worth."""
+        logger.info("t=%.6g: MUMPS solves the next %d steps", self.problem.state.time, _PATIENCE)
+        self._matrices_due, self._patience = True, _PATIENCE
+        self._take("direct")
+        self.problem.guess(flight=True)
+        last = self._attempt()
+        return replace(last, iterations=iterations + last.iterations)
 
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""

@@ -1,0 +1,89 @@
+"""The choice of the linear solver, and the way back when it was wrong."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, create_box
+from mpi4py import MPI
+from test_friction import difference
+
+import dolfinx_nts as nts
+from dolfinx_nts import linear_solver
+
+COMM = MPI.COMM_WORLD
+
+
+def pressed_block(poisson, n=5, name="block"):
+    """A block that trembles on a floor, of more coordinates than MUMPS is chosen for."""
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [n, n, n + 1], CellType.hexahedron)
+    block = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=poisson), density=1e3, name=name,
+        velocity=lambda x: np.array([0.1 * x[2], 0 * x[0], 0.1 * np.sin(np.pi * x[0])]),
+    )  # fmt: skip
+    floor = nts.Plane((0, 0, -0.001), (0, 0, 1))
+    pair = nts.ContactPair(block.surface(lambda x: x[2] < 1e-9), floor)
+    return nts.System([block], contacts=[pair], gravity=(0, 0, -9.81))
+
+
+def stepper_of(system, **options):
+    return nts.Stepper(system, nts.EnergyMomentum(), newton=nts.Newton(**options))
+
+
+@pytest.mark.parametrize(
+    ("size", "inertia", "given", "preset"),
+    [
+        (1000, True, {}, "krylov"),
+        (50_000, True, {}, "krylov"),
+        (100, True, {}, "direct"),
+        (50_000, False, {}, "direct"),
+        (50_000, True, {"mat_mumps_icntl_7": 4}, "direct"),
+    ],
+)
+def test_choice(size, inertia, given, preset):
+    assert linear_solver.choose(size, inertia, given) == preset
+
+
+def test_more_iterations_are_worth_it_on_larger_meshes():
+    limits = [linear_solver.most_iterations(n) for n in (1, 1_000, 5_000, 50_000, 500_000)]
+    assert limits[:2] == [60, 60] and limits == sorted(limits) and limits[-1] < 1_000
+
+
+@pytest.mark.mpi
+def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
+    """A nearly incompressible block at steps in which waves pass it ten times, then at short ones.
+
+    Krylov's method alone cannot solve these steps.
+    """
+    caplog.set_level("INFO", logger="dolfinx_nts.newton")
+    long, short = 0.06, 5e-4
+    tables = {}
+    for solver in ("auto", "direct"):
+        stepper = stepper_of(pressed_block(0.49), linear_solver=solver)
+        for dt in [long] * 2 + [short] * 12:
+            stepper.advance(dt)
+        tables[solver] = stepper.solution.balance
+        assert stepper.solution.retries == 0
+        # Without MUMPS, GMRES asks for more than the one iteration of a factorised matrix.
+        again = stepper.solver.snes.getKSP().getType()
+        assert again == {"auto": "gmres", "direct": "preonly"}[solver]
+        stepper.close()
+    assert len([r for r in caplog.records if "MUMPS" in r.getMessage()]) == 1
+    assert difference(tables["auto"], tables["direct"]) < 1e-9
+    krylov = stepper_of(pressed_block(0.49), linear_solver="krylov", max_retries=0)
+    with pytest.raises(nts.StepFailedError):
+        krylov.advance(long)
+    krylov.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("condense", [False, True])
+def test_the_choice_changes_no_solution(condense):
+    tables = []
+    for solver in ("auto", "direct"):
+        newton = nts.Newton(linear_solver=solver, condense=condense)
+        run = nts.simulate(
+            pressed_block(0.3), nts.EnergyMomentum(), dt=1e-3, t_end=0.04, newton=newton
+        )
+        assert run.status == "completed"
+        assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * run.balance["energy"].max()
+        tables.append(run.balance)
+    assert tables[0]["active"].max() >= 30 and difference(*tables) < 1e-9
