@@ -15,6 +15,8 @@ Lengths may come in any unit: every test in this module is relative.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -176,8 +178,8 @@ def _solve_2x2(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 def _descent_step(
     start: FloatArray, spans: FloatArray, xi: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Newton step for |xbar - x|^2 / 2, and its exact change along the step.
+) -> tuple[FloatArray, Callable[[], FloatArray]]:
+    """Newton step for |xbar - x|^2 / 2, and what gives its exact change along the step.
 
     Args:
         start: First corner relative to the point [m], shape (n, 3).
@@ -185,8 +187,8 @@ def _descent_step(
         xi: Convective coordinates [-], shape (n, 2).
 
     Returns:
-        Step [-], shape (n, 2), and the coefficients of t, t^2, ... [m^2] of the change after t
-        times the step, shape (n, 4), over a patch (n, 12).
+        Step [-], shape (n, 2), and a function without arguments for the coefficients of t, t^2, ..
+        [m^2] of the change after t times the step, shape (n, 4), over a patch (n, 12).
     """
     values, first, second = shape(xi, spans.shape[1])
     offset = start + np.einsum("ni,nij->nj", values, spans)
@@ -203,19 +205,23 @@ def _descent_step(
     hessian[bad, 0, 1] = np.clip(mixed[bad], -limit, limit)
     hessian[bad, 0, 0], hessian[bad, 1, 1] = metric[bad, 0, 0], metric[bad, 1, 1]
     step = -_solve_2x2(hessian, gradient)
-    # Differences of distances would cancel near the solution; this polynomial does not.
-    if spans.shape[1] == patches.NUM_POINTS:
-        powers = np.einsum("nip,nij->pnj", patches.along(xi, step)[:, :, 1:], spans)
-    else:
-        twist = np.einsum("ni,nij->nj", second[..., 0, 1], spans)
-        along = np.einsum("naj,na->nj", tangents, step)
-        powers = np.stack([along, twist * (step[:, 0] * step[:, 1])[:, None]])
-    change = np.zeros((len(xi), 2 * len(powers)))
-    change[:, : len(powers)] = np.einsum("pnj,nj->np", powers, offset)
-    change[:, 0] = np.einsum("na,na->n", gradient, step)
-    for i, one in enumerate(powers):
-        for j, two in enumerate(powers):
-            change[:, i + j + 1] += 0.5 * np.einsum("nj,nj->n", one, two)
+
+    def change() -> FloatArray:
+        # Differences of distances would cancel near the solution; this polynomial does not.
+        if spans.shape[1] == patches.NUM_POINTS:
+            powers = np.einsum("nip,nij->pnj", patches.along(xi, step)[:, :, 1:], spans)
+        else:
+            twist = np.einsum("ni,nij->nj", second[..., 0, 1], spans)
+            along = np.einsum("naj,na->nj", tangents, step)
+            powers = np.stack([along, twist * (step[:, 0] * step[:, 1])[:, None]])
+        out = np.zeros((len(xi), 2 * len(powers)))
+        out[:, : len(powers)] = np.einsum("pnj,nj->np", powers, offset)
+        out[:, 0] = np.einsum("na,na->n", gradient, step)
+        for i, one in enumerate(powers):
+            for j, two in enumerate(powers):
+                out[:, i + j + 1] += 0.5 * np.einsum("nj,nj->n", one, two)
+        return out
+
     return step, change
 
 
@@ -256,7 +262,7 @@ def _refine(start: FloatArray, spans: FloatArray, xi: FloatArray) -> tuple[Float
         step, change = _descent_step(start[active], spans[active], xi[active])
         finite = np.isfinite(step).all(axis=1)
         last = finite & (np.abs(step).max(axis=1) <= last_step[active])
-        length = np.where(last, 1.0, _step_length(change))
+        length = np.ones(len(last)) if last.all() else np.where(last, 1.0, _step_length(change()))
         xi[active[finite]] += (length[:, None] * step)[finite]
         converged[active[last]] = True
         active = active[finite & ~last & (length > 0.0)]
