@@ -33,7 +33,7 @@ PARTS = {
 }
 
 
-def cubes(comm: MPI.Comm, n: int) -> nts.System:
+def cubes(comm: MPI.Comm, n: int, gap: float = 0.05) -> nts.System:
     """The scene."""
     box = dict(cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
     rubber = nts.NeoHookean(young=1e6, poisson=0.3)
@@ -47,12 +47,12 @@ def cubes(comm: MPI.Comm, n: int) -> nts.System:
         rubber, density=1e3, velocity=throw, name="left",
     )  # fmt: skip
     right = nts.Continuum(
-        create_box(comm, [[1.05, 0, 0], [2.05, 1, 1]], [n + 1] * 3, **box),
+        create_box(comm, [[1 + gap, 0, 0], [2 + gap, 1, 1]], [n + 1] * 3, **box),
         rubber, density=1e3, name="right",
     )  # fmt: skip
     pair = nts.ContactPair(
         slave=left.surface(lambda x: x[0] > 1 - 1e-9),
-        master=right.surface(lambda x: x[0] < 1.05 + 1e-9),
+        master=right.surface(lambda x: x[0] < 1 + gap + 1e-9),
     )
     return nts.System([left, right], contacts=[pair])
 
