@@ -22,6 +22,7 @@ from dolfinx_nts.linear_solver import (
     most_iterations,
 )
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import known_options
 
 logger = logging.getLogger(__name__)
@@ -40,7 +41,8 @@ class Newton:
         max_iterations: Newton iterations before a step is dropped.
         max_retries: How often a dropped step may be halved before the run stops.
         condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
-            lambda_N and lambda_T reach the linear solver; the same solution, smaller factors.
+            lambda_N and lambda_T reach the linear solver; the same solution, smaller factors. By
+            default where Krylov's method is used.
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
             a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
             incomplete factors weaken as dt grows beyond the time a wave needs through an element.
@@ -58,7 +60,7 @@ class Newton:
     rtol: float = 1e-12
     max_iterations: int = 25
     max_retries: int = 8
-    condense: bool = False
+    condense: bool | None = None
     linear_solver: str = "auto"
     reuse: bool = False
 
@@ -69,8 +71,8 @@ class Newton:
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool):
                 raise TypeError(f"{name}={value!r}: pass a whole number")
-        for name in ("condense", "reuse"):
-            if not isinstance(getattr(self, name), bool):
+        for name, kinds in (("condense", bool | None), ("reuse", bool)):
+            if not isinstance(getattr(self, name), kinds):
                 raise TypeError(f"{name}={getattr(self, name)!r}: pass True or False")
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
@@ -79,6 +81,12 @@ class Newton:
         if self.linear_solver not in ("auto", *PRESETS):
             known = ", ".join(map(repr, ("auto", *PRESETS)))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
+
+    def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
+        """Preset of the linear solver for a system; arguments as of `choose`. Collective."""
+        if self.linear_solver != "auto":
+            return self.linear_solver
+        return choose(system.size, inertia, given)
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
@@ -103,6 +111,7 @@ class StepSolver:
     Args:
         problem: Equations; `problem.begin` comes before each `solve`.
         newton: Tolerances.
+        preset: Of the linear solver, to begin with.
         petsc_options: PETSc options of the SNES without prefix; they override the preset.
 
     Attributes:
@@ -111,15 +120,11 @@ class StepSolver:
     """
 
     def __init__(
-        self, problem: StepProblem, newton: Newton, petsc_options: Mapping[str, Any] | None = None
+        self, problem: StepProblem, newton: Newton, preset: str, petsc_options: Mapping[str, Any]
     ) -> None:
-        self.problem, self.newton, self._given = problem, newton, petsc_options or {}
-        system = problem.system
-        self._size = system.comm.allreduce(sum(b.num_owned for b in system.bodies))
-        self._chosen = newton.linear_solver
-        if newton.linear_solver == "auto":
-            self._chosen = choose(self._size, problem.integrator.inertia, self._given)
-        self._automatic = self._chosen != newton.linear_solver and self._chosen == "krylov"
+        self.problem, self.newton, self._given = problem, newton, petsc_options
+        self._chosen = preset
+        self._automatic = preset == "krylov" and newton.linear_solver == "auto"
         self._patience = 0
         self._options = self._solver_options(self._chosen)
         self._version, self._factor = -1, 0.0
@@ -131,9 +136,9 @@ class StepSolver:
         self.snes: Any = None
 
     def _solver_options(self, preset: str) -> SolverOptions:
-        limit = most_iterations(self._size) if self._automatic else None
-        comm = self.problem.system.comm
-        return SolverOptions(comm, preset, self.newton.condense, self._given, limit)
+        system = self.problem.system
+        limit = most_iterations(system.size) if self._automatic else None
+        return SolverOptions(system.comm, preset, self.problem.condense, self._given, limit)
 
     def _take(self, preset: str) -> None:
         """Solve with another preset from now on."""

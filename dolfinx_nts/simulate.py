@@ -123,10 +123,16 @@ class Stepper:
                 f"petsc_options={petsc_options!r}: pass a dict, e.g. {{'pc_type': 'lu'}}"
             )
         self.newton = newton or Newton()
+        given = petsc_options or {}
+        preset = self.newton.preset(system, integrator.inertia, given)
+        condense = self.newton.condense
         self.problem = StepProblem(
-            system, integrator, rtol=self.newton.rtol, condense=self.newton.condense
+            system,
+            integrator,
+            rtol=self.newton.rtol,
+            condense=preset == "krylov" if condense is None else condense,
         )
-        self.solver = StepSolver(self.problem, self.newton, petsc_options)
+        self.solver = StepSolver(self.problem, self.newton, preset, given)
         self.system = system
         self._started = False
         self._accept(_first_state(system, start))

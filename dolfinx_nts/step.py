@@ -101,7 +101,7 @@ class StepProblem:
 
     def __init__(self, system: System, integrator: Any, *, rtol: float, condense: bool) -> None:
         self.system, self.integrator = system, integrator
-        self._rtol, self._condense = rtol, condense
+        self._rtol, self.condense = rtol, condense
         self._numbers: tuple[Any, ...] | None = None
         self.contacts: list[ContactStep] = []
         self._petsc: list[Any] = []
@@ -228,7 +228,7 @@ class StepProblem:
         x0 = self._points(index, found, state.u)
         mass = slave.body.nodal_mass if self.integrator.inertia else slave.body.nodal_stiffness()
         scale, theta = mass[rows[:, 0]], self.integrator.theta
-        rule, condense = self.integrator.contact_gradient, self._condense
+        rule, condense = self.integrator.contact_gradient, self.condense
         if pair.rigid:
             path = self._path(index)
             return ObstacleStep(pair, found, rule, condense, x0 - path[0], scale, theta, path)

@@ -57,6 +57,9 @@ class System:
         contacts: Pairs of surfaces of these bodies.
         gravity: Acceleration [m/s^2]; its work counts as external work.
 
+    Attributes:
+        size: Coordinates of all bodies.
+
     Raises:
         TypeError: An item is no body or no contact.
         ValueError: No body, equal names, several communicators, `gravity` is not three numbers, a
@@ -88,6 +91,7 @@ class System:
                     f"bodies: {b.name!r} and {names[0]!r} live on different communicators; "
                     "make all meshes on one"
                 )
+        self.size = int(self.comm.allreduce(sum(b.num_owned for b in self.bodies)))
         for pair in self.contacts:
             for role, body in zip(("slave", "master"), pair.bodies, strict=False):
                 if not any(body is b for b in self.bodies):

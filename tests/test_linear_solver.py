@@ -42,6 +42,17 @@ def test_choice(size, inertia, given, preset):
     assert linear_solver.choose(size, inertia, given) == preset
 
 
+def test_condensed_by_default_where_krylov_is_used():
+    system = pressed_block(0.3)
+    for solver, condense, condensed in (
+        ("auto", None, True), ("krylov", None, True), ("direct", None, False),
+        ("auto", False, False), ("direct", True, True),
+    ):  # fmt: skip
+        stepper = stepper_of(system, linear_solver=solver, condense=condense)
+        assert stepper.problem.condense is condensed
+        stepper.close()
+
+
 def test_more_iterations_are_worth_it_on_larger_meshes():
     limits = [linear_solver.most_iterations(n) for n in (1, 1_000, 5_000, 50_000, 500_000)]
     assert limits[:2] == [60, 60] and limits == sorted(limits) and limits[-1] < 1_000
@@ -75,11 +86,11 @@ def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("condense", [False, True])
+@pytest.mark.parametrize("condense", [None, False])
 def test_the_choice_changes_no_solution(condense):
     tables = []
-    for solver in ("auto", "direct"):
-        newton = nts.Newton(linear_solver=solver, condense=condense)
+    for solver, condensed in (("auto", condense), ("direct", False)):
+        newton = nts.Newton(linear_solver=solver, condense=condensed)
         run = nts.simulate(
             pressed_block(0.3), nts.EnergyMomentum(), dt=1e-3, t_end=0.04, newton=newton
         )
