@@ -113,6 +113,11 @@ class SolverOptions:
         self._entered: dict[str, str] = {}
 
     @property
+    def most_iterations(self) -> int:
+        """Iterations of a linear solve, for five digits, that are not too many."""
+        return int(self._all["ksp_max_it"])
+
+    @property
     def split(self) -> bool:
         """Whether the preconditioner is a field split, which takes the blocks of a nest."""
         return bool(self._all["pc_type"] == "fieldsplit")

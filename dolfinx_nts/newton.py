@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -97,6 +98,11 @@ ACCURACY: Mapping[str, Newton] = {
 }
 #: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
 _SLOW = 0.05
+#: Of the tolerance, what an iteration aims at that could be the last: a step that only just
+#: converges would leave its whole tolerance to the ledger, where factors leave rounding.
+_AIM = 1e-3
+#: Range of the linear solver's tolerance that is worth it.
+_FINE, _COARSE = 1e-10, 1e-5
 #: Steps with MUMPS before "auto" tries Krylov's method again, at the price of about one of them.
 _PATIENCE = 10
 
@@ -308,7 +314,17 @@ class StepSolver:
             return reasons.CONVERGED_FNORM_RELATIVE
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
+        if self._chosen == "krylov" and not self.newton.reuse:
+            self._aim_at(_AIM / worst)
         return reasons.ITERATING
+
+    def _aim_at(self, rtol: float) -> None:
+        """Let the linear solver of Krylov's preset reach a tolerance, if that is worth it."""
+        if not self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
+            rtol = rtol if _FINE <= rtol <= _COARSE else _COARSE
+            digits = math.log(rtol) / math.log(_COARSE)
+            limit = self._options.most_iterations
+            self.snes.getKSP().setTolerances(rtol=rtol, max_it=int(limit * digits))
 
     # ---- failure
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:
