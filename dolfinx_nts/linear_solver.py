@@ -13,8 +13,10 @@ from dolfinx_nts.assembly import StepMatrix, model_problem
 
 _BODIES = "fieldsplit_bodies_"
 _CONTACT = "fieldsplit_contact_"
-#: Presets by `Newton.linear_solver`; a user's `petsc_options` override them one by one.
-PRESETS: Mapping[str, Mapping[str, Any]] = {
+#: What `Newton.linear_solver` may be.
+SOLVERS = ("auto", "direct", "krylov")
+#: Presets; a user's `petsc_options` override them one by one.
+PRESETS: dict[str, dict[str, Any]] = {
     # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses.
     "direct": {
         "snes_linesearch_type": "basic",
@@ -45,6 +47,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         _CONTACT + "pc_factor_mat_solver_type": "mumps",
     },
 }
+# Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
+# wall has more constraints than coordinates.
+PRESETS |= {"redundant": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
 #: Below so many coordinates both presets cost the same, most of it not the solver's.
 _FEW = 600
 
@@ -74,7 +79,6 @@ def most_iterations(size: int) -> int:
 #: In place of the preset's where the contact unknowns are condensed: without zeros on its diagonal
 #: their small block needs no pivoting, and starting MUMPS takes longer than all else.
 _CONDENSED: Mapping[str, Mapping[str, Any]] = {
-    "direct": {},
     "krylov": {_CONTACT + "pc_type": "redundant"},
 }
 #: PETSc's errors "no support", "unknown type", "missing factor": an option has a wrong value.
@@ -105,7 +109,7 @@ class SolverOptions:
         known = dict(PRESETS[preset])
         if limit is not None:
             known["ksp_max_it"] = limit
-        if condense and _CONDENSED[preset]:
+        if condense and preset in _CONDENSED:
             known = {k: v for k, v in known.items() if not k.startswith(_CONTACT + "pc_")}
             known |= _CONDENSED[preset]
         self._all = {**known, **given}

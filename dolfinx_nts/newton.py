@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from dolfinx_nts.assembly import StepMatrix
 from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.linear_solver import (
-    PRESETS,
+    SOLVERS,
     SolverOptions,
     choose,
     keep_bodies,
@@ -79,8 +79,8 @@ class Newton:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
         if self.max_retries < 0:
             raise ValueError(f"max_retries={self.max_retries!r}: must not be negative")
-        if self.linear_solver not in ("auto", *PRESETS):
-            known = ", ".join(map(repr, ("auto", *PRESETS)))
+        if self.linear_solver not in SOLVERS:
+            known = ", ".join(map(repr, SOLVERS))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
 
     def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
@@ -103,7 +103,7 @@ _SLOW = 0.05
 _AIM = 1e-3
 #: Range of the linear solver's tolerance that is worth it.
 _FINE, _COARSE = 1e-10, 1e-5
-#: Steps with MUMPS before "auto" tries Krylov's method again, at the price of about one of them.
+#: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 
 
@@ -129,10 +129,12 @@ class StepSolver:
         self, problem: StepProblem, newton: Newton, preset: str, petsc_options: Mapping[str, Any]
     ) -> None:
         self.problem, self.newton, self._given = problem, newton, petsc_options
-        self._chosen = preset
-        self._automatic = preset == "krylov" and newton.linear_solver == "auto"
-        self._patience = 0
-        self._options = self._solver_options(self._chosen)
+        # What takes over where a linear solve fails: in turn MUMPS, and MUMPS without what repeats.
+        self._presets = {"krylov": ("krylov",), "direct": ("direct", "redundant")}[preset]
+        if preset == "krylov" and newton.linear_solver == "auto":
+            self._presets += ("direct", "redundant")
+        self._chosen, self._patience = 0, 0
+        self._options = self._solver_options()
         self._version, self._factor = -1, 0.0
         self._matrices_due, self._solved = True, False
         self._bodies: list[Any] = []
@@ -141,15 +143,16 @@ class StepSolver:
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
 
-    def _solver_options(self, preset: str) -> SolverOptions:
-        system = self.problem.system
-        limit = most_iterations(system.size) if self._automatic else None
+    def _solver_options(self) -> SolverOptions:
+        system, preset = self.problem.system, self._presets[self._chosen]
+        limit = most_iterations(system.size) if len(self._presets) == 3 else None
         return SolverOptions(system.comm, preset, self.problem.condense, self._given, limit)
 
-    def _take(self, preset: str) -> None:
+    def _take(self, chosen: int) -> None:
         """Solve with another preset from now on."""
         self.destroy()
-        self._chosen, self._options = preset, self._solver_options(preset)
+        self._chosen = chosen
+        self._options = self._solver_options()
 
     def solve(self) -> Evaluation:
         """Solve the step that `problem.begin` fixed.
@@ -159,10 +162,10 @@ class StepSolver:
             ValueError: PETSc does not know an option or its value.
         """
         iterations = 0
-        if self._automatic and self._chosen == "direct":
+        if self._chosen > 0:
             self._patience -= 1
             if self._patience < 0:
-                self._take("krylov")
+                self._take(0)
         while True:
             last = self._attempt()
             iterations += last.iterations
@@ -186,13 +189,13 @@ class StepSolver:
                 # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
                 self._matrices_due = True
                 self.destroy()
-                if self._automatic and self._chosen == "krylov":
-                    return self._attempt_with_mumps(iterations)
+                if self._chosen < len(self._presets) - 1:
+                    return self._attempt_otherwise(iterations)
                 state = self.problem.state
                 raise StepFailedError(
                     f"step from t={state.time:.6g} with dt={self.problem.dt:.3g}: PETSc stopped "
-                    f"with error {error.ierr}; do two contacts, or a contact and a support, close "
-                    "the same gap?"
+                    f"with error {error.ierr}; two contacts, or a contact and a support, may hold "
+                    "the same nodes"
                 ) from error
             last = self._at(self.problem.x)
             iterations += self.snes.getIterationNumber()
@@ -201,8 +204,8 @@ class StepSolver:
                 return replace(last, iterations=iterations)
             reason = self.snes.getConvergedReason()
             unsolved = reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
-            if unsolved and self._automatic and self._chosen == "krylov":
-                return self._attempt_with_mumps(iterations)
+            if unsolved and self._chosen < len(self._presets) - 1:
+                return self._attempt_otherwise(iterations)
         self._matrices_due = True
         message = self._diagnosis(last, reason, iterations)
         if unsolved:
@@ -210,11 +213,12 @@ class StepSolver:
             self.destroy()
         raise StepFailedError(message)
 
-    def _attempt_with_mumps(self, iterations: int) -> Evaluation:
-        """Solve the step after Krylov's method took more iterations than it is worth."""
-        logger.info("t=%.6g: MUMPS solves the next %d steps", self.problem.state.time, _PATIENCE)
+    def _attempt_otherwise(self, iterations: int) -> Evaluation:
+        """Solve the step with the next preset, after the linear solver failed or took too long."""
         self._matrices_due, self._patience = True, _PATIENCE
-        self._take("direct")
+        self._take(self._chosen + 1)
+        name, time = self._presets[self._chosen], self.problem.state.time
+        logger.info("t=%.6g: linear solver %r for the next %d steps", time, name, _PATIENCE)
         self.problem.guess(flight=True)
         last = self._attempt()
         return replace(last, iterations=iterations + last.iterations)
@@ -314,7 +318,7 @@ class StepSolver:
             return reasons.CONVERGED_FNORM_RELATIVE
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
-        if self._chosen == "krylov" and not self.newton.reuse:
+        if self._presets[self._chosen] == "krylov" and not self.newton.reuse:
             self._aim_at(_AIM / worst)
         return reasons.ITERATING
 
