@@ -105,6 +105,7 @@ class StepSolver:
             problem.system.comm, newton.linear_solver, newton.condense, petsc_options or {}
         )
         self._version, self._factor = -1, 0.0
+        self._awake: tuple[int, ...] = ()
         self._matrices_due, self._solved = True, False
         self._bodies: list[Any] = []
         self._assembled: Evaluation | None = None
@@ -169,8 +170,9 @@ class StepSolver:
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
         # Equal steps differ by rounding.
-        self._matrices_due |= not self.newton.reuse or changed > 1e-6
-        self._factor = self.problem.factor
+        others = self._awake != self.problem.awake
+        self._matrices_due |= not self.newton.reuse or changed > 1e-6 or others
+        self._factor, self._awake = self.problem.factor, self.problem.awake
         if self._version != self.problem.version:
             self.destroy()
             self._version = self.problem.version
@@ -211,7 +213,7 @@ class StepSolver:
         self.snes.setTolerances(max_it=self.newton.max_iterations)
         contact = self.matrix if self.problem.elements else None
         self._solved = False
-        self._options.configure(self.snes, contact, len(self.problem.system.bodies))
+        self._options.configure(self.snes, contact, len(self._bodies))
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:
