@@ -105,9 +105,8 @@ class StepSolver:
             problem.system.comm, newton.linear_solver, newton.condense, petsc_options or {}
         )
         self._version, self._factor = -1, 0.0
-        self._awake: tuple[int, ...] = ()
         self._matrices_due, self._solved = True, False
-        self._bodies: list[Any] = []
+        self._bodies: dict[int, Any] = {}
         self._assembled: Evaluation | None = None
         self._last: Evaluation | None = None
         self.matrix: StepMatrix | None = None
@@ -170,9 +169,8 @@ class StepSolver:
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
         # Equal steps differ by rounding.
-        others = self._awake != self.problem.awake
-        self._matrices_due |= not self.newton.reuse or changed > 1e-6 or others
-        self._factor, self._awake = self.problem.factor, self.problem.awake
+        self._matrices_due |= not self.newton.reuse or changed > 1e-6
+        self._factor = self.problem.factor
         if self._version != self.problem.version:
             self.destroy()
             self._version = self.problem.version
@@ -184,20 +182,23 @@ class StepSolver:
 
         The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
         """
-        fresh = self._matrices_due
+        fresh, new, awake = self._matrices_due, self.matrix is None, self.problem.awake
         if fresh:
-            self._bodies = self.problem.body_tangents(e)
+            self._bodies = dict(zip(awake, self.problem.body_tangents(e), strict=True))
             self._matrices_due = not self.newton.reuse
+        for k in awake:
+            if k not in self._bodies:
+                self._bodies[k] = self.problem.body_tangent(k, e.bodies[k].u1)
         if self.matrix is None:
             self.matrix = StepMatrix(
                 self.problem.layout,
-                self._bodies,
+                [self._bodies[k] for k in awake],
                 self.problem.elements,
                 split=self._options.split,
             )
         elif self._solved and self.newton.reuse and self.problem.elements:
             keep_bodies(self.snes, not fresh)
-        if fresh or self.problem.elements:
+        if fresh or new or self.problem.elements:
             tangents = [c.tangent for c in e.contacts] if self.problem.elements else []
             self.matrix.assemble(tangents, fresh=fresh)
         self._assembled = e
@@ -213,7 +214,7 @@ class StepSolver:
         self.snes.setTolerances(max_it=self.newton.max_iterations)
         contact = self.matrix if self.problem.elements else None
         self._solved = False
-        self._options.configure(self.snes, contact, len(self._bodies))
+        self._options.configure(self.snes, contact, len(self.problem.awake))
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:

@@ -110,6 +110,7 @@ class StepProblem:
         self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
         self._asleep: dict[int, BodyTerms] = {}
         self.awake: tuple[int, ...] = ()
+        self._searched: dict[int, tuple[list[FloatArray], ContactStep]] = {}
         self._numbers: tuple[Any, ...] | None = None
         self.contacts: list[ContactStep] = []
         self._petsc: list[Any] = []
@@ -152,7 +153,7 @@ class StepProblem:
         if motion is not None:
             self._motion = np.maximum(self._motion, motion)
         if search:
-            self._found = [self._contact_step(k) for k in range(len(system.contacts))]
+            self._found = [self._search(k) for k in range(len(system.contacts))]
             self._drop_doubles()
             self._awake = [self._may_touch(k, c) for k, c in enumerate(self._found)]
         self._asleep = self._find_asleep(np.maximum(self._motion, speed) == 0.0)
@@ -180,7 +181,7 @@ class StepProblem:
     def _force_rounding(self, k: int) -> float:
         """Of the forces on a body at rest [N]; at most the part of `_rounding`, in any step."""
         if not self._diagonal[k]:
-            self._note_diagonal(k, self.system.bodies[k].tangent(self.state.u[k]))
+            self.body_tangent(k, self.state.u[k])
         return float(self._rounding[k] / max(self.factor, self._diagonal_factor[k]))
 
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
@@ -258,10 +259,19 @@ class StepProblem:
             reach += float(np.linalg.norm(np.diff(self._path(index), axis=0)))
         return reach
 
-    def _contact_step(self, index: int) -> ContactStep:
+    def _search(self, index: int) -> ContactStep:
+        """Candidates of a contact, found anew unless all its bodies slept and nothing moves."""
+        u = [self.state.u[b] for b in self.system.contact_bodies[index]]
+        known, reach = self._searched.pop(index, None), self._reach(index, self._motion)
+        if reach > 0.0:
+            return self._contact_step(index, u, reach)
+        if known is None or any(a is not b for a, b in zip(known[0], u, strict=True)):
+            known = u, self._contact_step(index, u, reach)
+        self._searched[index] = known
+        return known[1]
+
+    def _contact_step(self, index: int, u: list[FloatArray], reach: float) -> ContactStep:
         pair, state = self.system.contacts[index], self.state
-        u = [state.u[b] for b in self.system.contact_bodies[index]]
-        reach = self._reach(index, self._motion)
         ahead = [0.5 * (self.first[b] - state.u[b]) for b in self.system.contact_bodies[index]]
         found = pair.find(u, state.facets[index], reach, state.time, ahead)
         slave = pair.slave
@@ -487,20 +497,20 @@ class StepProblem:
 
     def body_tangents(self, e: Evaluation) -> list[Any]:
         """PETSc matrices of the bodies that are awake at an iterate, without contact."""
-        tangents = [self.system.bodies[k].tangent(e.bodies[k].u1) for k in self.awake]
-        for k, a in zip(self.awake, tangents, strict=True):
-            if self.stabilization:
-                held = a.createVecLeft()
-                held.array_w[:] = self._stabilization(self.system.bodies[k])
-                a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
-                held.destroy()
-            self._note_diagonal(k, a)
-        return tangents
+        return [self.body_tangent(k, e.bodies[k].u1) for k in self.awake]
 
-    def _note_diagonal(self, k: int, tangent: Any) -> None:
-        diagonal = tangent.getDiagonal()
+    def body_tangent(self, k: int, u1: FloatArray) -> Any:
+        """PETSc matrix of a body at a displacement, without contact."""
+        a = self.system.bodies[k].tangent(u1)
+        if self.stabilization:
+            held = a.createVecLeft()
+            held.array_w[:] = self._stabilization(self.system.bodies[k])
+            a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
+            held.destroy()
+        diagonal = a.getDiagonal()
         self._diagonal[k], self._diagonal_factor[k] = diagonal.norm(), self.factor
         diagonal.destroy()
+        return a
 
     # ---- convergence
     @property
