@@ -306,7 +306,8 @@ def simulate(
             1e-8 and "fast" to about 1e-5 of the energy, with matrices kept over many steps.
         sleep: Leave a body out of a step while its velocity is exactly zero, its forces balance to
             rounding and no contact may reach it; it wakes in the first step in which that ends. The
-            solution is the same; a body that has moved hardly ever comes to rest exactly.
+            solution is the same; a body that has moved hardly ever comes to rest exactly. What a
+            caller changes in a material during the run wakes nothing.
 
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then.

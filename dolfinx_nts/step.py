@@ -179,7 +179,10 @@ class StepProblem:
         return set().union(*itertools.compress(self.system.contact_bodies, on))
 
     def _force_rounding(self, k: int) -> float:
-        """Of the forces on a body at rest [N]; at most the part of `_rounding`, in any step."""
+        """Norm of the forces on a body at rest [N] that is rounding, as in `ratios`.
+
+        A diagonal of another step never allows more: it grows with the factor, but less than that.
+        """
         if not self._diagonal[k]:
             self.body_tangent(k, self.state.u[k])
         return float(self._rounding[k] / max(self.factor, self._diagonal_factor[k]))

@@ -5,7 +5,6 @@ import pytest
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
-from test_friction import difference
 
 import dolfinx_nts as nts
 
@@ -85,10 +84,12 @@ def assert_same(a, b, dt=DT):
         assert np.array_equal(one[name], two[name]), name
     near = np.isfinite(two["min_gap"])
     assert np.array_equal(near, np.isfinite(one["min_gap"]))
-    for table in (one, two):
-        table["min_gap"][~near] = 0.0
-    assert np.abs(one["min_gap"] - two["min_gap"]).max() <= 1e-12 * top
-    assert difference(one, two) < 1e-12
+    assert np.abs(one["min_gap"][near] - two["min_gap"][near]).max(initial=0.0) <= 1e-12 * top
+    for name in ("kinetic", "potential", "external_work", "friction_dissipation",
+                 "contact_defect", "ledger_residual"):  # fmt: skip
+        assert np.abs(one[name] - two[name]).max() <= 1e-12 * two["energy"].max(), name
+    for name in ("linear_momentum", "angular_momentum"):
+        assert np.abs(one[name] - two[name]).max() <= 1e-12 * np.abs(two[name]).max(), name
 
 
 # ---- a row of cubes
@@ -126,10 +127,10 @@ def test_units_change_nothing(metre):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("reuse", [False, True])
-def test_a_step_that_fails_is_halved(reuse):
+@pytest.mark.parametrize(("reuse", "iterations"), [(False, 3), (True, 5)])
+def test_a_step_that_fails_is_halved(reuse, iterations):
     """The impact takes more iterations than these."""
-    a, b, awake = both(row, 5, max_iterations=3, reuse=reuse)
+    a, b, awake = both(row, 5, max_iterations=iterations, reuse=reuse)
     assert a.solution.retries == b.solution.retries > 0
     assert "ab" in awake
     assert_same(a, b)
@@ -144,7 +145,9 @@ def test_what_failed_is_told_beside_sleepers():
 def count(body, names, calls):
     """Note the calls of a body's methods."""
     for name in names:
-        def counted(*args, name=name, method=getattr(body, name)):
+        method = getattr(body, name)
+
+        def counted(*args, name=name, method=method):
             calls.append(name)
             return method(*args)
 
@@ -161,7 +164,7 @@ def test_a_sleeper_is_neither_evaluated_nor_assembled_nor_searched(monkeypatch):
     monkeypatch.setattr(
         nts.ContactPair, "find", lambda pair, *args: searched.append(pair) or find(pair, *args)
     )
-    for k in range(12):
+    for _ in range(12):
         s.advance(DT)
         # Whether it rests is asked once.
         assert calls == ["internal", "tangent", "inertia", "potential"]
@@ -182,7 +185,7 @@ def test_a_strained_body_between_its_supports_sleeps():
                nts.Dirichlet(lambda x: x[0] > 4 - 1e-9, value=(-0.1, 0.0, 0.02))]  # fmt: skip
         return nts.System([cube((0, 0, 0), "a", velocity=(1, 0, 0)), cube((3, 0, 0), "b", bcs=bcs)])
 
-    tables, system = [], scene()
+    steppers, system = [], scene()
     settled = nts.equilibrium(system)
     strained = settled.balance["energy"][-1]
     for sleep in (True, False):
@@ -191,11 +194,12 @@ def test_a_strained_body_between_its_supports_sleeps():
             s.advance(DT)
         assert s.problem.awake == ((0,) if sleep else (0, 1))
         assert np.array_equal(s.state.u[1], settled.state.u[1]) or not sleep
-        tables.append(s.solution.balance)
+        steppers.append(s)
         s.close()
     assert strained > 100.0
-    assert tables[0]["potential"][-1] == pytest.approx(strained, rel=1e-12)
-    assert difference(*tables) < 1e-12
+    for s in steppers:
+        assert s.solution.balance["potential"][-1] == pytest.approx(strained, rel=1e-12)
+    assert_same(*steppers)
 
 
 def test_where_all_sleep_one_keeps_watch():
@@ -235,9 +239,7 @@ MOVERS = {
     "later support": {
         "bcs": [nts.Dirichlet(right, value=lambda t: (0, 0, max(t - BEGIN, 0.0) ** 2))]
     },
-    "extra form": {
-        "extra_form": lambda u, v, w: ufl.inner(ufl.as_vector((5.0, 0, 0)), w) * ufl.dx
-    },
+    "extra form": {"extra_form": lambda u, v, w: ufl.inner(ufl.as_vector((5.0, 0, 0)), w) * ufl.dx},
 }
 
 
@@ -281,7 +283,9 @@ def test_an_obstacle_wakes_what_it_reaches(integrator):
         system = beside()()
         motion = lambda t: (-0.5 * max(t - BEGIN, 0.0), 0, 0)  # noqa: E731
         wall = nts.Plane((4, 0, 0), (-1, 0, 0), motion=motion)
-        return nts.System(system.bodies, contacts=[nts.ContactPair(face(system.bodies[1], 1), wall)])
+        return nts.System(
+            system.bodies, contacts=[nts.ContactPair(face(system.bodies[1], 1), wall)]
+        )
 
     a, b, awake = both(scene, STEPS, integrator=integrator)
     assert awake == ["a"] * 3 + ["ab"] * 3
