@@ -5,6 +5,7 @@ import pytest
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from test_single_mass import PointMass
 
 import dolfinx_nts as nts
 
@@ -214,6 +215,19 @@ def test_where_all_sleep_one_keeps_watch():
         assert not s.solution.balance["newton_iterations"].any()
         assert not any(a.any() for a in (*s.state.u, *s.state.v))
         s.close()
+
+
+@pytest.mark.mpi
+def test_a_body_of_the_users_own_sleeps():
+    def scene():
+        flying = cube((0, 0, 0), "a", velocity=(1, 0, 0))
+        return nts.System([PointMass(COMM, 2.0, (5, 0, 0), (0, 0, 0), name="m"), flying])
+
+    a, b, awake = both(scene, 3)
+    assert awake == ["a"] * 3
+    assert_same(a, b)
+    system = nts.System(scene().bodies, gravity=(0, 0, -9.81))
+    assert run(system, 2, sleep=True)[1] == ["ma"] * 2
 
 
 # ---- what wakes
