@@ -235,7 +235,8 @@ class StepMatrix:
         own = layout if len(fields) == layout.counts.shape[1] else Layout(layout.comm, counts)
         result = []
         for element in self._elements:
-            columns, numbers = [np.empty(0, np.int64)], [np.empty((element.numbers[0].shape[0], 0))]
+            count = len(element.numbers[0]) if element.numbers else 0
+            columns, numbers = [np.empty(0, np.int64)], [np.empty((count, 0))]
             for field, where, number in zip(*element[:3], strict=True):
                 if field in fields:
                     columns.append(np.arange(where.start, where.stop))

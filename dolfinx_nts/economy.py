@@ -43,11 +43,13 @@ _ORDERING = {"mat_mumps_icntl_7": 4}
 #: Steps that are not timed: the first ones set up what later ones keep.
 _WARM = 2
 _SPEED, _SPIN = 2.0, 20.0
-#: Gap between the cubes in facets, and speed of the first one towards the second [m/s].
-PLACES: Mapping[str, tuple[float, float]] = {
-    "far": (10.0, 0.0),
-    "near": (0.25, 0.0),
-    "touching": (0.0, _SPEED),
+#: Gap between the cubes in facets, speed of the first one towards the second [m/s], and whether
+#: the second one spins, too.
+PLACES: Mapping[str, tuple[float, float, bool]] = {
+    "far": (10.0, 0.0, True),
+    "near": (0.25, 0.0, True),
+    "touching": (0.0, _SPEED, True),
+    "one at rest": (10.0, 0.0, False),
 }
 
 
@@ -61,6 +63,7 @@ class Feature:
         place: Of the cubes, one of `PLACES`.
         contact: Whether a contact is declared.
         friction: Coulomb's coefficient [-].
+        sleep: Whether the second cube may sleep.
         ledger: Whether energies, momenta and works are computed.
         every: Cadence of a `Fields` writer, 0 for none.
         progress: Whether there is a progress line.
@@ -71,6 +74,7 @@ class Feature:
     place: str = "far"
     contact: bool = False
     friction: float = 0.0
+    sleep: bool = False
     ledger: bool = True
     every: int = 0
     progress: bool = False
@@ -94,6 +98,10 @@ FEATURES = (
     ),
     Feature(
         name="friction, active", against="active", contact=True, place="touching", friction=0.3
+    ),
+    Feature(name="one at rest", against="declared, far", contact=True, place="one at rest"),
+    Feature(
+        name="one asleep", against="one at rest", contact=True, place="one at rest", sleep=True
     ),
     Feature(name="output every 10 steps", against=_NONE, every=10),
     Feature(name="output every step", against=_NONE, every=1),
@@ -227,7 +235,7 @@ class Economy:
         self.comm, self.cells, self.dt = comm, cells, dt
         self._bodies = {place: self._cubes(*numbers) for place, numbers in PLACES.items()}
 
-    def _cubes(self, gap: float, speed: float) -> tuple[list[nts.Continuum], Any]:
+    def _cubes(self, gap: float, speed: float, both: bool) -> tuple[list[nts.Continuum], Any]:
         """Two cubes and the surfaces between which there may be contact."""
         rubber, n = nts.NeoHookean(young=1e6, poisson=0.3), self.cells
         start = 1.0 + gap / n
@@ -235,9 +243,12 @@ class Economy:
         left, right = (
             nts.Continuum(
                 create_box(self.comm, [[x, 0, 0], [x + 1, 1, 1]], [count] * 3, **box),
-                rubber, density=1e3, velocity=_spinning(v), name=name,
+                rubber, density=1e3, velocity=velocity, name=name,
             )
-            for x, count, v, name in ((0.0, n, speed, "left"), (start, n + 1, 0.0, "right"))
+            for x, count, velocity, name in (
+                (0.0, n, _spinning(speed), "left"),
+                (start, n + 1, _spinning(0.0) if both else (0.0, 0.0, 0.0), "right"),
+            )
         )  # fmt: skip
         slave = left.surface(lambda x: x[0] > 1 - 1e-9)
         return [left, right], (slave, right.surface(lambda x: x[0] < start + 1e-9))
@@ -277,7 +288,7 @@ class Economy:
             run = nts.simulate(
                 self.system(feature), nts.EnergyMomentum(), dt=self.dt, t_end=count * self.dt,
                 newton=nts.Newton(rtol=RTOL), petsc_options=_ORDERING, output=[*writers, watch],
-                progress=feature.progress,
+                progress=feature.progress, sleep=feature.sleep,
             )  # fmt: skip
         if run.status != "completed":
             raise RuntimeError(f"{feature.name}: {run.status}")

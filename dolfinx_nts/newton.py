@@ -137,7 +137,7 @@ class StepSolver:
         self._options = self._solver_options()
         self._version, self._factor = -1, 0.0
         self._matrices_due, self._solved = True, False
-        self._bodies: list[Any] = []
+        self._bodies: dict[int, Any] = {}
         self._assembled: Evaluation | None = None
         self._last: Evaluation | None = None
         self.matrix: StepMatrix | None = None
@@ -243,20 +243,23 @@ class StepSolver:
 
         The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
         """
-        fresh = self._matrices_due
+        fresh, new, awake = self._matrices_due, self.matrix is None, self.problem.awake
         if fresh:
-            self._bodies = self.problem.body_tangents(e)
+            self._bodies = dict(zip(awake, self.problem.body_tangents(e), strict=True))
             self._matrices_due = not self.newton.reuse
+        for k in awake:
+            if k not in self._bodies:
+                self._bodies[k] = self.problem.body_tangent(k, e.bodies[k].u1)
         if self.matrix is None:
             self.matrix = StepMatrix(
                 self.problem.layout,
-                self._bodies,
+                [self._bodies[k] for k in awake],
                 self.problem.elements,
                 split=self._options.split,
             )
         elif self._solved and self.newton.reuse and self.problem.elements:
             keep_bodies(self.snes, not fresh)
-        if fresh or self.problem.elements:
+        if fresh or new or self.problem.elements:
             tangents = [c.tangent for c in e.contacts] if self.problem.elements else []
             self.matrix.assemble(tangents, fresh=fresh)
         self._assembled = e
@@ -272,7 +275,7 @@ class StepSolver:
         self.snes.setTolerances(max_it=self.newton.max_iterations)
         contact = self.matrix if self.problem.elements else None
         self._solved = False
-        self._options.configure(self.snes, contact, len(self.problem.system.bodies))
+        self._options.configure(self.snes, contact, len(self.problem.awake))
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:
@@ -312,7 +315,7 @@ class StepSolver:
             return reasons.DIVERGED_FNORM_NAN
         unchanged = self.problem.system.comm.allreduce(self._rests, op=MPI.LAND)
         self._solved |= iteration > 0
-        self._matrices_due |= unchanged and worst > _SLOW * self._before
+        self._matrices_due |= unchanged and worst > max(1.0, _SLOW * self._before)
         self._before = worst
         if worst <= 1.0:
             return reasons.CONVERGED_FNORM_RELATIVE

@@ -22,6 +22,7 @@ from dolfinx_nts.assembly import ElementBlocks, Layout
 from dolfinx_nts.contact import Candidates
 from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.obstacle_contact import ObstacleStep
+from dolfinx_nts.sleep import Sleepers
 from dolfinx_nts.system import State, System
 
 FloatArray = npt.NDArray[np.float64]
@@ -87,8 +88,10 @@ class StepProblem:
         rtol: Residual of a block that counts as solved, relative to the forces or motions of the
             step.
         condense: Eliminate (d, f) and their multipliers pair by pair.
+        sleep: Leave out bodies that nothing moves.
 
     Attributes:
+        awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
         contacts: Candidates of each contact that have unknowns in this step.
         idle: The others, which the step's motion does not bring to their facets.
         layout: Fields of the unknowns.
@@ -99,15 +102,22 @@ class StepProblem:
         stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
     """
 
-    def __init__(self, system: System, integrator: Any, *, rtol: float, condense: bool) -> None:
+    def __init__(
+        self, system: System, integrator: Any, *, rtol: float, condense: bool, sleep: bool = False
+    ) -> None:
         self.system, self.integrator = system, integrator
         self._rtol, self.condense = rtol, condense
+        self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
+        self._asleep: dict[int, BodyTerms] = {}
+        self.awake: tuple[int, ...] = ()
+        self._searched: dict[int, tuple[list[FloatArray], ContactStep]] = {}
         self._numbers: tuple[Any, ...] | None = None
         self.contacts: list[ContactStep] = []
         self._petsc: list[Any] = []
         self.version = 0
         self.stabilization = 0.0
-        self._diagonal = np.zeros(len(system.bodies))
+        self._diagonal, self._diagonal_factor = np.zeros((2, len(system.bodies)))
+        self._steps, self._diagonal_step = 0, np.zeros(len(system.bodies), dtype=int)
 
     # ---- set-up of a step
     def begin(
@@ -123,30 +133,61 @@ class StepProblem:
         """
         system = self.system
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
+        self._steps += 1
         ramp = self.integrator.ramp(state.time + self.integrator.theta * dt)
         self._gravity = ramp * system.gravity
         for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
             body.begin_step(self.integrator, u, v, state.time, dt)
-        # In statics v only predicts the first guess.
-        momentum = dt if self.integrator.inertia else 0.0
-        self._inertia = [
-            self._inertial(b, momentum * v) for b, v in zip(system.bodies, state.v, strict=True)
-        ]
         self.first = [u + dt * v for u, v in zip(state.u, state.v, strict=True)]
         for body, u1 in zip(system.bodies, self.first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
         local = [
-            [np.abs(u1 - u).max(initial=0.0), np.abs(b.reference + u1).max(initial=0.0)]
-            for b, u1, u in zip(system.bodies, self.first, state.u, strict=True)
+            [np.abs(a).max(initial=0.0) for a in (u1 - u, b.reference + u1, v)]
+            for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
         ]
-        self._motion, self._extent = _global_max(system.comm, np.array(local)).T
+        self._motion, self._extent, speed = _global_max(system.comm, np.array(local)).T
+        # In statics v only predicts the first guess.
+        momentum = dt if self.integrator.inertia else 0.0
+        self._inertia = [
+            self._inertial(b, momentum * v) if top > 0.0 else np.zeros_like(v)
+            for b, v, top in zip(system.bodies, state.v, speed, strict=True)
+        ]
         if motion is not None:
             self._motion = np.maximum(self._motion, motion)
         if search:
-            self._found = [self._contact_step(k) for k in range(len(system.contacts))]
+            self._found = [self._search(k) for k in range(len(system.contacts))]
             self._drop_doubles()
             self._awake = [self._may_touch(k, c) for k, c in enumerate(self._found)]
+        self._asleep = self._find_asleep(np.maximum(self._motion, speed) == 0.0)
         self._choose()
+
+    def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
+        """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
+        if self._sleepers is None:
+            return {}
+        chosen = sorted(set(np.flatnonzero(rest).tolist()) - self._touched())
+        u, f = self.state.u, self.factor
+        found = self._sleepers.find(chosen, u, self._gravity, self._force_rounding)
+        none = {k: np.zeros_like(u[k]) for k in found}
+        return {
+            k: BodyTerms(u[k], none[k], f * a, f * b, none[k], f * (a - b))
+            for k, (a, b) in found.items()
+        }
+
+    def _touched(self) -> set[int]:
+        """Bodies of contacts that have unknowns, the same on all ranks."""
+        local = np.array([float(awake.any()) for awake in self._awake])
+        on = _global_max(self.system.comm, local) > 0.0
+        return set().union(*itertools.compress(self.system.contact_bodies, on))
+
+    def _force_rounding(self, k: int) -> float:
+        """Norm of the forces on a body at rest [N] that is rounding, as in `ratios`.
+
+        A diagonal of another step never allows more: it grows with the factor, but less than that.
+        """
+        if not self._diagonal[k]:
+            self.body_tangent(k, self.state.u[k])
+        return float(self._rounding[k] / max(self.factor, self._diagonal_factor[k]))
 
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
@@ -178,6 +219,8 @@ class StepProblem:
             return replace(e, idle_gaps=gaps)
         for awake, late in zip(self._awake, closed, strict=True):
             awake[np.flatnonzero(~awake)[late]] = True
+        for k in self._asleep.keys() & self._touched():
+            del self._asleep[k]
         self._choose()
         return None
 
@@ -187,7 +230,11 @@ class StepProblem:
         self.contacts, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
         system, watching = self.system, any(c.num_pairs for c in self.idle)
         self._watching = system.comm.allreduce(watching, op=MPI.LOR)
-        numbers = tuple(a for c in self.contacts for a in c.points())
+        if len(self._asleep) == len(system.bodies):
+            # SNES needs an unknown; at rest it takes no iteration.
+            del self._asleep[0]
+        self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
+        numbers = (np.array(self.awake), *(a for c in self.contacts for a in c.points()))
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
             self._lay_out()
             self._numbers = numbers
@@ -217,10 +264,19 @@ class StepProblem:
             reach += float(np.linalg.norm(np.diff(self._path(index), axis=0)))
         return reach
 
-    def _contact_step(self, index: int) -> ContactStep:
+    def _search(self, index: int) -> ContactStep:
+        """Candidates of a contact, found anew unless all its bodies slept and nothing moves."""
+        u = [self.state.u[b] for b in self.system.contact_bodies[index]]
+        known, reach = self._searched.pop(index, None), self._reach(index, self._motion)
+        if reach > 0.0:
+            return self._contact_step(index, u, reach)
+        if known is None or any(a is not b for a, b in zip(known[0], u, strict=True)):
+            known = u, self._contact_step(index, u, reach)
+        self._searched[index] = known
+        return known[1]
+
+    def _contact_step(self, index: int, u: list[FloatArray], reach: float) -> ContactStep:
         pair, state = self.system.contacts[index], self.state
-        u = [state.u[b] for b in self.system.contact_bodies[index]]
-        reach = self._reach(index, self._motion)
         ahead = [0.5 * (self.first[b] - state.u[b]) for b in self.system.contact_bodies[index]]
         found = pair.find(u, state.facets[index], reach, state.time, ahead)
         slave = pair.slave
@@ -269,8 +325,9 @@ class StepProblem:
     def _lay_out(self) -> None:
         """Layout, vectors and scatter; kept from step to step while no rank's candidates change."""
         self.destroy()
-        system, contacts, num_bodies = self.system, self.contacts, len(self.system.bodies)
-        sizes = [b.num_owned for b in system.bodies]
+        system, contacts, num_bodies = self.system, self.contacts, len(self.awake)
+        self._body_field = {k: f for f, k in enumerate(self.awake)}
+        sizes = [system.bodies[k].num_owned for k in self.awake]
         multipliers = sum(c.num_pairs * c.num_multipliers for c in contacts)
         self._fields: dict[str, int] = {}
         if system.comm.allreduce(multipliers) > 0:
@@ -283,8 +340,11 @@ class StepProblem:
         self.elements = self._element_blocks() if self._fields else []
         index = [np.empty(0, np.int64)]
         for c, bodies in zip(contacts, system.contact_bodies, strict=True):
-            parts = [self.layout.to_system(b, p) for b, p in zip(bodies, c.points(), strict=True)]
-            index.append(np.concatenate(parts, axis=1).ravel())
+            if c.num_pairs:
+                fields = [self._body_field[b] for b in bodies]
+                points = zip(fields, c.points(), strict=True)
+                parts = [self.layout.to_system(f, p) for f, p in points]
+                index.append(np.concatenate(parts, axis=1).ravel())
         needed = np.concatenate(index).astype(PETSc.IntType)
         self.x = PETSc.Vec().createMPI((self.layout.num_owned, None), comm=system.comm)
         self._forces = self.x.duplicate()
@@ -300,6 +360,9 @@ class StepProblem:
         blocks = []
         offset = {name: self.layout.start(f) for name, f in self._fields.items()}
         for c, bodies in zip(self.contacts, self.system.contact_bodies, strict=True):
+            if not all(b in self._body_field for b in bodies):
+                blocks.append(ElementBlocks((), (), (), np.empty((0, 0), dtype=bool)))
+                continue
             own = {"augmented": c.num_augmented, "multipliers": c.num_multipliers}
             numbers = list(c.dofs())
             widths = [n.shape[1] for n in numbers] + [own[name] for name in self._fields]
@@ -312,7 +375,7 @@ class StepProblem:
             pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
             pattern[stops[-2] :, stops[-2] :] = c.multiplier_pattern
             columns = tuple(slice(int(b - w), int(b)) for w, b in zip(widths, stops, strict=True))
-            fields = (*bodies, *self._fields.values())
+            fields = (*(self._body_field[b] for b in bodies), *self._fields.values())
             blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
         return blocks
 
@@ -326,10 +389,11 @@ class StepProblem:
         """
         with self.x as x:
             x[:] = 0.0
-            for k, (body, u1) in enumerate(zip(self.system.bodies, self.first, strict=True)):
+            for f, k in enumerate(self.awake):
+                fixed, u1 = self.system.bodies[k].fixed, self.first[k]
                 start = u1 if flight else self.state.u[k].copy()
-                start[body.fixed] = u1[body.fixed]
-                x[self.layout.owned(k)] = start
+                start[fixed] = u1[fixed]
+                x[self.layout.owned(f)] = start
         if self._fields and (flight or not self.integrator.inertia):
             guess = [
                 self._forces_as_before(k, p).ravel() for k, p in enumerate(self._positions(self.x))
@@ -399,19 +463,19 @@ class StepProblem:
         )
         none = np.zeros(len(values))
         force = self._contact_forces(contacts) if self._fields else none
-        bodies = []
-        for k, (body, u0) in enumerate(zip(self.system.bodies, self.state.u, strict=True)):
-            here = self.layout.owned(k)
+        bodies = dict(self._asleep)
+        for f, k in enumerate(self.awake):
+            body, u0, here = self.system.bodies[k], self.state.u[k], self.layout.owned(f)
             u1 = values[here]
             internal = self.factor * body.internal(u1)
             external = self.factor * body.external(u1, self._gravity)
             du, contact = u1 - u0, force[here]
             residual = self._inertial(body, du) - self._inertia[k] + internal - external + contact
-            bodies.append(BodyTerms(u1, du, internal, external, contact, residual))
+            bodies[k] = BodyTerms(u1, du, internal, external, contact, residual)
         forces = tuple(
             c.scale[:, None] * m for c, m in zip(self.contacts, multipliers, strict=True)
         )
-        return Evaluation(values, tuple(bodies), contacts, forces)
+        return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), contacts, forces)
 
     def _contact_forces(self, contacts: tuple[Contribution, ...]) -> FloatArray:
         """G^T lambda of all contacts in this rank's coordinates [kg m]."""
@@ -429,27 +493,33 @@ class StepProblem:
     def residual(self, e: Evaluation) -> FloatArray:
         """This rank's part of the residual, zero at prescribed coordinates."""
         out = np.zeros(self.layout.num_owned)
-        for k, (body, terms) in enumerate(zip(self.system.bodies, e.bodies, strict=True)):
-            out[self.layout.owned(k)] = _free(body, terms.residual)
+        for f, k in enumerate(self.awake):
+            out[self.layout.owned(f)] = _free(self.system.bodies[k], e.bodies[k].residual)
         for name, f in self._fields.items():
             rows = [c.rows(k, name).ravel() for c, k in zip(self.contacts, e.contacts, strict=True)]
             out[self.layout.owned(f)] = np.concatenate(rows)
         return out
 
     def body_tangents(self, e: Evaluation) -> list[Any]:
-        """PETSc matrices of the bodies at an iterate, without contact."""
-        tangents = [b.tangent(t.u1) for b, t in zip(self.system.bodies, e.bodies, strict=True)]
+        """PETSc matrices of the bodies that are awake at an iterate, without contact."""
+        return [self.body_tangent(k, e.bodies[k].u1) for k in self.awake]
+
+    def body_tangent(self, k: int, u1: FloatArray) -> Any:
+        """PETSc matrix of a body at a displacement, without contact."""
+        a = self.system.bodies[k].tangent(u1)
         if self.stabilization:
-            for body, a in zip(self.system.bodies, tangents, strict=True):
-                held = a.createVecLeft()
-                held.array_w[:] = self._stabilization(body)
-                a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
-                held.destroy()
-        for k, a in enumerate(tangents):
-            diagonal = a.getDiagonal()
-            self._diagonal[k] = diagonal.norm()
-            diagonal.destroy()
-        return tangents
+            held = a.createVecLeft()
+            held.array_w[:] = self._stabilization(self.system.bodies[k])
+            a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
+            held.destroy()
+        diagonal = a.getDiagonal()
+        norm = diagonal.norm()
+        # A diverging iterate may be stiffer by any factor; its rounding must not excuse a residual.
+        known = self._diagonal_step[k] == self._steps
+        self._diagonal[k] = min(self._diagonal[k], norm) if known else norm
+        self._diagonal_step[k], self._diagonal_factor[k] = self._steps, self.factor
+        diagonal.destroy()
+        return a
 
     # ---- convergence
     @property
@@ -486,12 +556,12 @@ class StepProblem:
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
         """Residual of each block over what counts as converged there; solved when all are <= 1."""
-        squares = []
-        for k, (body, t) in enumerate(zip(self.system.bodies, e.bodies, strict=True)):
-            free = _free(body, t.residual)
+        squares = np.zeros((len(e.bodies), 5))
+        for k in self.awake:
+            t, free = e.bodies[k], _free(self.system.bodies[k], e.bodies[k].residual)
             parts = (free, self._inertia[k], t.internal, t.external, t.contact)
-            squares.append([float(p @ p) for p in parts])
-        norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
+            squares[k] = [float(p @ p) for p in parts]
+        norms = np.sqrt(self.system.comm.allreduce(squares))
         ratio = {}
         for k, body in enumerate(self.system.bodies):
             limit = self._rtol * norms[k, 1:].max() + self._rounding[k]

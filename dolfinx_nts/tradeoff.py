@@ -7,8 +7,8 @@
 The scene is a Python file with a function `main`, or the name of one in `demos/`. Measured is the
 first run that `main` starts with `simulate`; what a choice names is an argument of `main` if it has
 one of that name, else an option of that run: `integrator` (energy-momentum or midpoint), `stress`,
-`contact_gradient`, `dt`, `dt_factor` (of the script's own step), `accuracy`, or a field of `Newton`
-(`rtol`, `condense`, `linear_solver`, `reuse`, ...). Written are a table of all runs, a
+`contact_gradient`, `dt`, `dt_factor` (of the script's own step), `accuracy`, `sleep`, or a field of
+`Newton` (`rtol`, `condense`, `linear_solver`, `reuse`, ...). Written are a table of all runs, a
 work-precision plot and what is cheapest for a given error. A run that fails is a row with its
 reason. The scene `economy` is the cost table of the features, see `dolfinx_nts.economy`.
 """
@@ -204,7 +204,7 @@ def _options(given: dict[str, Any], choices: Mapping[str, Any]) -> dict[str, Any
             options["integrator"] = INTEGRATORS[value]
         elif name == "dt_factor":
             options["dt"] = given["dt"] * value
-        elif name in ("dt", "accuracy"):
+        elif name in ("dt", "accuracy", "sleep"):
             options[name] = value
         elif name in ("stress", "contact_gradient"):
             rule[name] = value
@@ -227,7 +227,7 @@ def check(scene: str, choices: Mapping[str, Sequence[Any]]) -> None:
     Raises:
         ValueError: No.
     """
-    known = {"integrator", "stress", "contact_gradient", "dt", "dt_factor", "accuracy"}
+    known = {"integrator", "stress", "contact_gradient", "dt", "dt_factor", "accuracy", "sleep"}
     known |= {f.name for f in dataclasses.fields(nts.Newton)}
     taken = set(inspect.signature(load(scene).main).parameters)
     if {"dt", "dt_factor"} <= choices.keys():

@@ -71,6 +71,24 @@ def test_a_changed_step_makes_new_matrices():
     stepper.close()
 
 
+@pytest.mark.parametrize("solver", ["direct", "krylov"])
+def test_a_step_without_its_last_contact_takes_the_matrices_on(solver):
+    """The new layout gets its operator from the matrices kept."""
+    mesh = create_box(COMM, [[0, 0, 0.05], [1, 1, 1]], [1] * 3, CellType.hexahedron)
+    cube = nts.Continuum(
+        mesh, nts.NeoHookean(1e5, 0.3), density=1e3, name="cube", velocity=(0, 0, -1)
+    )
+    bottom = cube.surface(lambda x: x[2] < 0.05 + 1e-9)
+    pair = nts.ContactPair(bottom, nts.Plane((0, 0, 0), (0, 0, 1)))
+    run = nts.simulate(
+        nts.System([cube], contacts=[pair]), nts.EnergyMomentum(), dt=5e-3, t_end=0.9,
+        newton=nts.Newton(reuse=True, condense=True, linear_solver=solver),
+    )  # fmt: skip
+    assert run.status == "completed" and run.retries == 0
+    active, gap = run.balance["active"], run.balance["min_gap"]
+    assert active.max() == 4 and active[-1] == 0 and np.isinf(gap[-1])
+
+
 def test_reuse_with_a_split_of_another_kind():
     """A user's own field split need not be a Schur complement."""
     options = {

@@ -57,6 +57,12 @@ def test_mesh_refinement_compares_with_another_mesh(script):
     assert errors == sorted(errors, reverse=True)
 
 
+def test_sleep_is_a_choice(script):
+    rows = tradeoff.compare(script, {"sleep": [False, True]}, {}, {"dt_factor": 0.5}, COMM)
+    assert [r["sleep"] for r in rows[1:]] == [False, True]
+    assert rows[1]["trajectory"] == rows[2]["trajectory"] > 0
+
+
 def test_affine_motion_has_a_closed_form(script):
     """Shear u = a y e_x of a unit cube of size sqrt(3 / 12): a / 12 over the size."""
     run = tradeoff.measure(script, {}, COMM)
