@@ -6,7 +6,7 @@ import two_blocks
 from mpi4py import MPI
 from test_friction import rubbing_blocks
 from test_simulate import fail_once
-from test_single_mass import MASS, SPEED, STEP, PointMass, mass_on_wall
+from test_single_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall, wall
 
 import dolfinx_nts as nts
 from dolfinx_nts.simulate import Stepper
@@ -156,6 +156,44 @@ def test_the_first_impact_of_a_bar_is_one_event():
         bar_impact.scene(COMM, 10, False), nts.EnergyMomentum(), dt=dt, t_end=0.7
     ).balance
     assert fixed["contact_defect"].max() > 1e-2 * fixed["energy"][0]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("gap", "taken"), [(-4e-3, True), (0.3 * STEP * SPEED, False)])
+def test_a_step_that_moves_a_node_out_is_not_shortened(gap, taken):
+    """A node behind its facet leaves with 2 gap / h: the shorter the step, the faster."""
+    system, _ = mass_on_wall(gap, velocity=(SPEED, 0.0, 0.0 if taken else -SPEED))
+    stepper = Stepper(system, nts.EnergyMomentum())
+    pace = Pace(nts.Adapt(tolerance=1e-4), system, stepper.state, STEP, 1.0)
+    pace.dt = STEP
+    pace._before = (STEP, tuple(np.zeros_like(v) for v in stepper.state.v))
+    stepper.problem.begin(stepper.state, STEP)
+    step = stepper.solver.solve()
+    assert pace.accepts(stepper.problem, step) == taken
+    assert (pace.dt == STEP) == taken
+    assert pace._error > 1.0 or not taken
+    stepper.close()
+
+
+@pytest.mark.mpi
+def test_each_contact_is_met():
+    """A slow mass bounces off the wall before a fast one comes to it; neither loses."""
+    body, master, _ = wall()
+    places = ([0.3, 0.2, 0.6 * STEP * SPEED], [-0.3, -0.2, 3.4 * STEP * SPEED])
+    masses = [
+        PointMass(COMM, MASS, x, (0.0, 0.0, v), name=f"mass {k}")
+        for k, (x, v) in enumerate(zip(places, (-0.5 * SPEED, -SPEED), strict=True))
+    ]
+    pairs = [
+        nts.ContactPair(slave=PointSurface(m, x), master=master)
+        for m, x in zip(masses, places, strict=True)
+    ]
+    system = nts.System([*masses, body], contacts=pairs)
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=STEP, t_end=8 * STEP, adapt=nts.Adapt(tolerance=1e-2)
+    )
+    table = run.balance
+    assert table["contact_defect"][-1] < 1e-5 * table["energy"][0]
 
 
 # ---- what must not change
