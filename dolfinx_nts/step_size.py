@@ -81,7 +81,8 @@ def factor(error: float) -> float:
 class Pace:
     """Sizes of the steps of a run, the same on all ranks; remembers the last accepted step.
 
-    The first step, of which nothing is known, is the shortest.
+    The first step, and the first after a contact has been met, where the acceleration jumps, are
+    the shortest: nothing is known yet of how far they err.
 
     Args:
         adapt: Tolerances.
@@ -100,7 +101,7 @@ class Pace:
         self.dt = self._shortest
         self._top = _norms(system, state.v)[0]
         self._before: tuple[float, tuple[FloatArray, ...]] | None = None
-        self._error = 0.0
+        self._error, self._meets = 0.0, False
 
     def propose(self, left: float) -> float:
         """The next step [s]; the last two are equal.
@@ -134,10 +135,11 @@ class Pace:
             lost += float((force * gap[closing])[apart].sum())
             first = min(first, float(part[apart].min(initial=1.0)))
         lost, first = comm.allreduce(lost), comm.allreduce(first, op=MPI.MIN)
-        return first - _BEFORE if lost > self._tolerance * 0.5 * self._top**2 else 1.0
+        self._meets = lost > self._tolerance * 0.5 * self._top**2
+        return first - _BEFORE if self._meets else 1.0
 
     def accepts(self, problem: StepProblem, step: Evaluation) -> bool:
-        """Whether a solved step is good enough, and `dt` for what comes next. Collective.
+        """Whether a solved step is good enough; sets `dt` for what comes next. Collective.
 
         Where a change of facet has left nodes behind their facets the step is taken as it is: a
         shorter one would only expel them faster.
@@ -157,6 +159,8 @@ class Pace:
             self.dt = min(h * change, self._longest)
         self._top = max(self._top, speed)
         self._before, self._error = (h, acceleration), error
+        if self._meets:
+            self._before, self._error, self.dt = None, 0.0, self._shortest
         return True
 
     def cut(self, dt: float) -> None:
