@@ -86,7 +86,7 @@ def compare(scene: str, level: str, repeats: int, comm: Any) -> dict[str, float]
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenes", nargs="*", default=list(SCENES), help="two_blocks, bar_impact")
-    parser.add_argument("--accuracy", default="balanced")
+    parser.add_argument("--accuracy", default="exact")
     parser.add_argument("--repeats", type=int, default=1)
     options = parser.parse_args()
     for name in options.scenes:
