@@ -11,11 +11,13 @@ from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.newton import Newton, StepFailedError
 from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
 from dolfinx_nts.simulate import Solution, Stepper, simulate
+from dolfinx_nts.step_size import Adapt
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.system import State, System
 
 __version__ = version("dolfinx_nts")
 __all__ = [
+    "Adapt",
     "Body",
     "ContactPair",
     "Continuum",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
 from dolfinx_nts.newton import ACCURACY, Newton, StepFailedError, StepSolver
 from dolfinx_nts.step import Evaluation, StepProblem
+from dolfinx_nts.step_size import Adapt, Pace
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import items, known_options, require_positive
 
@@ -33,6 +34,7 @@ class Solution:
         status: "completed", or why the run stopped and what to do.
         rows: Balance table, one row for the start and one per accepted step.
         retries: How often a step was dropped and halved.
+        rejected: How often a step was dropped for its error and shortened, see `Adapt`.
         switches: Changes of facet of nodes in contact.
     """
 
@@ -40,6 +42,7 @@ class Solution:
     status: str = "running"
     rows: list[dict[str, Any]] = field(default_factory=list)
     retries: int = 0
+    rejected: int = 0
     switches: list[balance.Switch] = field(default_factory=list)
 
     @property
@@ -178,6 +181,44 @@ class Stepper:
                 done += 1
         return self.state
 
+    def paced(self, pace: Pace, end: float) -> Iterator[None]:
+        """Advance in steps of a pace, stopping after each.
+
+        Args:
+            pace: Sizes of the steps.
+            end: Where to stop [s].
+
+        Raises:
+            StepFailedError: Not solved even after `newton.max_retries` halvings in a row.
+        """
+        self.start(pace.dt)
+        retries = 0
+        while self.state.time < end:
+            now = self.state.time
+            left = end - now
+            dt = pace.propose(left)
+            self.problem.begin(self.state, dt)
+            part = pace.first_touch(self.problem)
+            if part < 1.0:
+                dt *= part
+                self.problem.begin(self.state, dt)
+            try:
+                step = self.solver.solve()
+            except StepFailedError as failure:
+                if retries == self.newton.max_retries:
+                    raise
+                retries += 1
+                self.solution.retries += 1
+                pace.dt = 0.5 * dt
+                logger.info("%s; retrying with dt=%.3g", failure, pace.dt)
+                continue
+            if not pace.accepts(self.problem, step):
+                self.solution.rejected += 1
+                continue
+            retries = 0
+            self._take(step, dt, end if dt == left else now + dt)
+            yield
+
     def start(self, dt: float) -> None:
         """Give prescribed coordinates the rate of their motion; later calls do nothing.
 
@@ -205,7 +246,9 @@ class Stepper:
 
     def _step(self, dt: float, time: float) -> None:
         self.problem.begin(self.state, dt)
-        step = self.solver.solve()
+        self._take(self.solver.solve(), dt, time)
+
+    def _take(self, step: Evaluation, dt: float, time: float) -> None:
         state = self._accepted(step, dt, time)
         rows = self.solution.rows
         terms = balance.step_terms(self.problem, step)
@@ -294,13 +337,14 @@ def simulate(
     start: Solution | None = None,
     accuracy: str | None = None,
     sleep: bool = False,
+    adapt: Adapt | None = None,
 ) -> Solution:
     """Run a system from t = 0, or from where an equilibrium ended, to t_end.
 
     Args:
         system: The scene.
         integrator: `Midpoint()` or `EnergyMomentum()`.
-        dt: Largest step [s], > 0; t_end is reached in equal steps.
+        dt: Largest step [s], > 0; t_end is reached in equal steps unless `adapt` is given.
         t_end: End of the run [s], > 0.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix, e.g. {"pc_type":
@@ -315,6 +359,7 @@ def simulate(
             rounding and no contact may reach it; it wakes in the first step in which that ends. The
             solution is the same; a body that has moved hardly ever comes to rest exactly. What a
             caller changes in a material during the run wakes nothing.
+        adapt: Choose the steps by their error and by closing gaps.
 
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then.
@@ -332,13 +377,19 @@ def simulate(
     begin = stepper.state.time
     if not t_end > begin:
         raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
+    if not isinstance(adapt, Adapt | None):
+        raise TypeError(f"adapt={adapt!r}: pass Adapt(tolerance=...)")
+    remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
+    if adapt is not None:
+        end = float(t_end)
+        pace = Pace(adapt, system, stepper.state, float(dt), end - begin)
+        return run(stepper, [end], output, progress=progress, remedy=remedy, pace=pace)
     # Equal steps: a last step much shorter than the others would expel a node that the one before
     # left behind a facet with a speed of gap / dt.
     steps = max(1, math.ceil((t_end - begin) / dt * (1 - 1e-9)))
     dt = (float(t_end) - begin) / steps
     stepper.start(dt)
     times = [begin + (k + 1) * dt for k in range(steps)]
-    remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
     return run(stepper, times, output, progress=progress, remedy=remedy)
 
 
@@ -354,7 +405,13 @@ def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
 
 
 def run(
-    stepper: Stepper, times: Sequence[float], output: Sequence[Any], *, progress: bool, remedy: str
+    stepper: Stepper,
+    times: Sequence[float],
+    output: Sequence[Any],
+    *,
+    progress: bool,
+    remedy: str,
+    pace: Pace | None = None,
 ) -> Solution:
     """Advance to each of the times, write, say how it ended, and free the stepper.
 
@@ -364,15 +421,15 @@ def run(
         output: Writers.
         progress: Show a progress line on rank 0.
         remedy: What to do if a step fails, for `status`.
+        pace: Sizes of the steps between, each of which is written.
     """
-    bar = _progress_bar(len(times), progress and stepper.system.comm.rank == 0)
+    bar = _progress_bar(None if pace else len(times), progress and stepper.system.comm.rank == 0)
     try:
         for writer in output:
             writer.start(stepper)
-        for k, time in enumerate(times):
-            stepper.advance(time - stepper.state.time)
+        for last in _moves(stepper, times, pace):
             for writer in output:
-                writer.write(stepper, last=k == len(times) - 1)
+                writer.write(stepper, last=last)
             if bar is not None:
                 row = stepper.solution.rows[-1]
                 bar.set_postfix(
@@ -392,12 +449,24 @@ def run(
     return stepper.solution
 
 
+def _moves(stepper: Stepper, times: Sequence[float], pace: Pace | None) -> Iterator[bool]:
+    """Advance from one state to be written to the next; tells whether it is the last."""
+    for k, time in enumerate(times):
+        final = k == len(times) - 1
+        if pace is None:
+            stepper.advance(time - stepper.state.time)
+            yield final
+        else:
+            for _ in stepper.paced(pace, time):
+                yield final and stepper.state.time == time
+
+
 def writers(output: Any) -> tuple[Any, ...]:
     """The argument `output`, checked."""
     return items("output", output, _is_writer, "writers of dolfinx_nts.output")
 
 
-def _progress_bar(steps: int, wanted: bool) -> Any:
+def _progress_bar(steps: int | None, wanted: bool) -> Any:
     if not wanted:
         return None
     from tqdm import tqdm

@@ -426,6 +426,12 @@ class StepProblem:
             multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
         return multipliers
 
+    def flight_gaps(self) -> list[FloatArray]:
+        """Gaps of each contact's candidates after free flight over the step [m]."""
+        return [
+            c.gap(self._points(k, c.candidates, self.first)) for k, c in enumerate(self.contacts)
+        ]
+
     # ---- iterates
     def _positions(self, x: Any) -> list[FloatArray]:
         """Slave and corners of each contact's pairs at an iterate [m], shape (n, nc + 1, 3)."""

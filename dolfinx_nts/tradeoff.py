@@ -7,10 +7,11 @@
 The scene is a Python file with a function `main`, or the name of one in `demos/`. Measured is the
 first run that `main` starts with `simulate`; what a choice names is an argument of `main` if it has
 one of that name, else an option of that run: `integrator` (energy-momentum or midpoint), `stress`,
-`contact_gradient`, `dt`, `dt_factor` (of the script's own step), `accuracy`, `sleep`, or a field of
-`Newton` (`rtol`, `condense`, `linear_solver`, `reuse`, ...). Written are a table of all runs, a
-work-precision plot and what is cheapest for a given error. A run that fails is a row with its
-reason. The scene `economy` is the cost table of the features, see `dolfinx_nts.economy`.
+`contact_gradient`, `dt`, `dt_factor` (of the script's own step), `accuracy`, `sleep`, `adapt` (a
+tolerance, or None for equal steps), or a field of `Newton` (`rtol`, `condense`, `linear_solver`,
+`reuse`, ...). Written are a table of all runs, a work-precision plot and what is cheapest for a
+given error. A run that fails is a row with its reason. The scene `economy` is the cost table of the
+features, see `dolfinx_nts.economy`.
 """
 
 from __future__ import annotations
@@ -119,7 +120,8 @@ class Run:
         choices: What it was made with.
         status: "completed", or why not.
         seconds: Wall time of `simulate`, the slowest rank.
-        dt: Step [s].
+        cpu: Processor time of `simulate` [s], the busiest rank.
+        dt: Largest step [s].
         solution: Its Solution, if it got that far.
         path: Motion and impulse.
     """
@@ -127,6 +129,7 @@ class Run:
     choices: dict[str, Any]
     status: str = "not started"
     seconds: float = math.nan
+    cpu: float = math.nan
     dt: float = math.nan
     solution: nts.Solution | None = None
     path: Motion | None = None
@@ -141,12 +144,15 @@ class Run:
         at = np.column_stack(
             [np.interp(self.path.times, reference.path.times, column) for column in exact.T]
         )
+        step = np.diff(self.path.times, append=np.nan, prepend=np.nan)
+        weight = np.nansum([step[1:], step[:-1]], axis=0)
+        square = ((np.array(self.path.motion) - at) ** 2).mean(axis=1)
         scale = np.abs(exact - exact[0]).max() or np.finfo(float).tiny
         energy = max(np.abs(other[k]).max() for k in ("energy", "external_work"))
         momentum = np.sqrt(2.0 * reference.path.mass * energy)
         lost = [t["friction_dissipation"][-1] + t["contact_defect"][-1] for t in (mine, other)]
         return {
-            "trajectory": float(np.sqrt(((np.array(self.path.motion) - at) ** 2).mean()) / scale),
+            "trajectory": float(np.sqrt(weight @ square / weight.sum()) / scale),
             "impulse": _relative(self.path.impulse, reference.path.impulse),
             "energy": float(abs(mine["energy"][-1] - other["energy"][-1]) / energy),
             "momentum": float(
@@ -164,9 +170,11 @@ class Run:
             **self.choices,
             "dt [s]": self.dt,
             "seconds": self.seconds,
+            "cpu [s]": self.cpu,
             "steps": len(table["time"]) - 1 if done else 0,
             "iterations": int(table["newton_iterations"].sum()) if done else 0,
             "retries": self.solution.retries if self.solution else 0,
+            "rejected": self.solution.rejected if self.solution else 0,
             **self.errors(reference),
             "status": self.status,
         }
@@ -206,6 +214,8 @@ def _options(given: dict[str, Any], choices: Mapping[str, Any]) -> dict[str, Any
             options["dt"] = given["dt"] * value
         elif name in ("dt", "accuracy", "sleep"):
             options[name] = value
+        elif name == "adapt":
+            options[name] = None if value is None else nts.Adapt(tolerance=value)
         elif name in ("stress", "contact_gradient"):
             rule[name] = value
         else:
@@ -227,7 +237,8 @@ def check(scene: str, choices: Mapping[str, Sequence[Any]]) -> None:
     Raises:
         ValueError: No.
     """
-    known = {"integrator", "stress", "contact_gradient", "dt", "dt_factor", "accuracy", "sleep"}
+    known = {"integrator", "stress", "contact_gradient", "dt", "dt_factor", "accuracy"}
+    known |= {"adapt", "sleep"}
     known |= {f.name for f in dataclasses.fields(nts.Newton)}
     taken = set(inspect.signature(load(scene).main).parameters)
     if {"dt", "dt_factor"} <= choices.keys():
@@ -258,8 +269,9 @@ def measure(scene: str, choices: Mapping[str, Any], comm: Any) -> Run:
         run.path, run.dt = Motion(), options["dt"]
         output = (*options.pop("output", ()), run.path)
         comm.Barrier()
-        begin = time.perf_counter()
+        begin, cpu = time.perf_counter(), time.process_time()
         run.solution = simulate(system, output=output, **options)
+        run.cpu = comm.allreduce(time.process_time() - cpu, op=MPI.MAX)
         run.seconds = comm.allreduce(time.perf_counter() - begin, op=MPI.MAX)
         run.status = run.solution.status
         raise _MeasuredError

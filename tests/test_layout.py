@@ -32,7 +32,7 @@ LEVELS = [
         "integrators",
     },
     {"system", "balance"},
-    {"newton", "step", "assembly", "linear_solver", "sleep"},
+    {"newton", "step", "step_size", "assembly", "linear_solver", "sleep"},
     {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]

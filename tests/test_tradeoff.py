@@ -51,6 +51,18 @@ def test_error_of_the_trajectory_is_of_second_order(script):
     assert tradeoff.recommend(rows)[0][1] in others
 
 
+@pytest.mark.mpi
+def test_adaptive_steps_beside_equal_ones(script):
+    """`dt` is the largest step; more and smaller steps for a smaller tolerance, less error."""
+    vary = {"dt_factor": [2.0], "adapt": [None, 1e-2, 1e-3]}
+    rows = tradeoff.compare(script, vary, {}, {"dt_factor": 1 / 8}, COMM)
+    equal, coarse, fine = rows[1:]
+    assert [r["dt [s]"] for r in rows[1:]] == [0.04] * 3 and equal["steps"] == 5
+    assert equal["rejected"] == 0 and 0.0 < fine["cpu [s]"] < 60.0
+    assert 5 < coarse["steps"] < fine["steps"]
+    assert fine["trajectory"] < coarse["trajectory"] < 0.1
+
+
 def test_mesh_refinement_compares_with_another_mesh(script):
     rows = tradeoff.compare(script, {"cells": [1, 2, 3]}, {"dt": 0.01}, {"cells": 6}, COMM)
     errors = [r["trajectory"] for r in rows[1:]]
