@@ -205,10 +205,11 @@ def plot(results, balances, folder):
     folder.mkdir(parents=True, exist_ok=True)
     compare_balances(balances, str(folder / "balance.png"))
     figure, axis = plt.subplots(figsize=(8, 5), layout="constrained")
-    for name, r in results.items():
+    # One lies on the other.
+    for width, (name, r) in zip((3.0, 1.0), results.items(), strict=False):
         h = r["history"]
-        (line,) = axis.plot(h["time"], h["speed"], lw=1, label=f"speed of the centre, {name}")
-        axis.plot(h["time"], h["spin"] * RADIUS, "--", lw=1, color=line.get_color(),
+        (line,) = axis.plot(h["time"], h["speed"], lw=width, label=f"speed of the centre, {name}")
+        axis.plot(h["time"], h["spin"] * RADIUS, "--", lw=width, color=line.get_color(),
                   label=f"spin times radius, {name}")  # fmt: skip
     t = np.linspace(0, h["time"][-1], 501)
     for k, values in enumerate(rigid(t, 0.5)):

@@ -155,6 +155,21 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
     return sorted((s for part in gathered for s in part), key=lambda s: s[:3])
 
 
+def expelled(problem: StepProblem, step: Evaluation) -> str:
+    """The node that brings most energy in by starting behind its facet. Every rank must call it."""
+    best = (0.0, "")
+    for contact, multiplier in zip(problem.contacts, step.multipliers, strict=True):
+        c, slave = contact.candidates, contact.pair.slave
+        gain = multiplier[:, 0] * c.gap / problem.factor
+        if len(gain) and gain.max() > best[0]:
+            i = int(gain.argmax())
+            node = int(slave.original[slave.owned[c.node[i]]])
+            best = float(gain[i]), (
+                f"{gain[i]:.3g} J by node {node} of {contact.pair.name!r}, {-c.gap[i]:.3g} m deep"
+            )
+    return max(problem.system.comm.allgather(best))[1]
+
+
 def first_row(system: System, state: State) -> dict[str, Any]:
     """Balance table row of the state a run starts from."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS, 0.0)

@@ -83,7 +83,8 @@ class ContactPair:
     ) -> None:
         _check_friction(friction)
         if not isinstance(slave, Surface):
-            raise TypeError(f"slave={slave!r}: pass a Surface, e.g. body.surface(marker)")
+            hint = "; an obstacle is a master" if isinstance(slave, Obstacle) else ""
+            raise TypeError(f"slave={slave!r}: pass a Surface, e.g. body.surface(marker){hint}")
         self.slave, self.friction = slave, float(friction)
         self.master: Any = master
         if isinstance(master, Obstacle):
@@ -249,5 +250,6 @@ class ContactPair:
 
 
 def _check_friction(friction: Any) -> None:
-    if not isinstance(friction, numbers.Real) or not float(friction) >= 0.0:
+    number = isinstance(friction, numbers.Real) and not isinstance(friction, bool)
+    if not number or not float(friction) >= 0.0:
         raise ValueError(f"friction={friction!r}: pass a number >= 0 (math.inf: never slips)")

@@ -332,7 +332,7 @@ class Continuum:
             values = at_points(self.comm, f"velocity of {self.name!r}", velocity, x, (3,))
             self.v.x.array[:] = values.T.ravel()
         else:
-            constant = vector("velocity", velocity, "m/s, or pass a callable x (3, n) -> (3, n)")
+            constant = vector("velocity", velocity, "m/s", or_else="a callable x (3, n) -> (3, n)")
             self.v.x.array[:] = np.tile(constant, len(self.v.x.array) // 3)
         values = self.v.x.array
         for dofs, _, value in self._conditions:

@@ -262,8 +262,11 @@ def equilibrium(
     more, save conditions against sliding and turning. Where bodies have to find each other first,
     or where directions stay free, pass `stabilization`.
 
+    The ledger closes as the square of the load steps: work is that of the mean of their forces.
+
     A dynamic run starts from the result, at its pseudo time and with the initial velocities of the
-    bodies. Bodies correspond by name, so that what holds them may differ:
+    bodies: `t_end=1.2` is 0.2 s later, and a motion that begins with the run is a function of
+    `max(t - 1, 0)`. Bodies correspond by name, so that what holds them may differ:
 
         def block(bcs=()):
             return nts.Continuum(mesh, rubber, density=1e3, bcs=bcs, name="block")

@@ -259,10 +259,14 @@ class Stepper:
         self._accept(state)
         gain = -terms["contact_defect"]
         if gain > _NOTABLE_GAIN * abs(rows[-1]["energy"]):
-            logger.warning(
-                "step to t=%.6g: changes of facet add %.3g J to %.3g J; use a finer or smoother "
-                "master, or a smaller, constant dt", time, gain, rows[-2]["energy"]
-            )  # fmt: skip
+            where = balance.expelled(self.problem, step)
+            if self.system.comm.rank == 0:
+                logger.warning(
+                    "step to t=%.6g: nodes that start behind their facets bring %.3g J to %.3g J, "
+                    "most %s; after changes of facet use a finer or smoother master, or a smaller, "
+                    "constant dt; a master must reach beyond where slaves pass below its edge",
+                    time, gain, rows[-2]["energy"], where,
+                )  # fmt: skip
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
         """State at t_{n+1}."""
@@ -439,7 +443,8 @@ def run(
         stepper.solution.status = "completed"
     except StepFailedError as failure:
         stepper.solution.status = f"{failure}. {remedy}"
-        logger.warning("%s", stepper.solution.status)
+        if stepper.system.comm.rank == 0:
+            logger.warning("%s", stepper.solution.status)
     finally:
         for writer in output:
             writer.close(stepper)

@@ -61,6 +61,8 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
         found = exterior[chosen[nodes].all(axis=1)]
         wrong = 0
     else:
+        if callable(marker):
+            raise TypeError(f"{what}: a function of x takes no tag, but {tag!r} is given")
         if not hasattr(marker, "find") or marker.dim != 2:
             raise ValueError(
                 f"{what}={marker!r}: pass facet meshtags (dimension 2), not cell or edge tags"

@@ -46,14 +46,15 @@ def require_positive(name: str, value: Any, unit: str) -> None:
         raise ValueError(f"{name}={value!r}: must be positive and finite [{unit}]")
 
 
-def vector(name: str, value: Any, unit: str) -> FloatArray:
+def vector(name: str, value: Any, unit: str, *, or_else: str = "") -> FloatArray:
     """The value as three finite components, shape (3,)."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.shape != (3,) or not np.isfinite(array).all():
-        raise ValueError(f"{name}={value!r}: pass three finite components [{unit}]")
+        other = f", or {or_else}" if or_else else ""
+        raise ValueError(f"{name}={value!r}: pass three finite components [{unit}]{other}")
     return array
 
 

@@ -158,7 +158,7 @@ def test_material_that_raises():
 # ---- velocity, loads, conditions
 @pytest.mark.parametrize("velocity", [(1, 2), 3.0, (1, np.nan, 0), (1, 2, "x"), np.zeros((3, 3))])
 def test_velocity(velocity):
-    pattern = r"(?s)^velocity=.*: pass three finite components \[m/s, or pass a callable"
+    pattern = r"(?s)^velocity=.*: pass three finite components \[m/s\], or a callable"
     with pytest.raises(ValueError, match=pattern):
         continuum(velocity=velocity)
 
@@ -305,7 +305,7 @@ def test_marker_of_wrong_kind():
     body.mesh.topology.create_entities(1)
     edges = facet_tags(body.mesh, dim=1)
     raises(ValueError, pattern, lambda: body.surface(edges, 3))
-    raises(ValueError, pattern, lambda: body.surface(top, 3))
+    raises(TypeError, "a function of x takes no tag, but 3 is given", lambda: body.surface(top, 3))
 
 
 def test_marker_of_wrong_shape():

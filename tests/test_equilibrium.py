@@ -343,6 +343,21 @@ def test_a_body_that_nothing_holds_is_reported():
     assert len(run.rows) == 1 and not run.state.u[1].any()
 
 
+@pytest.mark.parametrize("material", [RUBBER, nts.StVenantKirchhoff(young=1e6, poisson=0.3)])
+@pytest.mark.parametrize("above", [None, 0.01])
+def test_a_load_that_nothing_carries_is_no_equilibrium(above, material):
+    """Even where Newton runs off to stiffnesses beside which the load is rounding."""
+    mesh = box([0, 0, 0], [0.2, 0.2, 0.1], [3, 3, 2], MPI.COMM_SELF)
+    free = nts.Continuum(mesh, material, density=DENSITY)
+    contacts = []
+    if above is not None:
+        floor = nts.Plane((0, 0, -above), (0, 0, 1))
+        contacts = [nts.ContactPair(free.surface(at(2, 0.0)), floor, friction=0.3)]
+    system = nts.System([free], contacts=contacts, gravity=(0, 0, -GRAVITY))
+    run = nts.equilibrium(system, newton=nts.Newton(max_retries=1))
+    assert "not solved" in run.status and "stabilization=0.1" in run.status
+
+
 def test_a_body_that_falls_for_ever_is_reported():
     """Nothing below: the stabilization lets it down without end."""
     free = nts.Continuum(

@@ -346,7 +346,7 @@ def test_prescribed_tangential_direction_carries_no_force(friction, speed, integ
     stepper.close()
 
 
-@pytest.mark.parametrize("friction", [-0.1, math.nan, "a", None])
+@pytest.mark.parametrize("friction", [-0.1, math.nan, "a", None, True])
 def test_bad_coefficient(friction):
     with pytest.raises(ValueError, match="friction=.*pass a number >= 0"):
         rubbing_blocks(friction)
