@@ -346,7 +346,7 @@ def write(results, folder):
             if "traction" in table:
                 q = table["traction"] / exact["p0"] / problem.friction
                 axis.plot(at, q, marker="s+"[number % 2], label=f"q / (mu p0), {scale:g}", **look)
-        axis.set(title=name, xlabel="x / a")
+        axis.set(title=name, xlabel="x / a", ylabel="traction over its closed-form peak")
         axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.savefig(folder / "hertz.png", dpi=150)
     plt.close(figure)
