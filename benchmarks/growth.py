@@ -1,8 +1,9 @@
 """How time and memory of a step grow with the mesh: two cubes in contact at "balanced".
 
 The cubes of `step_time.py` at a gap that the first step closes, with more and more cells. Printed
-are time per step and coordinate, contact's share of it, and memory per coordinate. Run the largest
-meshes on 2 ranks.
+are time per step and coordinate, contact's share of it, and memory per coordinate, which is right
+for one mesh a run only: what a smaller one has freed may be used again. Run the largest meshes on 2
+ranks.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from step_time import PARTS, cubes
 import dolfinx_nts as nts
 from dolfinx_nts.newton import ACCURACY
 
-#: Of `PARTS`, what a scene without contact does not have.
+#: Of `PARTS`, what contact costs beside the linear solver; a fresh conversion of the bodies'
+#: matrices is in the last of them, too.
 CONTACT = ("search", "contact elements", "contact into the matrix")
 #: Steps before those that count: contact begins, matrices and solvers are made.
 _WARM = 3
@@ -31,7 +33,7 @@ def measure(comm: MPI.Comm, n: int, steps: int, dt: float) -> None:
     stepper = nts.Stepper(
         cubes(comm, n, gap=1e-3), nts.EnergyMomentum(), newton=ACCURACY["balanced"]
     )
-    size = sum(3 * b.space.dofmap.index_map.size_global for b in stepper.system.bodies)
+    size = stepper.system.size
     for _ in range(_WARM):
         stepper.advance(dt)
     clock = Clock()

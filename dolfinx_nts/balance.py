@@ -164,9 +164,9 @@ def expelled(problem: StepProblem, step: Evaluation) -> str:
         if len(gain) and gain.max() > best[0]:
             i = int(gain.argmax())
             node = int(slave.original[slave.owned[c.node[i]]])
-            best = float(gain[i]), (
-                f"{gain[i]:.3g} J by node {node} of {contact.pair.name!r}, {-c.gap[i]:.3g} m deep"
-            )
+            name, depth = contact.pair.name, -c.gap[i]
+            text = f"{gain[i]:.3g} J by node {node} of {name!r}, {depth:.3g} m deep"
+            best = float(gain[i]), text
     return max(problem.system.comm.allgather(best))[1]
 
 

@@ -49,7 +49,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
 # wall has more constraints than coordinates.
-PRESETS |= {"redundant": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
+PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
 #: Below so many coordinates both presets cost the same, most of it not the solver's.
 _FEW = 600
 

@@ -49,7 +49,8 @@ class Newton:
             incomplete factors weaken as dt grows beyond the time a wave needs through an element.
             "auto" takes "krylov" while that is the faster one: not for few coordinates, nor in
             statics, nor with `petsc_options`, nor for the next steps after a solve that needed
-            more iterations than MUMPS is worth.
+            more iterations than MUMPS is worth. Where MUMPS fails, it leaves out equations that
+            repeat others for some steps; "krylov" is left alone.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew.
 
@@ -130,9 +131,13 @@ class StepSolver:
     ) -> None:
         self.problem, self.newton, self._given = problem, newton, petsc_options
         # What takes over where a linear solve fails: in turn MUMPS, and MUMPS without what repeats.
-        self._presets = {"krylov": ("krylov",), "direct": ("direct", "redundant")}[preset]
-        if preset == "krylov" and newton.linear_solver == "auto":
-            self._presets += ("direct", "redundant")
+        mumps = ("direct", "null-pivots")
+        own = petsc_options.keys() & {"ksp_type", "pc_type", "pc_factor_mat_solver_type"}
+        self._presets: tuple[str, ...] = ("krylov",)
+        if preset == "direct":
+            self._presets = ("direct",) if own else mumps
+        elif newton.linear_solver == "auto":
+            self._presets += mumps
         self._chosen, self._patience = 0, 0
         self._options = self._solver_options()
         self._version, self._factor = -1, 0.0
@@ -145,10 +150,10 @@ class StepSolver:
 
     def _solver_options(self) -> SolverOptions:
         system, preset = self.problem.system, self._presets[self._chosen]
-        limit = most_iterations(system.size) if len(self._presets) == 3 else None
+        limit = most_iterations(system.size) if self.newton.linear_solver == "auto" else None
         return SolverOptions(system.comm, preset, self.problem.condense, self._given, limit)
 
-    def _take(self, chosen: int) -> None:
+    def _use(self, chosen: int) -> None:
         """Solve with another preset from now on."""
         self.destroy()
         self._chosen = chosen
@@ -165,7 +170,7 @@ class StepSolver:
         if self._chosen > 0:
             self._patience -= 1
             if self._patience < 0:
-                self._take(0)
+                self._use(0)
         while True:
             last = self._attempt()
             iterations += last.iterations
@@ -188,6 +193,7 @@ class StepSolver:
             except PETSc.Error as error:
                 # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
                 self._matrices_due = True
+                iterations += self.snes.getIterationNumber()
                 self.destroy()
                 if self._chosen < len(self._presets) - 1:
                     return self._attempt_otherwise(iterations)
@@ -216,7 +222,7 @@ class StepSolver:
     def _attempt_otherwise(self, iterations: int) -> Evaluation:
         """Solve the step with the next preset, after the linear solver failed or took too long."""
         self._matrices_due, self._patience = True, _PATIENCE
-        self._take(self._chosen + 1)
+        self._use(self._chosen + 1)
         name, time = self._presets[self._chosen], self.problem.state.time
         logger.info("t=%.6g: linear solver %r for the next %d steps", time, name, _PATIENCE)
         self.problem.guess(flight=True)
@@ -337,7 +343,9 @@ class StepSolver:
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:
         """One sentence that names what failed and where; every rank must call it."""
         problem = self.problem
-        ratio = {k: float(np.nan_to_num(r, nan=np.inf)) for k, r in problem.ratios(e).items()}
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = problem.ratios(e)
+        ratio = {k: float(np.nan_to_num(r, nan=np.inf)) for k, r in found.items()}
         worst = max(ratio, key=lambda name: ratio[name])
         notes = [
             _contact_note(c, k, flips)

@@ -58,7 +58,7 @@ class Solution:
         iterations = self.balance["newton_iterations"].sum() / max(steps, 1)
         lines = [
             f"{self.status}: {steps} steps to t = {last['time']:.6g} s, {self.retries} retries, "
-            f"{iterations:.2f} Newton iterations per step",
+            f"{self.rejected} rejected, {iterations:.2f} Newton iterations per step",
             f"energy {first['energy']:.6g} J + external work {last['external_work']:.6g} J - "
             f"friction {last['friction_dissipation']:.6g} J - contact "
             f"{last['contact_defect']:.6g} J = {last['energy']:.6g} J, "
@@ -369,11 +369,14 @@ def simulate(
         The Solution. A run that fails says so in `status` and keeps everything computed until then.
 
     Raises:
+        TypeError: An argument is of another type.
         ValueError: An argument is out of range; before any work.
     """
     require_positive("dt", dt, "s")
     require_positive("t_end", t_end, "s")
     output = writers(output)
+    if not isinstance(adapt, Adapt | None):
+        raise TypeError(f"adapt={adapt!r}: pass Adapt(tolerance=...)")
     newton = _newton(newton, accuracy)
     stepper = Stepper(
         system, integrator, newton=newton, petsc_options=petsc_options, start=start, sleep=sleep
@@ -381,11 +384,10 @@ def simulate(
     begin = stepper.state.time
     if not t_end > begin:
         raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
-    if not isinstance(adapt, Adapt | None):
-        raise TypeError(f"adapt={adapt!r}: pass Adapt(tolerance=...)")
     remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
     if adapt is not None:
         end = float(t_end)
+        stepper.start(adapt.shortest * float(dt))
         pace = Pace(adapt, system, stepper.state, float(dt), end - begin)
         return run(stepper, [end], output, progress=progress, remedy=remedy, pace=pace)
     # Equal steps: a last step much shorter than the others would expel a node that the one before

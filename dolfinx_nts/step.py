@@ -32,6 +32,8 @@ BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
+#: Distance from the origin over that of the expected motion, of an iterate that has run off.
+_RUN_OFF = 2.0
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
 _ONE = 1e-6
 
@@ -117,7 +119,6 @@ class StepProblem:
         self.version = 0
         self.stabilization = 0.0
         self._diagonal, self._diagonal_factor = np.zeros((2, len(system.bodies)))
-        self._steps, self._diagonal_step = 0, np.zeros(len(system.bodies), dtype=int)
 
     # ---- set-up of a step
     def begin(
@@ -133,7 +134,6 @@ class StepProblem:
         """
         system = self.system
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
-        self._steps += 1
         ramp = self.integrator.ramp(state.time + self.integrator.theta * dt)
         self._gravity = ramp * system.gravity
         for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
@@ -157,7 +157,7 @@ class StepProblem:
         if search:
             self._found = [self._search(k) for k in range(len(system.contacts))]
             self._drop_doubles()
-            self._awake = [self._may_touch(k, c) for k, c in enumerate(self._found)]
+            self._with_unknowns = [self._may_touch(k, c) for k, c in enumerate(self._found)]
         self._asleep = self._find_asleep(np.maximum(self._motion, speed) == 0.0)
         self._choose()
 
@@ -176,7 +176,7 @@ class StepProblem:
 
     def _touched(self) -> set[int]:
         """Bodies of contacts that have unknowns, the same on all ranks."""
-        local = np.array([float(awake.any()) for awake in self._awake])
+        local = np.array([float(awake.any()) for awake in self._with_unknowns])
         on = _global_max(self.system.comm, local) > 0.0
         return set().union(*itertools.compress(self.system.contact_bodies, on))
 
@@ -217,7 +217,7 @@ class StepProblem:
         closed = [~(gap >= 0.0) for gap in gaps]
         if not self.system.comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
             return replace(e, idle_gaps=gaps)
-        for awake, late in zip(self._awake, closed, strict=True):
+        for awake, late in zip(self._with_unknowns, closed, strict=True):
             awake[np.flatnonzero(~awake)[late]] = True
         for k in self._asleep.keys() & self._touched():
             del self._asleep[k]
@@ -226,7 +226,7 @@ class StepProblem:
 
     def _choose(self) -> None:
         """Give unknowns to the candidates that are awake."""
-        both = list(zip(self._found, self._awake, strict=True))
+        both = list(zip(self._found, self._with_unknowns, strict=True))
         self.contacts, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
         system, watching = self.system, any(c.num_pairs for c in self.idle)
         self._watching = system.comm.allreduce(watching, op=MPI.LOR)
@@ -520,11 +520,11 @@ class StepProblem:
             held.destroy()
         diagonal = a.getDiagonal()
         norm = diagonal.norm()
-        # A diverging iterate may be stiffer by any factor; its rounding must not excuse a residual.
-        known = self._diagonal_step[k] == self._steps
-        self._diagonal[k] = min(self._diagonal[k], norm) if known else norm
-        self._diagonal_step[k], self._diagonal_factor[k] = self._steps, self.factor
         diagonal.destroy()
+        reached = np.abs(self.system.bodies[k].reference + u1).max(initial=0.0)
+        # An iterate that runs off may be stiffer by any factor; its rounding excuses no residual.
+        if _global_max(self.system.comm, np.array([reached]))[0] <= _RUN_OFF * self._extent[k]:
+            self._diagonal[k], self._diagonal_factor[k] = norm, self.factor
         return a
 
     # ---- convergence

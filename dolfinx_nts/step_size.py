@@ -136,7 +136,7 @@ class Pace:
             first = min(first, float(part[apart].min(initial=1.0)))
         lost, first = comm.allreduce(lost), comm.allreduce(first, op=MPI.MIN)
         self._meets = lost > self._tolerance * 0.5 * self._top**2
-        return first - _BEFORE if self._meets else 1.0
+        return first * (1.0 - _BEFORE) if self._meets else 1.0
 
     def accepts(self, problem: StepProblem, step: Evaluation) -> bool:
         """Whether a solved step is good enough; sets `dt` for what comes next. Collective.

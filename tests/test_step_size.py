@@ -1,14 +1,18 @@
 """Steps that are chosen: their error, the gaps they meet, and that nothing else changes."""
 
+import csv
+
 import numpy as np
 import pytest
 import two_blocks
+from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 from test_friction import rubbing_blocks
 from test_simulate import fail_once
 from test_single_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall, wall
 
 import dolfinx_nts as nts
+from dolfinx_nts.output import BalanceCSV
 from dolfinx_nts.simulate import Stepper
 from dolfinx_nts.step_size import Pace, factor
 
@@ -302,3 +306,35 @@ def test_bad_options(options, kind, message):
 def test_adapt_is_an_adapt():
     with pytest.raises(TypeError, match=r"^adapt=0.001: pass Adapt\(tolerance="):
         nts.simulate(nts.System([SpringMass()]), nts.Midpoint(), dt=0.1, t_end=1.0, adapt=1e-3)
+
+
+@pytest.mark.mpi
+def test_a_node_that_is_moved_out_is_named(caplog):
+    """By one rank; it leaves with 2 gap / h."""
+    system, _ = mass_on_wall(-4e-3, velocity=(0.1 * SPEED, 0.0, 0.0))
+    stepper = Stepper(system, nts.EnergyMomentum())
+    stepper.advance(STEP)
+    stepper.close()
+    brought = 0.5 * MASS * (2 * 4e-3 / STEP) ** 2
+    messages = [r.getMessage() for r in caplog.records]
+    assert len(messages) == (COMM.rank == 0)
+    for text in messages:
+        assert f"bring {brought:.3g} J" in text and f"{brought:.3g} J by node 0 of" in text
+        assert "0.004 m deep" in text
+
+
+@pytest.mark.mpi
+def test_writers_see_the_motion_of_supports_from_the_start(mpi_tmp_path):
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron)
+    lift = nts.Dirichlet(lambda x: x[2] < 1e-9, value=lambda t: (0, 0, 0.5 * t))
+    block = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3, bcs=[lift])
+    path = mpi_tmp_path / "balance.csv"
+    run = nts.simulate(
+        nts.System([block]), nts.EnergyMomentum(), dt=1e-3, t_end=4e-3, adapt=nts.Adapt(),
+        output=[BalanceCSV(path)],
+    )  # fmt: skip
+    COMM.Barrier()
+    with path.open(encoding="utf-8") as file:
+        first = next(csv.DictReader(line for line in file if not line.startswith("#")))
+    assert list(first)[1].startswith("kinetic")
+    assert float(list(first.values())[1]) == run.balance["kinetic"][0] > 0
