@@ -16,6 +16,10 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 
+#: Damping of the second step towards the inverse of the bodies' matrix; below 2, the fastest of
+#: 1.4 to 1.9 on blocks of 1e4 and 5e4 coordinates.
+_DAMPING = 1.7
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
@@ -132,6 +136,7 @@ class StepMatrix:
         numbers = [self._numbers(half) for half in halves]
         self._part_numbers = [(a, b) for a in numbers for b in numbers]
         self._converted: list[Any] = []
+        self._touching: npt.NDArray[Any] | None = None
         self.operator: Any = None
 
     def _block(self, i: int, j: int) -> Any:
@@ -212,6 +217,49 @@ class StepMatrix:
                 _add(a, row, col, values[:, i][:, :, j])
             a.assemble()
         self.operator.assemble()
+
+    def schur(self) -> Any:
+        """Approximate Schur complement of the contact unknowns in the bodies' coordinates.
+
+        Of the inverse of the bodies' matrix A only its coordinates in contact count, and of these
+        two damped steps with the sums of the rows' moduli D, w D^-1 (2 D - w A) D^-1. D bounds the
+        spectrum of A, so that this stays positive; D^-1 alone leaves out how a consistent mass
+        matrix couples neighbours along the surface. The caller destroys the matrix. Collective.
+        """
+        bodies, above, below, contact = self._converted
+        rows = self._touched()
+        start, stop = contact.getOwnershipRange()
+        cols = PETSc.IS().createStride(stop - start, start, 1, comm=self._layout.comm)
+        near = bodies.createSubMatrix(rows, rows)
+        first = above.createSubMatrix(rows, cols)
+        back = below.createSubMatrix(cols, rows)
+        pointer, _, values = near.getValuesCSR()
+        inverse = near.createVecLeft()
+        inverse.array_w[:] = _DAMPING / np.add.reduceat(np.abs(values), pointer[:-1])
+        first.diagonalScale(inverse, None)
+        second = near.matMult(first)
+        second.diagonalScale(inverse, None)
+        different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+        second.aypx(-1.0, first, structure=different)
+        second.axpy(1.0, first, structure=different)
+        result = back.matMult(second)
+        result.aypx(-1.0, contact, structure=different)
+        for a in (rows, cols, near, first, back, inverse, second):
+            a.destroy()
+        return result
+
+    def _touched(self) -> Any:
+        """Index set of this rank's coordinates in contact, in the bodies' part."""
+        if self._touching is None:
+            mark = self._converted[0].createVecLeft()
+            for _, numbers in self._part_numbers[0][0]:
+                index = numbers[numbers >= 0].astype(PETSc.IntType)
+                mark.setValues(index, np.ones(len(index)), addv=PETSc.InsertMode.ADD_VALUES)
+            mark.assemble()
+            start, _ = mark.getOwnershipRange()
+            self._touching = (start + np.flatnonzero(mark.array_r)).astype(PETSc.IntType)
+            mark.destroy()
+        return PETSc.IS().createGeneral(self._touching, comm=self._layout.comm)
 
     def withdraw(self) -> None:
         """Take the contact tangents out of the bodies' matrices, but for rounding."""

@@ -25,8 +25,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pc_factor_mat_solver_type": "mumps",
         "mat_mumps_icntl_14": 80,
     },
-    # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good, and so is
-    # the Schur complement of the contact unknowns with the diagonal alone inverted.
+    # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good. In place of
+    # "selfp" comes `StepMatrix.schur`, unless the user asks for it.
     "krylov": {
         "snes_linesearch_type": "basic",
         "ksp_type": "gmres",
@@ -115,6 +115,12 @@ class SolverOptions:
         self._all = {**known, **given}
         self._unchecked = set(given)
         self._entered: dict[str, str] = {}
+
+    @property
+    def schur(self) -> bool:
+        """Whether the preset's Schur complement is to be replaced by `StepMatrix.schur`."""
+        name = "pc_fieldsplit_schur_precondition"
+        return self.split and name in self._all and name not in self._given
 
     @property
     def most_iterations(self) -> int:
@@ -232,6 +238,11 @@ def _split(snes: Any, *parts: tuple[str, Any]) -> None:
     snes.getKSP().getPC().setFieldSplitIS(*parts)
     for _, index in parts:
         index.destroy()
+
+
+def set_schur(snes: Any, schur: Any) -> None:
+    """Give a Schur field split the matrix its contact part is preconditioned with."""
+    snes.getKSP().getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, schur)
 
 
 def keep_bodies(snes: Any, keep: bool) -> None:

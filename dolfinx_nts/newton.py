@@ -21,6 +21,7 @@ from dolfinx_nts.linear_solver import (
     choose,
     keep_bodies,
     most_iterations,
+    set_schur,
 )
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.system import System
@@ -268,6 +269,8 @@ class StepSolver:
         if fresh or new or self.problem.elements:
             tangents = [c.tangent for c in e.contacts] if self.problem.elements else []
             self.matrix.assemble(tangents, fresh=fresh)
+        if self.snes is not None:
+            self._refresh_schur()
         self._assembled = e
         return self.matrix
 
@@ -282,6 +285,15 @@ class StepSolver:
         contact = self.matrix if self.problem.elements else None
         self._solved = False
         self._options.configure(self.snes, contact, len(self.problem.awake))
+        self._refresh_schur()
+
+    def _refresh_schur(self) -> None:
+        """Give the preset's field split the Schur complement of the matrix as it is now."""
+        if self.problem.elements and self._options.schur:
+            assert self.matrix is not None
+            schur = self.matrix.schur()
+            set_schur(self.snes, schur)
+            schur.destroy()
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:

@@ -85,6 +85,44 @@ def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
     krylov.close()
 
 
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+def test_schur_complement():
+    """Against the exact one: positive, and nearer than that of the inverted diagonal."""
+    stepper = stepper_of(pressed_block(0.3), linear_solver="krylov")
+    while stepper.solution.rows[-1]["active"] < 30:
+        stepper.advance(1e-3)
+    matrix = stepper.solver.matrix
+    a, b, c, d = (m.getValues(*map(range, m.getSize())) for m in matrix._converted)
+    exact = d - c @ np.linalg.solve(a, b)
+    schur = matrix.schur()
+    spreads = []
+    for near in (schur.getValues(*map(range, schur.getSize())), d - c / np.diag(a) @ b):
+        values = np.linalg.eigvals(np.linalg.solve(near, exact))
+        assert np.abs(values.imag).max() < 1e-9 and values.real.min() > 0
+        spreads.append(values.real.max() / values.real.min())
+    assert spreads[0] < 4 < spreads[1]
+    schur.destroy()
+    stepper.close()
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="there block Jacobi takes most of the iterations")
+def test_schur_complement_saves_iterations():
+    counts = []
+    for options in (None, {"pc_fieldsplit_schur_precondition": "selfp"}):
+        newton = nts.Newton(linear_solver="krylov")
+        stepper = nts.Stepper(
+            pressed_block(0.3), nts.EnergyMomentum(), newton=newton, petsc_options=options
+        )
+        count = 0
+        while stepper.state.time < 0.025:
+            stepper.advance(1e-3)
+            if stepper.solution.rows[-1]["active"] >= 30:
+                count += stepper.solver.snes.getLinearSolveIterations()
+        counts.append(count)
+        stepper.close()
+    assert 0 < counts[0] < 0.85 * counts[1]
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [None, False])
 def test_the_choice_changes_no_solution(condense):
