@@ -50,21 +50,18 @@ PRESETS: dict[str, dict[str, Any]] = {
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
 # wall has more constraints than coordinates.
 PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
-#: Below so many coordinates both presets cost the same, most of it not the solver's.
-_FEW = 600
 
 
-def choose(size: int, inertia: bool, given: Mapping[str, Any]) -> str:
-    """Preset for a system: "krylov", but "direct" where that is as fast or the user asks for it.
+def choose(inertia: bool, given: Mapping[str, Any]) -> str:
+    """Preset to begin with: "krylov", but "direct" where that is faster or the user asks for it.
 
     Without inertia incomplete factors are poor.
 
     Args:
-        size: Coordinates of all bodies.
         inertia: Whether the step equations have inertia.
-        given: The user's PETSc options, which are meant for the preset "direct".
+        given: The user's PETSc options; those of a linear solver are meant for "direct".
     """
-    return "krylov" if size >= _FEW and inertia and not given else "direct"
+    return "krylov" if inertia and all(name.startswith("snes_") for name in given) else "direct"
 
 
 def most_iterations(size: int) -> int:

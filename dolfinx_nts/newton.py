@@ -48,8 +48,8 @@ class Newton:
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
             a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
             incomplete factors weaken as dt grows beyond the time a wave needs through an element.
-            "auto" takes "krylov" while that is the faster one: not for few coordinates, nor in
-            statics, nor with `petsc_options`, nor for the next steps after a solve that needed
+            "auto" takes "krylov" while that is the faster one: not in statics, nor with
+            `petsc_options` beyond those of SNES, nor for the next steps after a solve that needed
             more iterations than MUMPS is worth. Where MUMPS fails, it leaves out equations that
             repeat others for some steps; "krylov" is left alone.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
@@ -85,11 +85,9 @@ class Newton:
             known = ", ".join(map(repr, SOLVERS))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
 
-    def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
-        """Preset of the linear solver for a system; arguments as of `choose`. Collective."""
-        if self.linear_solver != "auto":
-            return self.linear_solver
-        return choose(system.size, inertia, given)
+    def preset(self, inertia: bool, given: Mapping[str, Any]) -> str:
+        """Preset of the linear solver to begin with; arguments as of `choose`."""
+        return choose(inertia, given) if self.linear_solver == "auto" else self.linear_solver
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
@@ -151,7 +149,8 @@ class StepSolver:
 
     def _solver_options(self) -> SolverOptions:
         system, preset = self.problem.system, self._presets[self._chosen]
-        limit = most_iterations(system.size) if self.newton.linear_solver == "auto" else None
+        weighed = preset == "krylov" and self.newton.linear_solver == "auto"
+        limit = most_iterations(system.size) if weighed else None
         return SolverOptions(system.comm, preset, self.problem.condense, self._given, limit)
 
     def _use(self, chosen: int) -> None:

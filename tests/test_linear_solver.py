@@ -29,18 +29,17 @@ def stepper_of(system, **options):
 
 
 @pytest.mark.parametrize(
-    ("size", "inertia", "given", "preset"),
+    ("inertia", "given", "preset"),
     [
-        (1000, True, {}, "krylov"),
-        (50_000, True, {}, "krylov"),
-        (600, True, {}, "krylov"),
-        (599, True, {}, "direct"),
-        (50_000, False, {}, "direct"),
-        (50_000, True, {"mat_mumps_icntl_7": 4}, "direct"),
+        (True, {}, "krylov"),
+        (True, {"snes_linesearch_type": "bt"}, "krylov"),
+        (False, {}, "direct"),
+        (True, {"mat_mumps_icntl_7": 4}, "direct"),
+        (True, {"snes_linesearch_type": "bt", "ksp_type": "cg"}, "direct"),
     ],
 )
-def test_choice(size, inertia, given, preset):
-    assert linear_solver.choose(size, inertia, given) == preset
+def test_choice(inertia, given, preset):
+    assert linear_solver.choose(inertia, given) == preset
 
 
 def test_condensed_by_default_where_krylov_is_used():
@@ -147,7 +146,9 @@ def test_the_choice_changes_no_solution(condense):
 def test_nodes_with_more_constraints_than_coordinates(integrator, fine, friction):
     """A block slides along a floor into a wall: nodes of its edge stick to one and touch both.
 
-    The finer one has coordinates enough to begin with Krylov's method.
+    The finer one has coordinates enough to begin with Krylov's method. How the two share a node's
+    force is not determined, so rounding, which differs with processor and ranks, decides whether
+    Newton needs a halved step.
     """
     n = [4 * fine, 2 * fine, 2 * fine]
     mesh = create_box(COMM, [[0, 0, 0], [0.4, 0.2, 0.2]], n, CellType.hexahedron)
@@ -160,7 +161,7 @@ def test_nodes_with_more_constraints_than_coordinates(integrator, fine, friction
     ]
     system = nts.System([block], contacts=pairs, gravity=(0, 0, -9.81))
     run = nts.simulate(system, integrator, dt=1e-3, t_end=0.03)
-    assert run.status == "completed" and run.retries == 0
+    assert run.status == "completed"
     table = run.balance
     energy = table["energy"][0]
     assert table["active"].max() > 15 and table["friction_dissipation"][-1] > 1e-4 * energy
