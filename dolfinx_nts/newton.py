@@ -24,7 +24,6 @@ from dolfinx_nts.linear_solver import (
     set_schur,
 )
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
-from dolfinx_nts.system import System
 from dolfinx_nts.validation import known_options
 
 logger = logging.getLogger(__name__)

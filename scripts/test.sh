@@ -1,5 +1,6 @@
 #!/bin/bash
-# The whole test suite: lint, then pytest in serial, then the tests marked mpi on 2 ranks.
+# The whole test suite: lint, then pytest in serial (a process on each core, a test file at a time),
+# then the tests marked mpi on 2 ranks.
 # A failing stage does not stop the later ones. PYTEST_ARGS is given to pytest; NO_LINT=1 skips lint.
 set -uo pipefail
 . "$(dirname "$0")/common.sh"
@@ -13,7 +14,7 @@ clean_environment
 read -r -a args <<<"${PYTEST_ARGS:-}"
 
 say "pytest, serial"
-"$PYTHON" -m pytest -q "${args[@]}" </dev/null || failed+=("serial tests")
+"$PYTHON" -m pytest -q -n "$(nproc)" --dist loadfile "${args[@]}" </dev/null || failed+=("serial tests")
 
 say "pytest, 2 ranks, the tests marked mpi"
 color=no # mpirun gives every rank a terminal, so pytest cannot tell
