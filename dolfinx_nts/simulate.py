@@ -35,6 +35,8 @@ class Solution:
         rows: Balance table, one row for the start and one per accepted step.
         retries: How often a step was dropped and halved.
         rejected: How often a step was dropped for its error and shortened, see `Adapt`.
+        exceeded: Steps taken though they err more than `Adapt` asks for: the shortest it may take,
+            and those that move nodes out from behind their facets.
         switches: Changes of facet of nodes in contact.
     """
 
@@ -43,6 +45,7 @@ class Solution:
     rows: list[dict[str, Any]] = field(default_factory=list)
     retries: int = 0
     rejected: int = 0
+    exceeded: int = 0
     switches: list[balance.Switch] = field(default_factory=list)
 
     @property
@@ -58,7 +61,8 @@ class Solution:
         iterations = self.balance["newton_iterations"].sum() / max(steps, 1)
         lines = [
             f"{self.status}: {steps} steps to t = {last['time']:.6g} s, {self.retries} retries, "
-            f"{self.rejected} rejected, {iterations:.2f} Newton iterations per step",
+            f"{self.rejected} rejected, {self.exceeded} above their tolerance, {iterations:.2f} Newton "
+            "iterations per step",
             f"energy {first['energy']:.6g} J + external work {last['external_work']:.6g} J - "
             f"friction {last['friction_dissipation']:.6g} J - contact "
             f"{last['contact_defect']:.6g} J = {last['energy']:.6g} J, "
@@ -216,6 +220,7 @@ class Stepper:
                 self.solution.rejected += 1
                 continue
             retries = 0
+            self.solution.exceeded = pace.exceeded
             self._take(step, dt, end if dt == left else now + dt)
             yield
 

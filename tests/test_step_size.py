@@ -88,6 +88,24 @@ def test_error_of_a_step_is_that_of_the_trapezoidal_rule():
 
 
 @pytest.mark.mpi
+def test_steps_above_their_tolerance_are_told():
+    """The error of a step of the spring follows from its sine: h^3/12 times the third derivative."""
+    h, tolerances = 0.1, (1e-3, 1e-4)
+    for tolerance in tolerances:
+        run = nts.simulate(
+            nts.System([SpringMass()]), nts.EnergyMomentum(), dt=h, t_end=2.0,
+            adapt=nts.Adapt(tolerance=tolerance, shortest=1.0),
+        )  # fmt: skip
+        # Steps after the first: there nothing is known.
+        t = h * np.arange(1.5, 20)
+        error = h**3 / 12 * RATE**3 * np.abs(np.cos(RATE * t)) / (tolerance * 2.0 * RATE)
+        assert run.rejected == 0 and len(run.rows) == 21
+        assert run.exceeded == pytest.approx((error > 1).sum(), abs=2)
+        assert f"{run.exceeded} above their tolerance" in run.summary
+    assert run.exceeded > 10
+
+
+@pytest.mark.mpi
 def test_error_of_a_run_follows_the_tolerance():
     """Steps as tolerance^(-1/3), the error of a run as h^2, thus as tolerance^(2/3)."""
     errors, steps = [], []
@@ -335,6 +353,6 @@ def test_writers_see_the_motion_of_supports_from_the_start(mpi_tmp_path):
     )  # fmt: skip
     COMM.Barrier()
     with path.open(encoding="utf-8") as file:
-        first = next(csv.DictReader(line for line in file if not line.startswith("#")))
+        first = next(csv.DictReader(file))
     assert list(first)[1].startswith("kinetic")
     assert float(list(first.values())[1]) == run.balance["kinetic"][0] > 0
