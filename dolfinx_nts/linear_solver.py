@@ -52,16 +52,22 @@ PRESETS: dict[str, dict[str, Any]] = {
 PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
 
 
-def choose(inertia: bool, given: Mapping[str, Any]) -> str:
+#: Below so many coordinates both presets cost the same, and MUMPS leaves nothing but rounding.
+_FEW = 100
+
+
+def choose(size: int, inertia: bool, given: Mapping[str, Any]) -> str:
     """Preset to begin with: "krylov", but "direct" where that is faster or the user asks for it.
 
     Without inertia incomplete factors are poor.
 
     Args:
+        size: Coordinates of all bodies.
         inertia: Whether the step equations have inertia.
         given: The user's PETSc options; those of a linear solver are meant for "direct".
     """
-    return "krylov" if inertia and all(name.startswith("snes_") for name in given) else "direct"
+    direct = size < _FEW or not inertia or any(not name.startswith("snes_") for name in given)
+    return "direct" if direct else "krylov"
 
 
 def most_iterations(size: int) -> int:

@@ -47,10 +47,10 @@ class Newton:
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
             a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
             incomplete factors weaken as dt grows beyond the time a wave needs through an element.
-            "auto" takes "krylov" while that is the faster one: not in statics, nor with
-            `petsc_options` beyond those of SNES, nor for the next steps after a solve that needed
-            more iterations than MUMPS is worth. Where MUMPS fails, it leaves out equations that
-            repeat others for some steps; "krylov" is left alone.
+            "auto" takes "krylov" while that is the faster one: not for a handful of coordinates,
+            nor in statics, nor with `petsc_options` beyond those of SNES, nor for the next steps
+            after a solve that needed more iterations than MUMPS is worth. Where MUMPS fails, it
+            leaves out equations that repeat others for some steps; "krylov" is left alone.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew.
 
@@ -84,9 +84,9 @@ class Newton:
             known = ", ".join(map(repr, SOLVERS))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
 
-    def preset(self, inertia: bool, given: Mapping[str, Any]) -> str:
+    def preset(self, size: int, inertia: bool, given: Mapping[str, Any]) -> str:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
-        return choose(inertia, given) if self.linear_solver == "auto" else self.linear_solver
+        return choose(size, inertia, given) if self.linear_solver == "auto" else self.linear_solver
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.

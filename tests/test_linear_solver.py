@@ -29,17 +29,18 @@ def stepper_of(system, **options):
 
 
 @pytest.mark.parametrize(
-    ("inertia", "given", "preset"),
+    ("size", "inertia", "given", "preset"),
     [
-        (True, {}, "krylov"),
-        (True, {"snes_linesearch_type": "bt"}, "krylov"),
-        (False, {}, "direct"),
-        (True, {"mat_mumps_icntl_7": 4}, "direct"),
-        (True, {"snes_linesearch_type": "bt", "ksp_type": "cg"}, "direct"),
+        (100, True, {}, "krylov"),
+        (99, True, {}, "direct"),
+        (50_000, True, {"snes_linesearch_type": "bt"}, "krylov"),
+        (50_000, False, {}, "direct"),
+        (50_000, True, {"mat_mumps_icntl_7": 4}, "direct"),
+        (50_000, True, {"snes_linesearch_type": "bt", "ksp_type": "cg"}, "direct"),
     ],
 )
-def test_choice(inertia, given, preset):
-    assert linear_solver.choose(inertia, given) == preset
+def test_choice(size, inertia, given, preset):
+    assert linear_solver.choose(size, inertia, given) == preset
 
 
 def test_condensed_by_default_where_krylov_is_used():
