@@ -52,22 +52,24 @@ PRESETS: dict[str, dict[str, Any]] = {
 PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
 
 
-#: Below so many coordinates both presets cost the same, and MUMPS leaves nothing but rounding.
-_FEW = 100
+#: Below so many coordinates, without and with contact, both presets cost the same, and MUMPS leaves
+#: nothing but rounding.
+_FEW = (100, 500)
 
 
-def choose(size: int, inertia: bool, given: Mapping[str, Any]) -> str:
+def choose(size: int, contact: bool, inertia: bool, given: Mapping[str, Any]) -> str:
     """Preset to begin with: "krylov", but "direct" where that is faster or the user asks for it.
 
     Without inertia incomplete factors are poor.
 
     Args:
         size: Coordinates of all bodies.
+        contact: Whether contacts are declared.
         inertia: Whether the step equations have inertia.
         given: The user's PETSc options; those of a linear solver are meant for "direct".
     """
-    direct = size < _FEW or not inertia or any(not name.startswith("snes_") for name in given)
-    return "direct" if direct else "krylov"
+    own = any(not name.startswith("snes_") for name in given)
+    return "direct" if own or not inertia or size < _FEW[contact] else "krylov"
 
 
 def most_iterations(size: int) -> int:

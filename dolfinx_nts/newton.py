@@ -24,6 +24,7 @@ from dolfinx_nts.linear_solver import (
     set_schur,
 )
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import known_options
 
 logger = logging.getLogger(__name__)
@@ -47,7 +48,7 @@ class Newton:
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
             a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
             incomplete factors weaken as dt grows beyond the time a wave needs through an element.
-            "auto" takes "krylov" while that is the faster one: not for a handful of coordinates,
+            "auto" takes "krylov" while that is the faster one: not for some hundred coordinates,
             nor in statics, nor with `petsc_options` beyond those of SNES, nor for the next steps
             after a solve that needed more iterations than MUMPS is worth. Where MUMPS fails, it
             leaves out equations that repeat others for some steps; "krylov" is left alone.
@@ -84,9 +85,11 @@ class Newton:
             known = ", ".join(map(repr, SOLVERS))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
 
-    def preset(self, size: int, inertia: bool, given: Mapping[str, Any]) -> str:
+    def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
-        return choose(size, inertia, given) if self.linear_solver == "auto" else self.linear_solver
+        if self.linear_solver != "auto":
+            return self.linear_solver
+        return choose(system.size, bool(system.contacts), inertia, given)
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.

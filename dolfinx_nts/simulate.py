@@ -135,7 +135,7 @@ class Stepper:
             raise TypeError(f"sleep={sleep!r}: pass True or False")
         self.newton = newton or Newton()
         given = petsc_options or {}
-        preset = self.newton.preset(system.size, integrator.inertia, given)
+        preset = self.newton.preset(system, integrator.inertia, given)
         condense = self.newton.condense
         self.problem = StepProblem(
             system,

@@ -119,7 +119,8 @@ def on_ranks():
 
 def _on_ranks(ranks: int, *arguments: str) -> str:
     # This process is a rank itself; its own MPI variables would mislead the new ones.
-    own = ("OMPI_COMM", "OMPI_UNIVERSE", "PMIX_", "PRTE_")
+    own = ("OMPI_COMM", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PRTE_", "ORTE_")
+    own += ("OMPI_MCA_ess", "OMPI_MCA_orte", "OMPI_MCA_pmix")
     environment = {k: v for k, v in os.environ.items() if not k.startswith(own)}
     environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     environment |= {"OMP_NUM_THREADS": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}

@@ -23,6 +23,8 @@ INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum
 
 
 def stepper(scene, name="energy-momentum", **newton):
+    # One solver for all features, so that their rounding is the same.
+    newton = {"linear_solver": "direct", **newton}
     return nts.Stepper(scene, INTEGRATORS[name], newton=nts.Newton(**newton))
 
 

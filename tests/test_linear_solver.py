@@ -29,18 +29,20 @@ def stepper_of(system, **options):
 
 
 @pytest.mark.parametrize(
-    ("size", "inertia", "given", "preset"),
+    ("size", "contact", "inertia", "given", "preset"),
     [
-        (100, True, {}, "krylov"),
-        (99, True, {}, "direct"),
-        (50_000, True, {"snes_linesearch_type": "bt"}, "krylov"),
-        (50_000, False, {}, "direct"),
-        (50_000, True, {"mat_mumps_icntl_7": 4}, "direct"),
-        (50_000, True, {"snes_linesearch_type": "bt", "ksp_type": "cg"}, "direct"),
+        (500, True, True, {}, "krylov"),
+        (499, True, True, {}, "direct"),
+        (100, False, True, {}, "krylov"),
+        (99, False, True, {}, "direct"),
+        (50_000, True, True, {"snes_linesearch_type": "bt"}, "krylov"),
+        (50_000, True, False, {}, "direct"),
+        (50_000, True, True, {"mat_mumps_icntl_7": 4}, "direct"),
+        (50_000, True, True, {"snes_linesearch_type": "bt", "ksp_type": "cg"}, "direct"),
     ],
 )
-def test_choice(size, inertia, given, preset):
-    assert linear_solver.choose(size, inertia, given) == preset
+def test_choice(size, contact, inertia, given, preset):
+    assert linear_solver.choose(size, contact, inertia, given) == preset
 
 
 def test_condensed_by_default_where_krylov_is_used():
