@@ -14,7 +14,7 @@ clean_environment
 read -r -a args <<<"${PYTEST_ARGS:-}"
 
 say "pytest, serial"
-"$PYTHON" -m pytest -q -n "$(nproc)" --dist loadfile "${args[@]}" </dev/null || failed+=("serial tests")
+"$PYTHON" -m pytest -q -n auto --dist loadfile "${args[@]}" </dev/null || failed+=("serial tests")
 
 say "pytest, 2 ranks, the tests marked mpi"
 color=no # mpirun gives every rank a terminal, so pytest cannot tell
