@@ -16,8 +16,8 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 
-#: Damping of the second step towards the inverse of the bodies' matrix; below 2, the fastest of
-#: 1.4 to 1.9 on blocks of 1e4 and 5e4 coordinates.
+#: Factor of both Richardson steps towards the inverse of the bodies' matrix, which stays positive
+#: below 2; the fastest of 1.4 to 1.9 on blocks of 1e4 and 5e4 coordinates.
 _DAMPING = 1.7
 
 FloatArray = npt.NDArray[np.float64]
@@ -136,7 +136,7 @@ class StepMatrix:
         numbers = [self._numbers(half) for half in halves]
         self._part_numbers = [(a, b) for a in numbers for b in numbers]
         self._converted: list[Any] = []
-        self._touching: npt.NDArray[Any] | None = None
+        self._near: tuple[Any, ...] = ()
         self.operator: Any = None
 
     def _block(self, i: int, j: int) -> Any:
@@ -221,45 +221,47 @@ class StepMatrix:
     def schur(self) -> Any:
         """Approximate Schur complement of the contact unknowns in the bodies' coordinates.
 
-        Of the inverse of the bodies' matrix A only its coordinates in contact count, and of these
-        two damped steps with the sums of the rows' moduli D, w D^-1 (2 D - w A) D^-1. D bounds the
-        spectrum of A, so that this stays positive; D^-1 alone leaves out how a consistent mass
-        matrix couples neighbours along the surface. The caller destroys the matrix. Collective.
+        Only the coordinates in contact count; the inverse of their block A of the bodies' matrix is
+        replaced by two Richardson steps, w D^-1 (2 D - w A) D^-1, where D holds the sums of the
+        moduli of A's rows. D bounds the spectrum of a symmetric A, so that this stays positive;
+        D^-1 alone leaves out how a consistent mass matrix couples neighbours along the surface.
+        The caller destroys the matrix. Collective.
         """
         bodies, above, below, contact = self._converted
-        rows = self._touched()
-        start, stop = contact.getOwnershipRange()
-        cols = PETSc.IS().createStride(stop - start, start, 1, comm=self._layout.comm)
-        near = bodies.createSubMatrix(rows, rows)
-        first = above.createSubMatrix(rows, cols)
-        back = below.createSubMatrix(cols, rows)
+        rows, cols, *kept = self._near or (*self._touched(), None, None, None, None)
+        near, first, back, second = kept
+        near = bodies.createSubMatrix(rows, rows, submat=near)
+        first = above.createSubMatrix(rows, cols, submat=first)
+        back = below.createSubMatrix(cols, rows, submat=back)
         pointer, _, values = near.getValuesCSR()
         inverse = near.createVecLeft()
         inverse.array_w[:] = _DAMPING / np.add.reduceat(np.abs(values), pointer[:-1])
         first.diagonalScale(inverse, None)
-        second = near.matMult(first)
+        second = near.matMult(first, result=second)
+        self._near = (rows, cols, near, first, back, second)
         second.diagonalScale(inverse, None)
-        different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
-        second.aypx(-1.0, first, structure=different)
-        second.axpy(1.0, first, structure=different)
+        # The diagonal of A has no gaps.
+        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+        second.aypx(-1.0, first, structure=subset)
+        second.axpy(1.0, first, structure=subset)
         result = back.matMult(second)
-        result.aypx(-1.0, contact, structure=different)
-        for a in (rows, cols, near, first, back, inverse, second):
-            a.destroy()
+        result.aypx(-1.0, contact, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        inverse.destroy()
         return result
 
-    def _touched(self) -> Any:
-        """Index set of this rank's coordinates in contact, in the bodies' part."""
-        if self._touching is None:
-            mark = self._converted[0].createVecLeft()
-            for _, numbers in self._part_numbers[0][0]:
-                index = numbers[numbers >= 0].astype(PETSc.IntType)
-                mark.setValues(index, np.ones(len(index)), addv=PETSc.InsertMode.ADD_VALUES)
-            mark.assemble()
-            start, _ = mark.getOwnershipRange()
-            self._touching = (start + np.flatnonzero(mark.array_r)).astype(PETSc.IntType)
-            mark.destroy()
-        return PETSc.IS().createGeneral(self._touching, comm=self._layout.comm)
+    def _touched(self) -> tuple[Any, Any]:
+        """Index sets of this rank's coordinates in contact and of its contact unknowns."""
+        comm, mark = self._layout.comm, self._converted[0].createVecLeft()
+        for _, numbers in self._part_numbers[0][0]:
+            index = numbers[numbers >= 0].astype(PETSc.IntType)
+            mark.setValues(index, np.ones(len(index)), addv=PETSc.InsertMode.ADD_VALUES)
+        mark.assemble()
+        start, _ = mark.getOwnershipRange()
+        touched = (start + np.flatnonzero(mark.array_r)).astype(PETSc.IntType)
+        mark.destroy()
+        start, stop = self._converted[3].getOwnershipRange()
+        cols = PETSc.IS().createStride(stop - start, start, 1, comm=comm)
+        return PETSc.IS().createGeneral(touched, comm=comm), cols
 
     def withdraw(self) -> None:
         """Take the contact tangents out of the bodies' matrices, but for rounding."""
@@ -323,7 +325,7 @@ class StepMatrix:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
         operator = [self.operator] if self._split and self.operator else []
         nests = [self.nest, *(self._parts if self._split else [])]
-        for a in (*operator, *self._converted, *nests, *self._blocks.values()):
+        for a in (*operator, *self._near, *self._converted, *nests, *self._blocks.values()):
             a.destroy()
 
 

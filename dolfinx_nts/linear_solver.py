@@ -25,8 +25,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pc_factor_mat_solver_type": "mumps",
         "mat_mumps_icntl_14": 80,
     },
-    # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good. In place of
-    # "selfp" comes `StepMatrix.schur`, unless the user asks for it.
+    # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good. "selfp" is
+    # replaced by `StepMatrix.schur`, but for a user who asks for "selfp", and where options are
+    # checked.
     "krylov": {
         "snes_linesearch_type": "basic",
         "ksp_type": "gmres",
@@ -50,15 +51,13 @@ PRESETS: dict[str, dict[str, Any]] = {
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
 # wall has more constraints than coordinates.
 PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
-
-
 #: Below so many coordinates, without and with contact, both presets cost the same, and MUMPS leaves
 #: nothing but rounding.
 _FEW = (100, 500)
 
 
 def choose(size: int, contact: bool, inertia: bool, given: Mapping[str, Any]) -> str:
-    """Preset to begin with: "krylov", but "direct" where that is faster or the user asks for it.
+    """Preset to begin with: "krylov", but "direct" where that is as good or the user asks for it.
 
     Without inertia incomplete factors are poor.
 
@@ -124,8 +123,8 @@ class SolverOptions:
     @property
     def schur(self) -> bool:
         """Whether the preset's Schur complement is to be replaced by `StepMatrix.schur`."""
-        name = "pc_fieldsplit_schur_precondition"
-        return self.split and name in self._all and name not in self._given
+        name, kind = "pc_fieldsplit_schur_precondition", self._all.get("pc_fieldsplit_type")
+        return self.split and kind == "schur" and name in self._all and name not in self._given
 
     @property
     def most_iterations(self) -> int:

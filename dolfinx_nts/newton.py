@@ -48,10 +48,11 @@ class Newton:
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
             a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
             incomplete factors weaken as dt grows beyond the time a wave needs through an element.
-            "auto" takes "krylov" while that is the faster one: not for some hundred coordinates,
-            nor in statics, nor with `petsc_options` beyond those of SNES, nor for the next steps
-            after a solve that needed more iterations than MUMPS is worth. Where MUMPS fails, it
-            leaves out equations that repeat others for some steps; "krylov" is left alone.
+            "auto" takes "krylov" while that is the faster one: not below 500 coordinates (100
+            where no contact is declared), nor in statics, nor with `petsc_options` beyond those of
+            SNES, nor for the next steps after a solve that needed more iterations than MUMPS is
+            worth. Where MUMPS fails, it leaves out equations that repeat others for some steps;
+            "krylov" is left alone.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew.
 
@@ -104,7 +105,7 @@ _SLOW = 0.05
 #: converges would leave its whole tolerance to the ledger, where factors leave rounding.
 _AIM = 1e-3
 #: Range of the linear solver's tolerance that is worth it.
-_FINE, _COARSE = 1e-10, 1e-5
+_FINE, _COARSE = 1e-12, 1e-5
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 

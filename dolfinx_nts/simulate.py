@@ -61,13 +61,14 @@ class Solution:
         iterations = self.balance["newton_iterations"].sum() / max(steps, 1)
         lines = [
             f"{self.status}: {steps} steps to t = {last['time']:.6g} s, {self.retries} retries, "
-            f"{self.rejected} rejected, {self.exceeded} above their tolerance, {iterations:.2f} Newton "
-            "iterations per step",
+            f"{self.rejected} rejected, {iterations:.2f} Newton iterations per step",
             f"energy {first['energy']:.6g} J + external work {last['external_work']:.6g} J - "
             f"friction {last['friction_dissipation']:.6g} J - contact "
             f"{last['contact_defect']:.6g} J = {last['energy']:.6g} J, "
             f"but for {last['ledger_residual']:.2g} J",
         ]
+        if self.exceeded:
+            lines.append(f"{self.exceeded} steps taken though they err more than their tolerance")
         if self.switches:
             defects = np.array([s.defect for s in self.switches])
             worst = self.switches[int(np.abs(defects).argmax())]
@@ -220,7 +221,7 @@ class Stepper:
                 self.solution.rejected += 1
                 continue
             retries = 0
-            self.solution.exceeded = pace.exceeded
+            self.solution.exceeded += pace.exceeds
             self._take(step, dt, end if dt == left else now + dt)
             yield
 

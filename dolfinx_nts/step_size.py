@@ -93,7 +93,7 @@ class Pace:
 
     Attributes:
         dt: Size of the next step [s] unless a gap closes or the run ends before.
-        exceeded: Steps taken though their error is above the tolerance.
+        exceeds: Whether the last step was accepted though its error is above the tolerance.
     """
 
     def __init__(self, adapt: Adapt, system: System, state: State, dt: float, span: float) -> None:
@@ -102,7 +102,7 @@ class Pace:
         self.dt = self._shortest
         self._top = _norms(system, state.v)[0]
         self._before: tuple[float, tuple[FloatArray, ...]] | None = None
-        self._error, self._meets, self.exceeded = 0.0, False, 0
+        self._error, self._meets, self.exceeds = 0.0, False, False
 
     def propose(self, left: float) -> float:
         """The next step [s]; the last two are equal.
@@ -154,7 +154,7 @@ class Pace:
         if not error <= 1.0 and not short and not self._expels(problem, step):
             self.cut(h * factor(error))
             return False
-        self.exceeded += not error <= 1.0
+        self.exceeds = not error <= 1.0
         # After an error that was small by chance the next would be cut again.
         change = factor(max(error, self._error))
         if h >= self.dt * (1 - 1e-9) and change > 1.0:

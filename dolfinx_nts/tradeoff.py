@@ -175,6 +175,7 @@ class Run:
             "iterations": int(table["newton_iterations"].sum()) if done else 0,
             "retries": self.solution.retries if self.solution else 0,
             "rejected": self.solution.rejected if self.solution else 0,
+            "exceeded": self.solution.exceeded if self.solution else 0,
             **self.errors(reference),
             "status": self.status,
         }

@@ -1,7 +1,8 @@
 #!/bin/bash
 # The whole test suite: lint, then pytest in serial (a process on each core, a test file at a time),
 # then the tests marked mpi on 2 ranks.
-# A failing stage does not stop the later ones. PYTEST_ARGS is given to pytest; NO_LINT=1 skips lint.
+# A failing stage does not stop the later ones. PYTEST_ARGS is given to pytest ("-n0 --pdb ..." for
+# those that need its terminal, with one process); NO_LINT=1 skips lint.
 set -uo pipefail
 . "$(dirname "$0")/common.sh"
 cd "$REPO" || exit 1

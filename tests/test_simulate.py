@@ -64,7 +64,7 @@ def test_a_failed_run_keeps_what_it_has_and_says_where():
         assert word in run.status
     assert "Try a smaller dt" in run.status
     table = run.balance
-    assert len(table["time"]) > 2 and table["time"][-1] < 0.05
+    assert 2 < len(table["time"]) < 25
     assert np.abs(table["ledger_residual"]).max() <= 1e-6 * table["energy"][0]
 
 

@@ -89,7 +89,7 @@ def test_error_of_a_step_is_that_of_the_trapezoidal_rule():
 
 @pytest.mark.mpi
 def test_steps_above_their_tolerance_are_told():
-    """The error of a step of the spring follows from its sine: h^3/12 times the third derivative."""
+    """A step of the spring errs by h^3/12 times the third derivative of its sine."""
     h, tolerances = 0.1, (1e-3, 1e-4)
     for tolerance in tolerances:
         run = nts.simulate(
@@ -101,7 +101,7 @@ def test_steps_above_their_tolerance_are_told():
         error = h**3 / 12 * RATE**3 * np.abs(np.cos(RATE * t)) / (tolerance * 2.0 * RATE)
         assert run.rejected == 0 and len(run.rows) == 21
         assert run.exceeded == pytest.approx((error > 1).sum(), abs=2)
-        assert f"{run.exceeded} above their tolerance" in run.summary
+        assert (f"{run.exceeded} steps taken though" in run.summary) == (run.exceeded > 0)
     assert run.exceeded > 10
 
 
