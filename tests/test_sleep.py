@@ -131,7 +131,8 @@ def test_units_change_nothing(metre):
 @pytest.mark.parametrize(("reuse", "iterations"), [(False, 3), (True, 5)])
 def test_a_step_that_fails_is_halved(reuse, iterations):
     """The impact takes more iterations than these."""
-    a, b, awake = both(row, 5, max_iterations=iterations, reuse=reuse)
+    newton = {"max_iterations": iterations, "reuse": reuse, "linear_solver": "direct"}
+    a, b, awake = both(row, 5, **newton)
     assert a.solution.retries == b.solution.retries > 0
     assert "ab" in awake
     assert_same(a, b)
