@@ -51,9 +51,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
 # wall has more constraints than coordinates.
 PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
-#: Below so many coordinates, without and with contact, both presets cost the same, and MUMPS leaves
-#: nothing but rounding.
-_FEW = (100, 500)
+#: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
+#: leaves nothing but rounding, so that Newton's iterations do not depend on units or ranks.
+_FEW = (100, 600)
 
 
 def choose(size: int, contact: bool, inertia: bool, given: Mapping[str, Any]) -> str:
@@ -111,6 +111,9 @@ class SolverOptions:
     ) -> None:
         self._comm, self._given = comm, dict(given)
         known = dict(PRESETS[preset])
+        if preset == "krylov" and comm.size > 1:
+            # An overlap of one node halves the iterations of smooth motion; alone there is none.
+            known[_BODIES + "pc_type"] = "asm"
         if limit is not None:
             known["ksp_max_it"] = limit
         if condense and preset in _CONDENSED:

@@ -48,7 +48,7 @@ class Newton:
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
             a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
             incomplete factors weaken as dt grows beyond the time a wave needs through an element.
-            "auto" takes "krylov" while that is the faster one: not below 500 coordinates (100
+            "auto" takes "krylov" while that is the faster one: not below 600 coordinates (100
             where no contact is declared), nor in statics, nor with `petsc_options` beyond those of
             SNES, nor for the next steps after a solve that needed more iterations than MUMPS is
             worth. Where MUMPS fails, it leaves out equations that repeat others for some steps;
