@@ -35,8 +35,8 @@ class Solution:
         rows: Balance table, one row for the start and one per accepted step.
         retries: How often a step was dropped and halved.
         rejected: How often a step was dropped for its error and shortened, see `Adapt`.
-        exceeded: Steps taken though they err more than `Adapt` asks for: the shortest it may take,
-            and those that move nodes out from behind their facets.
+        exceeded: Steps taken though their motion errs more than `Adapt` asks for: the shortest it
+            may take, and those that move nodes out from behind their facets.
         switches: Changes of facet of nodes in contact.
     """
 
@@ -376,7 +376,9 @@ def simulate(
 
     Raises:
         TypeError: An argument is of another type.
-        ValueError: An argument is out of range; before any work.
+        ValueError: An argument is out of range; before any work, but for a load or a support that
+            is not finite later. What a function of the user's raises in the run is not caught; what
+            writers have written stays.
     """
     require_positive("dt", dt, "s")
     require_positive("t_end", t_end, "s")

@@ -41,8 +41,9 @@ class Adapt:
         tolerance: Largest error of a step, > 0: of the motion (root of its square, weighted by
             mass) relative to what the run's largest such speed covers until t_end; and of the
             energy that nodes lose by closing their gaps in mid step, relative to the largest
-            kinetic energy. A step in which a contact begins and would lose more is shortened to
-            end where the first gap closes, by the velocities at its start.
+            kinetic energy. A step in which two surfaces that were apart touch and would lose more
+            is shortened to end where the first gap closes, by the velocities at its start; gaps
+            that close while other nodes of the pair carry are not met.
         shortest: Smallest step, and smallest time to a gap's closing, over `dt`, in (0, 1].
 
     Raises:
