@@ -50,9 +50,9 @@ def fastest(scene: str, repeats: int, comm: Any) -> dict[str, float]:
     for _ in range(repeats):
         for solver in SOLVERS:
             run = tradeoff.measure(demo, {**choices, "linear_solver": solver}, comm)
-            if run.status != "completed":
+            if run.status != "completed" and comm.rank == 0:
                 print(f"{scene}, {solver}: {run.status}")
-            else:
+            if run.status == "completed":
                 step = run.seconds / (len(run.solution.rows) - 1)
                 seconds[solver] = min(seconds[solver], step)
     return seconds

@@ -52,7 +52,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 # wall has more constraints than coordinates.
 PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
 #: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
-#: leaves nothing but rounding, so that Newton's iterations do not depend on units or ranks.
+#: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.
 _FEW = (100, 600)
 
 

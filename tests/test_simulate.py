@@ -53,7 +53,7 @@ def test_a_cut_back_step_equals_the_small_steps(integrator):
 
 @pytest.mark.mpi
 def test_a_failed_run_keeps_what_it_has_and_says_where():
-    newton = nts.Newton(max_iterations=1, max_retries=2, linear_solver="direct")
+    newton = nts.Newton(max_iterations=1, max_retries=2)
     run = nts.simulate(
         two_blocks.scene(COMM), nts.EnergyMomentum(), dt=2e-3, t_end=0.05, newton=newton
     )
