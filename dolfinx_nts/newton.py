@@ -106,6 +106,8 @@ _SLOW = 0.05
 _AIM = 1e-3
 #: Range of the linear solver's tolerance that is worth it.
 _FINE, _COARSE = 1e-12, 1e-5
+#: The same with kept matrices, with which an iteration gains two or three digits.
+_KEPT = 1e-3
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 
@@ -147,6 +149,7 @@ class StepSolver:
         self._bodies: dict[int, Any] = {}
         self._assembled: Evaluation | None = None
         self._last: Evaluation | None = None
+        self._passed: Evaluation | None = None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
 
@@ -208,8 +211,9 @@ class StepSolver:
                 ) from error
             last = self._at(self.problem.x)
             iterations += self.snes.getIterationNumber()
-            # A line search of the user's may stop SNES by its own tests; ours decide.
-            if self._worst(last) <= 1.0 and self.snes.getConvergedReason() > 0:
+            # A solver of the user's may stop SNES by its own tests; ours decide.
+            solved = last is self._passed or self._worst(last) <= 1.0
+            if solved and self.snes.getConvergedReason() > 0:
                 return replace(last, iterations=iterations)
             reason = self.snes.getConvergedReason()
             unsolved = reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
@@ -338,20 +342,23 @@ class StepSolver:
         self._matrices_due |= unchanged and worst > max(1.0, _SLOW * self._before)
         self._before = worst
         if worst <= 1.0:
+            self._passed = self._last
             return reasons.CONVERGED_FNORM_RELATIVE
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
-        if self._presets[self._chosen] == "krylov" and not self.newton.reuse:
-            self._aim_at(_AIM / worst)
+        if self._presets[self._chosen] == "krylov":
+            self._aim(worst)
         return reasons.ITERATING
 
-    def _aim_at(self, rtol: float) -> None:
-        """Let the linear solver of Krylov's preset reach a tolerance, if that is worth it."""
-        if not self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
-            rtol = rtol if _FINE <= rtol <= _COARSE else _COARSE
-            digits = math.log(rtol) / math.log(_COARSE)
-            limit = self._options.most_iterations
-            self.snes.getKSP().setTolerances(rtol=rtol, max_it=int(limit * digits))
+    def _aim(self, worst: float) -> None:
+        """Let the linear solver of Krylov's preset go as far as is worth it at an iterate."""
+        if self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
+            return
+        rtol = _AIM / worst if _FINE <= _AIM / worst <= _COARSE else _COARSE
+        rtol = _KEPT if self.newton.reuse else rtol
+        digits = math.log(rtol) / math.log(_COARSE)
+        limit = self._options.most_iterations
+        self.snes.getKSP().setTolerances(rtol=rtol, max_it=int(limit * digits))
 
     # ---- failure
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:

@@ -518,14 +518,21 @@ class StepProblem:
             held.array_w[:] = self._stabilization(self.system.bodies[k])
             a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
             held.destroy()
-        diagonal = a.getDiagonal()
-        norm = diagonal.norm()
-        diagonal.destroy()
+        known = abs(self.factor - self._diagonal_factor[k]) <= 1e-6 * self.factor
+        known &= self.integrator.inertia and np.array_equal(u1, self.first[k])
+        # A matrix that stiffens from step to step is measured once a step needs a second iteration.
+        if not self.system.comm.allreduce(known, op=MPI.LAND):
+            self._measure_rounding(k, a, u1)
+        return a
+
+    def _measure_rounding(self, k: int, a: Any, u1: FloatArray) -> None:
+        """Note the diagonal of a body's matrix at a displacement. Collective."""
         reached = np.abs(self.system.bodies[k].reference + u1).max(initial=0.0)
         # An iterate that runs off may be stiffer by any factor; its rounding excuses no residual.
         if _global_max(self.system.comm, np.array([reached]))[0] <= _RUN_OFF * self._extent[k]:
-            self._diagonal[k], self._diagonal_factor[k] = norm, self.factor
-        return a
+            diagonal = a.getDiagonal()
+            self._diagonal[k], self._diagonal_factor[k] = diagonal.norm(), self.factor
+            diagonal.destroy()
 
     # ---- convergence
     @property
