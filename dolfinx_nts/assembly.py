@@ -92,6 +92,8 @@ class StepMatrix:
         elements: Unknowns of each batch of contact elements.
         split: Whether solvers see a nest of two fields, "bodies" and "contact", from which a field
             split takes its blocks without a copy; else one AIJ matrix.
+        blocked: Whether the bodies' part is stored in 3 x 3 blocks (BAIJ), with which a product
+            takes a third of the time; few of PETSc's preconditioners take it.
 
     Attributes:
         nest: Blocks of all fields, as of the last fresh assembly.
@@ -105,6 +107,7 @@ class StepMatrix:
         elements: Sequence[ElementBlocks],
         *,
         split: bool = False,
+        blocked: bool = False,
     ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
         self._in_bodies: list[FloatArray] = []
@@ -135,7 +138,8 @@ class StepMatrix:
             self._parts = [PETSc.Mat().createNest(q, comm=layout.comm) for q in quarters]
         numbers = [self._numbers(half) for half in halves]
         self._part_numbers = [(a, b) for a in numbers for b in numbers]
-        self._converted: list[Any] = []
+        self._converted = [PETSc.Mat() for _ in self._parts]
+        self._scalar = PETSc.Mat() if blocked else None
         self._near: tuple[Any, ...] = ()
         self.operator: Any = None
 
@@ -180,7 +184,7 @@ class StepMatrix:
             fresh: The bodies' matrices are without contact, newly assembled; else they are as the
                 last call left them, and only the operator is changed.
         """
-        if self._converted and not fresh:
+        if self.operator is not None and not fresh:
             self._change_operator(tangents)
             return
         self._in_bodies = self._in_operator = list(tangents)
@@ -194,12 +198,16 @@ class StepMatrix:
                 self._add_to_body(self._bodies[key[0]], sources, tangents)
         for part in (self.nest, *self._parts):
             part.assemble()
-        if self._converted:
-            for part, a in zip(self._parts, self._converted, strict=True):
-                part.convert("aij", out=a)
-        else:
+        for k, (part, a) in enumerate(zip(self._parts, self._converted, strict=True)):
             # Without `out` the nest itself is converted.
-            self._converted = [part.convert("aij", out=PETSc.Mat()) for part in self._parts]
+            if k == 0 and self._scalar is not None:
+                part.convert("aij", out=self._scalar)
+                if not a:
+                    a = self._converted[0] = _blocks_of(self._scalar)
+                self._scalar.convert("baij", out=a)
+            else:
+                part.convert("aij", out=a)
+        if self.operator is None:
             self.operator = self._converted[0]
             if self._split:
                 grid = [self._converted[:2], self._converted[2:]]
@@ -228,9 +236,12 @@ class StepMatrix:
         The caller destroys the matrix. Collective.
         """
         bodies, above, below, contact = self._converted
-        rows, cols, *kept = self._near or (*self._touched(), None, None, None, None)
+        rows, cols, *kept = self._near or (*self._touched(), PETSc.Mat(), None, None, None)
         near, first, back, second = kept
-        near = bodies.createSubMatrix(rows, rows, submat=near)
+        # PETSc has no product of the two formats, nor keeps a part of a BAIJ matrix on many ranks.
+        square = bodies.createSubMatrix(rows, rows)
+        square.convert("aij", out=near)
+        square.destroy()
         first = above.createSubMatrix(rows, cols, submat=first)
         back = below.createSubMatrix(cols, rows, submat=back)
         pointer, _, values = near.getValuesCSR()
@@ -250,14 +261,15 @@ class StepMatrix:
         return result
 
     def _touched(self) -> tuple[Any, Any]:
-        """Index sets of this rank's coordinates in contact and of its contact unknowns."""
+        """Index sets of this rank's nodes' coordinates in contact and of its contact unknowns."""
         comm, mark = self._layout.comm, self._converted[0].createVecLeft()
         for _, numbers in self._part_numbers[0][0]:
             index = numbers[numbers >= 0].astype(PETSc.IntType)
             mark.setValues(index, np.ones(len(index)), addv=PETSc.InsertMode.ADD_VALUES)
         mark.assemble()
         start, _ = mark.getOwnershipRange()
-        touched = (start + np.flatnonzero(mark.array_r)).astype(PETSc.IntType)
+        nodes = np.flatnonzero(mark.array_r.reshape(-1, 3).any(axis=1))
+        touched = (start + 3 * nodes[:, None] + np.arange(3)).ravel().astype(PETSc.IntType)
         mark.destroy()
         start, stop = self._converted[3].getOwnershipRange()
         cols = PETSc.IS().createStride(stop - start, start, 1, comm=comm)
@@ -324,9 +336,28 @@ class StepMatrix:
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
         operator = [self.operator] if self._split and self.operator else []
+        operator += [] if self._scalar is None else [self._scalar]
         nests = [self.nest, *(self._parts if self._split else [])]
         for a in (*operator, *self._near, *self._converted, *nests, *self._blocks.values()):
             a.destroy()
+
+
+def _blocks_of(a: Any) -> Any:
+    """BAIJ matrix for the entries of an AIJ matrix of nodes; PETSc would not know how many."""
+    a.setBlockSize(3)
+    pointer, column, _ = a.getValuesCSR()
+    length = np.diff(pointer)
+    # Of a node's coordinates those that are not prescribed have the most neighbours.
+    longest = 3 * np.arange(len(length) // 3) + length.reshape(-1, 3).argmax(axis=1)
+    chosen = np.zeros(len(length), dtype=bool)
+    chosen[longest] = True
+    row = np.repeat(np.arange(len(longest)), length[longest])
+    block = column[np.repeat(chosen, length)] // 3
+    new = np.diff(block, prepend=-1) != 0
+    new[1:] |= np.diff(row) != 0
+    start = np.append(0, np.cumsum(np.bincount(row[new], minlength=len(longest))))
+    csr = (start.astype(PETSc.IntType), block[new].astype(PETSc.IntType))
+    return PETSc.Mat().createBAIJ(a.getSizes(), 3, csr=csr, comm=a.comm)
 
 
 def _add(a: Any, rows: IntArray, cols: IntArray, values: FloatArray) -> None:

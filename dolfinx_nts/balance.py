@@ -144,13 +144,13 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
         return []
     found, state = [], problem.state
     for k, (contact, part) in enumerate(zip(problem.contacts, step.contacts, strict=True)):
-        c, slave = contact.candidates, contact.pair.slave
+        c = contact.candidates
         old, defect = state.facets[k][c.node], -step.multipliers[k][:, 0] * c.gap / problem.factor
         stayed = (state.force[k][c.node] > 0.0) & part.active
         for i in np.flatnonzero(stayed & (old >= 0) & (old != c.facet)):
-            node = int(slave.original[slave.owned[c.node[i]]])
             facets = (int(old[i]), int(c.facet[i]))
-            found.append(Switch(time, contact.pair.name, node, facets, float(defect[i])))
+            node, name = contact.input_node(i), contact.pair.name
+            found.append(Switch(time, name, node, facets, float(defect[i])))
     gathered = problem.system.comm.allgather(found)
     return sorted((s for part in gathered for s in part), key=lambda s: s[:3])
 
@@ -159,13 +159,11 @@ def expelled(problem: StepProblem, step: Evaluation) -> str:
     """The node that brings most energy in by starting behind its facet. Every rank must call it."""
     best = (0.0, "")
     for contact, multiplier in zip(problem.contacts, step.multipliers, strict=True):
-        c, slave = contact.candidates, contact.pair.slave
-        gain = multiplier[:, 0] * c.gap / problem.factor
+        gain = multiplier[:, 0] * contact.candidates.gap / problem.factor
         if len(gain) and gain.max() > best[0]:
             i = int(gain.argmax())
-            node = int(slave.original[slave.owned[c.node[i]]])
-            name, depth = contact.pair.name, -c.gap[i]
-            text = f"{gain[i]:.3g} J by node {node} of {name!r}, {depth:.3g} m deep"
+            where = f"node {contact.input_node(i)} of {contact.pair.name!r}"
+            text = f"{gain[i]:.3g} J by {where}, {-contact.candidates.gap[i]:.3g} m deep"
             best = float(gain[i]), text
     return max(problem.system.comm.allgather(best))[1]
 

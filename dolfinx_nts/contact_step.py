@@ -103,6 +103,11 @@ class ContactStep:
         fixed: BoolArray = (np.concatenate([*self.dofs()[1:]], axis=1) < 0).all(axis=1)
         return fixed
 
+    def input_node(self, i: int) -> int:
+        """Number of a pair's slave node in the user's mesh."""
+        slave = self.pair.slave
+        return int(slave.original[slave.owned[self.candidates.node[i]]])
+
     @property
     def num_corners(self) -> int:
         """Points that the master surface over a facet depends on: its corners, or its patch's."""

@@ -139,6 +139,11 @@ class SolverOptions:
         """Whether the preconditioner is a field split, which takes the blocks of a nest."""
         return bool(self._all["pc_type"] == "fieldsplit")
 
+    @property
+    def blocked(self) -> bool:
+        """Whether the bodies' matrices may be stored in blocks: their preset is not the user's."""
+        return self.split and not any(k.startswith(("pc_", _BODIES)) for k in self._given)
+
     def configure(self, snes: Any, matrix: StepMatrix | None, num_bodies: int) -> None:
         """Set a SNES up from the options.
 

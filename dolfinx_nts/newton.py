@@ -43,8 +43,7 @@ class Newton:
         max_iterations: Newton iterations before a step is dropped.
         max_retries: How often a dropped step may be halved before the run stops.
         condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
-            lambda_N and lambda_T reach the linear solver; the same solution, smaller factors. By
-            default where Krylov's method is used.
+            lambda_N and lambda_T reach the linear solver: the same solution in fewer iterations.
         linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
             a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
             incomplete factors weaken as dt grows beyond the time a wave needs through an element.
@@ -64,7 +63,7 @@ class Newton:
     rtol: float = 1e-12
     max_iterations: int = 25
     max_retries: int = 8
-    condense: bool | None = None
+    condense: bool = True
     linear_solver: str = "auto"
     reuse: bool = False
 
@@ -75,8 +74,8 @@ class Newton:
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool):
                 raise TypeError(f"{name}={value!r}: pass a whole number")
-        for name, kinds in (("condense", bool | None), ("reuse", bool)):
-            if not isinstance(getattr(self, name), kinds):
+        for name in ("condense", "reuse"):
+            if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name}={getattr(self, name)!r}: pass True or False")
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
@@ -96,8 +95,8 @@ class Newton:
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
 ACCURACY: Mapping[str, Newton] = {
     "exact": Newton(),
-    "balanced": Newton(rtol=1e-9, condense=True, reuse=True),
-    "fast": Newton(rtol=1e-6, condense=True, reuse=True),
+    "balanced": Newton(rtol=1e-9, reuse=True),
+    "fast": Newton(rtol=1e-6, reuse=True),
 }
 #: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
 _SLOW = 0.05
@@ -269,6 +268,7 @@ class StepSolver:
                 [self._bodies[k] for k in awake],
                 self.problem.elements,
                 split=self._options.split,
+                blocked=self._options.blocked,
             )
         elif self._solved and self.newton.reuse and self.problem.elements:
             keep_bodies(self.snes, not fresh)
@@ -409,10 +409,9 @@ def _contact_note(c: ContactStep, k: Contribution, flips: IntArray) -> tuple[str
     rows = np.abs(k.residual[:, c.num_coordinates :]).max(axis=1)
     weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips)
     i = int(np.argmax(weight))
-    node = int(c.pair.slave.original[c.pair.slave.owned[c.candidates.node[i]]])
     facet = "" if c.pair.rigid else f" on facet {int(c.candidates.facet[i])}"
-    text = f"contact {c.pair.name!r}: node {node}{facet}, {int(flips[i])} active-set flips"
-    return c.pair.name, float(weight[i]), text
+    where = f"contact {c.pair.name!r}: node {c.input_node(i)}{facet}"
+    return c.pair.name, float(weight[i]), f"{where}, {int(flips[i])} active-set flips"
 
 
 def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:

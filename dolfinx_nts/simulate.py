@@ -137,12 +137,11 @@ class Stepper:
         self.newton = newton or Newton()
         given = petsc_options or {}
         preset = self.newton.preset(system, integrator.inertia, given)
-        condense = self.newton.condense
         self.problem = StepProblem(
             system,
             integrator,
             rtol=self.newton.rtol,
-            condense=preset == "krylov" if condense is None else condense,
+            condense=self.newton.condense,
             sleep=sleep,
         )
         self.solver = StepSolver(self.problem, self.newton, preset, given)

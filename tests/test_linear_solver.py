@@ -45,17 +45,6 @@ def test_choice(size, contact, inertia, given, preset):
     assert linear_solver.choose(size, contact, inertia, given) == preset
 
 
-def test_condensed_by_default_where_krylov_is_used():
-    system = pressed_block(0.3)
-    for solver, condense, condensed in (
-        ("auto", None, True), ("krylov", None, True), ("direct", None, False),
-        ("auto", False, False), ("direct", True, True),
-    ):  # fmt: skip
-        stepper = stepper_of(system, linear_solver=solver, condense=condense)
-        assert stepper.problem.condense is condensed
-        stepper.close()
-
-
 def test_more_iterations_are_worth_it_on_larger_meshes():
     limits = [linear_solver.most_iterations(n) for n in (1, 1_000, 5_000, 50_000, 500_000)]
     assert limits[:2] == [60, 60] and limits == sorted(limits) and limits[-1] < 1_000
@@ -158,8 +147,53 @@ def test_who_chooses_the_schur_complement(given, ours):
     assert linear_solver.SolverOptions(COMM, "krylov", True, given).schur == ours
 
 
+@pytest.mark.parametrize(
+    ("preset", "given", "ours"),
+    [
+        ("krylov", {}, True),
+        ("krylov", {"ksp_rtol": 1e-8}, True),
+        ("krylov", {"fieldsplit_bodies_pc_type": "gamg"}, False),
+        ("krylov", {"pc_type": "lu"}, False),
+        ("direct", {}, False),
+    ],
+)
+def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
+    assert linear_solver.SolverOptions(COMM, preset, True, given).blocked == ours
+
+
 @pytest.mark.mpi
-@pytest.mark.parametrize("condense", [None, False])
+@pytest.mark.parametrize("contact", [False, True])
+def test_matrix_in_blocks_of_nodes(contact):
+    """Against the nest it is made from, with nodes that are held along some axes."""
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [4, 4, 4], CellType.hexahedron)
+    held = [
+        nts.Dirichlet(lambda x: x[0] < 1e-9, components=(0,)),
+        nts.Dirichlet(lambda x: x[1] < 1e-9, components=(0, 1)),
+    ]
+    rubber, velocity = nts.NeoHookean(young=1e6, poisson=0.3), (0, 0, -0.1)
+    block = nts.Continuum(mesh, rubber, density=1e3, velocity=velocity, bcs=held, name="block")
+    top = create_box(COMM, [[0, 0, -1.0005], [1.1, 1.1, 0]], [5, 5, 5], CellType.hexahedron)
+    other = nts.Continuum(top, rubber, density=1e3, name="other")
+    slave, master = block.surface(lambda x: x[2] < 1e-9), other.surface(lambda x: x[2] > -1e-9)
+    pairs = [nts.ContactPair(slave, master, friction=0.3)] if contact else []
+    stepper = stepper_of(nts.System([block, other], contacts=pairs), linear_solver="krylov")
+    for _ in range(10):
+        stepper.advance(1e-3)
+    assert contact == (stepper.solution.rows[-1]["active"] > 0)
+    matrix = stepper.solver.matrix
+    bodies = matrix.operator.getNestSubMatrix(0, 0) if contact else matrix.operator
+    assert bodies.getType().endswith("baij") and bodies.getInfo()["mallocs"] == 0
+    x, y, z = (stepper.problem.x.duplicate() for _ in range(3))
+    x.array_w[:] = np.random.default_rng(COMM.rank).uniform(-1, 1, len(x.array_r))
+    matrix.operator.mult(x, y)
+    matrix.nest.mult(x, z)
+    error = COMM.allreduce(np.abs(y.array_r - z.array_r).max(initial=0.0), op=MPI.MAX)
+    assert error <= 1e-14 * z.norm()
+    stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("condense", [False, True])
 def test_the_choice_changes_no_solution(condense):
     tables = []
     for solver, condensed in (("auto", condense), ("direct", False)):
