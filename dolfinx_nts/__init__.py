@@ -8,12 +8,13 @@ from dolfinx_nts.equilibrium import Equilibrium, equilibrium
 from dolfinx_nts.integrators import EnergyMomentum, Midpoint
 from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
-from dolfinx_nts.newton import Newton, StepFailedError
+from dolfinx_nts.newton import Newton
 from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
 from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.step_size import Adapt
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.system import State, System
+from dolfinx_nts.validation import StepFailedError
 
 __version__ = version("dolfinx_nts")
 __all__ = [

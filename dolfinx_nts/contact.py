@@ -195,7 +195,8 @@ class ContactPair:
     def _near_obstacle(self, u: FloatArray, reach: float, time: float) -> Candidates:
         """Candidates of an obstacle. Nothing limits the depth: what is behind it is inside."""
         slave = self.slave
-        x = slave.reference[slave.owned] + u[slave.rows] - self.master.displacement(time)
+        moved = self.master.displacement(time, slave.body.comm)
+        x = slave.reference[slave.owned] + u[slave.rows] - moved
         gap, length = self.master.gap(x), np.sqrt(slave.area[slave.owned])
         movable = ~slave.fixed[slave.owned].all(axis=1)
         node = np.flatnonzero(movable & (gap.value < reach + _MARGIN * length))

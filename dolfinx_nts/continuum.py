@@ -23,6 +23,7 @@ from dolfinx_nts.integrators import Static
 from dolfinx_nts.surfaces import Surface, flux, locate_facets, oriented_nodes
 from dolfinx_nts.validation import (
     at_points,
+    at_time,
     items,
     known_options,
     raise_together,
@@ -151,12 +152,6 @@ class Traction:
     value: VectorInTime
 
 
-def _at(name: str, value: VectorInTime, time: float, unit: str) -> FloatArray:
-    if callable(value):
-        name, value = f"{name} at t={time!r}", value(time)
-    return vector(name, value, unit)
-
-
 def _facets(mesh: Any, where: Any, what: str) -> IntArray:
     marker, tag = where if isinstance(where, tuple) else (where, None)
     return locate_facets(mesh, marker, tag, what)
@@ -240,11 +235,9 @@ class Continuum:
             "dx", mesh, metadata={"quadrature_degree": quadrature_degree or 2 * degree}
         )
         self._ds = self._boundary_measure(quadrature_degree or 2 * degree)
-        _at("body_force", body_force, 0.0, "N/m^3")
-        for load in traction:
-            _at("Traction.value", load.value, 0.0, "Pa")
-        for condition in bcs:
-            _at("Dirichlet.value", condition.value, 0.0, "m")
+        self._loads_at(0.0)
+        for k, condition in enumerate(bcs):
+            self._at(f"Dirichlet.value of bcs[{k}]", condition.value, 0.0, "m")
         self._set_conditions(bcs)
         self._set_velocity(velocity)
         self._build_constant_forms()
@@ -309,17 +302,17 @@ class Continuum:
 
     def _set_conditions(self, bcs: Sequence[Dirichlet]) -> None:
         self._bcs: list[Any] = []
-        self._conditions: list[tuple[IntArray, int, VectorInTime]] = []
-        self._num_conditions = len(bcs)
+        self._conditions: list[tuple[VectorInTime, list[tuple[int, IntArray]]]] = []
         owner = np.full(self.num_owned, -1)
         for number, bc in enumerate(bcs):
             facets = _facets(self.mesh, bc.where, "Dirichlet.where")
             blocks = np.asarray(fem.locate_dofs_topological(self.space, 2, facets))
+            self._conditions.append((bc.value, []))
             for component in bc.components:
                 self._bcs.append(compat.subspace_component_bc(self.space, component, blocks))
                 dofs = np.sort(blocks * 3 + component)
                 dofs = dofs[dofs < self.num_owned]
-                self._conditions.append((dofs, component, bc.value))
+                self._conditions[-1][1].append((component, dofs))
                 owner[dofs] = number
         self.fixed = np.flatnonzero(owner >= 0)
         # Where two conditions meet, the later one's value holds, so it carries the force.
@@ -335,8 +328,8 @@ class Continuum:
             constant = vector("velocity", velocity, "m/s", or_else="a callable x (3, n) -> (3, n)")
             self.v.x.array[:] = np.tile(constant, len(self.v.x.array) // 3)
         values = self.v.x.array
-        for dofs, _, value in self._conditions:
-            if not callable(value):
+        for value, parts in self._conditions:
+            for _, dofs in parts if not callable(value) else ():
                 values[dofs] = 0.0
         self.v.x.scatter_forward()
         self.initial_velocity = values[: self.num_owned].copy()
@@ -420,14 +413,25 @@ class Continuum:
         self._factor.value = integrator.factor(dt)
         self._rate.value = 1.0 / dt if integrator.inertia else 0.0
         when = time + integrator.theta * dt
-        given = [("body_force", self.body_force, "N/m^3")]
-        given += [("Traction.value", traction.value, "Pa") for traction in self._traction]
-        for constant, (name, value, unit) in zip(self._loads, given, strict=True):
-            part = 1.0 if callable(value) else integrator.ramp(when)
-            constant.value[:] = part * _at(name, value, when, unit)
+        for constant, (value, now) in zip(self._loads, self._loads_at(when), strict=True):
+            constant.value[:] = now if callable(value) else integrator.ramp(when) * now
         loads = np.concatenate([constant.value for constant in self._loads])
         if not np.array_equal(loads, self._assembled_loads):
             self._load, self._assembled_loads = self._assemble(self._load_form), loads
+
+    def _loads_at(self, time: float) -> list[tuple[VectorInTime, FloatArray]]:
+        """Body force and tractions as they were given, and their values at a time."""
+        given = [("body_force", self.body_force, "N/m^3")]
+        for k, traction in enumerate(self._traction):
+            given.append((f"Traction.value of traction[{k}]", traction.value, "Pa"))
+        return [(value, self._at(name, value, time, unit)) for name, value, unit in given]
+
+    def _at(self, name: str, value: VectorInTime, time: float, unit: str) -> FloatArray:
+        """A vector, or a function of time at a time, for which every rank must call this."""
+        name = f"{name} of {self.name!r}"
+        if callable(value):
+            return at_time(self.comm, name, value, time, unit)
+        return vector(name, value, unit)
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]."""
@@ -472,15 +476,17 @@ class Continuum:
 
     def reactions(self, residual: FloatArray) -> FloatArray:
         """Resultants on the coordinates of each `Dirichlet` condition, this rank's part [N]."""
-        total = np.zeros((self._num_conditions, 3))
+        total = np.zeros((len(self._conditions), 3))
         np.add.at(total, (self._condition, self.fixed % 3), residual[self.fixed])
         return total
 
     def prescribed(self, time: float) -> FloatArray:
         """Prescribed displacements at a time, in the order of `fixed` [m]."""
         values = np.zeros(self.num_owned)
-        for dofs, component, value in self._conditions:
-            values[dofs] = _at("Dirichlet.value", value, time, "m")[component]
+        for k, (value, parts) in enumerate(self._conditions):
+            now = self._at(f"Dirichlet.value of bcs[{k}]", value, time, "m")
+            for component, dofs in parts:
+                values[dofs] = now[component]
         return values[self.fixed]
 
     def potential(self, u: FloatArray) -> float:

@@ -12,11 +12,16 @@ from mpi4py import MPI
 
 from dolfinx_nts import balance
 from dolfinx_nts.integrators import Static
-from dolfinx_nts.newton import Newton, StepFailedError
+from dolfinx_nts.newton import Newton
 from dolfinx_nts.simulate import Solution, Stepper, run, writers
 from dolfinx_nts.step import Evaluation
 from dolfinx_nts.system import State, System
-from dolfinx_nts.validation import known_options, require_positive
+from dolfinx_nts.validation import (
+    StepFailedError,
+    UserFunctionError,
+    known_options,
+    require_positive,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -110,8 +115,9 @@ class _LoadStepper(Stepper):
         for k, pair in enumerate(self.system.contacts):
             if pair.rigid:
                 mean = 0.5 * (before["contact_forces"][k] + resultants["contact_forces"][k])
-                path = pair.master.displacement(time) - pair.master.displacement(old.time)
-                terms["external_work"] += float(mean @ path)
+                times, comm = (old.time, time), self.system.comm
+                start, end = (pair.master.displacement(t, comm) for t in times)
+                terms["external_work"] += float(mean @ (end - start))
         terms |= {"time": time, "newton_iterations": iterations, "contact_defect": 0.0}
         rows, measured = self.solution.rows, balance.measure(self.system, state)
         row = balance.next_row(rows[0], rows[-1], measured, terms)
@@ -141,6 +147,8 @@ class _LoadStepper(Stepper):
                     reached = replace(reached, slip=total)
                     self._check_inverted(reached)
                     self._check_missed(reached)
+                except UserFunctionError:
+                    raise
                 except StepFailedError:
                     # Bodies in search of each other move by load over stabilization, whatever dt.
                     if not 0.0 < problem.stabilization < _STIFFEST:
@@ -294,7 +302,8 @@ def equilibrium(
 
     Returns:
         The Equilibrium; the bodies' u hold it. A run that fails says so in `status` and keeps
-        everything computed until then.
+        everything computed until then, also where a function of time or a writer raises, on any
+        rank.
 
     Raises:
         ValueError: An argument is out of range; before any work.
@@ -308,5 +317,5 @@ def equilibrium(
     stepper = _LoadStepper(
         system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options
     )
-    run(stepper, times, output, progress=progress, remedy=_REMEDY)
+    run(stepper, times, output, dt=times[0], progress=progress, remedy=_REMEDY)
     return stepper.solution

@@ -25,7 +25,7 @@ from dolfinx_nts.linear_solver import (
 )
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.system import System
-from dolfinx_nts.validation import known_options
+from dolfinx_nts.validation import StepFailedError, known_options
 
 logger = logging.getLogger(__name__)
 
@@ -109,10 +109,6 @@ _FINE, _COARSE = 1e-12, 1e-5
 _KEPT = 1e-3
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
-
-
-class StepFailedError(RuntimeError):
-    """A step was not solved; the message names the worst block, nodes and facets."""
 
 
 class StepSolver:

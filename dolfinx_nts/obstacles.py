@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from dolfinx_nts.nts import Gap
-from dolfinx_nts.validation import known_options, require_positive, vector
+from dolfinx_nts.validation import at_time, known_options, require_positive, vector
 
 FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float] | FloatArray
@@ -32,15 +34,15 @@ class Obstacle:
     name: str
     motion: Motion | None
 
-    def displacement(self, time: float) -> FloatArray:
-        """Displacement at a time [m], shape (3,).
+    def displacement(self, time: float, comm: Any) -> FloatArray:
+        """Displacement at a time [m], shape (3,). Collective if there is a motion.
 
         Raises:
-            ValueError: `motion` returns anything but three finite numbers.
+            ValueError: `motion` raises, or returns anything but three finite numbers.
         """
         if self.motion is None:
             return np.zeros(3)
-        return vector(f"motion of {self.name!r} at t={time!r}", self.motion(time), "m")
+        return at_time(comm, f"motion of {self.name!r}", self.motion, time, "m")
 
     @property
     def extent(self) -> float:
@@ -71,7 +73,7 @@ class Obstacle:
                 f"motion={self.motion!r}: pass a function of time [s] that returns a displacement "
                 "[m], e.g. lambda t: (0, 0, -0.1 * t)"
             )
-        start = self.displacement(0.0)
+        start = self.displacement(0.0, MPI.COMM_SELF)
         if start.any():
             raise ValueError(
                 f"motion={self.motion!r}: is {start.tolist()} at t=0; it must start at zero, so "

@@ -13,11 +13,18 @@ import numpy.typing as npt
 
 from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
-from dolfinx_nts.newton import ACCURACY, Newton, StepFailedError, StepSolver
+from dolfinx_nts.newton import ACCURACY, Newton, StepSolver
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.step_size import Adapt, Pace
 from dolfinx_nts.system import State, System
-from dolfinx_nts.validation import items, known_options, require_positive
+from dolfinx_nts.validation import (
+    StepFailedError,
+    UserFunctionError,
+    first_problem,
+    items,
+    known_options,
+    require_positive,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -162,8 +169,9 @@ class Stepper:
 
         Raises:
             ValueError: dt is not positive.
-            StepFailedError: Not solved even with the smallest step; everything accepted so far is
-                kept.
+            StepFailedError: Not solved even with the smallest step, or a function of time raised or
+                returned no vector on some rank, which is not tried again; everything accepted so
+                far is kept.
         """
         require_positive("dt", dt, "s")
         dt = float(dt)
@@ -174,6 +182,8 @@ class Stepper:
             target = end - dt * (part - done - 1) / part
             try:
                 self._step(target - self.state.time, target)
+            except UserFunctionError:
+                raise
             except StepFailedError as failure:
                 if retries == self.newton.max_retries:
                     raise
@@ -193,7 +203,8 @@ class Stepper:
             end: Where to stop [s].
 
         Raises:
-            StepFailedError: Not solved even after `newton.max_retries` halvings in a row.
+            StepFailedError: Not solved even after `newton.max_retries` halvings in a row, or as in
+                `advance`.
         """
         self.start(pace.dt)
         retries = 0
@@ -235,13 +246,13 @@ class Stepper:
         """
         if self._started:
             return
-        self._started = True
         v = [v.copy() for v in self.state.v]
         for body, values in zip(self.system.bodies, v, strict=True):
             p0, p1, p2 = (body.prescribed(self.state.time + s * dt) for s in (0.0, 0.5, 1.0))
             # So written, what does not move has the rate 0, not that of rounding.
             values[body.fixed] = (4.0 * (p1 - p0) - (p2 - p0)) / dt
         self._accept(replace(self.state, v=tuple(v)))
+        self._started = True
         self.solution.rows[:] = [balance.first_row(self.system, self.state)]
 
     def _accept(self, state: State) -> None:
@@ -371,13 +382,15 @@ def simulate(
         adapt: Choose the steps by their error and by closing gaps.
 
     Returns:
-        The Solution. A run that fails says so in `status` and keeps everything computed until then.
+        The Solution. A run that fails says so in `status` and keeps everything computed until then,
+        also where a function of time or a writer raises, or returns what it must not, on any rank:
+        the run ends there, and all writers are closed. Only a writer that raises between collective
+        calls of its own on some ranks alone makes the others wait for ever.
 
     Raises:
         TypeError: An argument is of another type.
-        ValueError: An argument is out of range; before any work, but for a load or a support that
-            is not finite later. What a function of the user's raises in the run is not caught; what
-            writers have written stays.
+        ValueError: An argument is out of range; before any work.
+        Exception: Before any step, what the `start` of a writer raises.
     """
     require_positive("dt", dt, "s")
     require_positive("t_end", t_end, "s")
@@ -393,17 +406,14 @@ def simulate(
         raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
     remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
     if adapt is not None:
-        end = float(t_end)
-        stepper.start(adapt.shortest * float(dt))
-        pace = Pace(adapt, system, stepper.state, float(dt), end - begin)
-        return run(stepper, [end], output, progress=progress, remedy=remedy, pace=pace)
+        end, dt = [float(t_end)], float(dt)
+        return run(stepper, end, output, dt=dt, progress=progress, remedy=remedy, adapt=adapt)
     # Equal steps: a last step much shorter than the others would expel a node that the one before
     # left behind a facet with a speed of gap / dt.
     steps = max(1, math.ceil((t_end - begin) / dt * (1 - 1e-9)))
     dt = (float(t_end) - begin) / steps
-    stepper.start(dt)
     times = [begin + (k + 1) * dt for k in range(steps)]
-    return run(stepper, times, output, progress=progress, remedy=remedy)
+    return run(stepper, times, output, dt=dt, progress=progress, remedy=remedy)
 
 
 def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
@@ -422,45 +432,110 @@ def run(
     times: Sequence[float],
     output: Sequence[Any],
     *,
+    dt: float,
     progress: bool,
     remedy: str,
-    pace: Pace | None = None,
+    adapt: Adapt | None = None,
 ) -> Solution:
     """Advance to each of the times, write, say how it ended, and free the stepper.
 
     Args:
-        stepper: Started stepper.
+        stepper: Stepper that has made no step.
         times: Where to go, increasing.
         output: Writers.
+        dt: First step [s], the largest with `adapt`.
         progress: Show a progress line on rank 0.
         remedy: What to do if a step fails, for `status`.
-        pace: Sizes of the steps between, each of which is written.
+        adapt: How to choose the steps between, each of which is written.
     """
-    bar = _progress_bar(None if pace else len(times), progress and stepper.system.comm.rank == 0)
+    solution, root = stepper.solution, stepper.system.comm.rank == 0
+    bar = _progress_bar(None if adapt else len(times), progress and root)
     try:
-        for writer in output:
-            writer.start(stepper)
-        for last in _moves(stepper, times, pace):
-            for writer in output:
-                writer.write(stepper, last=last)
-            if bar is not None:
-                row = stepper.solution.rows[-1]
-                bar.set_postfix(
-                    active=int(row["active"]), newton=row["newton_iterations"], refresh=False
-                )
-                bar.update()
-        stepper.solution.status = "completed"
-    except StepFailedError as failure:
-        stepper.solution.status = f"{failure}. {remedy}"
-        if stepper.system.comm.rank == 0:
-            logger.warning("%s", stepper.solution.status)
+        try:
+            _march(stepper, times, output, dt, adapt, bar)
+            solution.status = "completed"
+        except UserFunctionError as failure:
+            _stop(stepper, str(failure), failure.__cause__)
+        except StepFailedError as failure:
+            _stop(stepper, f"{failure}. {remedy}")
+        except BaseException:
+            # Where one rank alone comes here, no other answers.
+            _call(stepper, output, "close")
+            raise
+        problem, cause = _call_together(stepper, output, "close")
+        if problem is not None:
+            _stop(stepper, problem, cause)
     finally:
-        for writer in output:
-            writer.close(stepper)
         stepper.close()
         if bar is not None:
             bar.close()
-    return stepper.solution
+    return solution
+
+
+def _march(
+    stepper: Stepper,
+    times: Sequence[float],
+    output: Sequence[Any],
+    dt: float,
+    adapt: Adapt | None,
+    bar: Any,
+) -> None:
+    """Make the steps and write them; arguments as of `run`."""
+    pace = None
+    if adapt is None:
+        stepper.start(dt)
+    else:
+        stepper.start(adapt.shortest * dt)
+        state = stepper.state
+        pace = Pace(adapt, stepper.system, state, dt, times[-1] - state.time)
+    problem, cause = _call_together(stepper, output, "start")
+    if problem is not None:
+        raise cause or RuntimeError(problem)
+    for last in _moves(stepper, times, pace):
+        problem, cause = _call_together(stepper, output, "write", last=last)
+        if problem is not None:
+            raise UserFunctionError(problem) from cause
+        if bar is not None:
+            row = stepper.solution.rows[-1]
+            bar.set_postfix(
+                active=int(row["active"]), newton=row["newton_iterations"], refresh=False
+            )
+            bar.update()
+
+
+def _stop(stepper: Stepper, reason: str, cause: BaseException | None = None) -> None:
+    """Keep in the status why a run ended, and log it where it is known best."""
+    solution = stepper.solution
+    ended = solution.status not in ("running", "completed")
+    solution.status = f"{solution.status}; {reason}" if ended else reason
+    if stepper.system.comm.rank == 0 or cause is not None:
+        logger.warning("%s", reason, exc_info=cause)
+
+
+def _call(
+    stepper: Stepper, output: Sequence[Any], name: str, **options: Any
+) -> tuple[str | None, Exception | None]:
+    """Call a method of all writers, also when one raises: what the first raised here, and it."""
+    problem, cause = None, None
+    for k, writer in enumerate(output):
+        try:
+            getattr(writer, name)(stepper, **options)
+        except Exception as error:  # any: a rank that raises alone would leave the others waiting
+            if cause is None:
+                what = f"output[{k}] ({type(writer).__name__}): {name}"
+                what += f" at t={stepper.state.time!r} raised {error!r}"
+                problem, cause = f"{what}; correct it, or leave this writer out", error
+    return problem, cause
+
+
+def _call_together(
+    stepper: Stepper, output: Sequence[Any], name: str, **options: Any
+) -> tuple[str | None, Exception | None]:
+    """`_call` with the first problem of any rank, on all ranks alike. Every rank must call it."""
+    problem, cause = _call(stepper, output, name, **options)
+    if output:
+        problem = first_problem(stepper.system.comm, problem)
+    return problem, cause
 
 
 def _moves(stepper: Stepper, times: Sequence[float], pace: Pace | None) -> Iterator[bool]:

@@ -138,6 +138,7 @@ class StepProblem:
         self._gravity = ramp * system.gravity
         for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
             body.begin_step(self.integrator, u, v, state.time, dt)
+        self._paths = {k: self._path(c) for k, c in enumerate(system.contacts) if c.rigid}
         self.first = [u + dt * v for u, v in zip(state.u, state.v, strict=True)]
         for body, u1 in zip(system.bodies, self.first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
@@ -253,15 +254,15 @@ class StepProblem:
         stiffness[body.fixed] = 0.0
         return stiffness
 
-    def _path(self, index: int) -> FloatArray:
+    def _path(self, pair: Any) -> FloatArray:
         """Displacements of the obstacle of a contact at t_n and t_{n+1} [m], shape (2, 3)."""
         times = (self.state.time, self.state.time + self.dt)
-        return np.stack([self.system.contacts[index].master.displacement(t) for t in times])
+        return np.stack([pair.master.displacement(t, self.system.comm) for t in times])
 
     def _reach(self, index: int, motion: FloatArray) -> float:
         reach = np.sqrt(3.0) * float(sum(motion[b] for b in self.system.contact_bodies[index]))
         if self.system.contacts[index].rigid:
-            reach += float(np.linalg.norm(np.diff(self._path(index), axis=0)))
+            reach += float(np.linalg.norm(np.diff(self._paths[index], axis=0)))
         return reach
 
     def _search(self, index: int) -> ContactStep:
@@ -286,7 +287,7 @@ class StepProblem:
         scale, theta = mass[rows[:, 0]], self.integrator.theta
         rule, condense = self.integrator.contact_gradient, self.condense
         if pair.rigid:
-            path = self._path(index)
+            path = self._paths[index]
             return ObstacleStep(pair, found, rule, condense, x0 - path[0], scale, theta, path)
         return ContactStep(pair, found, rule, condense, x0, scale, theta)
 

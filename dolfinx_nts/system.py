@@ -160,11 +160,11 @@ class System:
     @staticmethod
     def _check_start(body: Body, old: Body, u: FloatArray, time: float) -> None:
         """Raise on every rank unless u fits the body's mesh and conditions."""
-        problem = None
+        problem, there = None, body.prescribed(time)
         if not np.array_equal(body.reference, old.reference):
             problem = f"start: body {body.name!r} has another mesh there; use the same mesh object"
         else:
-            off = np.abs(body.prescribed(time) - u[body.fixed]).max(initial=0.0)
+            off = np.abs(there - u[body.fixed]).max(initial=0.0)
             if off > _ON_SUPPORT * np.abs(body.reference).max(initial=0.0):
                 problem = (
                     f"start: the Dirichlet values of body {body.name!r} at t={time:.6g} are "

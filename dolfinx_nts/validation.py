@@ -16,6 +16,18 @@ FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 
+class StepFailedError(RuntimeError):
+    """A step was not solved; the message names the worst block, nodes and facets."""
+
+
+class UserFunctionError(StepFailedError, ValueError):
+    """A function of the user's raised or returned what it must not; a smaller step mends nothing.
+
+    The message says which and when, on all ranks alike; what it raised is `__cause__` on the rank
+    where it did.
+    """
+
+
 def known_options(target: T) -> T:
     """Decorate a function or class: an unknown keyword raises with the list of known ones."""
     wrapped: Any = target
@@ -69,11 +81,51 @@ def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tu
     return found
 
 
-def raise_together(comm: Any, problem: str | None) -> None:
-    """Raise ValueError with the first rank's problem on every rank, if any rank has one."""
-    found = next((p for p in comm.allgather(problem) if p is not None), None)
+def first_problem(comm: Any, problem: str | None) -> str | None:
+    """The first rank's problem, on every rank."""
+    return next((p for p in comm.allgather(problem) if p is not None), None)
+
+
+def raise_together(
+    comm: Any,
+    problem: str | None,
+    kind: type[Exception] = ValueError,
+    cause: Exception | None = None,
+) -> None:
+    """Raise with the first rank's problem on every rank, if any rank has one."""
+    found = first_problem(comm, problem)
     if found is not None:
-        raise ValueError(found)
+        raise kind(found) from cause
+
+
+def at_time(
+    comm: Any, name: str, function: Callable[[float], Any], time: float, unit: str
+) -> FloatArray:
+    """The user's vector at a time, shape (3,); what fails on one rank raises on all.
+
+    Args:
+        comm: MPI communicator.
+        name: Name of the argument.
+        function: Callable time [s] -> three components.
+        time: [s].
+        unit: Of the components.
+
+    Raises:
+        UserFunctionError: It raised, or returned anything but three finite numbers.
+    """
+    name = f"{name} at t={float(time)!r}"
+    problem, cause, value = None, None, np.zeros(3)
+    try:
+        given = function(time)
+    except Exception as error:  # any: a rank that raises alone would leave the others waiting
+        cause, problem = error, f"{name}: {function!r} raised {error!r}; correct it"
+    else:
+        try:
+            value = vector(name, given, unit)
+        except ValueError as error:
+            problem = str(error)
+    raise_together(comm, problem, UserFunctionError, cause)
+    return value
 
 
 def at_points(

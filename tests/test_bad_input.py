@@ -190,13 +190,16 @@ def test_velocity_that_raises_on_one_rank():
 
 def test_loads():
     traction = nts.Traction(top, (1.0, 0.0))
-    pattern = r"^Traction.value=\(1.0, 0.0\): pass three finite components \[Pa\]"
+    pattern = (
+        r"^Traction.value of traction\[0\] of 'body'=\(1.0, 0.0\): pass three finite components "
+        r"\[Pa\]"
+    )
     raises(ValueError, pattern, lambda: continuum(traction=[traction]))
     pattern = r"^traction=Traction\(.*: pass a sequence of Traction"
     raises(TypeError, pattern, lambda: continuum(traction=nts.Traction(top, (1, 0, 0))))
     pattern = r"^traction\[0\]='push': pass a sequence of Traction"
     raises(TypeError, pattern, lambda: continuum(traction=["push"]))
-    pattern = r"^body_force at t=0.0=4.0: pass three finite components \[N/m\^3\]"
+    pattern = r"^body_force of 'body' at t=0.0=4.0: pass three finite components \[N/m\^3\]"
     raises(ValueError, pattern, lambda: continuum(body_force=lambda t: 4.0))
     pattern = r"^Traction.where.*selects no exterior facet; check the marker"
     raises(
@@ -225,9 +228,9 @@ def test_conditions():
     pattern = r"^bcs\[0\]=.*: pass a sequence of Dirichlet"
     raises(TypeError, pattern, lambda: continuum(bcs=[top]))
     raises(TypeError, r"^bcs=Dirichlet.*sequence", lambda: continuum(bcs=nts.Dirichlet(top)))
-    pattern = r"^Dirichlet.value=\(0, 0\): pass three finite components \[m\]"
+    pattern = r"^Dirichlet.value of bcs\[0\] of 'body'=\(0, 0\): pass three finite components \[m\]"
     raises(ValueError, pattern, lambda: continuum(bcs=[nts.Dirichlet(top, (0, 0))]))
-    pattern = r"^Dirichlet.value at t=0.0=\(0, nan, 0\): pass three finite"
+    pattern = r"^Dirichlet.value of bcs\[0\] of 'body' at t=0.0=\(0, nan, 0\): pass three finite"
     moving = nts.Dirichlet(top, lambda t: (0, np.nan, 0))
     raises(ValueError, pattern, lambda: continuum(bcs=[moving]))
     pattern = r"^Dirichlet.where=5: pass a function of x"

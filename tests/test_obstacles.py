@@ -495,10 +495,10 @@ def test_bad_contacts():
 
 
 @pytest.mark.mpi
-def test_a_motion_that_breaks_down_raises_on_all_ranks():
+def test_a_motion_that_breaks_down_ends_the_run():
     motion = {0.0: (0, 0, 0)}
     floor = nts.Plane((0, 0, -1), (0, 0, 1), motion=lambda t: motion.get(t, (0, 0, np.nan)))
     body, face = block()
     system = nts.System([body], contacts=[nts.ContactPair(face, floor)])
-    with pytest.raises(ValueError, match=r"motion of 'plane' at t=0.001=.*three finite"):
-        nts.simulate(system, nts.Midpoint(), dt=1e-3, t_end=1e-3)
+    run = nts.simulate(system, nts.Midpoint(), dt=1e-3, t_end=1e-3)
+    assert re.search(r"^motion of 'plane' at t=0.001=.*three finite", run.status)

@@ -1,0 +1,251 @@
+"""What a run calls of the user's and fails: everything computed is kept, and all ranks end alike.
+
+Where a test has one rank raise, it is the last one, which is the only one in serial.
+"""
+
+import re
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+from dolfinx_nts import continuum, output
+
+COMM = MPI.COMM_WORLD
+DT = 1e-3
+#: After this all of a scene's functions fail: in the third step.
+LATE = 2.2e-3
+
+pytestmark = pytest.mark.mpi
+
+
+def bottom(x):
+    return x[2] < 1e-9
+
+
+def top(x):
+    return x[2] > 1 - 1e-9
+
+
+def raises(t):
+    raise KeyError("table")
+
+
+def nan(t):
+    return (0, 0, np.nan)
+
+
+def two_numbers(t):
+    return (0, 0)
+
+
+def until_late(fails, ranks):
+    """A function of time that is zero at first and fails later, on some ranks."""
+    failing = ranks == "all" or COMM.rank == COMM.size - 1
+    return lambda t: fails(t) if t > LATE and failing else (0, 0, -0.01 * t)
+
+
+def scene(what=None, function=None):
+    """A block that flies above a floor, with a function of time somewhere."""
+    options = {
+        "Dirichlet": {
+            "bcs": [nts.Dirichlet(bottom, components=(0,)), nts.Dirichlet(top, function)]
+        },
+        "Traction": {"traction": [nts.Traction(top, function)]},
+        "body_force": {"body_force": function},
+    }.get(what, {})
+    low, high = [0, 0, 0], [1, 1, 1]
+    mesh = create_box(
+        COMM, [low, high], [2, 2, 2], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
+    )
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    body = nts.Continuum(mesh, rubber, density=1e3, name="block", velocity=(0, 0, 0.1), **options)
+    motion = function if what == "motion" else None
+    floor = nts.Plane((0, 0, -1e-3), (0, 0, 1), motion=motion, name="floor")
+    return nts.System([body], contacts=[nts.ContactPair(body.surface(bottom), floor)])
+
+
+NAMES = {
+    "Dirichlet": r"^Dirichlet.value of bcs\[1\] of 'block' at t=0.003",
+    "Traction": r"^Traction.value of traction\[0\] of 'block' at t=0.0025",
+    "body_force": r"^body_force of 'block' at t=0.0025",
+    "motion": r"^motion of 'floor' at t=0.003",
+}
+FAILURES = {
+    raises: r": <function .* raised KeyError\('table'\); correct it$",
+    nan: r"=\(0, 0, nan\): pass three finite components \[[\w^/]+\]$",
+    two_numbers: r"=\(0, 0\): pass three finite components \[[\w^/]+\]$",
+}
+
+
+def same_on_all_ranks(value):
+    assert len(set(COMM.allgather(value))) == 1
+    return value
+
+
+@pytest.mark.parametrize("ranks", ["all", "last"])
+@pytest.mark.parametrize("fails", FAILURES)
+@pytest.mark.parametrize("what", NAMES)
+def test_a_run_keeps_what_it_has(what, fails, ranks):
+    system = scene(what, until_late(fails, ranks))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=DT, t_end=5 * DT)
+    assert re.search(NAMES[what] + r"\d*" + FAILURES[fails], same_on_all_ranks(run.status))
+    assert run.retries == 0
+    good = scene(what, until_late(lambda t: (0, 0, -0.01 * t), ranks))
+    whole = nts.simulate(good, nts.EnergyMomentum(), dt=DT, t_end=5 * DT)
+    assert whole.status == "completed"
+    for name, column in run.balance.items():
+        assert np.array_equal(column, whole.balance[name][:3]), name
+    assert np.allclose(system.bodies[0].v.x.array[2::3], 0.1, atol=0.2)
+
+
+def test_a_run_of_chosen_steps_keeps_what_it_has():
+    system = scene("body_force", until_late(raises, "last"))
+    run = nts.simulate(system, nts.Midpoint(), dt=DT, t_end=5 * DT, adapt=nts.Adapt())
+    assert re.search(r"^body_force of 'block' at t=0.00\d*: ", same_on_all_ranks(run.status))
+    assert len(run.rows) > 1 and run.retries == 0
+    assert run.balance["time"][-1] < 5 * DT
+
+
+@pytest.mark.parametrize("what", NAMES)
+def test_equilibrium_keeps_what_it_has(what):
+    supports = nts.Dirichlet(bottom)
+    fails = until_late(raises, "last")
+    system = scene(what, fails) if what == "Dirichlet" else held(what, fails, supports)
+    # Pseudo times, which the functions take as time.
+    run = nts.equilibrium(system, load_steps=[DT, 2 * DT, 3 * DT, 4 * DT])
+    pattern = NAMES[what].replace("0.0025", "0.003") + r"\d*: .*raised KeyError\('table'\)"
+    assert re.search(pattern, same_on_all_ranks(run.status))
+    assert run.retries == 0
+    assert np.allclose(run.balance["time"], [0, DT, 2 * DT])
+
+
+def held(what, function, supports):
+    """The block on a support, with a function of time in another place."""
+    system = scene(what, function)
+    body, floor = system.bodies[0], system.contacts[0].master
+    options = {"traction": body._traction, "body_force": body.body_force}
+    block = nts.Continuum(
+        body.mesh, body.material, density=1e3, name="block", bcs=[supports], **options
+    )
+    pair = nts.ContactPair(block.surface(top), floor) if what == "motion" else None
+    return nts.System([block], contacts=[pair] if pair else [])
+
+
+def test_a_stepper_learns_the_cause_and_goes_on():
+    broken = [True]
+
+    def force(t):
+        return raises(t) if broken and t > LATE and COMM.rank == COMM.size - 1 else (0, 0, 0)
+
+    stepper = nts.Stepper(scene("body_force", force), nts.EnergyMomentum())
+    with pytest.raises(nts.StepFailedError, match="^body_force of 'block' at t=0.0025") as caught:
+        for _ in range(5):
+            stepper.advance(DT)
+    assert isinstance(caught.value.__cause__, KeyError) == (COMM.rank == COMM.size - 1)
+    assert len(stepper.solution.rows) == 3 and stepper.solution.retries == 0
+    broken.clear()
+    stepper.advance(DT)
+    assert np.isclose(stepper.state.time, 3 * DT)
+    stepper.close()
+
+
+def test_a_support_that_fails_at_the_start_of_the_motion():
+    """Its rate there takes its values over the first step; what failed can be tried again."""
+    working = []
+
+    def value(t):
+        return (0, 0, t) if working or not t else raises(t)
+
+    run = nts.simulate(scene("Dirichlet", value), nts.Midpoint(), dt=DT, t_end=DT)
+    assert same_on_all_ranks(run.status).startswith("Dirichlet.value of bcs[1] of 'block' at t=0.0")
+    assert len(run.rows) == 1
+    stepper = nts.Stepper(scene("Dirichlet", value), nts.Midpoint())
+    with pytest.raises(nts.StepFailedError, match="Dirichlet.value"):
+        stepper.advance(DT)
+    working.append(True)
+    stepper.advance(DT)
+    held = stepper.system.bodies[0].fixed
+    speed = stepper.state.v[0][held[held % 3 == 2]]
+    assert np.allclose(speed, 1.0)
+    stepper.close()
+
+
+@pytest.mark.parametrize("what", NAMES)
+def test_at_the_start_it_is_a_bad_argument(what):
+    with pytest.raises(ValueError, match=r"at t=0.0: <function raises.*KeyError\('table'\); corr"):
+        scene(what, raises)
+
+
+def test_an_interrupt_goes_through():
+    def stop(t):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        nts.simulate(
+            scene("body_force", until_late(stop, "all")), nts.Midpoint(), dt=DT, t_end=5 * DT
+        )
+
+
+def test_constants_are_not_agreed_on(monkeypatch):
+    monkeypatch.setattr(continuum, "at_time", raises)
+    run = nts.simulate(scene("Traction", (0, 0, 1.0)), nts.Midpoint(), dt=DT, t_end=2 * DT)
+    assert run.status == "completed"
+
+
+class Writer:
+    """Counts its calls; one of them fails."""
+
+    def __init__(self, failing=None, ranks="all"):
+        self.failing = failing if ranks == "all" or COMM.rank == COMM.size - 1 else None
+        self.calls = []
+
+    def _call(self, name):
+        self.calls.append(name)
+        if self.failing == name and (name != "write" or self.calls.count("write") == 2):
+            raise KeyError("table")
+
+    def start(self, run):
+        self._call("start")
+
+    def write(self, run, *, last=False):
+        self._call("write")
+
+    def close(self, run):
+        self._call("close")
+
+
+@pytest.mark.parametrize("ranks", ["all", "last"])
+@pytest.mark.parametrize(("failing", "written"), [("write", 2), ("close", 3)])
+def test_a_writer_that_fails(failing, written, ranks, mpi_tmp_path):
+    writers = [Writer(), Writer(failing, ranks), output.BalanceCSV(mpi_tmp_path / "b.csv")]
+    run = nts.simulate(scene(), nts.Midpoint(), dt=DT, t_end=3 * DT, output=writers)
+    assert re.search(
+        rf"^output\[1\] \(Writer\): {failing} at t=0.00{written}\d* raised KeyError\('table'\); "
+        "correct it, or leave this writer out$",
+        same_on_all_ranks(run.status),
+    )
+    assert len(run.rows) == written + 1
+    for writer in writers[:2]:
+        assert writer.calls == ["start"] + written * ["write"] + ["close"]
+    assert len((mpi_tmp_path / "b.csv").read_text().splitlines()) == written + 2
+    assert writers[2]._file is None
+
+
+@pytest.mark.parametrize("ranks", ["all", "last"])
+def test_a_writer_that_cannot_start_stops_before_any_step(ranks):
+    writers = [Writer("start", ranks), Writer()]
+    mine = ranks == "all" or COMM.rank == COMM.size - 1
+    with pytest.raises(KeyError if mine else RuntimeError, match="table"):
+        nts.simulate(scene(), nts.Midpoint(), dt=DT, t_end=DT, output=writers)
+    assert writers[1].calls == ["start", "close"]
+    assert not writers[0].calls.count("write")
+
+
+def test_a_writer_of_equilibrium_that_fails():
+    system = held("body_force", (0, 0, -1.0), nts.Dirichlet(bottom))
+    run = nts.equilibrium(system, load_steps=4, output=[Writer("write", "last")])
+    assert same_on_all_ranks(run.status).startswith("output[0] (Writer): write at t=0.5 raised")
+    assert np.allclose(run.balance["time"], [0, 0.25, 0.5])
