@@ -24,9 +24,12 @@ from dolfinx_nts.surfaces import Surface, flux, locate_facets, oriented_nodes
 from dolfinx_nts.validation import (
     at_points,
     at_time,
+    is_whole,
     items,
     known_options,
     raise_together,
+    require_bool,
+    require_name,
     require_positive,
     vector,
 )
@@ -134,7 +137,8 @@ class Dirichlet:
 
     def __post_init__(self) -> None:
         given = self.components
-        if not isinstance(given, Sequence) or not given or not set(given) <= {0, 1, 2}:
+        listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
+        if not listed or not given:
             raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
 
 
@@ -153,8 +157,9 @@ class Traction:
 
 
 def _facets(mesh: Any, where: Any, what: str) -> IntArray:
-    marker, tag = where if isinstance(where, tuple) else (where, None)
-    return locate_facets(mesh, marker, tag, what)
+    if isinstance(where, tuple) and len(where) == 2:
+        return locate_facets(mesh, *where, what)
+    return locate_facets(mesh, where, None, what)
 
 
 @known_options
@@ -211,8 +216,10 @@ class Continuum:
             )
         require_positive("density", density, "kg/m^3")
         for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
-            if value is not None and not (isinstance(value, int) and value > 0):
+            default = option == "quadrature_degree" and value is None
+            if not default and not (is_whole(value) and value > 0):
                 raise ValueError(f"{option}={value!r}: must be a positive integer")
+        require_name("name", name)
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
         bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")
         _check_mesh(mesh, name)
@@ -273,8 +280,7 @@ class Continuum:
             TypeError: smoothing is no bool.
             ValueError: Degree above 1, no facet, or interior facets; smoothing of triangles.
         """
-        if not isinstance(smoothing, bool):
-            raise TypeError(f"smoothing={smoothing!r}: pass True or False")
+        require_bool("smoothing", smoothing)
         if self.degree != 1:
             raise ValueError(
                 f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"

@@ -19,7 +19,10 @@ from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
+    floats,
+    is_whole,
     known_options,
+    require_bool,
     require_positive,
 )
 
@@ -222,14 +225,11 @@ class _LoadStepper(Stepper):
 
 def _pseudo_times(load_steps: Any) -> list[float]:
     """End of each load step."""
-    if isinstance(load_steps, int | np.integer) and not isinstance(load_steps, bool):
+    if is_whole(load_steps):
         if load_steps >= 1:
             return [(k + 1) / int(load_steps) for k in range(int(load_steps))]
     elif isinstance(load_steps, Sequence | np.ndarray) and not isinstance(load_steps, str):
-        try:
-            times = np.asarray(load_steps, dtype=np.float64)
-        except (TypeError, ValueError):
-            times = np.empty(0)
+        times = floats(load_steps)
         good = times.ndim == 1 and times.size and np.isfinite(times).all()
         if good and (np.diff(times, prepend=0.0) > 0).all():
             return [float(t) for t in times]
@@ -311,6 +311,7 @@ def equilibrium(
     times = _pseudo_times(load_steps)
     if stabilization is not None:
         require_positive("stabilization", stabilization, "-")
+    require_bool("progress", progress)
     output = writers(output)
     if isinstance(system, System):
         _check_bodies(system)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.discrete_gradient import gonzalez_stress, mean_value_stress, strain_derivative
-from dolfinx_nts.validation import known_options
+from dolfinx_nts.validation import is_whole, known_options
 
 FloatArray = npt.NDArray[np.float64]
 Energy = Callable[[Any], Any]
@@ -85,7 +85,7 @@ class EnergyMomentum(_InTime):
     def __post_init__(self) -> None:
         _choose("stress", self.stress, ("gonzalez", "mean-value"))
         _choose("contact_gradient", self.contact_gradient, ("mean-value", "gonzalez"))
-        if self.quadrature_points not in range(1, 8):
+        if not (is_whole(self.quadrature_points) and 1 <= self.quadrature_points <= 7):
             raise ValueError(f"quadrature_points={self.quadrature_points!r}: choose 1 to 7")
 
     def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import ufl
 
-from dolfinx_nts.validation import known_options, require_positive
-
-
-def _require(condition: bool, name: str, value: float, remedy: str) -> None:
-    if not condition:
-        raise ValueError(f"{name}={value!r}: {remedy}")
+from dolfinx_nts.validation import is_finite, known_options, require_positive
 
 
 def _lame(young: float, poisson: float) -> tuple[float, float]:
@@ -23,9 +17,8 @@ def _lame(young: float, poisson: float) -> tuple[float, float]:
 
 def _check_elastic(young: float, poisson: float) -> None:
     require_positive("young", young, "Pa")
-    _require(
-        -1 < poisson < 0.5, "poisson", poisson, "must lie in (-1, 0.5); use e.g. 0.49 for rubber"
-    )
+    if not (is_finite(poisson) and -1 < poisson < 0.5):
+        raise ValueError(f"poisson={poisson!r}: must lie in (-1, 0.5); use e.g. 0.49 for rubber")
 
 
 @known_options
@@ -103,13 +96,12 @@ class MooneyRivlin:
     c: float
 
     def __post_init__(self) -> None:
-        _require(math.isfinite(self.a + self.b), "a, b", self.a + self.b, "must be finite [Pa]")
-        _require(
-            self.a + self.b > 0,
-            "a + b",
-            self.a + self.b,
-            "must be positive [Pa]: half the shear modulus",
-        )
+        for name, value in (("a", self.a), ("b", self.b)):
+            if not is_finite(value):
+                raise ValueError(f"{name}={value!r}: pass a finite number [Pa]")
+        if not self.a + self.b > 0:
+            shear = self.a + self.b
+            raise ValueError(f"a + b={shear!r}: must be positive [Pa]: half the shear modulus")
         require_positive("c", self.c, "Pa")
 
     def __call__(self, c: Any) -> Any:

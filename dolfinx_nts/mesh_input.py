@@ -23,9 +23,11 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
+from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.continuum import Continuum
+from dolfinx_nts.validation import is_whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -70,7 +72,7 @@ class Part:
         tag = self.surfaces.get(surface) if isinstance(surface, str) else surface
         # A rank need not hold facets of a tag, so a number that no rank knows is left to the user
         # of the tags, who asks all ranks.
-        if tag is None:
+        if not is_whole(tag):
             raise ValueError(
                 f"surface={surface!r}: body {self.name!r} has {_listed(self.surfaces)}; "
                 "pass one of these names, or a tag"
@@ -147,9 +149,12 @@ def bodies_from_gmsh(file_or_model: Any, comm: Any) -> Parts:
 
     Raises:
         ImportError: There is no Gmsh on rank 0.
+        TypeError: `comm` is no communicator.
         ValueError: No such file or no physical volume; a volume is not all hexahedra or all
             tetrahedra of degree 1, or has no mesh; physical groups overlap. Raised on every rank.
     """
+    if not isinstance(comm, MPI.Comm):
+        raise TypeError(f"comm={comm!r}: pass an MPI communicator, e.g. MPI.COMM_WORLD")
     return _parts(comm, _on_root(comm, lambda: _read_gmsh(file_or_model)))
 
 
@@ -175,9 +180,17 @@ def bodies_from_tags(
         Name -> Part.
 
     Raises:
+        TypeError: An argument is of another type.
         ValueError: The mesh or the tags are of the wrong kind, or a name stands for a tag that no
             cell or facet has. Raised on every rank.
     """
+    if not isinstance(mesh, dolfinx_mesh.Mesh):
+        raise TypeError(f"mesh={mesh!r}: pass a dolfinx mesh")
+    for what, mapping in (("names", names), ("surfaces", surfaces)):
+        if not isinstance(mapping, Mapping | None):
+            raise TypeError(
+                f"{what}={mapping!r}: pass a dict of names and tags, e.g. {{'base': 1}}"
+            )
     kind = compat.cell_name(mesh)
     if kind not in _CORNERS or mesh.geometry.dim != 3:
         raise ValueError(

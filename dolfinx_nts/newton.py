@@ -25,7 +25,13 @@ from dolfinx_nts.linear_solver import (
 )
 from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.system import System
-from dolfinx_nts.validation import StepFailedError, known_options
+from dolfinx_nts.validation import (
+    StepFailedError,
+    is_finite,
+    is_whole,
+    known_options,
+    require_bool,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -68,15 +74,14 @@ class Newton:
     reuse: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 < self.rtol < 1:
+        if not (is_finite(self.rtol) and 0 < self.rtol < 1):
             raise ValueError(f"rtol={self.rtol!r}: must lie in (0, 1)")
         for name in ("max_iterations", "max_retries"):
             value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool):
+            if not is_whole(value):
                 raise TypeError(f"{name}={value!r}: pass a whole number")
         for name in ("condense", "reuse"):
-            if not isinstance(getattr(self, name), bool):
-                raise TypeError(f"{name}={getattr(self, name)!r}: pass True or False")
+            require_bool(name, getattr(self, name))
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
         if self.max_retries < 0:

@@ -16,7 +16,13 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts.nts import Gap
-from dolfinx_nts.validation import at_time, known_options, require_positive, vector
+from dolfinx_nts.validation import (
+    at_time,
+    known_options,
+    require_name,
+    require_positive,
+    vector,
+)
 
 FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float] | FloatArray
@@ -66,6 +72,7 @@ class Obstacle:
         raise NotImplementedError
 
     def _check(self) -> None:
+        require_name("name", self.name)
         if self.motion is None:
             return
         if not callable(self.motion):

@@ -23,6 +23,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact import ContactPair
 from dolfinx_nts.simulate import Stepper
 from dolfinx_nts.system import State
+from dolfinx_nts.validation import is_whole, require_positive
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -61,6 +62,17 @@ def node_blocks(body: Any) -> IntArray:
     blocks = np.full(len(body.mesh.geometry.x), -1, dtype=np.int64)
     blocks[geometry] = compat.cell_dofs(body.space)[: len(geometry), : geometry.shape[1]]
     return blocks
+
+
+def as_path(name: str, value: Any) -> Path:
+    """The path that an argument is.
+
+    Raises:
+        TypeError: It is none.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError(f"{name}={value!r}: pass a path, e.g. {name}='out/run'")
+    return Path(value)
 
 
 def _file_name(name: str) -> str:
@@ -203,14 +215,13 @@ class Fields:
     """
 
     def __init__(self, folder: StrPath, *, every: int = 1, interval: float | None = None) -> None:
-        if not isinstance(every, int | np.integer) or isinstance(every, bool) or every < 1:
+        if not is_whole(every) or every < 1:
             raise ValueError(f"every={every!r}: pass a whole number of steps >= 1")
         if interval is not None:
-            if not (isinstance(interval, int | float) and 0 < interval < math.inf):
-                raise ValueError(f"interval={interval!r}: must be positive and finite [s]")
+            require_positive("interval", interval, "s")
             if every != 1:
                 raise ValueError(f"every={every!r}, interval={interval!r}: pass one of the two")
-        self.folder, self.every, self.interval = Path(folder), every, interval
+        self.folder, self.every, self.interval = as_path("folder", folder), every, interval
         self._series: list[_Series] = []
 
     def start(self, stepper: Stepper) -> None:
@@ -279,7 +290,7 @@ class BalanceCSV:
     """
 
     def __init__(self, path: StrPath) -> None:
-        self.path = Path(path)
+        self.path = as_path("path", path)
         self._file: IO[str] | None = None
 
     def start(self, stepper: Stepper) -> None:

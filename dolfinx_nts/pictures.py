@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,8 +13,9 @@ from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.discrete_gradient import strain_derivative
-from dolfinx_nts.output import StrPath, gather, node_blocks, on_root
+from dolfinx_nts.output import StrPath, as_path, gather, node_blocks, on_root
 from dolfinx_nts.surfaces import oriented_nodes
+from dolfinx_nts.validation import floats, items, require_bool, require_positive
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -76,7 +76,10 @@ def picture(
         ValueError: Unknown colour, no body, or an argument out of range.
         OSError: On all ranks: the file cannot be written.
     """
+    items("bodies", bodies, lambda b: True, "Continuum bodies")
     _check_picture(bodies, colour, view, limits, width)
+    require_bool("labels", labels)
+    file = as_path("path", path)
     comm = bodies[0].comm
     drawn = []
     for body in bodies:
@@ -85,12 +88,12 @@ def picture(
         drawn.append(_Drawn(body.name, gather(comm, corners), gather(comm, values)))
 
     def draw() -> None:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
         figure, axes = _figure(drawn, width, title)
         scale = _colour_scale(drawn, colour, limits)
         axes.add_collection(_painted(drawn, scale))
         _furnish(figure, axes, scale, _COLOURS[colour][1], view, drawn if labels else ())
-        figure.savefig(path, dpi=200, bbox_inches="tight", pad_inches=0.05)
+        figure.savefig(file, dpi=200, bbox_inches="tight", pad_inches=0.05)
 
     on_root(comm, f"path={str(path)!r}", draw)
 
@@ -98,20 +101,19 @@ def picture(
 def _check_picture(
     bodies: Sequence[Any], colour: str, view: Any, limits: Any, width: float
 ) -> None:
-    if colour not in _COLOURS:
+    if not (isinstance(colour, str) and colour in _COLOURS):
         raise ValueError(f"colour={colour!r}: choose one of {', '.join(map(repr, _COLOURS))}")
     if not bodies:
         raise ValueError(f"bodies={bodies!r}: pass at least one")
-    for name, values in (("view", view), ("limits", limits or (0, 1))):
-        if np.shape(values) != (2,) or not np.isfinite(values).all():
+    for name, values in (("view", view), ("limits", (0, 1) if limits is None else limits)):
+        if floats(values).shape != (2,) or not np.isfinite(floats(values)).all():
             raise ValueError(f"{name}={values!r}: pass two finite numbers")
     for body in bodies:
         if not hasattr(body, "mesh"):
             raise TypeError(f"bodies: {body!r} has no mesh; pass Continuum bodies")
     if limits is not None and limits[0] >= limits[1]:
         raise ValueError(f"limits={limits!r}: the first must be below the second")
-    if not (math.isfinite(width) and width > 0):
-        raise ValueError(f"width={width!r}: must be positive and finite [inch]")
+    require_positive("width", width, "inch")
 
 
 class _Drawn(NamedTuple):
@@ -215,7 +217,7 @@ def _colour_scale(drawn: Sequence[_Drawn], colour: str, limits: Any) -> Any:
     from matplotlib.colors import Normalize
 
     values = np.concatenate([d.values for d in drawn])
-    low, high = limits or (float(values.min()), float(values.max()))
+    low, high = (values.min(), values.max()) if limits is None else limits
     if limits is None and high - low <= 1e-9 * high:
         # A constant field would otherwise show its rounding errors.
         low, high = 0.0, 1.1 * high or 1.0

@@ -23,6 +23,7 @@ from dolfinx_nts.validation import (
     first_problem,
     items,
     known_options,
+    require_bool,
     require_positive,
 )
 
@@ -93,9 +94,10 @@ class Solution:
         Args:
             path: Picture file; its ending chooses the format.
         """
-        from dolfinx_nts.output import on_root
+        from dolfinx_nts.output import as_path, on_root
         from dolfinx_nts.plots import plot_balance
 
+        as_path("path", path)
         on_root(self.system.comm, f"path={path!r}", lambda: plot_balance(self.balance, path))
 
 
@@ -139,8 +141,7 @@ class Stepper:
             raise TypeError(
                 f"petsc_options={petsc_options!r}: pass a dict, e.g. {{'pc_type': 'lu'}}"
             )
-        if not isinstance(sleep, bool):
-            raise TypeError(f"sleep={sleep!r}: pass True or False")
+        require_bool("sleep", sleep)
         self.newton = newton or Newton()
         given = petsc_options or {}
         preset = self.newton.preset(system, integrator.inertia, given)
@@ -394,6 +395,7 @@ def simulate(
     """
     require_positive("dt", dt, "s")
     require_positive("t_end", t_end, "s")
+    require_bool("progress", progress)
     output = writers(output)
     if not isinstance(adapt, Adapt | None):
         raise TypeError(f"adapt={adapt!r}: pass Adapt(tolerance=...)")
@@ -421,7 +423,7 @@ def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
         return newton
     if newton is not None:
         raise ValueError(f"accuracy={accuracy!r}, newton={newton!r}: pass one of them")
-    if accuracy not in ACCURACY:
+    if not (isinstance(accuracy, str) and accuracy in ACCURACY):
         known = ", ".join(map(repr, ACCURACY))
         raise ValueError(f"accuracy={accuracy!r}: choose one of {known}")
     return ACCURACY[accuracy]

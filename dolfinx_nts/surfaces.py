@@ -18,7 +18,7 @@ from mpi4py import MPI
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import facets as facet_math
 from dolfinx_nts import patches, search
-from dolfinx_nts.validation import at_points
+from dolfinx_nts.validation import at_points, is_whole
 
 logger = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
             )
         nodes = compat.entities_to_geometry(mesh, 2, exterior)
         used, chosen = np.unique(nodes), np.zeros(len(mesh.geometry.x), dtype=bool)
-        chosen[used] = at_points(mesh.comm, what, marker, mesh.geometry.x[used].T, ())
+        chosen[used] = at_points(mesh.comm, what, marker, mesh.geometry.x[used].T, (), "b")
         found = exterior[chosen[nodes].all(axis=1)]
         wrong = 0
     else:
@@ -67,6 +67,8 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
             raise ValueError(
                 f"{what}={marker!r}: pass facet meshtags (dimension 2), not cell or edge tags"
             )
+        if not is_whole(tag):
+            raise TypeError(f"{what} (tag {tag!r}): pass a whole number as the tag")
         tagged = marker.find(tag)
         found = np.intersect1d(tagged, exterior).astype(np.int32)
         owned = tagged < mesh.topology.index_map(2).size_local

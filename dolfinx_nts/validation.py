@@ -7,7 +7,7 @@ import inspect
 import math
 import numbers
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -52,18 +52,50 @@ def known_options(target: T) -> T:
     return decorated
 
 
+def is_finite(value: Any) -> TypeGuard[float]:
+    """Whether the value is a finite real number; text and truth values are none."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def is_whole(value: Any) -> TypeGuard[int]:
+    """Whether the value is a whole number; a truth value is none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
 def require_positive(name: str, value: Any, unit: str) -> None:
     """Raise ValueError unless the value is a positive, finite number."""
-    if not (isinstance(value, numbers.Real) and math.isfinite(value) and float(value) > 0):
+    if not (is_finite(value) and value > 0):
         raise ValueError(f"{name}={value!r}: must be positive and finite [{unit}]")
+
+
+def require_bool(name: str, value: Any) -> None:
+    """Raise TypeError unless the value is True or False."""
+    if not isinstance(value, bool):
+        raise TypeError(f"{name}={value!r}: pass True or False")
+
+
+def require_name(argument: str, value: Any) -> None:
+    """Raise TypeError or ValueError unless the value is text with something to read."""
+    if not isinstance(value, str):
+        raise TypeError(f"{argument}={value!r}: pass text, e.g. {argument}='block'")
+    if not value.strip():
+        raise ValueError(f"{argument}={value!r}: is empty; pass e.g. {argument}='block'")
+
+
+def floats(value: Any) -> FloatArray:
+    """The value as floats; an empty array where it is no array of real numbers, text included."""
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind in "iufO":
+            return array.astype(np.float64)
+    except (TypeError, ValueError):
+        pass
+    return np.empty(0)
 
 
 def vector(name: str, value: Any, unit: str, *, or_else: str = "") -> FloatArray:
     """The value as three finite components, shape (3,)."""
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.empty(0)
+    array = floats(value)
     if array.shape != (3,) or not np.isfinite(array).all():
         other = f", or {or_else}" if or_else else ""
         raise ValueError(f"{name}={value!r}: pass three finite components [{unit}]{other}")
@@ -129,7 +161,12 @@ def at_time(
 
 
 def at_points(
-    comm: Any, name: str, function: Callable[[Any], Any], x: FloatArray, rows: tuple[int, ...]
+    comm: Any,
+    name: str,
+    function: Callable[[Any], Any],
+    x: FloatArray,
+    rows: tuple[int, ...],
+    kinds: str = "iuf",
 ) -> npt.NDArray[Any]:
     """The user's function at this rank's points; what fails on one rank raises on all.
 
@@ -139,20 +176,25 @@ def at_points(
         function: Callable x (3, n) -> (*rows, n).
         x: Points [m], shape (3, n).
         rows: Leading shape of the result.
+        kinds: NumPy's kinds that the result may be of, "b" for truth values.
     """
-    problem, shape, values = None, (*rows, x.shape[1]), np.empty(0)
+    problem, cause, shape, values = None, None, (*rows, x.shape[1]), np.empty(0)
     try:
         values = np.asarray(function(x))
     except Exception as error:  # any: a rank that raises alone would leave the others waiting
         problem = f"{name}={function!r}: raised {error!r} for x of shape {x.shape}; correct it"
+        cause = error
     else:
         if values.shape != shape:
             problem = (
                 f"{name}={function!r}: returned shape {values.shape} for x of shape {x.shape}; "
                 f"return shape {shape}"
             )
+        elif values.size and values.dtype.kind not in kinds:
+            wanted = "truth values, e.g. x[0] < 1e-9" if kinds == "b" else "real numbers"
+            problem = f"{name}={function!r}: returned {values.dtype} values; return {wanted}"
         elif not np.isfinite(values).all():
             bad = x[:, np.flatnonzero(~np.isfinite(values.reshape(-1, x.shape[1])).all(axis=0))[0]]
             problem = f"{name}={function!r}: not finite at x={bad.tolist()}; check it for NaN"
-    raise_together(comm, problem)
+    raise_together(comm, problem, cause=cause)
     return values

@@ -22,6 +22,8 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 import dolfinx_nts as nts
+from dolfinx_nts.output import BalanceCSV, Fields
+from dolfinx_nts.pictures import picture
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
@@ -84,7 +86,7 @@ def raises(kind, pattern, action):
     message = str(caught.value)
     assert re.search(pattern, message), message
     assert "\n" not in message and len(message) < 400, message
-    assert len(set(COMM.allgather(kind.__name__))) == 1
+    assert len(set(COMM.allgather(type(caught.value).__name__))) == 1
     return message
 
 
@@ -133,6 +135,74 @@ def test_gravity(gravity):
 def test_degree(name):
     pattern = rf"^{name}=0: must be a positive integer"
     raises(ValueError, pattern, lambda: continuum(**{name: 0}))
+
+
+@pytest.mark.parametrize("bad", ["1", None, np.nan, True, [], 1j, np.array([1.0, 2.0]), len])
+@pytest.mark.parametrize(
+    ("name", "action"),
+    [
+        ("young", lambda bad: nts.NeoHookean(young=bad, poisson=0.3)),
+        ("poisson", lambda bad: nts.NeoHookean(young=1.0, poisson=bad)),
+        ("poisson", lambda bad: nts.StVenantKirchhoff(young=1.0, poisson=bad)),
+        ("a", lambda bad: nts.MooneyRivlin(a=bad, b=1.0, c=1.0)),
+        ("b", lambda bad: nts.MooneyRivlin(a=1.0, b=bad, c=1.0)),
+        ("c", lambda bad: nts.MooneyRivlin(a=1.0, b=1.0, c=bad)),
+        ("rtol", lambda bad: nts.Newton(rtol=bad)),
+        ("max_iterations", lambda bad: nts.Newton(max_iterations=bad)),
+        ("max_retries", lambda bad: nts.Newton(max_retries=bad)),
+        ("tolerance", lambda bad: nts.Adapt(tolerance=bad)),
+        ("shortest", lambda bad: nts.Adapt(shortest=bad)),
+        ("quadrature_points", lambda bad: nts.EnergyMomentum(quadrature_points=bad)),
+        ("friction", lambda bad: nts.ContactPair(None, None, friction=bad)),
+        ("radius", lambda bad: nts.Sphere((0, 0, 0), radius=bad)),
+        ("density", lambda bad: continuum("no mesh", density=bad)),
+        ("degree", lambda bad: continuum("no mesh", degree=bad)),
+        ("dt", lambda bad: nts.simulate(None, None, dt=bad, t_end=1.0)),
+        (
+            "stabilization",
+            lambda bad: nts.equilibrium(None, stabilization="" if bad is None else bad),
+        ),
+        ("load_steps", lambda bad: nts.equilibrium(None, load_steps=bad)),
+        ("interval", lambda bad: Fields("folder", interval="" if bad is None else bad)),
+        ("width", lambda bad: picture([SimpleNamespace(mesh=None)], "p.png", width=bad)),
+        ("accuracy", lambda bad: run(accuracy="" if bad is None else bad)),
+        ("components", lambda bad: nts.Dirichlet(top, components=(bad,))),
+    ],
+)
+def test_what_is_no_number(name, action, bad):
+    """Nor any other of a few names: it is text, a truth value, NaN, complex or an array."""
+    if name == "load_steps" and isinstance(bad, np.ndarray):
+        bad = bad[::-1]
+    raises((TypeError, ValueError), rf"^{name}=", lambda: action(bad))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "action"),
+    [
+        (
+            r"^gravity=\('0', '0', '1'\): pass three",
+            lambda: nts.System([continuum()], gravity=tuple("001")),
+        ),
+        (
+            r"^load_steps=\['1', '2'\]: pass a number",
+            lambda: nts.equilibrium(0, load_steps=["1", "2"]),
+        ),
+        (r"^progress='no': pass True or False", lambda: run(progress="no")),
+        (r"^progress=1: pass True or False", lambda: nts.equilibrium(None, progress=1)),
+        (r"^folder=None: pass a path, e.g.", lambda: Fields(None)),
+        (r"^path=3: pass a path, e.g.", lambda: BalanceCSV(3)),
+        (r"^path=3: pass a path, e.g.", lambda: nts.Solution(None).plot(3)),
+        (r"^bodies=3: pass a sequence of", lambda: picture(3, "p.png")),
+        (r"^colour=\[\]: choose one", lambda: picture([continuum()], "p.png", colour=[])),
+        (r"^limits=\[\]: pass two", lambda: picture([continuum()], "p.png", limits=[])),
+        (r"^mesh=None: pass a dolfinx mesh", lambda: nts.bodies_from_tags(None, None)),
+        (r"^names='a': pass a dict", lambda: nts.bodies_from_tags(box(), None, names="a")),
+        (r"^surfaces=3: pass a dict", lambda: nts.bodies_from_tags(box(), None, surfaces=3)),
+        (r"^comm=None: pass an MPI comm", lambda: nts.bodies_from_gmsh("a.msh", None)),
+    ],
+)
+def test_what_is_of_another_kind(pattern, action):
+    raises((TypeError, ValueError), pattern, action)
 
 
 # ---- materials
@@ -304,6 +374,8 @@ def test_marker_of_wrong_kind():
     raises(TypeError, pattern, lambda: body.surface(7))
     tags = facet_tags(body.mesh)
     raises(TypeError, r"pass a function of x .*, or meshtags and a tag", lambda: body.surface(tags))
+    pattern = r"^marker of a surface of 'body' \(tag '3'\): pass a whole number as the tag"
+    raises(TypeError, pattern, lambda: body.surface(tags, "3"))
     pattern = r"pass facet meshtags \(dimension 2\), not cell or edge tags"
     body.mesh.topology.create_entities(1)
     edges = facet_tags(body.mesh, dim=1)
