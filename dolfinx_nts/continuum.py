@@ -290,7 +290,10 @@ class Continuum:
 
     # ---- set-up
     def _boundary_measure(self, degree: int) -> Any:
-        indices = [_facets(self.mesh, load.where, "Traction.where") for load in self._traction]
+        indices = [
+            _facets(self.mesh, load.where, f"Traction.where of traction[{k}] of {self.name!r}")
+            for k, load in enumerate(self._traction)
+        ]
         tags = [np.full(len(i), k, np.int32) for k, i in enumerate(indices)]
         empty = np.empty(0, np.int32)
         index, tag = (
@@ -298,7 +301,10 @@ class Continuum:
             np.concatenate([empty, *tags]),
         )
         shared = len(index) - len(np.unique(index))
-        text = f"traction: {shared} facets carry two loads; add their values up in one Traction"
+        text = (
+            f"traction of {self.name!r}: {shared} facets carry two loads; add their values up in "
+            "one Traction"
+        )
         raise_together(self.comm, text if shared else None)
         order = np.argsort(index)
         data = dolfinx_mesh.meshtags(self.mesh, 2, index[order], tag[order])
@@ -311,7 +317,8 @@ class Continuum:
         self._conditions: list[tuple[VectorInTime, list[tuple[int, IntArray]]]] = []
         owner = np.full(self.num_owned, -1)
         for number, bc in enumerate(bcs):
-            facets = _facets(self.mesh, bc.where, "Dirichlet.where")
+            what = f"Dirichlet.where of bcs[{number}] of {self.name!r}"
+            facets = _facets(self.mesh, bc.where, what)
             blocks = np.asarray(fem.locate_dofs_topological(self.space, 2, facets))
             self._conditions.append((bc.value, []))
             for component in bc.components:

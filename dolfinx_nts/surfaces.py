@@ -46,8 +46,8 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
 
     Raises:
         TypeError: `marker` is neither callable nor meshtags with a tag.
-        ValueError: The tags are not facet tags, or no exterior facet is selected, or an interior
-            facet is.
+        ValueError: The marker raises or returns no truth values, the tags are not facet tags, or
+            no exterior facet is selected, or an interior facet is.
     """
     exterior = compat.exterior_facets(mesh)
     if tag is None:

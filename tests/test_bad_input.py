@@ -271,11 +271,15 @@ def test_loads():
     raises(TypeError, pattern, lambda: continuum(traction=["push"]))
     pattern = r"^body_force of 'body' at t=0.0=4.0: pass three finite components \[N/m\^3\]"
     raises(ValueError, pattern, lambda: continuum(body_force=lambda t: 4.0))
-    pattern = r"^Traction.where.*selects no exterior facet; check the marker"
+    pattern = (
+        r"^Traction.where of traction\[1\] of 'body': selects no exterior facet; check the marker"
+    )
     raises(
         ValueError,
         pattern,
-        lambda: continuum(traction=[nts.Traction(lambda x: x[0] > 9, (1, 0, 0))]),
+        lambda: continuum(
+            traction=[nts.Traction(top, (1, 0, 0)), nts.Traction(lambda x: x[0] > 9, (1, 0, 0))]
+        ),
     )
 
 
@@ -284,7 +288,7 @@ def test_tractions_overlap_on_one_rank():
         return top(x) & (x[0] < 0.5 + 1e-9) & (x[1] < 0.5 + 1e-9)
 
     loads = [nts.Traction(top, (1, 0, 0)), nts.Traction(corner, (0, 1, 0))]
-    pattern = r"^traction: 1 facets carry two loads; add their values up in one Traction"
+    pattern = r"^traction of 'body': 1 facets carry two loads; add their values up in one Traction"
     raises(ValueError, pattern, lambda: continuum(traction=loads))
 
 
@@ -303,7 +307,7 @@ def test_conditions():
     pattern = r"^Dirichlet.value of bcs\[0\] of 'body' at t=0.0=\(0, nan, 0\): pass three finite"
     moving = nts.Dirichlet(top, lambda t: (0, np.nan, 0))
     raises(ValueError, pattern, lambda: continuum(bcs=[moving]))
-    pattern = r"^Dirichlet.where=5: pass a function of x"
+    pattern = r"^Dirichlet.where of bcs\[0\] of 'body'=5: pass a function of x"
     raises(TypeError, pattern, lambda: continuum(bcs=[nts.Dirichlet(5)]))
 
 
@@ -386,6 +390,44 @@ def test_marker_of_wrong_kind():
 def test_marker_of_wrong_shape():
     pattern = r"returned shape \(3, \d+\) for x of shape \(3, \d+\); return shape \(\d+,\)"
     raises(ValueError, pattern, lambda: continuum().surface(lambda x: x > 0))
+
+
+@pytest.mark.parametrize(
+    "marker",
+    [lambda x: x[2], lambda x: 1 - np.round(x[2]).astype(int), lambda x: x[2].astype(str)],
+    ids=["float", "int", "text"],
+)
+def test_marker_that_returns_no_truth_values(marker):
+    """Taken for truth, these would select what is not zero, nearly everything."""
+    returned = r"=<function .*>: returned [\w<>]+ values; return truth values, e.g. x\[0\] < 1e-9$"
+    pattern = r"^marker of a surface of 'body'" + returned
+    raises(ValueError, pattern, lambda: continuum().surface(marker))
+    pattern = r"^Dirichlet.where of bcs\[1\] of 'body'" + returned
+    held = [nts.Dirichlet(top), nts.Dirichlet(marker)]
+    raises(ValueError, pattern, lambda: continuum(bcs=held))
+    pattern = r"^Traction.where of traction\[0\] of 'body'" + returned
+    raises(ValueError, pattern, lambda: continuum(traction=[nts.Traction(marker, (1, 0, 0))]))
+
+
+def test_marker_that_returns_numbers_on_one_rank():
+    def mixed(x):
+        return top(x).astype(float) if COMM.rank == COMM.size - 1 else top(x)
+
+    raises(ValueError, r"returned float64 values; return truth", lambda: continuum().surface(mixed))
+
+
+def test_marker_that_returns_a_list_of_truth_values():
+    """Where a rank has no points the list is empty, and of no kind at all."""
+    column = continuum(box(cells=(1, 1, 1)))
+    surface = column.surface(lambda x: [bool(z > 0.5) for z in x[2]])
+    assert len(surface.facets) == 1
+
+
+def test_velocity_that_is_no_number():
+    pattern = r"^velocity of 'body'=<function.*returned <U\d+ values; return real numbers"
+    raises(ValueError, pattern, lambda: continuum(velocity=lambda x: x.astype(str)))
+    pattern = r"^velocity of 'body'=<function.*returned complex128 values; return real numbers"
+    raises(ValueError, pattern, lambda: continuum(velocity=lambda x: 1j * x))
 
 
 def test_marker_that_raises_on_one_rank():
