@@ -20,6 +20,7 @@ from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.integrators import Static
+from dolfinx_nts.materials import misfit
 from dolfinx_nts.surfaces import Surface, flux, locate_facets, oriented_nodes
 from dolfinx_nts.validation import (
     at_points,
@@ -190,7 +191,8 @@ class Continuum:
         space: Their function space.
 
     Raises:
-        TypeError: `material` or a condition is not of the right kind.
+        TypeError: `material`, `extra_form`, `name` or a condition is not of the right kind, or what
+            the first two make cannot be compiled on this mesh.
         ValueError: An argument is out of range, or the mesh is not a valid 3D mesh.
     """
 
@@ -220,6 +222,8 @@ class Continuum:
             if not default and not (is_whole(value) and value > 0):
                 raise ValueError(f"{option}={value!r}: must be a positive integer")
         require_name("name", name)
+        if extra_form is not None and not callable(extra_form):
+            raise TypeError(f"extra_form={extra_form!r}: pass a callable (u, v, w) -> UFL form")
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
         bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")
         _check_mesh(mesh, name)
@@ -357,17 +361,9 @@ class Continuum:
         for k, value in enumerate(self._loads[1:]):
             load += ufl.inner(value, w) * self._ds(k)
         f = ufl.Identity(3) + ufl.grad(self.u)
-        try:
-            energy = ufl.as_ufl(self.material(f.T * f))
-        except Exception as error:
-            raise TypeError(
-                f"material={self.material!r}: W(C) raised {error!r}; return a UFL scalar"
-            ) from error
-        if energy.ufl_shape != ():
-            raise TypeError(
-                f"material={self.material!r}: W(C) has shape {energy.ufl_shape}; "
-                "return a UFL scalar"
-            )
+        energy = self._energy(f.T * f)
+        if self._extra_form is not None:
+            self._check_extra_form(self._extra_form, w)
         inside_out = ufl.conditional(ufl.lt(ufl.det(f), 0.0), 1.0, 0.0)
         mass, self._load_form, self._energy_form, self._inverted_form = compat.compile_forms(
             [
@@ -385,6 +381,42 @@ class Continuum:
         self._load, self._assembled_loads = np.zeros(self.num_owned), np.zeros(3 * len(self._loads))
         self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
         self.nodal_mass = self.inertia(np.ones(self.num_owned))
+
+    def _energy(self, c: Any) -> Any:
+        """W(C) in UFL; what is wrong with it raises on every rank."""
+        problem, cause, energy = None, None, None
+        try:
+            energy = ufl.as_ufl(self.material(c))
+        except Exception as error:  # any: a rank that raises alone would leave the others waiting
+            problem, cause = f"raised {error!r}; return a UFL scalar", error
+        else:
+            if energy.ufl_shape != ():
+                problem = f"has shape {energy.ufl_shape}; return a UFL scalar"
+            else:
+                problem = misfit([energy], self.mesh.ufl_domain())
+        text = f"material={self.material!r} of {self.name!r}: W(C) {problem}"
+        raise_together(self.comm, text if problem else None, TypeError, cause)
+        return energy
+
+    def _check_extra_form(self, extra_form: Any, w: Any) -> None:
+        """Raise on every rank unless it makes a linear form of the test function w."""
+        problem, cause = None, None
+        wanted = "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx"
+        try:
+            # Sums, as those that it will be given.
+            form = extra_form(self.u + self.v, self.u - self.v, w)
+        except Exception as error:  # any: as above
+            problem, cause = f"raised {error!r}; {wanted}", error
+        else:
+            if not isinstance(form, ufl.Form):
+                problem = f"returned an object of type {type(form).__name__}; {wanted}"
+            elif set(form.arguments()) != {w}:
+                problem = f"is not linear in the test function w alone; {wanted}"
+            else:
+                integrands = [part.integrand() for part in form.integrals()]
+                problem = misfit(integrands, self.mesh.ufl_domain())
+        text = f"extra_form={extra_form!r} of {self.name!r}: {problem}"
+        raise_together(self.comm, text if problem else None, TypeError, cause)
 
     def _compile(self, integrator: Any) -> tuple[Any, Any, Any]:
         """Compiled internal virtual work, tangent and extra virtual work of an integrator."""

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import ufl
+from ufl.constantvalue import RealValue
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts.validation import is_finite, known_options, require_positive
 
@@ -19,6 +23,22 @@ def _check_elastic(young: float, poisson: float) -> None:
     require_positive("young", young, "Pa")
     if not (is_finite(poisson) and -1 < poisson < 0.5):
         raise ValueError(f"poisson={poisson!r}: must lie in (-1, 0.5); use e.g. 0.49 for rubber")
+
+
+def misfit(expressions: Iterable[Any], domain: Any) -> str | None:
+    """What keeps UFL expressions from being compiled on a mesh, in words, if anything does.
+
+    Args:
+        expressions: In UFL.
+        domain: UFL domain of the mesh.
+    """
+    for expression in expressions:
+        for t in traverse_unique_terminals(expression):
+            if any(d != domain for d in t.ufl_domains()):
+                return f"contains {t!s} of another mesh; make it on the mesh of the body"
+            if isinstance(t, RealValue) and not math.isfinite(float(t)):
+                return f"contains the number {float(t)!r}; check it for NaN"
+    return None
 
 
 @known_options

@@ -4,6 +4,7 @@ Serial tests show the message; on two ranks the wrong data sit on one rank only 
 """
 
 import re
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +23,7 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.output import BalanceCSV, Fields
 from dolfinx_nts.pictures import picture
 
@@ -211,7 +213,7 @@ def test_material_that_is_no_function():
 
 
 def test_material_that_is_no_scalar():
-    pattern = r"^material=<function.*shape \(3, 3\); return a UFL scalar"
+    pattern = r"^material=<function.* of 'body': W\(C\) has shape \(3, 3\); return a UFL scalar"
     raises(TypeError, pattern, lambda: continuum(None, lambda c: c))
     pattern = r"^material=<function.*raised .*return a UFL scalar"
     raises(TypeError, pattern, lambda: continuum(None, lambda c: None))
@@ -223,6 +225,70 @@ def test_material_that_raises():
 
     pattern = r"^material=<function.*raised RuntimeError\('no such invariant'\); return"
     raises(TypeError, pattern, lambda: continuum(None, broken))
+
+
+def test_material_that_raises_on_one_rank():
+    def picky(c):
+        if COMM.rank == COMM.size - 1:
+            raise KeyError("table")
+        return ufl.tr(c)
+
+    raises(TypeError, r"W\(C\) raised KeyError\('table'\)", lambda: continuum(None, picky))
+
+
+def of_another_mesh(kind):
+    """A UFL scalar that lives on another mesh than the bodies."""
+    other = box()
+    return {
+        "function": lambda: fem.Function(compat.scalar_space(other, "DG", 0), name="stiffness"),
+        "constant": lambda: fem.Constant(other, 1.0),
+        "coordinate": lambda: ufl.SpatialCoordinate(other)[0],
+    }[kind]()
+
+
+@pytest.mark.parametrize("kind", ["function", "constant", "coordinate"])
+def test_coefficients_of_another_mesh(kind):
+    other = of_another_mesh(kind)
+    found = r".* of another mesh; make it on the mesh of the body$"
+    pattern = r"^material=<function .* of 'body': W\(C\) contains " + found
+    raises(TypeError, pattern, lambda: continuum(None, lambda c: other * ufl.tr(c)))
+    mesh = box()
+    dx = ufl.Measure("dx", mesh)
+    pattern = r"^extra_form=<function .* of 'body': contains " + found
+    extra = {"extra_form": lambda u, v, w: other * ufl.inner(v, w) * dx}
+    raises(TypeError, pattern, lambda: continuum(mesh, **extra))
+
+
+def test_a_number_in_a_material_that_is_none():
+    pattern = r"^material=<function .*: W\(C\) contains the number nan; check it for NaN"
+    raises(TypeError, pattern, lambda: continuum(None, lambda c: np.nan * ufl.tr(c)))
+
+
+@pytest.mark.parametrize(
+    ("extra_form", "problem"),
+    [
+        (lambda u, v, w: 3.0, r"returned an object of type float; return a UFL form like"),
+        (lambda u, v, w: ufl.inner(v, w), r"returned an object of type \w+; return a UFL form"),
+        (lambda u, v, w: None, r"returned an object of type NoneType; return a UFL form"),
+        (lambda u, v, w: ufl.inner(u, v) * ufl.dx, r"is not linear in the test function w alone"),
+        (lambda u, v, w: 0 * ufl.inner(v, w) * ufl.dx, r"raised|is not linear in the test"),
+        (lambda u, v, w: u.x, r"raised AttributeError.*; return a UFL form"),
+        (lambda u, w: ufl.inner(u, w) * ufl.dx, r"raised TypeError.*; return a UFL form"),
+        (lambda u, v, w: {}["drag"] if COMM.rank == COMM.size - 1 else None, "KeyError|NoneType"),
+    ],
+)
+def test_extra_form(extra_form, problem):
+    pattern = rf"^extra_form=<function .* of 'body': .*({problem})"
+    raises(TypeError, pattern, lambda: continuum(extra_form=extra_form))
+    raises(TypeError, r"^extra_form=3.0: pass a callable", lambda: continuum(extra_form=3.0))
+
+
+@pytest.mark.parametrize("make", [continuum, partial(nts.Plane, (0, 0, 0), (0, 0, 1))])
+def test_name(make):
+    for name in (3, None, b"left"):
+        pattern = rf"^name={name!r}: pass text, e.g. name='block'"
+        raises(TypeError, pattern, lambda name=name: make(name=name))
+    raises(ValueError, r"^name=' ': is empty; pass e.g. name='block'", lambda: make(name=" "))
 
 
 # ---- velocity, loads, conditions
