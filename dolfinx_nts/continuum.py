@@ -6,6 +6,8 @@ coordinates this rank owns.
 
 from __future__ import annotations
 
+import logging
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,10 +37,17 @@ from dolfinx_nts.validation import (
     vector,
 )
 
+logger = logging.getLogger(__name__)
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 VectorInTime = Vector | Callable[[float], Vector]
+
+#: Stress of an undeformed body, over its stiffness, that counts as none.
+_STRESS_FREE = 1e-6
+#: Strain that tells the stiffness: of the size that leaves linear terms and rounding far apart.
+_SMALL_STRAIN = 1e-4
 
 
 class Body(Protocol):
@@ -254,6 +263,7 @@ class Continuum:
         self._build_constant_forms()
         self._compiled: dict[Any, tuple[Any, Any, Any]] = {}
         self._stiffness: FloatArray | None = None
+        self._seen_at_rest = False
 
     def surface(self, marker: Any, tag: int | None = None, *, smoothing: bool = False) -> Surface:
         """A part of the boundary for contact.
@@ -454,6 +464,8 @@ class Continuum:
         total = self.comm.allreduce(np.array([scale.sum(), self.num_owned]))
         self._diagonal = float(total[0] / total[1])
         self._forms = self._compile(integrator)
+        if not self._seen_at_rest:
+            self._warn_of_stress_at_rest(integrator.theta)
         self._fill(self._u0, u0)
         self._factor.value = integrator.factor(dt)
         self._rate.value = 1.0 / dt if integrator.inertia else 0.0
@@ -463,6 +475,28 @@ class Continuum:
         loads = np.concatenate([constant.value for constant in self._loads])
         if not np.array_equal(loads, self._assembled_loads):
             self._load, self._assembled_loads = self._assemble(self._load_form), loads
+
+    def _warn_of_stress_at_rest(self, theta: float) -> None:
+        """Tell whether forces of its own move the undeformed body, as where dW/dC(1) is not 0.
+
+        Beside them stand those of a small shear x, -y. Costs two evaluations of internal forces.
+        """
+        self._seen_at_rest = True
+        shear = _SMALL_STRAIN * np.resize([1.0, -1.0, 0.0], self.num_owned) * self.reference
+        for u in (self._u0, self._u1):
+            self._fill(u, 0.0 * shear)
+        at_rest = self._assemble(self._forms[0])
+        self._fill(self._u1, shear)
+        change = (self._assemble(self._forms[0]) - at_rest) / (theta * _SMALL_STRAIN)
+        at_rest[self.fixed] = 0.0
+        squares = np.array([at_rest @ at_rest, change @ change])
+        stress, stiffness = np.sqrt(self.comm.allreduce(squares)).tolist()
+        if not stress <= _STRESS_FREE * stiffness and self.comm.rank == 0:
+            logger.warning(
+                "body %r is under a stress of about %.2g of its stiffness while undeformed, and "
+                "will move by itself; unless that is meant, let W(C) have dW/dC = 0 at C = 1",
+                self.name, stress / stiffness if stiffness else math.inf,
+            )  # fmt: skip
 
     def _loads_at(self, time: float) -> list[tuple[VectorInTime, FloatArray]]:
         """Body force and tractions as they were given, and their values at a time."""

@@ -1,0 +1,91 @@
+"""A strain energy with stress in the undeformed body is told of: once, on rank 0, by its size."""
+
+import logging
+import re
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+SHEAR = 1e6 / 2.6
+LAWS = [nts.Midpoint(), nts.EnergyMomentum()]
+
+pytestmark = pytest.mark.mpi
+
+
+def block(part, **options):
+    """A cube of NeoHookean with a stress of this part of the shear modulus, alike everywhere."""
+    low, high = np.array([[0, 0, 0], [1, 1, 1]]) + [5.0, -3.0, 2.0]
+    mesh = create_box(
+        COMM, [low, high], [2, 2, 2], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
+    )
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    # A Constant, so that all parts share one compiled form.
+    stress = fem.Constant(mesh, part * SHEAR)
+
+    def energy(c):
+        return rubber(c) + stress / 2 * (ufl.tr(c) - 3)
+
+    material = energy if part else rubber
+    return nts.Continuum(mesh, material, density=1e3, name="block", **options)
+
+
+def told(caplog):
+    """What was logged of stress: the size, once, on rank 0 and nowhere else."""
+    texts = [r.getMessage() for r in caplog.records if "undeformed" in r.getMessage()]
+    assert not texts or (COMM.rank == 0 and len(texts) == 1)
+    text = COMM.bcast(texts[0] if texts else None)
+    if text is None:
+        return 0.0
+    assert text.startswith("body 'block' is under a stress of about ")
+    assert text.endswith("let W(C) have dW/dC = 0 at C = 1")
+    return float(re.search(r"about (\S+) of its stiffness", text)[1])
+
+
+def test_silent_without_stress(caplog):
+    body = block(0.0, velocity=lambda x: 10.0 * x[[1, 2, 0]])
+    nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=1e-3, t_end=2e-3)
+    assert told(caplog) == 0.0
+
+
+@pytest.mark.parametrize("integrator", LAWS)
+@pytest.mark.parametrize("part", [1e-4, 0.3])
+def test_the_size_of_the_stress(part, integrator, caplog):
+    """Closed form for a cube: stress part mu in three directions beside (2 + part) mu in two."""
+    stepper = nts.Stepper(nts.System([block(part)]), integrator)
+    for _ in range(2):
+        stepper.advance(1e-4)
+    stepper.close()
+    assert told(caplog) == pytest.approx(np.sqrt(3 / 2) * part / (2 + part), rel=0.02)
+    assert np.abs(stepper.state.v[0]).max(initial=0.0) > 0.0
+
+
+def test_statics_and_dynamics_of_one_body_tell_once(caplog):
+    system = nts.System([block(0.01, bcs=[nts.Dirichlet(lambda x: x[2] < 2 + 1e-9)])])
+    nts.equilibrium(system)
+    nts.simulate(system, nts.Midpoint(), dt=1e-4, t_end=1e-4)
+    assert 0.003 < told(caplog) < 0.01
+
+
+def test_a_body_held_everywhere_does_not_move(caplog):
+    held = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
+    body = block(0.3, bcs=[held])
+    nts.simulate(nts.System([body]), nts.Midpoint(), dt=1e-4, t_end=1e-4)
+    assert told(caplog) == 0.0
+
+
+def test_the_check_leaves_no_trace(caplog):
+    """The first step starts from the body's state, not from what was tried."""
+    caplog.set_level(logging.ERROR)
+    runs = []
+    for seen in (False, True):
+        body = block(0.1, velocity=(1.0, 0, 0))
+        body._seen_at_rest = seen
+        runs.append(nts.simulate(nts.System([body]), nts.Midpoint(), dt=1e-3, t_end=3e-3))
+    assert np.array_equal(*(run.balance["potential"] for run in runs))
