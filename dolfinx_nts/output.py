@@ -76,7 +76,8 @@ def as_path(name: str, value: Any) -> Path:
 
 
 def _file_name(name: str) -> str:
-    return re.sub(r"[^\w.-]+", "_", name)
+    """Of a body: a name without folders, and none that is hidden."""
+    return re.sub(r"^\.+|[^\w.-]+", "_", name)
 
 
 # ---- fields

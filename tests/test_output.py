@@ -480,6 +480,21 @@ def test_fields_of_bodies_without_a_mesh(tmp_path):
 
 
 @mpi
+@pytest.mark.parametrize(
+    "name, file", [("../x", "__x"), ("a/b", "a_b"), (".hid", "_hid"), ("/tmp/ä b", "_tmp_ä_b")]
+)
+def test_a_body_name_is_no_path(name, file, mpi_tmp_path):
+    mesh = box([0.0, 0, 0], [1.0, 1, 1], [1, 1, 1])
+    system = nts.System([nts.Continuum(mesh, RUBBER, density=1.0, name=name)])
+    folder = mpi_tmp_path / "inner"
+    run = nts.simulate(system, nts.Midpoint(), dt=1e-3, t_end=1e-3, output=[output.Fields(folder)])
+    assert run.status == "completed"
+    assert len(read(folder / f"{file}.xdmf").times) == 2
+    assert {p.name for p in folder.iterdir()} == {f"{file}.xdmf", f"{file}.h5"}
+    assert [p.name for p in mpi_tmp_path.iterdir()] == ["inner"]
+
+
+@mpi
 def test_body_names_that_give_one_file(mpi_tmp_path):
     mesh = box([0.0, 0, 0], [1.0, 1, 1], [1, 1, 1])
     bodies = [nts.Continuum(mesh, RUBBER, density=1.0, name=n) for n in ("a b", "a_b")]
