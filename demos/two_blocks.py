@@ -87,13 +87,15 @@ def figures(run: nts.Solution) -> dict[str, Any]:
     """What the run kept and lost, relative to the energy and momenta it started with."""
     table = run.balance
     energy, momentum, spin = (table[k] for k in ("energy", "linear_momentum", "angular_momentum"))
+    lost, defect = 1 - energy[-1] / energy[0], table["contact_defect"][-1] / energy[0]
     return {
         "status": run.status,
         "ledger": float(np.abs(table["ledger_residual"]).max() / energy[0]),
         "linear_momentum": float(np.abs(momentum - momentum[0]).max() / np.abs(momentum[0]).max()),
         "angular_momentum": float(np.abs(spin - spin[0]).max() / np.abs(spin[0]).max()),
-        "energy_lost": float(1 - energy[-1] / energy[0]),
-        "contact_defect": float(table["contact_defect"][-1] / energy[0]),
+        "energy_lost": float(lost),
+        "contact_defect": float(defect),
+        "their_difference": float(abs(lost - defect)),
         "min_gap": float(table["min_gap"].min()),
         "newton_iterations": int(table["newton_iterations"].sum()),
         "max_active": int(table["active"].max()),
