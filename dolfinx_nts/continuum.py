@@ -560,7 +560,7 @@ class Continuum:
         return total
 
     def prescribed(self, time: float) -> FloatArray:
-        """Prescribed displacements at a time, in the order of `fixed` [m]."""
+        """Prescribed displacements at a time, in the order of `fixed` [m]. Collective."""
         values = np.zeros(self.num_owned)
         for k, (value, parts) in enumerate(self._conditions):
             now = self._at(f"Dirichlet.value of bcs[{k}]", value, time, "m")

@@ -154,7 +154,7 @@ def at_time(
     else:
         try:
             value = vector(name, given, unit)
-        except ValueError as error:
+        except Exception as error:  # any: as above
             problem = str(error)
     raise_together(comm, problem, UserFunctionError, cause)
     return value
@@ -193,7 +193,7 @@ def at_points(
         elif values.size and values.dtype.kind not in kinds:
             wanted = "truth values, e.g. x[0] < 1e-9" if kinds == "b" else "real numbers"
             problem = f"{name}={function!r}: returned {values.dtype} values; return {wanted}"
-        elif not np.isfinite(values).all():
+        elif values.size and not np.isfinite(values).all():
             bad = x[:, np.flatnonzero(~np.isfinite(values.reshape(-1, x.shape[1])).all(axis=0))[0]]
             problem = f"{name}={function!r}: not finite at x={bad.tolist()}; check it for NaN"
     raise_together(comm, problem, cause=cause)

@@ -492,6 +492,8 @@ def test_marker_that_returns_a_list_of_truth_values():
 def test_velocity_that_is_no_number():
     pattern = r"^velocity of 'body'=<function.*returned <U\d+ values; return real numbers"
     raises(ValueError, pattern, lambda: continuum(velocity=lambda x: x.astype(str)))
+    cell = box(cells=(1, 1, 1))  # one rank has no nodes
+    raises(ValueError, pattern, lambda: continuum(cell, velocity=lambda x: x.astype(str)))
     pattern = r"^velocity of 'body'=<function.*returned complex128 values; return real numbers"
     raises(ValueError, pattern, lambda: continuum(velocity=lambda x: 1j * x))
 

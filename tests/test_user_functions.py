@@ -97,7 +97,8 @@ def test_a_run_keeps_what_it_has(what, fails, ranks):
     whole = nts.simulate(good, nts.EnergyMomentum(), dt=DT, t_end=5 * DT)
     assert whole.status == "completed"
     for name, column in run.balance.items():
-        assert np.array_equal(column, whole.balance[name][:3]), name
+        # Ranks add up in any order; energy, momentum and time here are of the order of 1 to 100.
+        assert np.allclose(column, whole.balance[name][:3], rtol=1e-10, atol=1e-12), name
     assert np.allclose(system.bodies[0].v.x.array[2::3], 0.1, atol=0.2)
 
 
