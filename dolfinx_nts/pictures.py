@@ -103,7 +103,7 @@ def _check_picture(
 ) -> None:
     if not (isinstance(colour, str) and colour in _COLOURS):
         raise ValueError(f"colour={colour!r}: choose one of {', '.join(map(repr, _COLOURS))}")
-    if not bodies:
+    if not len(bodies):
         raise ValueError(f"bodies={bodies!r}: pass at least one")
     for name, values in (("view", view), ("limits", (0, 1) if limits is None else limits)):
         if floats(values).shape != (2,) or not np.isfinite(floats(values)).all():
