@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import functools
 import io
-import statistics
 import tempfile
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,33 +110,59 @@ FEATURES = (
 )  # fmt: skip
 
 
-class Stopwatch:
-    """Writer, and clock of any loop: CPU and wall time between its calls, the slowest rank's.
+class Turn:
+    """A run in a thread that makes a step when it is told to; as a writer, it ends each step.
+
+    What else the machine does falls on all runs alike if their steps take turns. One thread only
+    ever runs.
+
+    Args:
+        run: Is called with this, and calls `start` before its first step, `write` after each.
 
     Attributes:
-        laps: CPU and wall time [s] of each, shape (laps, 2).
+        laps: CPU and wall time of each step [s].
     """
 
-    def __init__(self, comm: Any) -> None:
-        self._comm, self._times = comm, [self._now()]
+    def __init__(self, run: Callable[[Turn], float]) -> None:
+        self._go, self._rest = threading.Semaphore(0), threading.Semaphore(0)
+        self._error: BaseException | None = None
+        self.laps: list[FloatArray] = []
+        self.iterations = 0.0
+        self._thread = threading.Thread(target=self._whole, args=(run,), daemon=True)
+        self._thread.start()
+
+    def _whole(self, run: Callable[[Turn], float]) -> None:
+        self._go.acquire()
+        try:
+            self.iterations = run(self)
+        except BaseException as error:  # for the thread that takes turns
+            self._error = error
+        self._rest.release()
+
+    def take(self) -> None:
+        """Let the run go on to the end of its next step; raises what it raises."""
+        self._go.release()
+        self._rest.acquire()
+        if self._error is not None:
+            raise self._error
+
+    def _pause(self) -> None:
+        self._rest.release()
+        self._go.acquire()
+        self._begin = self._now()
 
     @staticmethod
-    def _now() -> tuple[float, float]:
-        return time.process_time(), time.perf_counter()
-
-    @property
-    def laps(self) -> FloatArray:  # noqa: D102
-        laps: FloatArray = np.diff(np.array(self._times), axis=0)
-        self._comm.Allreduce(MPI.IN_PLACE, laps, op=MPI.MAX)
-        return laps
+    def _now() -> FloatArray:
+        return np.array([time.process_time(), time.perf_counter()])
 
     def start(self, stepper: nts.Stepper | None = None) -> None:
-        """Start."""
-        self._times = [self._now()]
+        """Wait for the first step's turn."""
+        self._pause()
 
     def write(self, stepper: nts.Stepper | None = None, *, last: bool = False) -> None:
-        """Take the time."""
-        self._times.append(self._now())
+        """Take the time of a step, and wait for the next one's turn."""
+        self.laps.append(self._now() - self._begin)
+        self._pause()
 
     def close(self, stepper: nts.Stepper) -> None:
         """Nothing is open."""
@@ -266,35 +293,55 @@ class Economy:
             for b in self._bodies["far"][0]
         ]
 
-    def run_plain(self, steps: int) -> tuple[FloatArray, float]:
-        """Mean CPU and wall time of a step [s], and its Newton iterations."""
-        bodies, watch, iterations = self.plain(), Stopwatch(self.comm), 0
-        for k in range(_WARM + steps):
-            if k == _WARM:
-                watch.start()
-            done = max([body.step() for body in bodies])
-            iterations += done if k >= _WARM else 0
-            watch.write()
+    def run_plain(self, count: int, turn: Turn) -> float:
+        """Make the steps of the plain loop; returns the Newton iterations of a timed one."""
+        bodies = self.plain()
+        turn.start()
+        iterations = []
+        for _ in range(count):
+            iterations.append(max([body.step() for body in bodies]))
+            turn.write()
         for body in bodies:
             body.destroy()
-        return watch.laps[-steps:].mean(axis=0), iterations / steps
+        return float(np.mean(iterations[_WARM:-1]))
 
-    def run(self, feature: Feature, steps: int, folder: str) -> tuple[FloatArray, float]:
+    def run(self, feature: Feature, count: int, folder: str, turn: Turn) -> float:
         """As `run_plain`, with this package; `folder` is for its output."""
-        watch = Stopwatch(self.comm)
-        writers = [output.Fields(folder, every=feature.every)] if feature.every else []
-        count = _WARM + steps + 1  # the last one, which is always written, is not timed
-        with _ledger(feature.ledger), contextlib.redirect_stderr(io.StringIO()):
-            run = nts.simulate(
-                self.system(feature), nts.EnergyMomentum(), dt=self.dt, t_end=count * self.dt,
-                newton=nts.Newton(rtol=RTOL), petsc_options=_ORDERING, output=[*writers, watch],
-                progress=feature.progress, sleep=feature.sleep,
-            )  # fmt: skip
+        where = Path(folder) / feature.name
+        writers = [output.Fields(where, every=feature.every)] if feature.every else []
+        run = nts.simulate(
+            self.system(feature), nts.EnergyMomentum(), dt=self.dt, t_end=count * self.dt,
+            newton=nts.Newton(rtol=RTOL), petsc_options=_ORDERING, output=[*writers, turn],
+            progress=feature.progress, sleep=feature.sleep,
+        )  # fmt: skip
         if run.status != "completed":
             raise RuntimeError(f"{feature.name}: {run.status}")
-        timed = slice(_WARM, _WARM + steps)
-        iterations = run.balance["newton_iterations"][1:][timed]
-        return watch.laps[timed].mean(axis=0), float(iterations.mean())
+        return float(run.balance["newton_iterations"][1 + _WARM : -1].mean())
+
+    def round(self, steps: int, folder: str, order: Any) -> dict[str, tuple[FloatArray, float]]:
+        """Of each row CPU and wall time of the steps [s], (steps, 2), and a step's iterations.
+
+        Args:
+            steps: Steps that are timed.
+            folder: For output.
+            order: Random numbers, the same on all ranks: whose turn is next.
+        """
+        count = _WARM + steps + 1  # the last one, which is always written, is not timed
+        ledger = {PLAIN: True} | {f.name: f.ledger for f in FEATURES}
+        turns = {PLAIN: Turn(functools.partial(self.run_plain, count))}
+        turns |= {f.name: Turn(functools.partial(self.run, f, count, folder)) for f in FEATURES}
+        names = list(turns)
+        with contextlib.redirect_stderr(io.StringIO()):
+            for _ in range(count + 2):  # set-up, steps, end
+                for k in order.permutation(len(names)):
+                    with _ledger(ledger[names[k]]):
+                        turns[names[k]].take()
+        result = {}
+        for name, turn in turns.items():
+            laps = np.array(turn.laps[_WARM : _WARM + steps])
+            self.comm.Allreduce(MPI.IN_PLACE, laps, op=MPI.MAX)
+            result[name] = laps, turn.iterations
+        return result
 
 
 def _spinning(speed: float) -> Any:
@@ -328,7 +375,8 @@ def _ledger(on: bool) -> Iterator[None]:
 def table(comm: Any, *, cells: int = 8, steps: int = 10, rounds: int = 9) -> list[dict[str, Any]]:
     """Rows of the cost table, the same on all ranks.
 
-    All rows are run once in each round, and compared within it, as the machine may be shared.
+    All rows are run once in each round, step by step in turn, and compared within it, as the
+    machine may be shared.
 
     Args:
         comm: MPI communicator.
@@ -345,14 +393,13 @@ def table(comm: Any, *, cells: int = 8, steps: int = 10, rounds: int = 9) -> lis
     seconds: dict[str, list[FloatArray]] = {PLAIN: []}
     seconds |= {f.name: [] for f in FEATURES}
     iterations: dict[str, float] = {}
+    order = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
         where = comm.bcast(folder)
-        for k in range(rounds):
-            for feature in (FEATURES, FEATURES[::-1])[k % 2]:
-                mean, iterations[feature.name] = scenes.run(feature, steps, where)
-                seconds[feature.name].append(mean)
-            mean, iterations[PLAIN] = scenes.run_plain(steps)
-            seconds[PLAIN].append(mean)
+        for _ in range(rounds):
+            for name, (laps, needed) in scenes.round(steps, where, order).items():
+                seconds[name].append(laps)
+                iterations[name] = needed
         comm.Barrier()
     against = {PLAIN: PLAIN} | {f.name: f.against for f in FEATURES}
     return [_row(name, base, seconds, iterations[name]) for name, base in against.items()]
@@ -361,24 +408,27 @@ def table(comm: Any, *, cells: int = 8, steps: int = 10, rounds: int = 9) -> lis
 def _row(
     name: str, base: str, seconds: Mapping[str, Sequence[FloatArray]], iterations: float
 ) -> dict[str, Any]:
-    """Medians over the rounds: of times, and of ratios and differences within each.
+    """Of times the mean over the steps of the median over the rounds, or of the fastest.
 
-    The fastest rounds are compared, too: other programs only ever make a run slower.
+    Others' programs only ever make a step slower. Ratios and differences are those of steps of one
+    turn, and of them the medians.
     """
     own, other, plain = (np.array(seconds[key]) for key in (name, base, PLAIN))
-    middle = [1e3 * statistics.median(column) for column in own.T.tolist()]
+    middle = 1e3 * np.median(own, axis=0).mean(axis=0)
+    fastest, least = (1e3 * a[..., 0].min(axis=0).mean() for a in (own, plain))
+    ratio = np.median(own / other, axis=(0, 1))
     return {
         "row": name,
-        "cpu [ms/step]": middle[0],
-        "wall [ms/step]": middle[1],
+        "cpu [ms/step]": float(middle[0]),
+        "wall [ms/step]": float(middle[1]),
         "iterations": iterations,
-        "cpu / plain": float(np.median(own[:, 0] / plain[:, 0])),
-        "fastest [ms/step]": float(1e3 * own[:, 0].min()),
-        "fastest / plain": float(own[:, 0].min() / plain[:, 0].min()),
+        "cpu / plain": float(np.median(own[..., 0] / plain[..., 0])),
+        "fastest [ms/step]": float(fastest),
+        "fastest / plain": float(fastest / least),
         "against": base,
-        "cpu price [ms/step]": float(1e3 * np.median(own[:, 0] - other[:, 0])),
-        "cpu ratio": float(np.median(own[:, 0] / other[:, 0])),
-        "wall ratio": float(np.median(own[:, 1] / other[:, 1])),
+        "cpu price [ms/step]": float(1e3 * np.median(own[..., 0] - other[..., 0])),
+        "cpu ratio": float(ratio[0]),
+        "wall ratio": float(ratio[1]),
     }
 
 
