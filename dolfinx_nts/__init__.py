@@ -14,7 +14,7 @@ from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.step_size import Adapt
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.system import State, System
-from dolfinx_nts.validation import StepFailedError
+from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 __version__ = version("dolfinx_nts")
 __all__ = [
@@ -40,6 +40,7 @@ __all__ = [
     "Surface",
     "System",
     "Traction",
+    "UserFunctionError",
     "bodies_from_gmsh",
     "bodies_from_tags",
     "equilibrium",

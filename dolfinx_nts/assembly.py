@@ -91,9 +91,9 @@ class StepMatrix:
         bodies: PETSc matrices of the body fields; contact adds to them in place.
         elements: Unknowns of each batch of contact elements.
         split: Whether solvers see a nest of two fields, "bodies" and "contact", from which a field
-            split takes its blocks without a copy; else one AIJ matrix.
-        blocked: Whether the bodies' part is stored in 3 x 3 blocks (BAIJ), with which a product
-            takes a third of the time; few of PETSc's preconditioners take it.
+            split takes its blocks without a copy; else one matrix.
+        blocked: Whether the bodies' part may be stored in the 3 x 3 blocks of nodes (BAIJ), with
+            which a product takes a third of the time; few of PETSc's preconditioners take it.
 
     Attributes:
         nest: Blocks of all fields, as of the last fresh assembly.
@@ -139,7 +139,9 @@ class StepMatrix:
         numbers = [self._numbers(half) for half in halves]
         self._part_numbers = [(a, b) for a in numbers for b in numbers]
         self._converted = [PETSc.Mat() for _ in self._parts]
-        self._scalar = PETSc.Mat() if blocked else None
+        # Bodies of the user's own may have any coordinates; DOLFINx's matrices tell of their nodes.
+        self._blocked = blocked and all(a.getBlockSize() == 3 for a in bodies)
+        self._scalar = PETSc.Mat()
         self._near: tuple[Any, ...] = ()
         self.operator: Any = None
 
@@ -198,21 +200,26 @@ class StepMatrix:
                 self._add_to_body(self._bodies[key[0]], sources, tangents)
         for part in (self.nest, *self._parts):
             part.assemble()
-        for k, (part, a) in enumerate(zip(self._parts, self._converted, strict=True)):
-            # Without `out` the nest itself is converted.
-            if k == 0 and self._scalar is not None:
-                part.convert("aij", out=self._scalar)
-                if not a:
-                    a = self._converted[0] = _blocks_of(self._scalar)
-                self._scalar.convert("baij", out=a)
-            else:
-                part.convert("aij", out=a)
+        for k in range(len(self._parts)):
+            self._convert(k)
         if self.operator is None:
             self.operator = self._converted[0]
             if self._split:
                 grid = [self._converted[:2], self._converted[2:]]
                 self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
         self.operator.assemble()
+
+    def _convert(self, k: int) -> None:
+        """Bring what the solvers see of a part up to date."""
+        # Without `out` the nest itself is converted.
+        part, out = self._parts[k], self._converted[k]
+        if k or not self._blocked:
+            part.convert("aij", out=out)
+            return
+        part.convert("aij", out=self._scalar)
+        if not out:
+            out = self._converted[0] = _blocks_of(self._scalar)
+        self._scalar.convert("baij", out=out)
 
     def _change_operator(self, tangents: Sequence[FloatArray]) -> None:
         """Put other contact tangents into the operator; on several ranks converting is slow."""
@@ -236,12 +243,15 @@ class StepMatrix:
         The caller destroys the matrix. Collective.
         """
         bodies, above, below, contact = self._converted
-        rows, cols, *kept = self._near or (*self._touched(), PETSc.Mat(), None, None, None)
+        rows, cols, *kept = self._near or (*self._touched(), None, None, None, None)
         near, first, back, second = kept
-        # PETSc has no product of the two formats, nor keeps a part of a BAIJ matrix on many ranks.
-        square = bodies.createSubMatrix(rows, rows)
-        square.convert("aij", out=near)
-        square.destroy()
+        if self._blocked:
+            # PETSc has no product of the two formats, nor renews a part of MPIBAIJ.
+            square = bodies.createSubMatrix(rows, rows)
+            near = square.convert("aij", out=near or PETSc.Mat())
+            square.destroy()
+        else:
+            near = bodies.createSubMatrix(rows, rows, submat=near)
         first = above.createSubMatrix(rows, cols, submat=first)
         back = below.createSubMatrix(cols, rows, submat=back)
         pointer, _, values = near.getValuesCSR()
@@ -261,15 +271,18 @@ class StepMatrix:
         return result
 
     def _touched(self) -> tuple[Any, Any]:
-        """Index sets of this rank's nodes' coordinates in contact and of its contact unknowns."""
+        """Index sets of this rank's coordinates in contact and of its contact unknowns."""
         comm, mark = self._layout.comm, self._converted[0].createVecLeft()
         for _, numbers in self._part_numbers[0][0]:
             index = numbers[numbers >= 0].astype(PETSc.IntType)
             mark.setValues(index, np.ones(len(index)), addv=PETSc.InsertMode.ADD_VALUES)
         mark.assemble()
         start, _ = mark.getOwnershipRange()
-        nodes = np.flatnonzero(mark.array_r.reshape(-1, 3).any(axis=1))
-        touched = (start + 3 * nodes[:, None] + np.arange(3)).ravel().astype(PETSc.IntType)
+        touched = np.flatnonzero(mark.array_r)
+        if self._blocked:
+            # PETSc takes a part of a BAIJ matrix by whole blocks.
+            touched = (3 * np.unique(touched // 3)[:, None] + np.arange(3)).ravel()
+        touched = (start + touched).astype(PETSc.IntType)
         mark.destroy()
         start, stop = self._converted[3].getOwnershipRange()
         cols = PETSc.IS().createStride(stop - start, start, 1, comm=comm)
@@ -336,14 +349,24 @@ class StepMatrix:
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
         operator = [self.operator] if self._split and self.operator else []
-        operator += [] if self._scalar is None else [self._scalar]
         nests = [self.nest, *(self._parts if self._split else [])]
-        for a in (*operator, *self._near, *self._converted, *nests, *self._blocks.values()):
+        for a in (
+            *operator,
+            self._scalar,
+            *self._near,
+            *self._converted,
+            *nests,
+            *self._blocks.values(),
+        ):
             a.destroy()
 
 
 def _blocks_of(a: Any) -> Any:
-    """BAIJ matrix for the entries of an AIJ matrix of nodes; PETSc would not know how many."""
+    """BAIJ matrix with room for the entries of an AIJ matrix of nodes, whose block size it sets.
+
+    PETSc would count a node's blocks by its first coordinate, which has none of those of contact
+    where it is prescribed.
+    """
     a.setBlockSize(3)
     pointer, column, _ = a.getValuesCSR()
     length = np.diff(pointer)

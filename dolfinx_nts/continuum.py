@@ -415,13 +415,16 @@ class Continuum:
         try:
             # Sums, as those that it will be given.
             form = extra_form(self.u + self.v, self.u - self.v, w)
+            arguments = set(form.arguments()) if isinstance(form, ufl.Form) else set()
         except Exception as error:  # any: as above
             problem, cause = f"raised {error!r}; {wanted}", error
         else:
             if not isinstance(form, ufl.Form):
                 problem = f"returned an object of type {type(form).__name__}; {wanted}"
-            elif set(form.arguments()) != {w}:
+            elif arguments != {w}:
                 problem = f"is not linear in the test function w alone; {wanted}"
+            elif any(d != self.mesh.ufl_domain() for d in form.ufl_domains()):
+                problem = "has a measure of another mesh; use ufl.dx, or one of the body's mesh"
             else:
                 integrands = [part.integrand() for part in form.integrals()]
                 problem = misfit(integrands, self.mesh.ufl_domain())

@@ -141,7 +141,7 @@ class SolverOptions:
 
     @property
     def blocked(self) -> bool:
-        """Whether the bodies' matrices may be stored in blocks: their preset is not the user's."""
+        """Whether the bodies' matrices may be in blocks: their preconditioner is the preset's."""
         return self.split and not any(k.startswith(("pc_", _BODIES)) for k in self._given)
 
     def configure(self, snes: Any, matrix: StepMatrix | None, num_bodies: int) -> None:

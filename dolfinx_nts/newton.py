@@ -110,7 +110,7 @@ _SLOW = 0.05
 _AIM = 1e-3
 #: Range of the linear solver's tolerance that is worth it.
 _FINE, _COARSE = 1e-12, 1e-5
-#: The same with kept matrices, with which an iteration gains two or three digits.
+#: Its tolerance with kept matrices, with which an iteration gains two or three digits anyway.
 _KEPT = 1e-3
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
@@ -238,7 +238,7 @@ class StepSolver:
 
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
-        self._last = None
+        self._last = self._passed = None
         self._flips = [np.zeros(c.num_pairs, dtype=int) for c in self.problem.contacts]
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
@@ -355,11 +355,13 @@ class StepSolver:
         """Let the linear solver of Krylov's preset go as far as is worth it at an iterate."""
         if self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
             return
-        rtol = _AIM / worst if _FINE <= _AIM / worst <= _COARSE else _COARSE
-        rtol = _KEPT if self.newton.reuse else rtol
-        digits = math.log(rtol) / math.log(_COARSE)
-        limit = self._options.most_iterations
-        self.snes.getKSP().setTolerances(rtol=rtol, max_it=int(limit * digits))
+        aim, limit = _AIM / worst, self._options.most_iterations
+        if self.newton.reuse:
+            rtol = _KEPT
+        else:
+            rtol = aim if _FINE <= aim <= _COARSE else _COARSE
+            limit = int(limit * math.log(rtol) / math.log(_COARSE))
+        self.snes.getKSP().setTolerances(rtol=rtol, max_it=limit)
 
     # ---- failure
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:

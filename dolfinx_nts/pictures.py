@@ -76,7 +76,7 @@ def picture(
         ValueError: Unknown colour, no body, or an argument out of range.
         OSError: On all ranks: the file cannot be written.
     """
-    items("bodies", bodies, lambda b: True, "Continuum bodies")
+    bodies = items("bodies", bodies, lambda b: hasattr(b, "mesh"), "Continuum bodies")
     _check_picture(bodies, colour, view, limits, width)
     require_bool("labels", labels)
     file = as_path("path", path)
@@ -103,14 +103,11 @@ def _check_picture(
 ) -> None:
     if not (isinstance(colour, str) and colour in _COLOURS):
         raise ValueError(f"colour={colour!r}: choose one of {', '.join(map(repr, _COLOURS))}")
-    if not len(bodies):
+    if not bodies:
         raise ValueError(f"bodies={bodies!r}: pass at least one")
     for name, values in (("view", view), ("limits", (0, 1) if limits is None else limits)):
         if floats(values).shape != (2,) or not np.isfinite(floats(values)).all():
             raise ValueError(f"{name}={values!r}: pass two finite numbers")
-    for body in bodies:
-        if not hasattr(body, "mesh"):
-            raise TypeError(f"bodies: {body!r} has no mesh; pass Continuum bodies")
     if limits is not None and limits[0] >= limits[1]:
         raise ValueError(f"limits={limits!r}: the first must be below the second")
     require_positive("width", width, "inch")

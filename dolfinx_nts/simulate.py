@@ -170,9 +170,10 @@ class Stepper:
 
         Raises:
             ValueError: dt is not positive.
-            StepFailedError: Not solved even with the smallest step, or a function of time raised or
-                returned no vector on some rank, which is not tried again; everything accepted so
-                far is kept.
+            StepFailedError: Not solved even with the smallest step; everything accepted so far is
+                kept.
+            UserFunctionError: A function of time raised or returned no vector on some rank; not
+                tried again, everything is kept.
         """
         require_positive("dt", dt, "s")
         dt = float(dt)
@@ -452,9 +453,10 @@ def run(
     """
     solution, root = stepper.solution, stepper.system.comm.rank == 0
     bar = _progress_bar(None if adapt else len(times), progress and root)
+    started: list[Any] = []
     try:
         try:
-            _march(stepper, times, output, dt, adapt, bar)
+            _march(stepper, times, output, started, dt, adapt, bar)
             solution.status = "completed"
         except UserFunctionError as failure:
             _stop(stepper, str(failure), failure.__cause__)
@@ -462,9 +464,9 @@ def run(
             _stop(stepper, f"{failure}. {remedy}")
         except BaseException:
             # Where one rank alone comes here, no other answers.
-            _call(stepper, output, "close")
+            _call(stepper, started, "close")
             raise
-        problem, cause = _call_together(stepper, output, "close")
+        problem, cause = _call_together(stepper, started, "close")
         if problem is not None:
             _stop(stepper, problem, cause)
     finally:
@@ -478,11 +480,12 @@ def _march(
     stepper: Stepper,
     times: Sequence[float],
     output: Sequence[Any],
+    started: list[Any],
     dt: float,
     adapt: Adapt | None,
     bar: Any,
 ) -> None:
-    """Make the steps and write them; arguments as of `run`."""
+    """Make the steps and write them; arguments as of `run`, and the writers it has started."""
     pace = None
     if adapt is None:
         stepper.start(dt)
@@ -490,6 +493,7 @@ def _march(
         stepper.start(adapt.shortest * dt)
         state = stepper.state
         pace = Pace(adapt, stepper.system, state, dt, times[-1] - state.time)
+    started.extend(output)
     problem, cause = _call_together(stepper, output, "start")
     if problem is not None:
         raise cause or RuntimeError(problem)
@@ -535,9 +539,7 @@ def _call_together(
 ) -> tuple[str | None, Exception | None]:
     """`_call` with the first problem of any rank, on all ranks alike. Every rank must call it."""
     problem, cause = _call(stepper, output, name, **options)
-    if output:
-        problem = first_problem(stepper.system.comm, problem)
-    return problem, cause
+    return first_problem(stepper.system.comm, problem), cause
 
 
 def _moves(stepper: Stepper, times: Sequence[float], pace: Pace | None) -> Iterator[bool]:

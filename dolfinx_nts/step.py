@@ -184,7 +184,7 @@ class StepProblem:
     def _force_rounding(self, k: int) -> float:
         """Norm of the forces on a body at rest [N] that is rounding, as in `ratios`.
 
-        A diagonal of another step never allows more: it grows with the factor, but less than that.
+        A diagonal of another step hardly allows more: it grows with the factor, but less than that.
         """
         if not self._diagonal[k]:
             self.body_tangent(k, self.state.u[k])
@@ -521,7 +521,8 @@ class StepProblem:
             held.destroy()
         known = abs(self.factor - self._diagonal_factor[k]) <= 1e-6 * self.factor
         known &= self.integrator.inertia and np.array_equal(u1, self.first[k])
-        # A matrix that stiffens from step to step is measured once a step needs a second iteration.
+        # At the first guess of an equal step the last one's diagonal is as good; a body that has
+        # stiffened needs more than one iteration.
         if not self.system.comm.allreduce(known, op=MPI.LAND):
             self._measure_rounding(k, a, u1)
         return a

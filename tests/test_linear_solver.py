@@ -162,10 +162,13 @@ def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("contact", [False, True])
-def test_matrix_in_blocks_of_nodes(contact):
-    """Against the nest it is made from, with nodes that are held along some axes."""
-    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [4, 4, 4], CellType.hexahedron)
+@pytest.mark.parametrize(("cells", "contact"), [(1, False), (4, False), (4, True)])
+def test_matrix_in_blocks_of_nodes(cells, contact):
+    """Against the nest it is made from, with nodes that are held along some axes.
+
+    Of one cell some ranks own no node.
+    """
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [cells] * 3, CellType.hexahedron)
     held = [
         nts.Dirichlet(lambda x: x[0] < 1e-9, components=(0,)),
         nts.Dirichlet(lambda x: x[1] < 1e-9, components=(0, 1)),

@@ -121,9 +121,9 @@ def mass_on_wall(gap, velocity=(0.0, 0.0, -SPEED), turned=False):
     return nts.System([mass, body], contacts=[pair]), q
 
 
-def run(system, integrator, steps):
+def run(system, integrator, steps, **newton):
     """Velocities of the mass after each step, shape (steps + 1, 3), and the Stepper."""
-    stepper = nts.Stepper(system, INTEGRATORS[integrator])
+    stepper = nts.Stepper(system, INTEGRATORS[integrator], newton=nts.Newton(**newton))
     v = [COMM.bcast(stepper.state.v[0])]
     for _ in range(steps):
         stepper.advance(STEP)
@@ -157,6 +157,17 @@ def test_rebound(integrator, theta, turned):
     assert np.allclose(rows["energy"][1:], energy - lost, rtol=0, atol=1e-12 * energy)
     assert np.abs(rows["ledger_residual"]).max() < 1e-12 * energy
     assert rows["min_gap"].min() > -1e-12 * STEP * SPEED
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_rebound_with_the_solver_of_large_scenes(integrator):
+    """Whose storage in blocks of nodes is not for bodies of the user's own."""
+    theta = 0.25
+    system, q = mass_on_wall(theta * STEP * SPEED)
+    v, _ = run(system, integrator, 2, linear_solver="krylov")
+    expected = [-1.0, 1 - 2 * theta, 1 - 2 * theta]
+    assert np.allclose(v @ q[:, 2] / SPEED, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)

@@ -83,6 +83,7 @@ def slide(shape, variant, part, integrator=None, facets=FACETS, uneven=0.0):
     if variant == "start":
         pair._crossings = lambda *_: (np.empty(0, dtype=int), np.empty(0, dtype=int))
     system = nts.System([mass, body], contacts=[pair], gravity=(0, 0, -WEIGHT))
+    # The weight is large: what 1e-13 leaves of it, times the way, is 1e-11 of the energy.
     newton = nts.Newton(rtol=1e-14)
     stepper = nts.Stepper(system, integrator or nts.EnergyMomentum(), newton=newton)
     dt = part * 2 * END / (facets * SPEED)
