@@ -374,12 +374,14 @@ def _blocks_of(a: Any) -> Any:
     longest = 3 * np.arange(len(length) // 3) + length.reshape(-1, 3).argmax(axis=1)
     chosen = np.zeros(len(length), dtype=bool)
     chosen[longest] = True
-    row = np.repeat(np.arange(len(longest)), length[longest])
     block = column[np.repeat(chosen, length)] // 3
-    new = np.diff(block, prepend=-1) != 0
-    new[1:] |= np.diff(row) != 0
-    start = np.append(0, np.cumsum(np.bincount(row[new], minlength=len(longest))))
-    csr = (start.astype(PETSc.IntType), block[new].astype(PETSc.IntType))
+    stop = np.cumsum(length[longest])
+    new = np.ones(len(block), dtype=bool)
+    np.not_equal(block[1:], block[:-1], out=new[1:])
+    new[stop[stop < len(block)]] = True
+    # So counted an empty row has no block, either.
+    count = np.append(0, np.cumsum(new))[np.append(0, stop)]
+    csr = (count.astype(PETSc.IntType), block[new].astype(PETSc.IntType, copy=False))
     return PETSc.Mat().createBAIJ(a.getSizes(), 3, csr=csr, comm=a.comm)
 
 
