@@ -28,6 +28,7 @@ LEVELS = [
         "search",
         "surfaces",
         "materials",
+        "mesh_check",
         "mesh_input",
         "integrators",
     },
