@@ -386,9 +386,14 @@ class StepSolver:
         best = {name: text for name, _, text in sorted(gathered, key=lambda n: n[1])}
         trouble = {name: max(r for k, r in ratio.items() if k.startswith(name)) for name in best}
         top = [best[name] for name in sorted(best, key=lambda name: -trouble[name])[:4]]
+        why = f"SNES reason {reason}"
+        if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+            ksp = self.snes.getKSP().getConvergedReason()
+            why = f"the linear solver {self._presets[self._chosen]!r} failed, KSP reason {ksp}"
+            why += f", with petsc_options={dict(self._given)!r}" if self._given else ""
         return (
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
-            f"{iterations} iterations (SNES reason {reason}); worst block {worst!r} at "
+            f"{iterations} iterations ({why}); worst block {worst!r} at "
             f"{ratio[worst]:.3g} times its tolerance; {'; '.join(top)}"
         )
 

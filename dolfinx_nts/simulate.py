@@ -137,13 +137,14 @@ class Stepper:
             raise TypeError(f"integrator={integrator!r}: pass Midpoint() or EnergyMomentum()")
         if not isinstance(newton, Newton | None):
             raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")
-        if not isinstance(petsc_options, Mapping | None):
+        given = {} if petsc_options is None else petsc_options
+        if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
             raise TypeError(
-                f"petsc_options={petsc_options!r}: pass a dict, e.g. {{'pc_type': 'lu'}}"
+                f"petsc_options={petsc_options!r}: pass a dict of names and values, e.g. "
+                "{'pc_type': 'lu'}"
             )
         require_bool("sleep", sleep)
         self.newton = newton or Newton()
-        given = petsc_options or {}
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
             system,

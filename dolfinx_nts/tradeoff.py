@@ -25,6 +25,7 @@ import inspect
 import itertools
 import math
 import platform
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,6 +40,7 @@ import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import economy
 from dolfinx_nts.newton import ACCURACY
+from dolfinx_nts.validation import require_bool, require_positive
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -192,7 +194,8 @@ def load(scene: str) -> Any:
         ValueError: There is no such file, or it has no `main`.
     """
     beside = Path(nts.__file__).resolve().parents[1] / "demos"
-    places = [Path(scene), Path("demos") / f"{scene}.py", beside / f"{scene}.py"]
+    file = f"{scene.removesuffix('.py')}.py"
+    places = [Path(scene), Path("demos") / file, beside / file]
     found = next((p for p in places if p.is_file()), None)
     if found is None:
         raise ValueError(f"scene={scene!r}: no such file; looked for {', '.join(map(str, places))}")
@@ -236,7 +239,7 @@ def check(scene: str, choices: Mapping[str, Sequence[Any]]) -> None:
     """Whether there is such a scene and it has such choices.
 
     Raises:
-        ValueError: No.
+        TypeError, ValueError: No.
     """
     known = {"integrator", "stress", "contact_gradient", "dt", "dt_factor", "accuracy"}
     known |= {"adapt", "sleep"}
@@ -250,9 +253,21 @@ def check(scene: str, choices: Mapping[str, Sequence[Any]]) -> None:
                 f"{name}={values!r}: neither an argument of main ({', '.join(sorted(taken))}) nor "
                 f"one of {', '.join(sorted(known))}"
             )
-        for value in values:
-            if name == "integrator" and name not in taken and value not in INTEGRATORS:
-                raise ValueError(f"integrator={value!r}: choose one of {', '.join(INTEGRATORS)}")
+        for value in values if name not in taken else ():
+            _check_value(name, value)
+
+
+def _check_value(name: str, value: Any) -> None:
+    """Raise ValueError unless a choice that is no argument of main may have the value."""
+    known = {"integrator": INTEGRATORS, "accuracy": ACCURACY}.get(name)
+    if known is not None and not (isinstance(value, str) and value in known):
+        raise ValueError(f"{name}={value!r}: choose one of {', '.join(known)}")
+    if name in ("dt", "dt_factor"):
+        require_positive(name, value, "s" if name == "dt" else "-")
+    elif name == "sleep":
+        require_bool(name, value)
+    else:
+        _options({"dt": 1.0, "integrator": nts.EnergyMomentum()}, {name: value})
 
 
 def measure(scene: str, choices: Mapping[str, Any], comm: Any) -> Run:
@@ -331,7 +346,7 @@ def compare(
         rows.append({"run": _label(choices), **row})
         if comm.rank == 0:
             text = f"{row['seconds']:.3g} s, trajectory off by {row['trajectory']:.2g}"
-            print(f"{_label(choices)}: {text}" if row["status"] == "completed" else row["status"])
+            print(f"{_label(choices)}: {text if row['status'] == 'completed' else row['status']}")
     return rows
 
 
@@ -379,7 +394,8 @@ def plot(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     axis.set(xlabel="wall time [s]", ylabel="error of the trajectory [-]")
     axis.set_title(title, fontsize="small", wrap=True)
     axis.grid(which="both", alpha=0.3)
-    axis.legend(fontsize="small")
+    if curves:
+        axis.legend(fontsize="small")
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
@@ -404,6 +420,17 @@ def _choice(text: str) -> tuple[str, list[Any]]:
     except (ValueError, SyntaxError):
         parsed = [_literal(v) for v in values.split(",")]
     return name, parsed
+
+
+def _one(option: str, choices: Sequence[tuple[str, list[Any]]]) -> dict[str, Any]:
+    """Name -> value of choices that have one value each."""
+    for name, values in choices:
+        if len(values) > 1:
+            raise ValueError(
+                f"{option} {name}={values!r}: has {len(values)} values; give one (a tuple in "
+                f'brackets: "{name}=(8,7)"), or use --vary'
+            )
+    return {name: values[0] for name, values in choices}
 
 
 def _literal(text: str) -> Any:
@@ -433,9 +460,14 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     )  # fmt: skip
     parser.add_argument("--output", default="out/tradeoff", help="folder for table and plot")
     options = parser.parse_args(arguments)
-    fixed = {name: values[0] for name, values in options.set}
-    comm = MPI.COMM_WORLD
+    fixed, comm = _one("--set", options.set), MPI.COMM_WORLD
+    names = [name for name, _ in options.vary]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"--vary {name}: is given twice; write {name}=value,value")
     if options.scene == "economy":
+        if options.vary or options.reference:
+            raise ValueError("economy: takes --set cells=, steps= and rounds= only")
         rows, title = economy.table(comm, **fixed), provenance(options.scene, comm)
         if comm.rank == 0:
             economy.write(rows, Path(options.output), title)
@@ -447,10 +479,13 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     reference: dict[str, Any] = {"accuracy": "exact"}
     for name in ("dt", "dt_factor"):
         if name in vary or name in fixed:
-            reference[name] = min(vary.get(name, [fixed.get(name)])) / 4
+            steps_given = vary.get(name, [fixed.get(name)])
+            for value in steps_given:
+                _check_value(name, value)
+            reference[name] = min(steps_given) / 4
     if not reference.keys() & {"dt", "dt_factor"}:
         reference["dt_factor"] = 0.25
-    reference |= {name: values[0] for name, values in options.reference}
+    reference |= _one("--reference", options.reference)
     rows = compare(options.scene, vary, fixed, reference, comm)
     title = provenance(options.scene, comm)
     if comm.rank == 0:
@@ -464,4 +499,9 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        done = main()
+    except (TypeError, ValueError) as error:
+        sys.exit(f"tradeoff: {error}" if MPI.COMM_WORLD.rank == 0 else 2)
+    if not any(row.get("status", "completed") == "completed" for row in done[1:]):
+        sys.exit("tradeoff: no run completed" if MPI.COMM_WORLD.rank == 0 else 1)

@@ -147,6 +147,17 @@ def test_who_chooses_the_schur_complement(given, ours):
     assert linear_solver.SolverOptions(COMM, "krylov", True, given).schur == ours
 
 
+def test_who_failed_is_told():
+    newton = nts.Newton(linear_solver="krylov", max_retries=0)
+    options = {"ksp_max_it": 1, "ksp_rtol": 1e-14}
+    run = nts.simulate(
+        pressed_block(0.3), nts.EnergyMomentum(), dt=1e-3, t_end=2e-3, newton=newton,
+        petsc_options=options,
+    )  # fmt: skip
+    told = "the linear solver 'krylov' failed, KSP reason -3, with petsc_options={'ksp_max_it': 1, "
+    assert told in run.status
+
+
 @pytest.mark.parametrize(
     ("preset", "given", "ours"),
     [

@@ -103,11 +103,32 @@ def test_a_run_that_fails_is_a_row_with_its_reason(script):
         ({"colour": ["red"]}, "colour=.*neither an argument of main"),
         ({"integrator": ["euler"]}, "integrator='euler': choose one of"),
         ({"dt": [0.1], "dt_factor": [1.0]}, "dt, dt_factor: choose one of them"),
+        ({"accuracy": ["exact", "fats"]}, "accuracy='fats': choose one of"),
+        ({"linear_solver": ["mumps"]}, "linear_solver='mumps': choose one of"),
+        ({"adapt": [-1.0]}, "tolerance=-1.0: must be positive"),
+        ({"stress": ["foo"]}, "stress='foo': choose one of"),
+        ({"dt_factor": [0]}, "dt_factor=0: must be positive"),
+        ({"reuse": ["yes"]}, "reuse='yes': pass True or False"),
     ],
 )
 def test_unknown_choices(script, vary, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         tradeoff.compare(script, vary, {}, {}, COMM)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "cells=3,4"], r"--set cells=\[3, 4\]: has 2 values"),
+        (["--vary", "accuracy=fast", "accuracy=exact"], "--vary accuracy: is given twice"),
+        (["--vary", "dt=abc"], "dt='abc': must be positive"),
+    ],
+)
+def test_unfit_arguments(script, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        tradeoff.main([script, *arguments])
+    with pytest.raises(ValueError, match="economy: takes"):
+        tradeoff.main(["economy", "--vary", "cells=2,3"])
 
 
 def test_unknown_scene(tmp_path):
