@@ -132,7 +132,7 @@ class ContactPair:
         u: Sequence[FloatArray],
         current: IntArray,
         reach: float,
-        time: float,
+        moved: FloatArray | None,
         ahead: Sequence[FloatArray] | None = None,
     ) -> Candidates:
         """Search for this rank's candidates; every rank must call it.
@@ -141,11 +141,11 @@ class ContactPair:
             u: Owned displacements of each of `bodies` at t_n [m].
             current: Facet of each owned slave node in the last step or -1.
             reach: Bound on the relative motion of slave and master in the step [m].
-            time: t_n [s].
+            moved: Displacement of an obstacle at t_n [m], shape (3,); None of a surface.
             ahead: Displacements of each of `bodies` expected until the middle of the step [m].
         """
-        if self.rigid:
-            return self._near_obstacle(u[0], reach, time)
+        if moved is not None:
+            return self._near_obstacle(u[0], reach, moved)
         master = self.master.positions(u[1])
         corners = master[self.master.facets]
         slaves = self.slave.positions(u[0])
@@ -192,10 +192,9 @@ class ContactPair:
             node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
         )
 
-    def _near_obstacle(self, u: FloatArray, reach: float, time: float) -> Candidates:
+    def _near_obstacle(self, u: FloatArray, reach: float, moved: FloatArray) -> Candidates:
         """Candidates of an obstacle. Nothing limits the depth: what is behind it is inside."""
         slave = self.slave
-        moved = self.master.displacement(time, slave.body.comm)
         x = slave.reference[slave.owned] + u[slave.rows] - moved
         gap, length = self.master.gap(x), np.sqrt(slave.area[slave.owned])
         movable = ~slave.fixed[slave.owned].all(axis=1)

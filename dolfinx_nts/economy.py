@@ -382,7 +382,7 @@ def table(comm: Any, *, cells: int = 8, steps: int = 10, rounds: int = 9) -> lis
         comm: MPI communicator.
         cells: Cells across the first cube.
         steps: Steps that are timed.
-        rounds: Repetitions of which the median counts.
+        rounds: Repetitions, of which the median and the fastest count.
 
     Raises:
         ValueError: A number is not positive.

@@ -23,7 +23,7 @@ from dolfinx_nts.linear_solver import (
     most_iterations,
     set_schur,
 )
-from dolfinx_nts.step import BodyTerms, Evaluation, StepProblem
+from dolfinx_nts.step import EQUAL, BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -242,8 +242,7 @@ class StepSolver:
         self._flips = [np.zeros(c.num_pairs, dtype=int) for c in self.problem.contacts]
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
-        # Equal steps differ by rounding.
-        self._matrices_due |= not self.newton.reuse or changed > 1e-6
+        self._matrices_due |= not self.newton.reuse or changed > EQUAL
         self._factor = self.problem.factor
         if self._version != self.problem.version:
             self.destroy()

@@ -32,6 +32,8 @@ BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
+#: Relative difference of the factors of two equal steps, which differ by rounding.
+EQUAL = 1e-6
 #: Distance from the origin over that of the expected motion, of an iterate that has run off.
 _RUN_OFF = 2.0
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
@@ -279,7 +281,8 @@ class StepProblem:
     def _contact_step(self, index: int, u: list[FloatArray], reach: float) -> ContactStep:
         pair, state = self.system.contacts[index], self.state
         ahead = [0.5 * (self.first[b] - state.u[b]) for b in self.system.contact_bodies[index]]
-        found = pair.find(u, state.facets[index], reach, state.time, ahead)
+        moved = self._paths[index][0] if pair.rigid else None
+        found = pair.find(u, state.facets[index], reach, moved, ahead)
         slave = pair.slave
         rows = slave.rows[found.node]
         x0 = self._points(index, found, state.u)
@@ -519,7 +522,7 @@ class StepProblem:
             held.array_w[:] = self._stabilization(self.system.bodies[k])
             a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
             held.destroy()
-        known = abs(self.factor - self._diagonal_factor[k]) <= 1e-6 * self.factor
+        known = abs(self.factor - self._diagonal_factor[k]) <= EQUAL * self.factor
         known &= self.integrator.inertia and np.array_equal(u1, self.first[k])
         # At the first guess of an equal step the last one's diagonal is as good; a body that has
         # stiffened needs more than one iteration.

@@ -209,7 +209,8 @@ class System:
         for pair, bodies, facets in zip(
             self.contacts, self.contact_bodies, state.facets, strict=True
         ):
-            found = pair.find([state.u[b] for b in bodies], facets, 0.0, state.time)
+            moved = pair.master.displacement(state.time, self.comm) if pair.rigid else None
+            found = pair.find([state.u[b] for b in bodies], facets, 0.0, moved)
             depth = np.zeros(len(pair.slave.points))
             depth[pair.slave.owned[found.node]] = np.maximum(-found.gap, 0.0) / found.length
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)
