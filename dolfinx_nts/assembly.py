@@ -15,6 +15,7 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import node_blocks
 
 #: Factor of both Richardson steps towards the inverse of the bodies' matrix, which stays positive
 #: below 2; the fastest of 1.4 to 1.9 on blocks of 1e4 and 5e4 coordinates.
@@ -96,7 +97,8 @@ class StepMatrix:
             which a product takes a third of the time; few of PETSc's preconditioners take it.
 
     Attributes:
-        nest: Blocks of all fields, as of the last fresh assembly.
+        nest: Blocks of all fields, as of the last fresh assembly. Where the bodies' part is stored
+            in blocks of nodes, contact between coordinates is left to `operator`.
         operator: What the solvers see, after `assemble`.
     """
 
@@ -118,6 +120,11 @@ class StepMatrix:
                 for j, col in enumerate(element.fields):
                     self._sources.setdefault((row, col), []).append((e, i, j))
         fields = range(layout.counts.shape[1])
+        found = node_blocks.patterns(bodies) if blocked else None
+        self._by_nodes: node_blocks.NodeBlocks | None = None
+        if found is not None:
+            for key in [k for k in self._sources if max(k) < len(bodies)]:
+                del self._sources[key]
         self._split = split and len(fields) > len(bodies)
         self._blocks = {
             key: self._new_block(*key)
@@ -137,11 +144,17 @@ class StepMatrix:
             quarters = [[[grid[i][j] for j in b] for i in a] for a in halves for b in halves]
             self._parts = [PETSc.Mat().createNest(q, comm=layout.comm) for q in quarters]
         numbers = [self._numbers(half) for half in halves]
+        if found is not None:
+            own = Layout(layout.comm, layout.counts[layout.comm.rank, halves[0]].tolist())
+            contact = [number for _, number in numbers[0]]
+            self._by_nodes = node_blocks.NodeBlocks(bodies, found, own.to_system, contact)
         self._part_numbers = [(a, b) for a in numbers for b in numbers]
         self._converted = [PETSc.Mat() for _ in self._parts]
-        # Bodies of the user's own may have any coordinates; DOLFINx's matrices tell of their nodes.
-        self._blocked = blocked and all(a.getBlockSize() == 3 for a in bodies)
-        self._scalar = PETSc.Mat()
+        if self._by_nodes:
+            size = (self._by_nodes.size, None)
+            self._converted[0].createBAIJ(
+                (size, size), 3, nnz=self._by_nodes.room, comm=layout.comm
+            )
         self._near: tuple[Any, ...] = ()
         self.operator: Any = None
 
@@ -201,7 +214,7 @@ class StepMatrix:
         for part in (self.nest, *self._parts):
             part.assemble()
         for k in range(len(self._parts)):
-            self._convert(k)
+            self._convert(k, tangents)
         if self.operator is None:
             self.operator = self._converted[0]
             if self._split:
@@ -209,17 +222,17 @@ class StepMatrix:
                 self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
         self.operator.assemble()
 
-    def _convert(self, k: int) -> None:
+    def _convert(self, k: int, tangents: Sequence[FloatArray]) -> None:
         """Bring what the solvers see of a part up to date."""
-        # Without `out` the nest itself is converted.
-        part, out = self._parts[k], self._converted[k]
-        if k or not self._blocked:
-            part.convert("aij", out=out)
+        if k or not self._by_nodes:
+            # Without `out` the nest itself is converted.
+            self._parts[k].convert("aij", out=self._converted[k])
             return
-        part.convert("aij", out=self._scalar)
-        if not out:
-            out = self._converted[0] = _blocks_of(self._scalar)
-        self._scalar.convert("baij", out=out)
+        bodies = self._converted[0]
+        self._by_nodes.fill(bodies)
+        for (i, row), tangent in zip(self._part_numbers[0][0], tangents, strict=True):
+            _add(bodies, row, row, tangent[:, i][:, :, i])
+        bodies.assemble()
 
     def _change_operator(self, tangents: Sequence[FloatArray]) -> None:
         """Put other contact tangents into the operator; on several ranks converting is slow."""
@@ -245,7 +258,7 @@ class StepMatrix:
         bodies, above, below, contact = self._converted
         rows, cols, *kept = self._near or (*self._touched(), None, None, None, None)
         near, first, back, second = kept
-        if self._blocked:
+        if self._by_nodes:
             # PETSc has no product of the two formats, nor renews a part of MPIBAIJ.
             square = bodies.createSubMatrix(rows, rows)
             near = square.convert("aij", out=near or PETSc.Mat())
@@ -279,7 +292,7 @@ class StepMatrix:
         mark.assemble()
         start, _ = mark.getOwnershipRange()
         touched = np.flatnonzero(mark.array_r)
-        if self._blocked:
+        if self._by_nodes:
             # PETSc takes a part of a BAIJ matrix by whole blocks.
             touched = (3 * np.unique(touched // 3)[:, None] + np.arange(3)).ravel()
         touched = (start + touched).astype(PETSc.IntType)
@@ -352,37 +365,12 @@ class StepMatrix:
         nests = [self.nest, *(self._parts if self._split else [])]
         for a in (
             *operator,
-            self._scalar,
             *self._near,
             *self._converted,
             *nests,
             *self._blocks.values(),
         ):
             a.destroy()
-
-
-def _blocks_of(a: Any) -> Any:
-    """BAIJ matrix with room for the entries of an AIJ matrix of nodes, whose block size it sets.
-
-    PETSc would count a node's blocks by its first coordinate, which has none of those of contact
-    where it is prescribed.
-    """
-    a.setBlockSize(3)
-    pointer, column, _ = a.getValuesCSR()
-    length = np.diff(pointer)
-    # Of a node's coordinates those that are not prescribed have the most neighbours.
-    longest = 3 * np.arange(len(length) // 3) + length.reshape(-1, 3).argmax(axis=1)
-    chosen = np.zeros(len(length), dtype=bool)
-    chosen[longest] = True
-    block = column[np.repeat(chosen, length)] // 3
-    stop = np.cumsum(length[longest])
-    new = np.ones(len(block), dtype=bool)
-    np.not_equal(block[1:], block[:-1], out=new[1:])
-    new[stop[stop < len(block)]] = True
-    # So counted an empty row has no block, either.
-    count = np.append(0, np.cumsum(new))[np.append(0, stop)]
-    csr = (count.astype(PETSc.IntType), block[new].astype(PETSc.IntType, copy=False))
-    return PETSc.Mat().createBAIJ(a.getSizes(), 3, csr=csr, comm=a.comm)
 
 
 def _add(a: Any, rows: IntArray, cols: IntArray, values: FloatArray) -> None:

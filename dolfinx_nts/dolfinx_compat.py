@@ -218,6 +218,7 @@ def assemble_matrix(a: Any, form: Any, bcs: Sequence[Any], diagonal: float) -> N
 
 # ---- what petsc4py 3.18 and 3.22 do not bind
 _lib: Any = None
+_INT: Any = np.ctypeslib.as_ctypes_type(PETSc.IntType)
 
 
 def _petsc_library() -> Any:
@@ -232,6 +233,8 @@ def _petsc_library() -> Any:
         _lib.MatSetPreallocationCOO.argtypes = (pointer, count, pointer, pointer)
         _lib.MatSetValuesCOO.argtypes = (pointer, pointer, ctypes.c_int)
         _lib.PetscOptionsUsed.argtypes = (pointer, ctypes.c_char_p, pointer)
+        _lib.MatMPIAIJGetSeqAIJ.argtypes = (pointer,) * 4
+        _lib.MatSeqAIJGetCSRAndMemType.argtypes = (pointer,) * 5
     return _lib
 
 
@@ -256,6 +259,45 @@ def set_values_coo(a: Any, values: npt.ArrayLike) -> None:
     mode = int(PETSc.InsertMode.INSERT_VALUES)
     if error := _petsc_library().MatSetValuesCOO(a.handle, values.ctypes.data, mode):
         raise PETSc.Error(error)
+
+
+def csr_parts(a: Any) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
+    """This rank's rows of an assembled AIJ matrix without copying, as `getValuesCSR` would.
+
+    Args:
+        a: The matrix; the arrays are its own and are valid while it lives unchanged.
+
+    Returns:
+        Of the part in the rank's own columns and, if there are several ranks, of that in the
+        others': row pointer, column within the part, number of each such column, value.
+    """
+    (rows, width), lib = a.getLocalSize(), _petsc_library()
+    numbers: list[IntArray] = [np.arange(width) + a.getOwnershipRangeColumn()[0]]
+    parts = [ctypes.c_void_p(a.handle)]
+    if a.getType() == "mpiaij":
+        parts = [ctypes.c_void_p(), ctypes.c_void_p()]
+        away = ctypes.POINTER(_INT)()
+        if error := lib.MatMPIAIJGetSeqAIJ(a.handle, *map(ctypes.byref, (*parts, away))):
+            raise PETSc.Error(error)
+    result: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
+    for part in parts:
+        pointer, column = ctypes.POINTER(_INT)(), ctypes.POINTER(_INT)()
+        value = ctypes.POINTER(ctypes.c_double)()
+        arrays = map(ctypes.byref, (pointer, column, value))
+        if error := lib.MatSeqAIJGetCSRAndMemType(part, *arrays, None):
+            raise PETSc.Error(error)
+        start = np.ctypeslib.as_array(pointer, (rows + 1,))
+        count = int(start[-1])
+        columns = _view(column, count)
+        if result:
+            numbers.append(_view(away, columns.max(initial=-1) + 1))
+        result.append((start, columns, numbers[-1], _view(value, count)))
+    return result
+
+
+def _view(pointer: Any, count: int) -> Any:
+    """Array of a C array, whose pointer may be NULL if it is empty."""
+    return np.ctypeslib.as_array(pointer, (int(count),)) if count else np.empty(0, pointer._type_)
 
 
 def option_used(name: str) -> bool:

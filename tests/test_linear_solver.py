@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
+from petsc4py import PETSc
 from test_friction import difference
 
 import dolfinx_nts as nts
-from dolfinx_nts import linear_solver
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import linear_solver, node_blocks
+from dolfinx_nts.assembly import StepMatrix
 
 COMM = MPI.COMM_WORLD
 
@@ -175,7 +178,7 @@ def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
 @pytest.mark.mpi
 @pytest.mark.parametrize(("cells", "contact"), [(1, False), (4, False), (4, True)])
 def test_matrix_in_blocks_of_nodes(cells, contact):
-    """Against the nest it is made from, with nodes that are held along some axes.
+    """Against AIJ made by way of a nest, with nodes that are held along some axes.
 
     Of one cell some ranks own no node.
     """
@@ -197,13 +200,62 @@ def test_matrix_in_blocks_of_nodes(cells, contact):
     matrix = stepper.solver.matrix
     bodies = matrix.operator.getNestSubMatrix(0, 0) if contact else matrix.operator
     assert bodies.getType().endswith("baij") and bodies.getInfo()["mallocs"] == 0
-    x, y, z = (stepper.problem.x.duplicate() for _ in range(3))
+    problem = stepper.problem
+    e = problem.evaluate(problem.x)
+    other = StepMatrix(problem.layout, problem.body_tangents(e), problem.elements, split=True)
+    tangents = [c.tangent for c in e.contacts] if problem.elements else []
+    matrix.assemble(tangents, fresh=True)
+    other.assemble(tangents)
+    x, y, z = (problem.x.duplicate() for _ in range(3))
     x.array_w[:] = np.random.default_rng(COMM.rank).uniform(-1, 1, len(x.array_r))
     matrix.operator.mult(x, y)
-    matrix.nest.mult(x, z)
+    other.operator.mult(x, z)
     error = COMM.allreduce(np.abs(y.array_r - z.array_r).max(initial=0.0), op=MPI.MAX)
     assert error <= 1e-14 * z.norm()
+    other.destroy()
     stepper.close()
+
+
+@pytest.mark.mpi
+def test_rows_of_a_matrix_without_copying():
+    """Against PETSc's own, for a matrix whose ranks hold columns of each other's, or no rows."""
+    local = [3, 5, 0, 4][COMM.rank % 4]
+    a = PETSc.Mat().createAIJ(((local, None), (local, None)), nnz=30, comm=COMM)
+    start, stop = a.getOwnershipRange()
+    rng = np.random.default_rng(COMM.rank)
+    for i in range(start, stop):
+        for j in np.unique(rng.integers(0, a.getSize()[1], 4)):
+            a.setValue(i, j, rng.uniform(1, 2))
+    a.assemble()
+    whole = np.zeros((local, a.getSize()[1]))
+    for pointer, column, number, value in compat.csr_parts(a):
+        row = np.repeat(np.arange(local), np.diff(pointer))
+        whole[row, number[column]] += value
+    pointer, column, value = a.getValuesCSR()
+    expected = np.zeros_like(whole)
+    expected[np.repeat(np.arange(local), np.diff(pointer)), column] = value
+    assert np.array_equal(whole, expected) and (local == 0 or whole.any())
+    a.destroy()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("missing", "whole"), [(None, True), ("row", False), ("column", False)])
+def test_blocks_that_are_not_whole_are_found_on_all_ranks(missing, whole):
+    nodes = 4 if COMM.rank == 0 else 1
+    a = PETSc.Mat().createAIJ(((3 * nodes, None), (3 * nodes, None)), nnz=12, bsize=3, comm=COMM)
+    start, _ = a.getOwnershipRange()
+    for i in range(nodes):
+        rows = start + 3 * i + np.arange(3, dtype=PETSc.IntType)
+        # Of the last node on the first rank alone, coupling to the first node.
+        near = np.arange(3, dtype=PETSc.IntType)
+        a.setValues(rows, rows, np.eye(3))
+        if COMM.rank == 0 and i == nodes - 1:
+            rows, near = rows[missing == "row" :], near[missing == "column" :]
+            a.setValues(rows, near, np.ones((len(rows), len(near))))
+    a.assemble()
+    found = node_blocks.patterns([a, a])
+    assert (found is not None) == whole
+    a.destroy()
 
 
 @pytest.mark.mpi

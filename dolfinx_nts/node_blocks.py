@@ -1,0 +1,153 @@
+"""The bodies' matrices side by side in the 3 x 3 blocks of their nodes (PETSc's BAIJ).
+
+They are filled from the bodies' AIJ matrices block by block: by way of a nest and PETSc's
+conversions a new layout of contact would cost as much as several Newton iterations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+
+IntArray = npt.NDArray[np.signedinteger[Any]]
+_AXES = np.arange(3, dtype=np.int8)
+_CHUNK = 500
+#: Of each part of a body's matrix: where its block rows begin, and the nodes in their columns.
+Pattern = list[tuple[IntArray, IntArray]]
+
+
+def patterns(bodies: Sequence[Any]) -> list[Pattern] | None:
+    """Block rows of the bodies' matrices, None unless all consist of whole blocks. Collective.
+
+    Bodies of the user's own may have any coordinates, and what contact adds to an AIJ matrix within
+    one body leaves out those that are prescribed.
+    """
+    whole = all(a.getBlockSize() == 3 and a.getType() in {"seqaij", "mpiaij"} for a in bodies)
+    found = [_pattern(a) for a in bodies] if whole else [None]
+    kept = [p for p in found if p is not None]
+    same = bodies[0].comm.tompi4py().allreduce(len(kept) == len(bodies), op=MPI.LAND)
+    return kept if same else None
+
+
+def _pattern(a: Any) -> Pattern | None:
+    """Block rows of this rank's parts of an AIJ matrix, if its entries are whole blocks."""
+    parts = []
+    for pointer, column, number, _ in compat.csr_parts(a):
+        if len(number) % 3 or (np.diff(pointer) % 3).any():
+            return None
+        node = number[::3] // 3
+        blocks = [np.empty(0, column.dtype)]
+        for chunk in _chunks(pointer):
+            first, *others = _by_axis(pointer, column, chunk)
+            blocks.append(first[:, 0] // 3)
+            whole = all(np.array_equal(first, other) for other in others)
+            if not whole or (first != 3 * blocks[-1][:, None] + _AXES).any():
+                return None
+        if (number != (3 * node[:, None] + _AXES).ravel()).any():
+            return None
+        parts.append((pointer[::3] // 9, node[np.concatenate(blocks)]))
+    return parts
+
+
+def _chunks(pointer: IntArray) -> list[slice]:
+    """Ranges of a matrix's nodes, so small that temporary arrays stay in the processor's cache."""
+    stop = len(pointer) // 3
+    return [slice(k, min(k + _CHUNK, stop)) for k in range(0, stop, _CHUNK)]
+
+
+def _by_axis(pointer: IntArray, entries: npt.NDArray[Any], chunk: slice) -> list[npt.NDArray[Any]]:
+    """Entries of the rows of nodes' first, second and third coordinates, three to a block."""
+    pointer = pointer[3 * chunk.start : 3 * chunk.stop + 1]
+    axis = np.repeat(np.tile(_AXES, chunk.stop - chunk.start), np.diff(pointer))
+    entries = entries[pointer[0] : pointer[-1]]
+    return [entries[axis == i].reshape(-1, 3) for i in range(3)]
+
+
+class NodeBlocks:
+    """What a BAIJ matrix of all bodies, with room for contact between their nodes, is made of.
+
+    Args:
+        bodies: Their PETSc matrices.
+        found: What `patterns` says of them.
+        to_whole: (body, numbers in it) -> numbers in the new matrix.
+        contact: Of each batch of elements the numbers in the new matrix, three to a node, shape
+            (n, 3 nodes); negative ones are left out.
+
+    Attributes:
+        size: Rows on this rank.
+        room: Blocks in each of its block rows, at most: in its own columns, in those of others.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Any],
+        found: Sequence[Pattern],
+        to_whole: Callable[[int, IntArray], IntArray],
+        contact: Sequence[IntArray],
+    ) -> None:
+        comm, index = bodies[0].comm.tompi4py(), PETSc.IntType
+        self._bodies, self._rows, self._patterns = list(bodies), [], []
+        local = sum(a.getLocalSize()[0] for a in bodies) // 3
+        first = np.cumsum([0, *comm.allgather(local)])
+        blocks = np.zeros((local, 2), dtype=np.int64)
+        for k, (a, parts) in enumerate(zip(bodies, found, strict=True)):
+            start, stop = (i // 3 for i in a.getOwnershipRange())
+            rows = to_whole(k, 3 * np.arange(start, stop)) // 3
+            for i, (pointer, _) in enumerate(parts):
+                blocks[rows - first[comm.rank], i] = np.diff(pointer)
+            self._rows.append(rows.astype(index))
+            self._patterns.append(
+                [(p, (to_whole(k, 3 * n.astype(np.int64)) // 3).astype(index)) for p, n in parts]
+            )
+        blocks += _most_couplings(comm, first, contact)
+        np.minimum(blocks, (local, first[-1] - local), out=blocks)
+        self.size = 3 * local
+        self.room = [b.astype(index) for b in np.ascontiguousarray(blocks.T)]
+
+    def fill(self, matrix: Any) -> None:
+        """Replace all values by those of the bodies, to which others may be added. Collective."""
+        if matrix.assembled:
+            matrix.zeroEntries()
+        for a, rows, parts in zip(self._bodies, self._rows, self._patterns, strict=True):
+            csr = compat.csr_parts(a)
+            for (pointer, node), (scalar, _, _, values) in zip(parts, csr, strict=True):
+                for chunk in _chunks(scalar):
+                    blocks = np.stack(_by_axis(scalar, values, chunk), axis=1)
+                    start, stop = pointer[[chunk.start, chunk.stop]]
+                    part = pointer[chunk.start : chunk.stop + 1] - start
+                    matrix.setValuesBlockedIJV(part, node[start:stop], blocks, rowmap=rows[chunk])
+        matrix.assemble(PETSc.Mat.AssemblyType.FLUSH)
+
+
+def _most_couplings(comm: Any, first: IntArray, contact: Sequence[IntArray]) -> IntArray:
+    """Upper bound of the blocks that contact needs in each of this rank's rows. Collective.
+
+    Args:
+        comm: MPI communicator.
+        first: First node of each rank, and the number of all.
+        contact: As of `NodeBlocks`.
+
+    Returns:
+        In the rank's own columns and in those of others, shape (nodes, 2).
+    """
+    local = int(first[comm.rank + 1] - first[comm.rank])
+    count = PETSc.Vec().createMPI((2 * local, None), comm=comm)
+    for numbers in contact:
+        node = numbers.reshape(len(numbers), numbers.shape[1] // 3, 3).max(axis=2) // 3
+        row, col = np.broadcast_arrays(node[:, :, None], node[:, None, :])
+        kept = (row >= 0) & (col >= 0) & (row != col)
+        row, col = row[kept], col[kept]
+        away = np.searchsorted(first, row, "right") != np.searchsorted(first, col, "right")
+        where = (2 * row + away).astype(PETSc.IntType)
+        count.setValues(where, np.ones(len(where)), addv=PETSc.InsertMode.ADD_VALUES)
+    count.assemble()
+    most: IntArray = count.array_r.reshape(-1, 2).astype(np.int64)
+    count.destroy()
+    return most
