@@ -1,9 +1,9 @@
 """How time and memory of a step grow with the mesh: two cubes in contact at "balanced".
 
 The cubes of `step_time.py` at a gap that the first step closes, with more and more cells. Printed
-are time per step and coordinate, contact's share of it, and memory per coordinate, which is right
-for one mesh a run only: what a smaller one has freed may be used again. Run the largest meshes on 2
-ranks.
+are time per step and coordinate, contact's share of it on the rank where it is the largest, and
+memory per coordinate, which is right for one mesh a run only: what a smaller one has freed may be
+used again. Run the largest meshes on 2 ranks.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def measure(comm: MPI.Comm, n: int, steps: int, dt: float) -> None:
         stepper.advance(dt)
     seconds = (time.perf_counter() - begin) / steps
     clock.close()
-    contact = sum(clock.seconds.values()) / steps
+    contact = comm.allreduce(sum(clock.seconds.values()), op=MPI.MAX) / steps
     memory = comm.allreduce(resident()) - before
     linear = stepper.solver.snes.getLinearSolveIterations()
     rows = stepper.solution.rows[-steps:]

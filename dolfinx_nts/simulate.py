@@ -31,6 +31,8 @@ logger = logging.getLogger(__name__)
 
 #: Part of the energy by which changes of facet may raise it in a step without a warning.
 _NOTABLE_GAIN = 0.01
+#: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
+_WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_divergence_tolerance"}
 
 
 @dataclass(eq=False)
@@ -142,6 +144,11 @@ class Stepper:
             raise TypeError(
                 f"petsc_options={petsc_options!r}: pass a dict of names and values, e.g. "
                 "{'pc_type': 'lu'}"
+            )
+        for name in sorted(given.keys() & _WITHOUT_EFFECT):
+            raise ValueError(
+                f"petsc_options[{name!r}]={given[name]!r}: has no effect, as each block of the "
+                "residual is tested by itself; pass newton=Newton(rtol=...)"
             )
         require_bool("sleep", sleep)
         self.newton = newton or Newton()
