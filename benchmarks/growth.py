@@ -22,7 +22,7 @@ from dolfinx_nts.newton import ACCURACY
 
 #: Of `PARTS`, what contact costs beside the linear solver; a fresh conversion of the bodies'
 #: matrices is in the last of them, too.
-CONTACT = ("search", "contact elements", "contact into the matrix")
+CONTACT = ("search", "contact elements", "contact into the matrix", "new layout")
 #: Steps before those that count: contact begins, matrices and solvers are made.
 _WARM = 3
 

@@ -30,6 +30,7 @@ PARTS = {
     "bulk forces": (Continuum, "internal"),
     "bulk matrices": (Continuum, "tangent"),
     "contact into the matrix": (StepMatrix, "assemble"),
+    "new layout": (StepMatrix, "__init__"),
 }
 
 

@@ -40,7 +40,7 @@ from dolfinx_nts.mesh_input import bodies_from_gmsh
 
 MESHES = Path(__file__).resolve().parents[1] / "meshes"
 RADIUS, VELOCITY, DENSITY = 76.0, (30.0, 0.0, 23.0), 0.1
-INTEGRATORS = {"em": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}
+INTEGRATORS = {"energy-momentum": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}
 
 
 def read_parts(comm, refinement):
@@ -160,7 +160,7 @@ def writers(output):
 
 def main(
     *,
-    integrator="em",
+    integrator="energy-momentum",
     refinement=1,
     dt=0.05,
     t_end=8.0,
@@ -171,7 +171,7 @@ def main(
     """Run the collision.
 
     Args:
-        integrator: "em" or "midpoint".
+        integrator: "energy-momentum" or "midpoint".
         refinement: Multiplies the cells in all directions.
         dt: Step.
         t_end: End of the run; the tori part at about 7.4.
@@ -202,7 +202,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--integrator", choices=INTEGRATORS, default="em")
+    parser.add_argument("--integrator", choices=INTEGRATORS, default="energy-momentum")
     parser.add_argument("--refinement", type=int, default=1, help="multiplies all cell numbers")
     parser.add_argument("--dt", type=float, default=0.05)
     parser.add_argument("--t-end", type=float, default=8.0)

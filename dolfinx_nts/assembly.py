@@ -89,12 +89,14 @@ class StepMatrix:
 
     Args:
         layout: Fields of the problem.
-        bodies: PETSc matrices of the body fields; contact adds to them in place.
+        bodies: PETSc matrices of the body fields; contact is added to them in place, unless they
+            are stored in blocks.
         elements: Unknowns of each batch of contact elements.
         split: Whether solvers see a nest of two fields, "bodies" and "contact", from which a field
             split takes its blocks without a copy; else one matrix.
         blocked: Whether the bodies' part may be stored in the 3 x 3 blocks of nodes (BAIJ), with
-            which a product takes a third of the time; few of PETSc's preconditioners take it.
+            which a product takes a third of the time; few of PETSc's preconditioners take it. With
+            contact it needs `split`.
 
     Attributes:
         nest: Blocks of all fields, as of the last fresh assembly. Where the bodies' part is stored
@@ -192,7 +194,7 @@ class StepMatrix:
         return a
 
     def assemble(self, tangents: Sequence[FloatArray], *, fresh: bool = True) -> None:
-        """Add the contact tangents (n, r, r) to the bodies; refresh nest and operator.
+        """Add the contact tangents (n, r, r); refresh nest and operator.
 
         Args:
             tangents: Of each batch of elements.
@@ -221,6 +223,10 @@ class StepMatrix:
                 grid = [self._converted[:2], self._converted[2:]]
                 self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
         self.operator.assemble()
+
+    def outgrown(self) -> bool:
+        """Whether the bodies' matrices have entries the operator has no room for. Collective."""
+        return self._by_nodes is not None and self._by_nodes.outgrown()
 
     def _convert(self, k: int, tangents: Sequence[FloatArray]) -> None:
         """Bring what the solvers see of a part up to date."""

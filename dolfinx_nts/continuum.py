@@ -88,7 +88,8 @@ class Body(Protocol):
     def tangent(self, u1: FloatArray) -> Any:
         """PETSc matrix M + factor d(internal - external)/du_1, without M in statics.
 
-        Rows and columns of `fixed` hold only a diagonal.
+        The same matrix in each call, with the same pattern. Rows and columns of `fixed` hold only a
+        diagonal.
         """
 
     def nodal_stiffness(self) -> FloatArray:

@@ -262,7 +262,7 @@ def set_values_coo(a: Any, values: npt.ArrayLike) -> None:
 
 
 def csr_parts(a: Any) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
-    """This rank's rows of an assembled AIJ matrix without copying, as `getValuesCSR` would.
+    """This rank's rows of an assembled AIJ matrix; unlike `getValuesCSR` nothing is copied.
 
     Args:
         a: The matrix; the arrays are its own and are valid while it lives unchanged.

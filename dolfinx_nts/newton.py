@@ -244,7 +244,8 @@ class StepSolver:
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
         self._matrices_due |= not self.newton.reuse or changed > EQUAL
         self._factor = self.problem.factor
-        if self._version != self.problem.version:
+        outgrown = self.matrix is not None and self.matrix.outgrown()
+        if self._version != self.problem.version or outgrown:
             self.destroy()
             self._version = self.problem.version
             self.assemble(self._at(self.problem.x))
@@ -257,7 +258,12 @@ class StepSolver:
         """
         fresh, new, awake = self._matrices_due, self.matrix is None, self.problem.awake
         if fresh:
-            self._bodies = dict(zip(awake, self.problem.body_tangents(e), strict=True))
+            bodies = dict(zip(awake, self.problem.body_tangents(e), strict=True))
+            for k, a in bodies.items():
+                if self._bodies.get(k, a) != a:
+                    name = self.problem.system.bodies[k].name
+                    raise TypeError(f"body {name!r}: tangent() must return one matrix in all calls")
+            self._bodies = bodies
             self._matrices_due = not self.newton.reuse
         for k in awake:
             if k not in self._bodies:

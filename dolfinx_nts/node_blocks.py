@@ -17,8 +17,10 @@ from petsc4py import PETSc
 from dolfinx_nts import dolfinx_compat as compat
 
 IntArray = npt.NDArray[np.signedinteger[Any]]
-_AXES = np.arange(3, dtype=np.int8)
+#: Nodes at a time.
 _CHUNK = 500
+#: Small integers make a quarter of the memory traffic.
+_AXES = np.arange(3, dtype=np.int8)
 #: Of each part of a body's matrix: where its block rows begin, and the nodes in their columns.
 Pattern = list[tuple[IntArray, IntArray]]
 
@@ -29,18 +31,19 @@ def patterns(bodies: Sequence[Any]) -> list[Pattern] | None:
     Bodies of the user's own may have any coordinates, and what contact adds to an AIJ matrix within
     one body leaves out those that are prescribed.
     """
-    whole = all(a.getBlockSize() == 3 and a.getType() in {"seqaij", "mpiaij"} for a in bodies)
-    found = [_pattern(a) for a in bodies] if whole else [None]
-    kept = [p for p in found if p is not None]
-    same = bodies[0].comm.tompi4py().allreduce(len(kept) == len(bodies), op=MPI.LAND)
-    return kept if same else None
+    nodes = all(a.getBlockSize() == 3 and a.getType() in {"seqaij", "mpiaij"} for a in bodies)
+    here = [_pattern(a) for a in bodies] if nodes else [None]
+    found = [p for p in here if p is not None]
+    everywhere = bodies[0].comm.tompi4py().allreduce(len(found) == len(bodies), op=MPI.LAND)
+    return found if everywhere else None
 
 
 def _pattern(a: Any) -> Pattern | None:
     """Block rows of this rank's parts of an AIJ matrix, if its entries are whole blocks."""
     parts = []
     for pointer, column, number, _ in compat.csr_parts(a):
-        if len(number) % 3 or (np.diff(pointer) % 3).any():
+        length = np.diff(pointer).reshape(-1, 3)
+        if len(number) % 3 or (length % 3).any() or (length != length[:, :1]).any():
             return None
         node = number[::3] // 3
         blocks = [np.empty(0, column.dtype)]
@@ -110,6 +113,19 @@ class NodeBlocks:
         np.minimum(blocks, (local, first[-1] - local), out=blocks)
         self.size = 3 * local
         self.room = [b.astype(index) for b in np.ascontiguousarray(blocks.T)]
+
+    def outgrown(self) -> bool:
+        """Whether a body's matrix has got entries that are not in its pattern. Collective.
+
+        Two runs of one system that take turns share the bodies' matrices, and one that stores them
+        otherwise adds contact within a body to them.
+        """
+        grown = any(
+            not np.array_equal(scalar[::3], 9 * pointer)
+            for a, parts in zip(self._bodies, self._patterns, strict=True)
+            for (pointer, _), (scalar, *_) in zip(parts, compat.csr_parts(a), strict=True)
+        )
+        return bool(self._bodies[0].comm.tompi4py().allreduce(grown, op=MPI.LOR))
 
     def fill(self, matrix: Any) -> None:
         """Replace all values by those of the bodies, to which others may be added. Collective."""

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 #: Part of the energy by which changes of facet may raise it in a step without a warning.
 _NOTABLE_GAIN = 0.01
 #: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
-_WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_divergence_tolerance"}
+_WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
 
 
 @dataclass(eq=False)
@@ -145,10 +145,10 @@ class Stepper:
                 f"petsc_options={petsc_options!r}: pass a dict of names and values, e.g. "
                 "{'pc_type': 'lu'}"
             )
-        for name in sorted(given.keys() & _WITHOUT_EFFECT):
+        for name in sorted(name for name in given if name.lower() in _WITHOUT_EFFECT):
             raise ValueError(
-                f"petsc_options[{name!r}]={given[name]!r}: has no effect, as each block of the "
-                "residual is tested by itself; pass newton=Newton(rtol=...)"
+                f"petsc_options[{name!r}]={given[name]!r}: each block of the residual is tested by "
+                "itself, not by PETSc; pass newton=Newton(rtol=...)"
             )
         require_bool("sleep", sleep)
         self.newton = newton or Newton()

@@ -51,7 +51,15 @@ DEFAULT: Mapping[str, list[Any]] = {
     "dt_factor": [4.0, 2.0, 1.0],
 }
 #: Measures of error, each relative to what the reference run has of it.
-ERRORS = ("trajectory", "impulse", "energy", "momentum", "dissipation", "ledger")
+ERRORS = (
+    "trajectory",
+    "impulse",
+    "energy",
+    "linear momentum",
+    "angular momentum",
+    "dissipation",
+    "ledger",
+)
 #: Errors of the trajectory that the cheapest run is named for.
 TARGETS = (0.1, 0.01, 1e-3)
 
@@ -71,6 +79,7 @@ class Motion:
         motion: The means at each time [m], shape (12 bodies,).
         impulse: Of all normal contact forces [N s].
         mass: Of all bodies [kg].
+        arm: Root of the mean square over the mass of the distance from the origin [m].
     """
 
     def start(self, stepper: nts.Stepper) -> None:
@@ -83,6 +92,8 @@ class Motion:
         ones = [np.resize([1.0, 0.0, 0.0], body.num_owned) for body in bodies]
         masses = (float(a @ body.inertia(a)) for a, body in zip(ones, bodies, strict=True))
         self.mass = stepper.system.comm.allreduce(sum(masses))
+        square = sum(float(b.reference @ b.inertia(b.reference)) for b in bodies)
+        self.arm = math.sqrt(stepper.system.comm.allreduce(square) / self.mass)
         self.write(stepper)
 
     def write(self, stepper: nts.Stepper, *, last: bool = False) -> None:
@@ -152,14 +163,19 @@ class Run:
         scale = np.abs(exact - exact[0]).max() or np.finfo(float).tiny
         energy = max(np.abs(other[k]).max() for k in ("energy", "external_work"))
         momentum = np.sqrt(2.0 * reference.path.mass * energy)
+        momenta = {
+            f"{name} momentum": float(np.abs(mine[key][-1] - other[key][-1]).max() / scale)
+            for name, key, scale in (
+                ("linear", "linear_momentum", momentum),
+                ("angular", "angular_momentum", momentum * reference.path.arm),
+            )
+        }
         lost = [t["friction_dissipation"][-1] + t["contact_defect"][-1] for t in (mine, other)]
         return {
             "trajectory": float(np.sqrt(weight @ square / weight.sum()) / scale),
             "impulse": _relative(self.path.impulse, reference.path.impulse),
             "energy": float(abs(mine["energy"][-1] - other["energy"][-1]) / energy),
-            "momentum": float(
-                np.abs(mine["linear_momentum"][-1] - other["linear_momentum"][-1]).max() / momentum
-            ),
+            **momenta,
             "dissipation": float(abs(lost[0] - lost[1]) / energy),
             "ledger": float(np.abs(mine["ledger_residual"]).max() / energy),
         }
@@ -363,8 +379,17 @@ def recommend(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, Mapping[st
     return picks
 
 
+def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What `recommend` picks, a line for each target."""
+    return "\n".join(
+        f"trajectory within {target:g}: "
+        + (f"{row['run']}: {row['seconds']:.3g} s" if row else "none of these")
+        for target, row in recommend(rows)
+    )
+
+
 def write(rows: Sequence[Mapping[str, Any]], folder: Path, title: str) -> None:
-    """Write table and plot; on one rank."""
+    """Write table, plot and recommendation; on one rank."""
     folder.mkdir(parents=True, exist_ok=True)
     names = list(dict.fromkeys(name for row in rows for name in row))
     with (folder / "tradeoff.csv").open("w", newline="", encoding="utf-8") as file:
@@ -372,6 +397,8 @@ def write(rows: Sequence[Mapping[str, Any]], folder: Path, title: str) -> None:
         table = csv.DictWriter(file, names)
         table.writeheader()
         table.writerows(rows)
+    text = f"{title}\n{recommendation(rows)}\n"
+    (folder / "recommendation.txt").write_text(text, encoding="utf-8")
     plot(rows, folder / "tradeoff.png", title)
 
 
@@ -491,10 +518,8 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     if comm.rank == 0:
         write(rows, Path(options.output), title)
         print(title)
-        for target, row in recommend(rows):
-            what = f"{row['run']}: {row['seconds']:.3g} s" if row else "none of these"
-            print(f"trajectory within {target:g}: {what}")
-        print(f"table and plot in {options.output}")
+        print(recommendation(rows))
+        print(f"table, plot and recommendation in {options.output}")
     return rows
 
 

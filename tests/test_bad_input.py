@@ -704,8 +704,9 @@ def test_petsc_options():
     raises(ValueError, pattern, lambda: run(system, petsc_options=bad))
     raises(TypeError, r"^petsc_options='-help': pass a dict", lambda: run(petsc_options="-help"))
     raises(TypeError, r"^petsc_options={1: 2}: pass a dict", lambda: run(petsc_options={1: 2}))
-    pattern = r"^petsc_options\['snes_rtol'\]=1e-06: has no effect, .*; pass newton=Newton\(rtol="
-    raises(ValueError, pattern, lambda: run(system, petsc_options={"snes_rtol": 1e-6}))
+    for name in ("snes_rtol", "snes_atol", "SNES_STOL", "snes_convergence_test"):
+        pattern = rf"^petsc_options\['{name}'\]=1: each block .*; pass newton=Newton\(rtol="
+        raises(ValueError, pattern, lambda name=name: run(system, petsc_options={name: 1}))
     good = {"ksp_type": "gmres", "pc_type": "bjacobi", "sub_pc_type": "ilu", "ksp_rtol": 1e-12}
     for options in (good, FIELD_SPLIT | {"snes_linesearch_type": "bt"}):
         assert run(system, petsc_options=options).status == "completed"

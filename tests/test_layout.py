@@ -120,7 +120,9 @@ def test_level_0_knows_neither_mpi_nor_petsc(module):
 
 @pytest.mark.parametrize("module", sorted(set(PRESENT) - {"assembly", "dolfinx_compat"}))
 def test_only_assembly_creates_petsc_matrices(module):
-    makes = re.findall(r"\bMat\(\)|\.createAIJ\(|\.createNest\(", code_without_text(module))
+    makes = re.findall(
+        r"\bMat\(\)|\.create(?:Seq)?S?B?AIJ\(|\.createNest\(", code_without_text(module)
+    )
     assert not makes, f"{module} makes a PETSc matrix: {makes}"
 
 

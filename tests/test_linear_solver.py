@@ -258,6 +258,57 @@ def test_blocks_that_are_not_whole_are_found_on_all_ranks(missing, whole):
     a.destroy()
 
 
+def test_rows_that_are_whole_only_one_after_another():
+    """Of two nodes x, and y and z, have blocks in other columns, in the same order."""
+    a = PETSc.Mat().createAIJ(((9, None), (9, None)), nnz=9, bsize=3, comm=MPI.COMM_SELF)
+    columns = {0: [0, 1], 1: [0], 2: [0], 3: [2], 4: [1, 2], 5: [1, 2], 6: [2], 7: [2], 8: [2]}
+    for row, nodes in columns.items():
+        for node in nodes:
+            a.setValues(row, np.arange(3 * node, 3 * node + 3, dtype=PETSc.IntType), np.ones(3))
+    a.assemble()
+    assert node_blocks.patterns([a]) is None
+    a.destroy()
+
+
+@pytest.mark.mpi
+def test_a_pattern_that_grows_under_another_run_of_the_same_scene():
+    """MUMPS adds the contact of a smooth master's nodes to the matrices that both runs share."""
+    low = create_box(COMM, [[-0.5, -0.5, -0.5], [1.5, 1.5, 0]], [7, 7, 2], CellType.hexahedron)
+    high = create_box(COMM, [[0, 0, 0.0005], [1, 1, 1]], [5, 5, 4], CellType.hexahedron)
+    rubber, fixed = nts.NeoHookean(young=1e6, poisson=0.3), lambda x: x[2] < -0.5 + 1e-9
+    base = nts.Continuum(low, rubber, density=1e3, bcs=[nts.Dirichlet(fixed)], name="base")
+    cube = nts.Continuum(high, rubber, density=1e3, velocity=(0.3, 0.1, -0.3), name="cube")
+    slave = cube.surface(lambda x: x[2] < 0.0005 + 1e-9)
+    master = base.surface(lambda x: x[2] > -1e-9, smoothing=True)
+    system = nts.System([base, cube], contacts=[nts.ContactPair(slave, master, friction=0.2)])
+    alone = stepper_of(system, linear_solver="krylov")
+    for _ in range(6):
+        alone.advance(1e-3)
+    alone.close()
+    ours, other = (stepper_of(system, linear_solver=name) for name in ("krylov", "direct"))
+    for _ in range(6):
+        ours.advance(1e-3)
+        other.advance(1e-3)
+    expected = alone.solution.rows[-1]
+    for stepper in (ours, other):
+        row = stepper.solution.rows[-1]
+        assert row["active"] == expected["active"] > 0
+        assert abs(row["potential"] / expected["potential"] - 1) < 1e-9
+        stepper.close()
+
+
+def test_a_body_that_makes_a_new_matrix_each_time_is_named():
+    class Copying(nts.Continuum):
+        def tangent(self, u1):
+            return super().tangent(u1).copy()
+
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [4, 4, 4], CellType.hexahedron)
+    rubber, velocity = nts.NeoHookean(young=1e6, poisson=0.3), lambda x: 0.1 * x[[1, 2, 0]]
+    body = Copying(mesh, rubber, density=1e3, velocity=velocity, name="block")
+    with pytest.raises(TypeError, match=r"^body 'block': tangent\(\) must return one matrix"):
+        stepper_of(nts.System([body])).advance(1e-3)
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 def test_the_choice_changes_no_solution(condense):
