@@ -19,8 +19,6 @@ from dolfinx_nts import dolfinx_compat as compat
 IntArray = npt.NDArray[np.signedinteger[Any]]
 #: Nodes at a time.
 _CHUNK = 500
-#: Small integers make a quarter of the memory traffic.
-_AXES = np.arange(3, dtype=np.int8)
 #: Of each part of a body's matrix: where its block rows begin, and the nodes in their columns.
 Pattern = list[tuple[IntArray, IntArray]]
 
@@ -46,31 +44,42 @@ def _pattern(a: Any) -> Pattern | None:
         if len(number) % 3 or (length % 3).any() or (length != length[:, :1]).any():
             return None
         node = number[::3] // 3
-        blocks = [np.empty(0, column.dtype)]
-        for chunk in _chunks(pointer):
-            first, *others = _by_axis(pointer, column, chunk)
-            blocks.append(first[:, 0] // 3)
-            whole = all(np.array_equal(first, other) for other in others)
-            if not whole or (first != 3 * blocks[-1][:, None] + _AXES).any():
-                return None
-        if (number != (3 * node[:, None] + _AXES).ravel()).any():
+        if (number.reshape(-1, 3) != 3 * node[:, None] + np.arange(3)).any():
             return None
-        parts.append((pointer[::3] // 9, node[np.concatenate(blocks)]))
+        start, blocks = pointer[::3] // 9, [np.empty(0, column.dtype)]
+        for chunk in _chunks(start):
+            block = _blocks(start, column, chunk)
+            blocks.append(block[:, 0, 0] // 3)
+            if (block != 3 * blocks[-1][:, None, None] + np.arange(3, dtype=column.dtype)).any():
+                return None
+        parts.append((start, node[np.concatenate(blocks)]))
     return parts
 
 
-def _chunks(pointer: IntArray) -> list[slice]:
-    """Ranges of a matrix's nodes, so small that temporary arrays stay in the processor's cache."""
-    stop = len(pointer) // 3
+def _chunks(start: IntArray) -> list[slice]:
+    """Ranges of block rows, so small that temporary arrays stay in the processor's cache."""
+    stop = len(start) - 1
     return [slice(k, min(k + _CHUNK, stop)) for k in range(0, stop, _CHUNK)]
 
 
-def _by_axis(pointer: IntArray, entries: npt.NDArray[Any], chunk: slice) -> list[npt.NDArray[Any]]:
-    """Entries of the rows of nodes' first, second and third coordinates, three to a block."""
-    pointer = pointer[3 * chunk.start : 3 * chunk.stop + 1]
-    axis = np.repeat(np.tile(_AXES, chunk.stop - chunk.start), np.diff(pointer))
-    entries = entries[pointer[0] : pointer[-1]]
-    return [entries[axis == i].reshape(-1, 3) for i in range(3)]
+def _blocks(start: IntArray, entries: npt.NDArray[Any], chunk: slice) -> npt.NDArray[Any]:
+    """Entries of an AIJ matrix, which come row by row, block by block.
+
+    Args:
+        start: Where its block rows begin, in blocks.
+        entries: Its columns or values.
+        chunk: Range of block rows.
+
+    Returns:
+        Shape (blocks, 3, 3).
+    """
+    start = start[chunk.start : chunk.stop + 1].astype(np.intp)
+    count = np.diff(start)
+    # Of the first axis; a node's other rows follow after as many triples as it has blocks.
+    triple = np.arange(start[0], start[-1]) + np.repeat(2 * start[:-1], count)
+    rows = triple[:, None] + np.repeat(count, count)[:, None] * np.arange(3)
+    blocks: npt.NDArray[Any] = np.take(entries.reshape(-1, 3), rows, axis=0)
+    return blocks
 
 
 class NodeBlocks:
@@ -133,12 +142,15 @@ class NodeBlocks:
             matrix.zeroEntries()
         for a, rows, parts in zip(self._bodies, self._rows, self._patterns, strict=True):
             csr = compat.csr_parts(a)
-            for (pointer, node), (scalar, _, _, values) in zip(parts, csr, strict=True):
-                for chunk in _chunks(scalar):
-                    blocks = np.stack(_by_axis(scalar, values, chunk), axis=1)
-                    start, stop = pointer[[chunk.start, chunk.stop]]
-                    part = pointer[chunk.start : chunk.stop + 1] - start
-                    matrix.setValuesBlockedIJV(part, node[start:stop], blocks, rowmap=rows[chunk])
+            for (start, node), (*_, values) in zip(parts, csr, strict=True):
+                for chunk in _chunks(start):
+                    here = start[chunk.start : chunk.stop + 1]
+                    matrix.setValuesBlockedIJV(
+                        here - here[0],
+                        node[here[0] : here[-1]],
+                        _blocks(start, values, chunk),
+                        rowmap=rows[chunk],
+                    )
         matrix.assemble(PETSc.Mat.AssemblyType.FLUSH)
 
 
