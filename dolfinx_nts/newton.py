@@ -188,11 +188,15 @@ class StepSolver:
         """Solve the step with the candidates that have unknowns."""
         self.prepare()
         assert self.matrix is not None
-        iterations = 0
+        iterations, unsolved = 0, False
         for retry in (False, True):
             if retry:
                 self._matrices_due = True
                 self.problem.guess(flight=False)
+                if unsolved:
+                    # What failed to factorise once fails from then on.
+                    self.destroy()
+                    self.prepare()
             try:
                 self._options.check(self.snes, self.matrix.operator)
                 self.snes.solve(None, self.problem.x)
@@ -222,7 +226,6 @@ class StepSolver:
         self._matrices_due = True
         message = self._diagnosis(last, reason, iterations)
         if unsolved:
-            # A factorisation that met a NaN fails from then on.
             self.destroy()
         raise StepFailedError(message)
 

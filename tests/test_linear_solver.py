@@ -380,3 +380,22 @@ def test_tolerances_of_the_user_are_kept():
         found = stepper.solver.snes.getKSP().getTolerances()[0]
         assert (found == 3e-7) is kept and 1e-10 <= found <= 1e-5
         stepper.close()
+
+
+def test_a_second_attempt_after_a_factorisation_that_failed(monkeypatch):
+    """Of the first Schur complement only zeros are given to PETSc, which remembers the failure."""
+    own, zeroed = StepMatrix.schur, []
+
+    def schur(self):
+        matrix = own(self)
+        if not zeroed:
+            matrix.zeroEntries()
+            zeroed.append(True)
+        return matrix
+
+    monkeypatch.setattr(StepMatrix, "schur", schur)
+    stepper = stepper_of(pressed_block(0.3), linear_solver="krylov", max_retries=0)
+    for _ in range(30):
+        stepper.advance(1e-3)
+    assert zeroed and stepper.solution.retries == 0
+    stepper.close()
