@@ -297,18 +297,6 @@ def test_a_pattern_that_grows_under_another_run_of_the_same_scene():
         stepper.close()
 
 
-def test_a_body_that_makes_a_new_matrix_each_time_is_named():
-    class Copying(nts.Continuum):
-        def tangent(self, u1):
-            return super().tangent(u1).copy()
-
-    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [4, 4, 4], CellType.hexahedron)
-    rubber, velocity = nts.NeoHookean(young=1e6, poisson=0.3), lambda x: 0.1 * x[[1, 2, 0]]
-    body = Copying(mesh, rubber, density=1e3, velocity=velocity, name="block")
-    with pytest.raises(TypeError, match=r"^body 'block': tangent\(\) must return one matrix"):
-        stepper_of(nts.System([body])).advance(1e-3)
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 def test_the_choice_changes_no_solution(condense):
