@@ -21,8 +21,8 @@ from step_time import PARTS, cubes
 import dolfinx_nts as nts
 from dolfinx_nts.newton import ACCURACY
 
-#: Of `PARTS`, what contact costs beside the linear solver; a fresh conversion of the bodies'
-#: matrices is in the last of them, too.
+#: Of `PARTS`, what contact costs beside the linear solver; the bodies' matrices are stored in
+#: blocks in the last two of them.
 CONTACT = ("search", "contact elements", "contact into the matrix", "new layout")
 #: Steps before those that count: contact begins, matrices and solvers are made.
 _WARM = 3

@@ -145,11 +145,12 @@ class StepMatrix:
             halves = [list(fields[: len(bodies)]), list(fields[len(bodies) :])]
             quarters = [[[grid[i][j] for j in b] for i in a] for a in halves for b in halves]
             self._parts = [PETSc.Mat().createNest(q, comm=layout.comm) for q in quarters]
-        numbers = [self._numbers(half) for half in halves]
+        local = layout.counts[layout.comm.rank]
+        layouts = [Layout(layout.comm, local[half].tolist()) for half in halves]
+        numbers = [self._numbers(*each) for each in zip(halves, layouts, strict=True)]
         if found is not None:
-            own = Layout(layout.comm, layout.counts[layout.comm.rank, halves[0]].tolist())
             contact = [number for _, number in numbers[0]]
-            self._by_nodes = node_blocks.NodeBlocks(bodies, found, own.to_system, contact)
+            self._by_nodes = node_blocks.NodeBlocks(bodies, found, layouts[0].to_system, contact)
         self._part_numbers = [(a, b) for a in numbers for b in numbers]
         self._converted = [PETSc.Mat() for _ in self._parts]
         if self._by_nodes:
@@ -322,11 +323,8 @@ class StepMatrix:
         values: FloatArray = tangents[e][:, columns[i], columns[j]][:, rows, cols]
         return values
 
-    def _numbers(self, fields: Sequence[int]) -> list[tuple[IntArray, IntArray]]:
+    def _numbers(self, fields: Sequence[int], own: Layout) -> list[tuple[IntArray, IntArray]]:
         """Each batch's columns in some fields, and their numbers in the layout of these alone."""
-        layout = self._layout
-        counts = layout.counts[layout.comm.rank, fields].tolist()
-        own = layout if len(fields) == layout.counts.shape[1] else Layout(layout.comm, counts)
         result = []
         for element in self._elements:
             count = len(element.numbers[0]) if element.numbers else 0

@@ -287,7 +287,7 @@ def csr_parts(a: Any) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
         if error := lib.MatSeqAIJGetCSRAndMemType(part, *arrays, None):
             raise PETSc.Error(error)
         start = np.ctypeslib.as_array(pointer, (rows + 1,))
-        count = int(start[-1])
+        count = start[-1]
         columns = _view(column, count)
         if result:
             numbers.append(_view(away, columns.max(initial=-1) + 1))

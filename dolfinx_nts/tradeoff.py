@@ -88,12 +88,9 @@ class Motion:
         self.motion: list[FloatArray] = []
         self.impulse = 0.0
         bodies = stepper.system.bodies
-        self._tests = [_affine(body) for body in bodies]
-        ones = [np.resize([1.0, 0.0, 0.0], body.num_owned) for body in bodies]
-        masses = (float(a @ body.inertia(a)) for a, body in zip(ones, bodies, strict=True))
-        self.mass = stepper.system.comm.allreduce(sum(masses))
-        square = sum(float(b.reference @ b.inertia(b.reference)) for b in bodies)
-        self.arm = math.sqrt(stepper.system.comm.allreduce(square) / self.mass)
+        tests, masses, squares = zip(*map(_affine, bodies), strict=True)
+        self._tests, self.mass = tests, sum(masses)
+        self.arm = math.sqrt(sum(squares) / self.mass)
         self.write(stepper)
 
     def write(self, stepper: nts.Stepper, *, last: bool = False) -> None:
@@ -113,8 +110,8 @@ class Motion:
         """Nothing is open."""
 
 
-def _affine(body: Any) -> FloatArray:
-    """What u . M is multiplied with for the means of a body, shape (num_owned, 12)."""
+def _affine(body: Any) -> tuple[FloatArray, float, float]:
+    """What u . M is multiplied with for the means of a body, shape (num_owned, 12); M; X . M X."""
     x, one = body.reference.reshape(-1, 3), np.tile(np.eye(3), (body.num_owned // 3, 1))
     nodal = body.inertia(one[:, 0].copy())[::3]
     square = body.reference @ body.inertia(body.reference)
@@ -122,7 +119,8 @@ def _affine(body: Any) -> FloatArray:
     mass, centre = moments[0], moments[1:4] / moments[0]
     size = np.sqrt(moments[4] / mass - centre @ centre)
     arms = (x - centre) / size
-    return np.hstack([one, *(np.kron(arms[:, k : k + 1], np.eye(3)) for k in range(3))]) / mass
+    tests = np.hstack([one, *(np.kron(arms[:, k : k + 1], np.eye(3)) for k in range(3))]) / mass
+    return tests, float(mass), float(moments[4])
 
 
 @dataclasses.dataclass
