@@ -167,72 +167,108 @@ def tributary_areas(facets: IntArray, corners: FloatArray, num_points: int) -> F
 
 
 def _solve_2x2(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions of symmetric 2 x 2 systems, shape (n, 2); not finite where singular."""
-    m11, m12, m22 = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
+    """Solutions (2, n) of symmetric 2 x 2 systems (11, 12, 22; n); not finite where singular."""
+    m11, m12, m22 = matrix
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / (m11 * m22 - m12 * m12)
-        first = (m22 * right[:, 0] - m12 * right[:, 1]) * inverse
-        second = (m11 * right[:, 1] - m12 * right[:, 0]) * inverse
-    return np.column_stack([first, second])
+        result = (matrix[::-2] * right - m12 * right[::-1]) / (m11 * m22 - m12 * m12)
+    return result
 
 
-def _descent_step(
-    start: FloatArray, spans: FloatArray, xi: FloatArray
-) -> tuple[FloatArray, Callable[[], FloatArray]]:
-    """Newton step for |xbar - x|^2 / 2, and what gives its exact change along the step.
+#: Of |xbar - x|^2 / 2 at the current coordinates: gradient (2, n), metric and Hessian (11, 12, 22)
+#: of shape (3, n), and step (2, n) -> coefficients of t, t^2, .. of the change after t steps.
+_Expansion = tuple[FloatArray, FloatArray, FloatArray, Callable[[FloatArray], list[FloatArray]]]
+
+
+def _modes(start: FloatArray, spans: FloatArray) -> FloatArray:
+    """Vectors of xbar - x = c_0 + c_1 s + c_2 t + c_3 s t [m], shape (4, 3, n)."""
+    if spans.shape[1] == 3:
+        return np.stack([start.T, spans[:, 1].T, spans[:, 2].T, np.zeros(start.T.shape)])
+    s, t = _REFERENCE[4].T
+    corners = spans.transpose(1, 2, 0).reshape(4, -1)
+    c = (0.25 * np.array([np.ones(4), s, t, s * t]) @ corners).reshape(4, 3, -1)
+    c[0] += start.T
+    return c
+
+
+def _bilinear(c: FloatArray, xi: FloatArray) -> _Expansion:
+    """Expansion of the distance from facets.
+
+    Args:
+        c: Of `_modes` [m], shape (4, 3, n).
+        xi: Convective coordinates [-], shape (2, n).
+    """
+    vectors = np.empty(c.shape)
+    vectors[:2] = c[1:3] + xi[::-1, None] * c[3]
+    vectors[2] = c[3]
+    vectors[3] = c[0] + xi[0] * c[1] + xi[1] * vectors[1]
+    g = np.einsum("kjn,ljn->kln", vectors, vectors)
+    metric = g[[0, 0, 1], [0, 1, 1]]
+    hessian = metric.copy()
+    hessian[1] += g[2, 3]
+
+    def change(step: FloatArray) -> list[FloatArray]:
+        a, b = step
+        twist = a * b
+        along = 0.5 * (a * (a * g[0, 0] + 2.0 * b * g[0, 1]) + b * b * g[1, 1])
+        cross = twist * (a * g[0, 2] + b * g[1, 2])
+        return [
+            a * g[0, 3] + b * g[1, 3], along + twist * g[2, 3], cross, 0.5 * twist**2 * g[2, 2],
+        ]  # fmt: skip
+
+    return g[:2, 3], metric, hessian, change
+
+
+def _bicubic(start: FloatArray, spans: FloatArray, xi: FloatArray) -> _Expansion:
+    """Expansion of the distance from smooth patches.
 
     Args:
         start: First corner relative to the point [m], shape (n, 3).
-        spans: Corners relative to the first corner [m], shape (n, nc, 3).
-        xi: Convective coordinates [-], shape (n, 2).
-
-    Returns:
-        Step [-], shape (n, 2), and a function without arguments for the coefficients of t, t^2, ..
-        [m^2] of the change after t times the step, shape (n, 4), over a patch (n, 12).
+        spans: Control points relative to the first corner [m], shape (n, 16, 3).
+        xi: Convective coordinates [-], shape (2, n).
     """
-    values, first, second = shape(xi, spans.shape[1])
+    values, first, second = shape(xi.T, spans.shape[1])
     offset = start + np.einsum("ni,nij->nj", values, spans)
-    tangents = np.einsum("nia,nij->naj", first, spans)
-    gradient = np.einsum("naj,nj->na", tangents, offset)
-    metric = np.einsum("naj,nbj->nab", tangents, tangents)
+    tangents = np.einsum("nia,nij->anj", first, spans)
+    gradient = np.einsum("anj,nj->an", tangents, offset)
+    square = np.einsum("anj,bnj->abn", tangents, tangents)
     height = np.matmul(spans, offset[:, :, None])[:, :, 0]
-    hessian = metric + np.einsum("niab,ni->nab", second, height)
-    # Beyond the centre of curvature Newton would climb to a saddle: descend on a definite matrix.
-    in_a, in_b, mixed = hessian[:, 0, 0], hessian[:, 1, 1], hessian[:, 0, 1]
-    bound = np.sqrt(np.maximum(in_a, 0.0) * np.maximum(in_b, 0.0))
-    bad = np.abs(mixed) >= bound * (1.0 - 1e-8)
-    limit = 0.9 * np.sqrt(metric[bad, 0, 0] * metric[bad, 1, 1])
-    hessian[bad, 0, 1] = np.clip(mixed[bad], -limit, limit)
-    hessian[bad, 0, 0], hessian[bad, 1, 1] = metric[bad, 0, 0], metric[bad, 1, 1]
-    step = -_solve_2x2(hessian, gradient)
+    curved = square + np.einsum("niab,ni->abn", second, height)
+    metric, hessian = (np.stack([a[0, 0], a[0, 1], a[1, 1]]) for a in (square, curved))
 
-    def change() -> FloatArray:
-        # Differences of distances would cancel near the solution; this polynomial does not.
-        if spans.shape[1] == patches.NUM_POINTS:
-            powers = np.einsum("nip,nij->pnj", patches.along(xi, step)[:, :, 1:], spans)
-        else:
-            twist = np.einsum("ni,nij->nj", second[..., 0, 1], spans)
-            along = np.einsum("naj,na->nj", tangents, step)
-            powers = np.stack([along, twist * (step[:, 0] * step[:, 1])[:, None]])
-        out = np.zeros((len(xi), 2 * len(powers)))
-        out[:, : len(powers)] = np.einsum("pnj,nj->np", powers, offset)
-        out[:, 0] = np.einsum("na,na->n", gradient, step)
+    def change(step: FloatArray) -> list[FloatArray]:
+        powers = np.einsum("nip,nij->pnj", patches.along(xi.T, step.T)[:, :, 1:], spans)
+        out = np.zeros((2 * len(powers), len(start)))
+        out[: len(powers)] = np.einsum("pnj,nj->pn", powers, offset)
+        out[0] = np.einsum("an,an->n", gradient, step)
         for i, one in enumerate(powers):
             for j, two in enumerate(powers):
-                out[:, i + j + 1] += 0.5 * np.einsum("nj,nj->n", one, two)
-        return out
+                out[i + j + 1] += 0.5 * np.einsum("nj,nj->n", one, two)
+        return list(out)
 
-    return step, change
+    return gradient, metric, hessian, change
 
 
-def _step_length(change: FloatArray) -> FloatArray:
+def _descent_step(gradient: FloatArray, metric: FloatArray, hessian: FloatArray) -> FloatArray:
+    """Newton step for |xbar - x|^2 / 2 [-], shape (2, n); arguments of `_Expansion`."""
+    in_a, mixed, in_b = hessian
+    # Beyond the centre of curvature Newton would climb to a saddle: descend on a definite matrix.
+    bound = np.sqrt(np.maximum(in_a, 0.0) * np.maximum(in_b, 0.0))
+    bad = np.abs(mixed) >= bound * (1.0 - 1e-8)
+    if bad.any():
+        limit = 0.9 * np.sqrt(metric[0, bad] * metric[2, bad])
+        mixed[bad] = np.clip(mixed[bad], -limit, limit)
+        in_a[bad], in_b[bad] = metric[0, bad], metric[2, bad]
+    return -_solve_2x2(hessian, gradient)
+
+
+def _step_length(change: list[FloatArray]) -> FloatArray:
     """First of 1, 1/2, 1/4, ... with sufficient descent, shape (n,); 0 where there is none."""
-    length = np.ones(len(change))
+    length = np.ones(len(change[0]))
     for _ in range(_MAX_HALVINGS):
-        gain = np.zeros(len(change))
-        for coefficient in change.T[::-1]:
+        gain = change[-1]
+        for coefficient in change[-2::-1]:
             gain = coefficient + length * gain
-        poor = ~(gain <= 1e-4 * change[:, 0])
+        poor = ~(gain <= 1e-4 * change[0])
         if not poor.any():
             return length
         length[poor] *= 0.5
@@ -249,24 +285,37 @@ def _local(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def _refine(start: FloatArray, spans: FloatArray, xi: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """The Newton iterations of `project`, arguments as in `_descent_step`."""
-    xi = np.array(xi, dtype=np.float64)
-    converged = np.zeros(len(xi), dtype=bool)
+    """The Newton iterations of `project`; start and spans as of `_local`."""
+    xi = np.array(np.transpose(xi), dtype=np.float64)
+    converged = np.zeros(xi.shape[1], dtype=bool)
     with np.errstate(divide="ignore", invalid="ignore"):
         # Rounding of `start` limits the step that a far point can reach.
-        last_step = _LAST_STEP + 1e3 * EPS * np.abs(start).max(axis=1) / size(spans)
-    active = np.arange(len(xi))
+        far = np.abs(start).max(axis=1) / np.abs(spans).max(axis=(1, 2))
+    last_step = _LAST_STEP + 1e3 * EPS * far
+    smooth = spans.shape[1] == patches.NUM_POINTS
+    modes = None if smooth else _modes(start, spans)
+    active = np.arange(len(start))
     for _ in range(_MAX_NEWTON):
         if not active.size:
             break
-        step, change = _descent_step(start[active], spans[active], xi[active])
-        finite = np.isfinite(step).all(axis=1)
-        last = finite & (np.abs(step).max(axis=1) <= last_step[active])
-        length = np.ones(len(last)) if last.all() else np.where(last, 1.0, _step_length(change()))
-        xi[active[finite]] += (length[:, None] * step)[finite]
+        if modes is None:
+            *terms, change = _bicubic(start[active], spans[active], xi[:, active])
+        else:
+            *terms, change = _bilinear(modes[:, :, active], xi[:, active])
+        step = _descent_step(*terms)
+        largest = np.abs(step).max(axis=0)
+        # Not so where a step is not finite.
+        last = largest <= last_step[active]
+        if last.all():
+            xi[:, active] += step
+            converged[active] = True
+            break
+        finite = np.isfinite(largest)
+        length = np.where(last, 1.0, _step_length(change(step)))
+        xi[:, active[finite]] += (length * step)[:, finite]
         converged[active[last]] = True
         active = active[finite & ~last & (length > 0.0)]
-    return xi, converged
+    return xi.T, converged
 
 
 def project(
@@ -342,20 +391,16 @@ def _closest_edge(start: FloatArray, spans: FloatArray) -> FloatArray:
 
 def _closest_triangle(start: FloatArray, spans: FloatArray) -> FloatArray:
     """Closest point on triangles [-], shape (n, 2)."""
-    tangents = spans[:, 1:]
-    metric = np.einsum("naj,nbj->nab", tangents, tangents)
-    xi = _solve_2x2(metric, -np.einsum("naj,nj->na", tangents, start))
+    gradient, metric, _, _ = _bilinear(_modes(start, spans), np.zeros((2, len(start))))
+    xi = -_solve_2x2(metric, gradient).T
     outside = ~((xi >= 0.0).all(axis=1) & (xi.sum(axis=1) <= 1.0))
     xi[outside] = _closest_edge(start[outside], spans[outside])
     return xi
 
 
 def _gram(start: FloatArray, spans: FloatArray) -> FloatArray:
-    """Products c_k . c_l of xbar - x = c_0 + c_1 s + c_2 t + c_3 s t [m^2], shape (4, 4, n)."""
-    s, t = _REFERENCE[4].T
-    modes = 0.25 * np.array([np.ones(4), s, t, s * t])
-    c = np.einsum("ki,nij->kjn", modes, spans)
-    c[0] += start.T
+    """Products c_k . c_l of `_modes` [m^2], shape (4, 4, n)."""
+    c = _modes(start, spans)
     return np.einsum("kjn,ljn->kln", c, c)
 
 
