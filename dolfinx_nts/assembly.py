@@ -17,10 +17,6 @@ from petsc4py import PETSc
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import node_blocks
 
-#: Factor of both Richardson steps towards the inverse of the bodies' matrix, which stays positive
-#: below 2; the fastest of 1.4 to 1.9 on blocks of 1e4 and 5e4 coordinates.
-_DAMPING = 1.7
-
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
@@ -253,14 +249,13 @@ class StepMatrix:
             a.assemble()
         self.operator.assemble()
 
-    def schur(self) -> Any:
-        """Approximate Schur complement of the contact unknowns in the bodies' coordinates.
+    def schur(self) -> tuple[Any, Any]:
+        """Two approximate Schur complements of the contact unknowns in the bodies' coordinates.
 
-        Only the coordinates in contact count; the inverse of their block A of the bodies' matrix is
-        replaced by two Richardson steps, w D^-1 (2 D - w A) D^-1, where D holds the sums of the
-        moduli of A's rows. D bounds the spectrum of a symmetric A, so that this stays positive;
-        D^-1 alone leaves out how a consistent mass matrix couples neighbours along the surface.
-        The caller destroys the matrix. Collective.
+        They are D - C W B and D - C W A W B, of the coordinates in contact alone: the inverse of
+        their block A of the bodies' matrix is replaced by the diagonal matrix W of one over the
+        sums of the moduli of its rows, and by W A W. `linear_solver.SchurInverse` uses them. The
+        caller destroys the matrices. Collective.
         """
         bodies, above, below, contact = self._converted
         rows, cols, *kept = self._near or (*self._touched(), None, None, None, None)
@@ -276,18 +271,15 @@ class StepMatrix:
         back = below.createSubMatrix(cols, rows, submat=back)
         pointer, _, values = near.getValuesCSR()
         inverse = near.createVecLeft()
-        inverse.array_w[:] = _DAMPING / np.add.reduceat(np.abs(values), pointer[:-1])
+        inverse.array_w[:] = 1.0 / np.add.reduceat(np.abs(values), pointer[:-1])
         first.diagonalScale(inverse, None)
         second = near.matMult(first, result=second)
-        self._near = (rows, cols, near, first, back, second)
         second.diagonalScale(inverse, None)
-        # The diagonal of A has no gaps.
-        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-        second.aypx(-1.0, first, structure=subset)
-        second.axpy(1.0, first, structure=subset)
-        result = back.matMult(second)
-        result.aypx(-1.0, contact, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         inverse.destroy()
+        self._near = (rows, cols, near, first, back, second)
+        result = back.matMult(first), back.matMult(second)
+        for product in result:
+            product.aypx(-1.0, contact, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         return result
 
     def _touched(self) -> tuple[Any, Any]:

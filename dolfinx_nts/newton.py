@@ -301,9 +301,10 @@ class StepSolver:
         """Give the preset's field split the Schur complement of the matrix as it is now."""
         if self.problem.elements and self._options.schur:
             assert self.matrix is not None
-            schur = self.matrix.schur()
-            set_schur(self.snes, schur)
-            schur.destroy()
+            pair = self.matrix.schur()
+            set_schur(self.snes, *pair)
+            for matrix in pair:
+                matrix.destroy()
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:
