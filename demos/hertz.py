@@ -242,7 +242,7 @@ def nodes_in_contact(problem, run):
     Friction counts against the direction of the shear. Cylinders: those of one end.
     """
     state, slave = run.state, run.system.contacts[0].slave
-    x, area = slave.reference[slave.owned], slave.area[slave.owned]
+    x, area = slave.reference[slave.share], slave.area[slave.share]
     rows = np.column_stack([x[:, :2], area, state.force[0], -state.tangential[0][:, 0]])
     rows = np.concatenate(run.system.comm.allgather(rows))
     if not problem.spheres:

@@ -38,7 +38,7 @@ class Candidates(NamedTuple):
     """Slave nodes that may touch in a step, one facet each; axis 0 = pair.
 
     Attributes:
-        node: Positions in the slave surface's `owned`, shape (n,).
+        node: Positions in the slave surface's `share`, shape (n,).
         facet: Facets of the master surface, shape (n,).
         xi: Orthogonal projection at t_n, shape (n, 2).
         normal: Outward unit normal of the master there, shape (n, 3).
@@ -139,7 +139,7 @@ class ContactPair:
 
         Args:
             u: Owned displacements of each of `bodies` at t_n [m].
-            current: Facet of each owned slave node in the last step or -1.
+            current: Facet of each of the rank's slave nodes in the last step or -1.
             reach: Bound on the relative motion of slave and master in the step [m].
             moved: Displacement of an obstacle at t_n [m], shape (3,); None of a surface.
             ahead: Displacements of each of `bodies` expected until the middle of the step [m].
@@ -153,13 +153,13 @@ class ContactPair:
         # Positions of all points are known everywhere, so all ranks leave here or none.
         if search.apart(slaves, corners, radius):
             return _NO_CANDIDATES
-        x = slaves[self.slave.owned]
+        x = slaves[self.slave.share]
         closest = search.closest_facets(x, corners, reach=radius, current=current)
         node = np.flatnonzero(closest.facet >= 0)
         found = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
         if ahead is None:
             return found
-        motion = self.slave.gather(ahead[0])[self.slave.owned], self.master.gather(ahead[1])
+        motion = self.slave.gather(ahead[0])[self.slave.share], self.master.gather(ahead[1])
         change, facet = self._crossings(found, master, *motion)
         if not len(change):
             return found
@@ -195,9 +195,9 @@ class ContactPair:
     def _near_obstacle(self, u: FloatArray, reach: float, moved: FloatArray) -> Candidates:
         """Candidates of an obstacle. Nothing limits the depth: what is behind it is inside."""
         slave = self.slave
-        x = slave.reference[slave.owned] + u[slave.rows] - moved
-        gap, length = self.master.gap(x), np.sqrt(slave.area[slave.owned])
-        movable = ~slave.fixed[slave.owned].all(axis=1)
+        x = slave.positions(u)[slave.share] - moved
+        gap, length = self.master.gap(x), np.sqrt(slave.area[slave.share])
+        movable = ~slave.fixed[slave.share].all(axis=1)
         node = np.flatnonzero(movable & (gap.value < reach + _MARGIN * length))
         only, xi = np.zeros(len(node), dtype=np.int64), np.zeros((len(node), 2))
         return Candidates(node, only, xi, gap.gradient[node, 0], gap.value[node], length[node])
@@ -244,7 +244,7 @@ class ContactPair:
 
     def _movable(self, node: IntArray, facet: IntArray) -> BoolArray:
         """Whether any coordinate of a pair is free; without one there is nothing to solve for."""
-        slave = self.slave.fixed[self.slave.owned[node]].all(axis=1)
+        slave = self.slave.fixed[self.slave.share[node]].all(axis=1)
         master = self.master.fixed[self.master.patches[facet]].all(axis=(1, 2))
         return ~(slave & master)
 

@@ -106,7 +106,7 @@ class ContactStep:
     def input_node(self, i: int) -> int:
         """Number of a pair's slave node in the user's mesh."""
         slave = self.pair.slave
-        return int(slave.original[slave.owned[self.candidates.node[i]]])
+        return int(slave.original[slave.share[self.candidates.node[i]]])
 
     @property
     def num_corners(self) -> int:
@@ -154,7 +154,7 @@ class ContactStep:
     def dofs(self) -> tuple[IntArray, ...]:
         """Global coordinates of slaves (n, 3) and facets (n, 3 nc); -1 where prescribed."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
-        points, corners = slave.owned[c.node], master.patches[c.facet]
+        points, corners = slave.share[c.node], master.patches[c.facet]
         s = np.where(slave.fixed, -1, slave.dofs)[points]
         m = np.where(master.fixed, -1, master.dofs)[corners].reshape(-1, 3 * self.num_corners)
         return s, m
@@ -163,7 +163,7 @@ class ContactStep:
         """Global coordinates as in `dofs`, prescribed ones included."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
         corners = master.patches[c.facet]
-        return slave.dofs[slave.owned[c.node]], master.dofs[corners].reshape(
+        return slave.dofs[slave.share[c.node]], master.dofs[corners].reshape(
             -1, 3 * self.num_corners
         )
 
@@ -246,7 +246,7 @@ class ContactStep:
     def reference(self) -> FloatArray:
         """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
-        nodes = slave.reference[slave.owned[c.node]]
+        nodes = slave.reference[slave.share[c.node]]
         return np.concatenate([nodes[:, None], master.reference[master.patches[c.facet]]], axis=1)
 
     def rows(self, k: Contribution, name: str) -> FloatArray:

@@ -53,12 +53,12 @@ class ObstacleStep(ContactStep):
     def dofs(self) -> tuple[IntArray, ...]:
         """Global coordinates of slaves (n, 3); -1 where prescribed."""
         slave = self.pair.slave
-        return (np.where(slave.fixed, -1, slave.dofs)[slave.owned[self.candidates.node]],)
+        return (np.where(slave.fixed, -1, slave.dofs)[slave.share[self.candidates.node]],)
 
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates as in `dofs`, prescribed ones included."""
         slave = self.pair.slave
-        return (slave.dofs[slave.owned[self.candidates.node]],)
+        return (slave.dofs[slave.share[self.candidates.node]],)
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves at t_{n+1}, shape (n, 1, 3)."""
@@ -68,7 +68,7 @@ class ObstacleStep(ContactStep):
     def reference(self) -> FloatArray:
         """Reference positions of slaves [m], shape (n, 1, 3)."""
         slave = self.pair.slave
-        x: FloatArray = slave.reference[slave.owned[self.candidates.node]][:, None]
+        x: FloatArray = slave.reference[slave.share[self.candidates.node]][:, None]
         return x
 
     def _control(self, x: FloatArray) -> FloatArray:

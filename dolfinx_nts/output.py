@@ -137,7 +137,7 @@ class _Series:
             contact = stepper.system.contacts[k]
             for name, (elsewhere, values) in _contact_fields(contact, state, k).items():
                 nodal = np.full((owned, *values.shape[1:]), elsewhere)
-                nodal[contact.slave.rows[:, 0] // 3] = values
+                nodal[contact.slave.rows[:, 0] // 3] = contact.slave.at_own(values)
                 fields[f"{name}_{label}"] = self._nodal(nodal)
         return fields
 
@@ -177,12 +177,12 @@ class _Series:
 
 
 def _contact_fields(pair: ContactPair, state: State, k: int) -> dict[str, tuple[float, FloatArray]]:
-    """Name -> value elsewhere and values at the owned slave nodes."""
+    """Name -> value elsewhere and values at this rank's slave nodes."""
     slave, force, gap = pair.slave, state.force[k], state.gap[k]
     near = np.isfinite(gap)
     fields = {
         "contact_force": (0.0, force),
-        "contact_pressure": (0.0, force / slave.area[slave.owned]),
+        "contact_pressure": (0.0, force / slave.area[slave.share]),
         "contact_gap": (np.nan, np.where(near, gap, np.nan)),
         "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + state.stick[k]),
     }

@@ -333,7 +333,7 @@ class Stepper:
 
 def _at_nodes(contact: ContactStep, values: npt.NDArray[Any], elsewhere: Any) -> npt.NDArray[Any]:
     """Values of the pairs at this rank's slave nodes, which are candidates or not."""
-    shape = (len(contact.pair.slave.owned), *values.shape[1:])
+    shape = (len(contact.pair.slave.share), *values.shape[1:])
     out = np.full(shape, elsewhere, dtype=values.dtype)
     out[contact.candidates.node] = values
     return out

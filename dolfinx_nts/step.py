@@ -283,11 +283,10 @@ class StepProblem:
         ahead = [0.5 * (self.first[b] - state.u[b]) for b in self.system.contact_bodies[index]]
         moved = self._paths[index][0] if pair.rigid else None
         found = pair.find(u, state.facets[index], reach, moved, ahead)
-        slave = pair.slave
-        rows = slave.rows[found.node]
+        slave, theta = pair.slave, self.integrator.theta
         x0 = self._points(index, found, state.u)
         mass = slave.body.nodal_mass if self.integrator.inertia else slave.body.nodal_stiffness()
-        scale, theta = mass[rows[:, 0]], self.integrator.theta
+        scale = slave.gather(mass)[slave.share[found.node], 0]
         rule, condense = self.integrator.contact_gradient, self.condense
         if pair.rigid:
             path = self._paths[index]
@@ -304,7 +303,7 @@ class StepProblem:
             a, b = self._found[i], self._found[j]
             if a.pair.slave.body is not b.pair.slave.body:
                 continue
-            one, two = (c.pair.slave.points[c.pair.slave.owned[c.candidates.node]] for c in (a, b))
+            one, two = (c.pair.slave.points[c.pair.slave.share[c.candidates.node]] for c in (a, b))
             _, ia, ib = np.intersect1d(one, two, return_indices=True)
             ca, cb = a.candidates.part(ia), b.candidates.part(ib)
             double = np.einsum("ni,ni->n", ca.normal, cb.normal) > 1.0 - _ONE
@@ -318,9 +317,8 @@ class StepProblem:
     def _points(self, index: int, found: Candidates, u: Sequence[FloatArray]) -> FloatArray:
         """Slave and control points of pairs [m], (n, nc + 1, 3), from all bodies' displacements."""
         pair, bodies = self.system.contacts[index], self.system.contact_bodies[index]
-        slave, node = pair.slave, found.node
-        x = slave.reference[slave.owned[node]] + u[bodies[0]][slave.rows[node]]
-        x = x[:, None]
+        slave = pair.slave
+        x = slave.positions(u[bodies[0]])[slave.share[found.node]][:, None]
         if pair.rigid:
             return x
         corners = pair.master.control_points(pair.master.positions(u[bodies[1]]), found.facet)

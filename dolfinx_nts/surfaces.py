@@ -8,6 +8,7 @@ positions are gathered when a search needs them.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,7 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 Marker = Callable[[FloatArray], npt.NDArray[np.bool_]]
 
 _CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 def gather_rows(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -106,8 +108,10 @@ class Surface:
         original: Input numbers of the points, the same for every number of ranks, shape (p,).
         reference: Reference positions [m], shape (p, 3).
         area: Tributary area of each point [m^2], shape (p,).
-        owned: Positions in `points` of the nodes this rank owns.
-        rows: Their coordinates among the body's owned ones, shape (owned, 3).
+        rows: Coordinates of the points that this rank owns among the body's owned ones, in the
+            order of `points`, shape (n, 3).
+        share: Positions in `points` of the nodes whose contact this rank computes, wherever their
+            coordinates are: all ranks have as much to do, however the mesh is divided.
         fixed: Which coordinates of the points are prescribed, shape (p, 3).
     """
 
@@ -144,8 +148,9 @@ class Surface:
         if smoothing:
             self._smooth(x)
         low, high = index_map.local_range
-        self.owned = np.flatnonzero((self.points >= low) & (self.points < high))
-        self.rows = 3 * (self.points[self.owned] - low)[:, None] + np.arange(3)
+        own = self.points[(self.points >= low) & (self.points < high)]
+        self.rows = 3 * (own - low)[:, None] + np.arange(3)
+        self.share = np.flatnonzero(_rank_of(self.original, mesh.comm.size) == mesh.comm.rank)
         prescribed = np.zeros(body.num_owned, dtype=bool)
         prescribed[body.fixed] = True
         self.fixed = self.gather(prescribed)
@@ -201,6 +206,14 @@ class Surface:
         """Values at all points, shape (p, 3), from this rank's owned body coordinates."""
         return gather_rows(self.body.comm, values[self.rows])
 
+    def at_own(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values at the points of `rows` from those at the points of `share`. Collective."""
+        comm = self.body.comm
+        table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
+        table[gather_rows(comm, self.share)] = gather_rows(comm, values)
+        start = comm.exscan(len(self.rows)) or 0
+        return table[start : start + len(self.rows)]
+
     def depth(self, x: FloatArray) -> FloatArray:
         """How deep points lie inside the undeformed body, in facet sizes. Collective.
 
@@ -242,6 +255,15 @@ class Surface:
         """Positions of all points [m], shape (p, 3), from this rank's owned displacements."""
         x: FloatArray = self.reference + self.gather(u)
         return x
+
+
+def _rank_of(nodes: IntArray, size: int) -> IntArray:
+    """Rank that computes the contact of each node (input number), shape (n,).
+
+    Multiples of the golden ratio fill the interval evenly: any part of a surface is divided about
+    evenly, the same in all surfaces of a body.
+    """
+    return (np.modf(nodes * _GOLDEN)[0] * size).astype(int)
 
 
 def flux(corners: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ class State:
         time: t [s].
         u: Owned displacements of each body [m].
         v: Owned velocities of each body [m/s].
-        facets: Facet of each owned slave node of each contact in the last step, or -1.
+        facets: Facet of each slave node in this rank's `Surface.share` in the last step, or -1.
         force: Contact force p_N of the same nodes [N], >= 0.
         gap: Gap of the same nodes [m], infinite where a node was no candidate.
         tangential: Friction force on the same nodes [N], shape (n, 3).
@@ -111,7 +111,7 @@ class System:
 
     def initial_state(self) -> State:
         """Undeformed bodies with their initial velocities at t = 0."""
-        nodes = [len(c.slave.owned) for c in self.contacts]
+        nodes = [len(c.slave.share) for c in self.contacts]
         return State(
             time=0.0,
             u=tuple(self._prescribed(b) for b in self.bodies),
@@ -212,7 +212,7 @@ class System:
             moved = pair.master.displacement(state.time, self.comm) if pair.rigid else None
             found = pair.find([state.u[b] for b in bodies], facets, 0.0, moved)
             depth = np.zeros(len(pair.slave.points))
-            depth[pair.slave.owned[found.node]] = np.maximum(-found.gap, 0.0) / found.length
+            depth[pair.slave.share[found.node]] = np.maximum(-found.gap, 0.0) / found.length
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)
             depths.append(depth)
         return depths

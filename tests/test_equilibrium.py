@@ -224,7 +224,7 @@ def patch(slave, master, *, metre=1.0, strain=1e-4, comm=COMM):
         nts.System(bodies, contacts=[nts.ContactPair(slave=faces[0], master=faces[1])])
     )
     assert run.status == "completed"
-    area = faces[0].area[faces[0].owned]
+    area = faces[0].area[faces[0].share]
     pressure = np.concatenate(comm.allgather(run.state.force[0] / area)) * metre / strain
     errors = np.concatenate([np.abs(mean_strain(b, n) / -strain - 1) for b, n in
                              zip(bodies, (slave, master), strict=True)])  # fmt: skip

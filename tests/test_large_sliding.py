@@ -416,7 +416,7 @@ def test_far_away_and_on_ranks_without_facets(integrator, condense):
     """A plate of one cell, which one rank owns, and another that nothing comes near."""
     near = plate(n=(1, 1), name="near")
     far = plate(low=(5.0, 5.0), high=(6.0, 6.0), n=(1, 1), name="far")
-    owned = COMM.allgather(len(near[1].owned))
+    owned = COMM.allgather(len(near[1].rows))
     assert COMM.size == 1 or min(owned) == 0
     start, velocity = (-0.5, 0.1, 0.03), np.array([1.5, 0.4, 0.0])
     system = scene(start, velocity, near, far)

@@ -133,11 +133,11 @@ def test_contact_fields(mpi_tmp_path):
         for fields in (file.fields[0], file.fields[-1])
     )
     slave, force, gap = run.system.contacts[0].slave, run.state.force[0], run.state.gap[0]
-    row = rows_at(file.points, slave.reference[slave.owned])
+    row = rows_at(file.points, slave.reference[slave.share])
     assert COMM.allreduce(force.sum()) > 0
     assert np.array_equal(last["force"][row], force)
     assert np.array_equal(last["gap"][row], gap)
-    assert np.allclose(last["pressure"][row] * slave.area[slave.owned], force, rtol=1e-14)
+    assert np.allclose(last["pressure"][row] * slave.area[slave.share], force, rtol=1e-14)
     assert np.array_equal(last["status"][row], np.where(force > 0, 2.0, 1.0))
 
     surface = file.points[:, 0] > 1 - 1e-9

@@ -82,7 +82,7 @@ class PointSurface(nts.Surface):
         self.points, self.original = np.array([0]), np.array([0])
         self.reference = np.array([position], dtype=float)
         self.facets, self.area = np.empty((0, 4), dtype=np.int64), np.ones(1)
-        self.owned = np.arange(body.num_owned // 3)
+        self.share = np.arange(body.num_owned // 3)
         self.rows = np.arange(body.num_owned).reshape(-1, 3)
         self.fixed = np.zeros((1, 3), dtype=bool)
 

@@ -195,11 +195,27 @@ def test_contact_comes_and_goes(place, integrator, friction):
 def test_one_facet_and_one_slave_cell(integrator, friction):
     """One cell each: every further rank owns neither facet nor slave."""
     system = scene(gap=0.002, velocity=(0.0, 0.0, -1.0), cells=1, friction=friction)
-    owned = np.array(COMM.allgather([len(c.slave.owned) for c in system.contacts]))
+    owned = np.array(COMM.allgather([len(c.slave.rows) for c in system.contacts]))
     assert owned.sum() == 4
     assert COMM.size == 1 or owned.min() == 0
     table = run(system, integrator)
     assert table["active"].max() == 4
+
+
+@pytest.mark.mpi
+def test_contact_is_divided_evenly_however_the_mesh_is():
+    """Every point once, each part of a surface about evenly, and back to where coordinates are."""
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [16, 16, 2], CellType.hexahedron)
+    body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3)
+    surface = body.surface(lambda x: x[2] > 1 - 1e-9)
+    shares = COMM.allgather(surface.share)
+    assert np.array_equal(np.sort(np.concatenate(shares)), np.arange(17**2))
+    x = surface.reference
+    for part in (x[:, 0] < 2, x[:, 0] < 0.4, x[:, 1] > 0.7, np.hypot(*x[:, :2].T) < 0.5):
+        count = np.array([np.count_nonzero(part[share]) for share in shares])
+        assert np.abs(count * COMM.size / part.sum() - 1).max() < 0.25
+    own = body.reference.reshape(-1, 3)[surface.rows[:, 0] // 3]
+    assert np.allclose(surface.at_own(x[surface.share]), own, rtol=0, atol=1e-14)
 
 
 def test_more_ranks_than_cells(on_ranks):

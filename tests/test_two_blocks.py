@@ -158,7 +158,7 @@ def history(comm, integrator, t_end, **scene):
     for _ in range(round(t_end / 2e-3)):
         state = stepper.advance(2e-3)
         surface = stepper.system.contacts[0].slave
-        nodes = surface.original[surface.owned[state.force[0] > 0]]
+        nodes = surface.original[surface.share[state.force[0] > 0]]
         active.append(sorted(n for part in comm.allgather(nodes.tolist()) for n in part))
     table = stepper.solution.balance
     stepper.close()
