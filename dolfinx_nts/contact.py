@@ -127,9 +127,25 @@ class ContactPair:
             return same_nodes and bool(self.master == other.master)
         return same_nodes and np.array_equal(self.master.facets, other.master.facets)
 
+    def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+        """Positions of all points of the slave and of a master surface [m], (p, 3). Collective.
+
+        Args:
+            u: Owned displacements of each of `bodies` [m].
+        """
+        surfaces = (self.slave,) if self.rigid else (self.slave, self.master)
+        return tuple(s.positions(each) for s, each in zip(surfaces, u, strict=True))
+
+    def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
+        """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
+        x = positions[0][self.slave.share[found.node]][:, None]
+        if self.rigid:
+            return x
+        return np.concatenate([x, self.master.control_points(positions[1], found.facet)], axis=1)
+
     def find(
         self,
-        u: Sequence[FloatArray],
+        positions: Sequence[FloatArray],
         current: IntArray,
         reach: float,
         moved: FloatArray | None,
@@ -138,17 +154,16 @@ class ContactPair:
         """Search for this rank's candidates; every rank must call it.
 
         Args:
-            u: Owned displacements of each of `bodies` at t_n [m].
+            positions: Of all points at t_n [m], as from `positions`.
             current: Facet of each of the rank's slave nodes in the last step or -1.
             reach: Bound on the relative motion of slave and master in the step [m].
             moved: Displacement of an obstacle at t_n [m], shape (3,); None of a surface.
             ahead: Displacements of each of `bodies` expected until the middle of the step [m].
         """
         if moved is not None:
-            return self._near_obstacle(u[0], reach, moved)
-        master = self.master.positions(u[1])
+            return self._near_obstacle(positions[0], reach, moved)
+        slaves, master = positions
         corners = master[self.master.facets]
-        slaves = self.slave.positions(u[0])
         radius = reach + _MARGIN * float(facets.size(corners).max())
         # Positions of all points are known everywhere, so all ranks leave here or none.
         if search.apart(slaves, corners, radius):
@@ -192,10 +207,10 @@ class ContactPair:
             node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
         )
 
-    def _near_obstacle(self, u: FloatArray, reach: float, moved: FloatArray) -> Candidates:
+    def _near_obstacle(self, slaves: FloatArray, reach: float, moved: FloatArray) -> Candidates:
         """Candidates of an obstacle. Nothing limits the depth: what is behind it is inside."""
         slave = self.slave
-        x = slave.positions(u)[slave.share] - moved
+        x = slaves[slave.share] - moved
         gap, length = self.master.gap(x), np.sqrt(slave.area[slave.share])
         movable = ~slave.fixed[slave.share].all(axis=1)
         node = np.flatnonzero(movable & (gap.value < reach + _MARGIN * length))

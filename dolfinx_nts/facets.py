@@ -31,6 +31,8 @@ EPS = float(np.finfo(np.float64).eps)
 # Newton converges quadratically, so the step after one of this size is at round-off.
 _LAST_STEP = 1e-10
 _MAX_NEWTON = 60
+# Squared sine of an angle between two edges that is rounding only.
+_COLLINEAR = 1e-14
 _MAX_HALVINGS = 40
 _MAX_BISECTIONS = 120
 
@@ -249,7 +251,7 @@ def _bicubic(start: FloatArray, spans: FloatArray, xi: FloatArray) -> _Expansion
 
 
 def _descent_step(gradient: FloatArray, metric: FloatArray, hessian: FloatArray) -> FloatArray:
-    """Newton step for |xbar - x|^2 / 2 [-], shape (2, n); arguments of `_Expansion`."""
+    """Newton step for |xbar - x|^2 / 2 [-], shape (2, n); makes the Hessian definite in place."""
     in_a, mixed, in_b = hessian
     # Beyond the centre of curvature Newton would climb to a saddle: descend on a definite matrix.
     bound = np.sqrt(np.maximum(in_a, 0.0) * np.maximum(in_b, 0.0))
@@ -393,6 +395,9 @@ def _closest_triangle(start: FloatArray, spans: FloatArray) -> FloatArray:
     """Closest point on triangles [-], shape (n, 2)."""
     gradient, metric, _, _ = _bilinear(_modes(start, spans), np.zeros((2, len(start))))
     xi = -_solve_2x2(metric, gradient).T
+    square = metric[0] * metric[2]
+    flat = square - metric[1] ** 2 <= _COLLINEAR * square
+    xi[flat] = -1.0
     outside = ~((xi >= 0.0).all(axis=1) & (xi.sum(axis=1) <= 1.0))
     xi[outside] = _closest_edge(start[outside], spans[outside])
     return xi

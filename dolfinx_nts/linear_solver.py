@@ -50,6 +50,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         _CONTACT + "pc_python_type": f"{__name__}.SchurInverse",
         _CONTACT + _FACTORS + "pc_type": "lu",
         _CONTACT + _FACTORS + "pc_factor_mat_solver_type": "mumps",
+        # Of a user who takes LU for the first of the two approximations alone.
+        _CONTACT + "pc_factor_mat_solver_type": "mumps",
     },
 }
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
@@ -260,9 +262,9 @@ class SchurInverse:
     """Preconditioner of the contact part: S^-1 ~ F^-1 M F^-1 from two approximations of S.
 
     With F = D - C W B and M = D - C W A W B this is Newton's (Schulz's) step from F^-1 towards the
-    inverse of D - C (2 W - W A W) B. If C and B span a space that A maps into itself, it is exact
-    whatever the diagonal W (the least-squares commutator): about so with consistent mass, which a
-    polynomial in A alone needs more terms for. Without M it is F^-1.
+    inverse of D - C (2 W - W A W) B. Where A W maps what B spans into itself, and D = 0, it is
+    exact (the least-squares commutator): about so with consistent mass, for which a polynomial in
+    A alone needs more terms. Without M it is F^-1.
     """
 
     def create(self, pc: Any) -> None:

@@ -19,7 +19,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.assembly import ElementBlocks, Layout
-from dolfinx_nts.contact import Candidates
 from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.obstacle_contact import ObstacleStep
 from dolfinx_nts.sleep import Sleepers
@@ -216,7 +215,7 @@ class StepProblem:
         if not self._watching:
             return replace(e, idle_gaps=tuple(np.empty(0) for _ in self.idle))
         u = [b.u1 for b in e.bodies]
-        gaps = tuple(c.gap(self._points(k, c.candidates, u)) for k, c in enumerate(self.idle))
+        gaps = tuple(self._gaps(self.idle, u))
         closed = [~(gap >= 0.0) for gap in gaps]
         if not self.system.comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
             return replace(e, idle_gaps=gaps)
@@ -282,11 +281,11 @@ class StepProblem:
         pair, state = self.system.contacts[index], self.state
         ahead = [0.5 * (self.first[b] - state.u[b]) for b in self.system.contact_bodies[index]]
         moved = self._paths[index][0] if pair.rigid else None
-        found = pair.find(u, state.facets[index], reach, moved, ahead)
-        slave, theta = pair.slave, self.integrator.theta
-        x0 = self._points(index, found, state.u)
-        mass = slave.body.nodal_mass if self.integrator.inertia else slave.body.nodal_stiffness()
-        scale = slave.gather(mass)[slave.share[found.node], 0]
+        positions = pair.positions(u)
+        found = pair.find(positions, state.facets[index], reach, moved, ahead)
+        slave, x0, theta = pair.slave, pair.points(positions, found), self.integrator.theta
+        scale = slave.mass if self.integrator.inertia else slave.nodal(slave.body.nodal_stiffness())
+        scale = scale[slave.share[found.node]]
         rule, condense = self.integrator.contact_gradient, self.condense
         if pair.rigid:
             path = self._paths[index]
@@ -313,16 +312,6 @@ class StepProblem:
             for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
                 if len(there):
                     self._found[k] = c.part(~np.isin(np.arange(c.num_pairs), there))
-
-    def _points(self, index: int, found: Candidates, u: Sequence[FloatArray]) -> FloatArray:
-        """Slave and control points of pairs [m], (n, nc + 1, 3), from all bodies' displacements."""
-        pair, bodies = self.system.contacts[index], self.system.contact_bodies[index]
-        slave = pair.slave
-        x = slave.positions(u[bodies[0]])[slave.share[found.node]][:, None]
-        if pair.rigid:
-            return x
-        corners = pair.master.control_points(pair.master.positions(u[bodies[1]]), found.facet)
-        return np.concatenate([x, corners], axis=1)
 
     def _lay_out(self) -> None:
         """Layout, vectors and scatter; kept from step to step while no rank's candidates change."""
@@ -430,9 +419,13 @@ class StepProblem:
 
     def flight_gaps(self) -> list[FloatArray]:
         """Gaps of each contact's candidates after free flight over the step [m]."""
-        return [
-            c.gap(self._points(k, c.candidates, self.first)) for k, c in enumerate(self.contacts)
-        ]
+        return self._gaps(self.contacts, self.first)
+
+    def _gaps(self, contacts: list[ContactStep], u: Sequence[FloatArray]) -> list[FloatArray]:
+        """Gaps of some candidates of all contacts at displacements of all bodies [m]."""
+        bodies = self.system.contact_bodies
+        moved = [c.pair.positions([u[k] for k in b]) for c, b in zip(contacts, bodies, strict=True)]
+        return [c.gap(c.pair.points(x, c.candidates)) for c, x in zip(contacts, moved, strict=True)]
 
     # ---- iterates
     def _positions(self, x: Any) -> list[FloatArray]:

@@ -8,8 +8,8 @@ positions are gathered when a search needs them.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,6 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 Marker = Callable[[FloatArray], npt.NDArray[np.bool_]]
 
 _CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 def gather_rows(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -206,6 +205,16 @@ class Surface:
         """Values at all points, shape (p, 3), from this rank's owned body coordinates."""
         return gather_rows(self.body.comm, values[self.rows])
 
+    def nodal(self, values: FloatArray) -> FloatArray:
+        """Values at all points, shape (p,), from one at each of this rank's owned coordinates."""
+        result: FloatArray = self.gather(values)[:, 0]
+        return result
+
+    @cached_property
+    def mass(self) -> FloatArray:
+        """Mass of the points' nodes [kg], shape (p,). Collective."""
+        return self.nodal(self.body.nodal_mass)
+
     def at_own(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values at the points of `rows` from those at the points of `share`. Collective."""
         comm = self.body.comm
@@ -260,10 +269,14 @@ class Surface:
 def _rank_of(nodes: IntArray, size: int) -> IntArray:
     """Rank that computes the contact of each node (input number), shape (n,).
 
-    Multiples of the golden ratio fill the interval evenly: any part of a surface is divided about
-    evenly, the same in all surfaces of a body.
+    As good as by lot, so that every part of a surface is divided, and alike in all surfaces of a
+    body. The mixing is that of Steele, Lea and Flood's SplitMix64.
     """
-    return (np.modf(nodes * _GOLDEN)[0] * size).astype(int)
+    x = np.asarray(nodes).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
+    rank: IntArray = ((x >> np.uint64(32)) * np.uint64(size) >> np.uint64(32)).astype(int)
+    return rank
 
 
 def flux(corners: FloatArray) -> FloatArray:

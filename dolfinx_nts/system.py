@@ -29,7 +29,7 @@ class State:
         time: t [s].
         u: Owned displacements of each body [m].
         v: Owned velocities of each body [m/s].
-        facets: Facet of each slave node in this rank's `Surface.share` in the last step, or -1.
+        facets: Facet in the last step, or -1, of each slave node in this rank's `Surface.share`.
         force: Contact force p_N of the same nodes [N], >= 0.
         gap: Gap of the same nodes [m], infinite where a node was no candidate.
         tangential: Friction force on the same nodes [N], shape (n, 3).
@@ -210,7 +210,8 @@ class System:
             self.contacts, self.contact_bodies, state.facets, strict=True
         ):
             moved = pair.master.displacement(state.time, self.comm) if pair.rigid else None
-            found = pair.find([state.u[b] for b in bodies], facets, 0.0, moved)
+            positions = pair.positions([state.u[b] for b in bodies])
+            found = pair.find(positions, facets, 0.0, moved)
             depth = np.zeros(len(pair.slave.points))
             depth[pair.slave.share[found.node]] = np.maximum(-found.gap, 0.0) / found.length
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)

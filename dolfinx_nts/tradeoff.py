@@ -204,6 +204,8 @@ def _relative(a: float, b: float) -> float:
 def load(scene: str) -> Any:
     """Module of a scene: a file, or a name in `demos/` here or beside the package.
 
+    It is executed anew each time, with what it imports from its folder.
+
     Raises:
         ValueError: There is no such file, or it has no `main`.
     """
@@ -213,10 +215,19 @@ def load(scene: str) -> Any:
     found = next((p for p in places if p.is_file()), None)
     if found is None:
         raise ValueError(f"scene={scene!r}: no such file; looked for {', '.join(map(str, places))}")
-    spec = importlib.util.spec_from_file_location(found.stem, found)
+    spec = importlib.util.spec_from_file_location(f"scene_{found.stem}", found)
     assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    folder, known = found.resolve().parent, set(sys.modules)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(folder))
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(folder))
+        for name in set(sys.modules) - known - {spec.name}:
+            # A helper may have taken `nts.simulate` as it is in this run.
+            if Path(getattr(sys.modules[name], "__file__", None) or ".").parent == folder:
+                del sys.modules[name]
     if not callable(getattr(module, "main", None)):
         raise ValueError(f"scene={scene!r}: {found} has no function main")
     return module

@@ -294,6 +294,19 @@ def test_closest_point_of_a_saddle_seen_from_its_axis():
         assert distance[0] < abs(height) and np.isclose(distance[0], sampled, rtol=1e-3)
 
 
+def test_closest_point_of_triangles_without_area():
+    """Three corners on a line: the closest point of the longest edge."""
+    rng = np.random.default_rng(21)
+    start, along = rng.normal(size=(2, 1000, 3))
+    at = np.sort(rng.uniform(size=(1000, 3)), axis=1)
+    corners = start[:, None] + at[:, rng.permutation(3), None] * along[:, None]
+    points = rng.normal(size=(1000, 3))
+    t = np.einsum("ni,ni->n", points - start, along) / np.einsum("ni,ni->n", along, along)
+    foot = start + t.clip(at[:, 0], at[:, 2])[:, None] * along
+    _, distance = fc.closest_point(points, corners)
+    assert np.allclose(distance, np.linalg.norm(points - foot, axis=1), rtol=1e-9, atol=0)
+
+
 def test_both_ways_to_the_closest_point_agree():
     rng = np.random.default_rng(14)
     corners, points = random_facets(rng, 1000, 4, 0.15), rng.uniform(-1, 2, (1000, 3))

@@ -1,6 +1,7 @@
 """The program that measures speed against accuracy, on a small script of a user's."""
 
 import csv
+import sys
 
 import numpy as np
 import pytest
@@ -165,3 +166,22 @@ def test_the_reference_takes_a_quarter_of_a_step_that_is_set(script, tmp_path):
 def test_levels_of_accuracy_are_ordered():
     fast, balanced, exact = (ACCURACY[name].rtol for name in ("fast", "balanced", "exact"))
     assert fast > balanced > exact
+
+
+def test_a_script_with_a_module_beside_it(tmp_path):
+    """As `python scene.py` finds it, and anew for each run."""
+    scene, beside = tmp_path / "scene.py", tmp_path / "spacing_of_scene.py"
+    scene.write_text(
+        "from __future__ import annotations\n"
+        "from dataclasses import dataclass\n"
+        "from spacing_of_scene import CELLS\n"
+        "@dataclass\n"
+        "class Size:\n"
+        "    cells: int = CELLS\n"
+        "def main():\n"
+        "    return Size().cells\n"
+    )
+    for cells in (3, 10):
+        beside.write_text(f"CELLS = {cells}\n")
+        assert tradeoff.load(str(scene)).main() == cells
+    assert str(tmp_path) not in sys.path and "spacing_of_scene" not in sys.modules
