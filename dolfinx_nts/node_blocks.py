@@ -27,9 +27,11 @@ def patterns(bodies: Sequence[Any]) -> list[Pattern] | None:
     """Block rows of the bodies' matrices, None unless all consist of whole blocks. Collective.
 
     Bodies of the user's own may have any coordinates, and what contact adds to an AIJ matrix within
-    one body leaves out those that are prescribed.
+    one body leaves out those that are prescribed. Of no rows PETSc has no incomplete factors in
+    blocks.
     """
     nodes = all(a.getBlockSize() == 3 and a.getType() in {"seqaij", "mpiaij"} for a in bodies)
+    nodes &= any(a.getLocalSize()[0] for a in bodies)
     here = [_pattern(a) for a in bodies] if nodes else [None]
     found = [p for p in here if p is not None]
     everywhere = bodies[0].comm.tompi4py().allreduce(len(found) == len(bodies), op=MPI.LAND)

@@ -202,7 +202,28 @@ def test_one_facet_and_one_slave_cell(integrator, friction):
     assert table["active"].max() == 4
 
 
-@pytest.mark.mpi
+@pytest.mark.parametrize("condense", [False, True])
+def test_krylov_with_ranks_that_own_nothing(condense):
+    newton = nts.Newton(linear_solver="krylov", condense=condense)
+    tables = {}
+    for name, comm in (("all", COMM), ("one", MPI.COMM_SELF)):
+        low, high = (
+            create_box(comm, corners, [1, 1, 1], CellType.hexahedron)
+            for corners in ([[0, 0, -1], [1, 1, 0]], [[0.1, 0.1, 0.01], [0.9, 0.9, 0.9]])
+        )
+        base = nts.Continuum(low, RUBBER, density=1e3, name="base")
+        cube = nts.Continuum(high, RUBBER, density=1e3, velocity=(0.5, 0.2, -2), name="cube")
+        slave = cube.surface(lambda x: x[2] < 0.01 + 1e-9)
+        pair = nts.ContactPair(slave, base.surface(lambda x: x[2] > -1e-9), friction=0.3)
+        run = nts.simulate(
+            nts.System([base, cube], contacts=[pair]), nts.EnergyMomentum(),
+            dt=2e-3, t_end=0.03, newton=newton,
+        )  # fmt: skip
+        assert run.status == "completed" and run.balance["active"].max() == 4
+        tables[name] = run.balance["energy"]
+    assert np.abs(tables["all"] / tables["one"] - 1).max() < 1e-10
+
+
 def test_contact_is_divided_evenly_however_the_mesh_is():
     """Every point once, each part of a surface about evenly, and back to where coordinates are."""
     mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [16, 16, 2], CellType.hexahedron)
