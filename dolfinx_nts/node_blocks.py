@@ -19,6 +19,8 @@ from dolfinx_nts import dolfinx_compat as compat
 IntArray = npt.NDArray[np.signedinteger[Any]]
 #: Nodes at a time.
 _CHUNK = 500
+#: Name by which a matrix knows its pattern.
+_PATTERN = "dolfinx_nts_pattern"
 #: Of each part of a body's matrix: where its block rows begin, and the nodes in their columns.
 Pattern = list[tuple[IntArray, IntArray]]
 
@@ -39,7 +41,26 @@ def patterns(bodies: Sequence[Any]) -> list[Pattern] | None:
 
 
 def _pattern(a: Any) -> Pattern | None:
-    """Block rows of this rank's parts of an AIJ matrix, if its entries are whole blocks."""
+    """Block rows of this rank's parts of an AIJ matrix, if its entries are whole blocks.
+
+    The matrix keeps it: contact has a new layout much more often than a body has.
+    """
+    known: Pattern | None = a.getAttr(_PATTERN)
+    if known is None or _grown(a, known):
+        known = _find_pattern(a)
+        a.setAttr(_PATTERN, known)
+    return known
+
+
+def _grown(a: Any, pattern: Pattern) -> bool:
+    """Whether an AIJ matrix has entries on this rank that are not in its pattern."""
+    return any(
+        not np.array_equal(scalar[::3], 9 * pointer)
+        for (pointer, _), (scalar, *_) in zip(pattern, compat.csr_parts(a), strict=True)
+    )
+
+
+def _find_pattern(a: Any) -> Pattern | None:
     parts = []
     for pointer, column, number, _ in compat.csr_parts(a):
         length = np.diff(pointer).reshape(-1, 3)
@@ -131,11 +152,7 @@ class NodeBlocks:
         Two runs of one system that take turns share the bodies' matrices, and one that stores them
         otherwise adds contact within a body to them.
         """
-        grown = any(
-            not np.array_equal(scalar[::3], 9 * pointer)
-            for a, parts in zip(self._bodies, self._patterns, strict=True)
-            for (pointer, _), (scalar, *_) in zip(parts, compat.csr_parts(a), strict=True)
-        )
+        grown = any(map(_grown, self._bodies, self._patterns))
         return bool(self._bodies[0].comm.tompi4py().allreduce(grown, op=MPI.LOR))
 
     def fill(self, matrix: Any) -> None:
