@@ -50,9 +50,10 @@ class Newton:
         max_retries: How often a dropped step may be halved before the run stops.
         condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
             lambda_N and lambda_T reach the linear solver: the same solution in fewer iterations.
-        linear_solver: "direct" (MUMPS) or "krylov" (GMRES with incomplete factors of the bodies and
-            a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth. Its
-            incomplete factors weaken as dt grows beyond the time a wave needs through an element.
+        linear_solver: "direct" (MUMPS) or "krylov" (FGMRES with incomplete factors of the bodies
+            and a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth.
+            Its incomplete factors weaken as dt grows beyond the time a wave needs through an
+            element.
             "auto" takes "krylov" while that is the faster one: not below 600 coordinates (100
             where no contact is declared), nor in statics, nor with `petsc_options` beyond those of
             SNES, nor for the next steps after a solve that needed more iterations than MUMPS is
