@@ -17,6 +17,9 @@ from petsc4py import PETSc
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import node_blocks
 
+#: Coordinates of the busiest rank over the mean; parts of the mesh with their overlap come to more.
+_EVENLY = 1.25
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
@@ -143,6 +146,7 @@ class StepMatrix:
             self._parts = [PETSc.Mat().createNest(q, comm=layout.comm) for q in quarters]
         local = layout.counts[layout.comm.rank]
         layouts = [Layout(layout.comm, local[half].tolist()) for half in halves]
+        self._body_layout = layouts[0]
         numbers = [self._numbers(*each) for each in zip(halves, layouts, strict=True)]
         if found is not None:
             contact = [number for _, number in numbers[0]]
@@ -338,6 +342,22 @@ class StepMatrix:
             values = tangents[e][:, element.columns[i], element.columns[j]]
             _add(a, element.numbers[i], element.numbers[j], values)
         a.assemble()
+
+    def whole_bodies(self) -> list[IntArray] | None:
+        """Numbers of the bodies dealt to this rank in their part of the operator, body by body.
+
+        Returns:
+            None unless the bodies divide among all ranks about evenly; the same on all ranks.
+        """
+        layout, comm = self._body_layout, self._layout.comm
+        sizes = layout.counts[:, : len(self._bodies)].sum(axis=0)
+        load, mine = np.zeros(comm.size), []
+        for k in np.argsort(-sizes, kind="stable"):
+            rank = int(load.argmin())
+            load[rank] += sizes[k]
+            if rank == comm.rank:
+                mine.append(np.sort(layout.to_system(k, np.arange(sizes[k]))))
+        return mine if load.max() <= _EVENLY * load.mean() else None
 
     def field_sets(self, num_bodies: int) -> tuple[tuple[str, Any], tuple[str, Any]]:
         """Index sets "bodies" and "contact" of the system vector for a field split."""

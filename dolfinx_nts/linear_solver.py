@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from petsc4py import PETSc
@@ -56,6 +56,17 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
 # wall has more constraints than coordinates.
+#: In place of the preset's on several ranks: parts of the mesh, which overlap by a node. It halves
+#: the iterations of smooth motion; alone there is none.
+_PARTS = {_BODIES + "pc_type": "asm"}
+#: The same where each rank takes whole bodies: as few iterations as on one rank. Their numbering
+#: is that of the parts, which makes incomplete factors poor; of blocks PETSc reorders LU's only.
+_WHOLE = _PARTS | {
+    _BODIES + "pc_asm_type": "basic",
+    _BODIES + "pc_asm_overlap": 0,
+    _BODIES + "sub_pc_type": "ilu",
+    _BODIES + "sub_pc_factor_mat_ordering_type": "rcm",
+}
 PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
 #: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
 #: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.
@@ -118,13 +129,13 @@ class SolverOptions:
         self._comm, self._given = comm, dict(given)
         known = dict(PRESETS[preset])
         if preset == "krylov" and comm.size > 1:
-            # An overlap of one node halves the iterations of smooth motion; alone there is none.
-            known[_BODIES + "pc_type"] = "asm"
+            known |= _PARTS
         if limit is not None:
             known["ksp_max_it"] = limit
         if condense and preset in _CONDENSED:
             known = {k: v for k, v in known.items() if not k.startswith(_CONTACT + _FACTORS)}
             known |= _CONDENSED[preset]
+        self._preset = known
         self._all = {**known, **given}
         self._unchecked = set(given)
         self._entered: dict[str, str] = {}
@@ -150,7 +161,9 @@ class SolverOptions:
         """Whether the bodies' matrices may be in blocks: their preconditioner is the preset's."""
         return self.split and not any(k.startswith(("pc_", _BODIES)) for k in self._given)
 
-    def configure(self, snes: Any, matrix: StepMatrix | None, num_bodies: int) -> None:
+    def configure(
+        self, snes: Any, matrix: StepMatrix | None, num_bodies: int, *, whole: bool = False
+    ) -> None:
         """Set a SNES up from the options.
 
         Without contact unknowns a field split has one part only, so the bodies' options are used.
@@ -159,10 +172,12 @@ class SolverOptions:
             snes: The SNES.
             matrix: Its matrix, if there are contact unknowns to split off.
             num_bodies: Fields of the matrix that are bodies.
+            whole: Whether each rank's preconditioner takes whole bodies, see `take_bodies`.
 
         Raises:
             ValueError: PETSc refuses a value.
         """
+        self._all = self._preset | (_WHOLE if whole else {}) | self._given
         options = {k: k for k in self._all}
         if matrix is None and self.split:
             outer = {k: k for k in self._all if not k.startswith(("pc_", "fieldsplit_"))}
@@ -320,6 +335,28 @@ def set_schur(snes: Any, first: Any, second: Any) -> None:
     """
     first.compose(_SECOND, second)
     snes.getKSP().getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, first)
+
+
+def take_bodies(snes: Any, operator: Any, bodies: Sequence[Any], contact: bool) -> None:
+    """Let this rank's preconditioner take whole bodies. Collective, before the first solve.
+
+    Args:
+        snes: Configured with `whole`.
+        operator: What it solves with.
+        bodies: Numbers of each body in the bodies' part of the operator.
+        contact: Whether the preconditioner is a field split.
+    """
+    ksp = snes.getKSP()
+    ksp.setOperators(operator, operator)
+    pc = ksp.getPC()
+    if contact:
+        pc.setUp()
+        pc = pc.getFieldSplitSubKSP()[0].getPC()
+    index = [numbers.astype(PETSc.IntType) for numbers in bodies]
+    parts = [PETSc.IS().createGeneral(numbers, comm=PETSc.COMM_SELF) for numbers in index]
+    pc.setASMLocalSubdomains(len(parts), parts)
+    for part in parts:
+        part.destroy()
 
 
 def keep_bodies(snes: Any, keep: bool) -> None:

@@ -22,6 +22,7 @@ from dolfinx_nts.linear_solver import (
     keep_bodies,
     most_iterations,
     set_schur,
+    take_bodies,
 )
 from dolfinx_nts.step import EQUAL, BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.system import System
@@ -295,8 +296,13 @@ class StepSolver:
         self.snes.setTolerances(max_it=self.newton.max_iterations)
         contact = self.matrix if self.problem.elements else None
         self._solved = False
-        self._options.configure(self.snes, contact, len(self.problem.awake))
+        ours = self._options.blocked and self.problem.system.comm.size > 1
+        bodies = self.matrix.whole_bodies() if ours else None
+        whole = bodies is not None
+        self._options.configure(self.snes, contact, len(self.problem.awake), whole=whole)
         self._refresh_schur()
+        if bodies is not None:
+            take_bodies(self.snes, self.matrix.operator, bodies, contact is not None)
 
     def _refresh_schur(self) -> None:
         """Give the preset's field split the Schur complement of the matrix as it is now."""

@@ -283,6 +283,65 @@ def test_rows_that_are_whole_only_one_after_another():
     a.destroy()
 
 
+def thrown_cubes(comm, *cells):
+    """Cubes in a row, the first thrown at the others."""
+    hexahedron = CellType.hexahedron
+    bodies = [
+        nts.Continuum(
+            create_box(comm, [[1.01 * k, 0, 0], [1.01 * k + 1, 1, 1]], [n] * 3, hexahedron),
+            nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, name=f"cube {k}",
+            velocity=(3.0 if k == 0 else 0.0, 0.1 * k, 0.0),
+        )
+        for k, n in enumerate(cells)
+    ]  # fmt: skip
+    contacts = [
+        nts.ContactPair(
+            slave=bodies[k].surface(lambda x, end=1.01 * k + 1: x[0] > end - 1e-9),
+            master=bodies[k + 1].surface(lambda x, end=1.01 * k + 1.01: x[0] < end + 1e-9),
+            friction=0.2,
+        )
+        for k in range(len(bodies) - 1)
+    ]
+    return nts.System(bodies, contacts=contacts)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("reuse", [False, True])
+def test_as_many_bodies_as_ranks_need_no_more_iterations_than_one_rank(reuse):
+    counts, energy = [], []
+    for comm in (COMM, MPI.COMM_SELF):
+        system = thrown_cubes(comm, *[6] * max(2, COMM.size))
+        stepper = stepper_of(system, linear_solver="krylov", reuse=reuse)
+        count = 0
+        for _ in range(10):
+            stepper.advance(1e-3)
+            count += stepper.solver.snes.getLinearSolveIterations()
+        assert stepper.solution.rows[-1]["active"] > 0
+        counts.append(count)
+        energy.append(stepper.solution.balance["energy"])
+        stepper.close()
+    assert counts[0] <= 1.1 * counts[1]
+    assert np.abs(energy[0] / energy[1] - 1).max() < 1e-10
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("cells", "ranks"), [((4, 4), (1, 2)), ((4, 6), (1,)), ((3, 3, 3, 3), (1, 2, 4))]
+)
+def test_bodies_are_dealt_to_ranks_where_they_divide_evenly(cells, ranks):
+    stepper = stepper_of(thrown_cubes(COMM, *cells), linear_solver="krylov")
+    for _ in range(2):
+        stepper.advance(1e-3)
+    matrix = stepper.solver.matrix
+    own = matrix.whole_bodies()
+    assert (own is not None) == (COMM.size in ranks)
+    if own is not None:
+        parts = [n for part in COMM.allgather(own) for n in part]
+        assert sorted(map(len, parts)) == sorted(3 * (n + 1) ** 3 for n in cells)
+        assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(stepper.system.size))
+    stepper.close()
+
+
 @pytest.mark.mpi
 def test_a_pattern_that_grows_under_another_run_of_the_same_scene():
     """MUMPS adds the contact of a smooth master's nodes to the matrices that both runs share."""
