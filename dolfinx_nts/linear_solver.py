@@ -15,6 +15,8 @@ _BODIES = "fieldsplit_bodies_"
 _CONTACT = "fieldsplit_contact_"
 #: What `SchurInverse` factorises with.
 _FACTORS = "factors_"
+#: Name by which its matrix knows the second approximation.
+_SECOND = "dolfinx_nts_second"
 #: What `Newton.linear_solver` may be.
 SOLVERS = ("auto", "direct", "krylov")
 #: Presets; a user's `petsc_options` override them one by one.
@@ -319,10 +321,6 @@ class SchurInverse:
         for each in (self._factors, self._between, *self._work):
             if each:
                 each.destroy()
-
-
-#: Name by which a matrix knows the second approximation.
-_SECOND = "dolfinx_nts_second"
 
 
 def set_schur(snes: Any, first: Any, second: Any) -> None:

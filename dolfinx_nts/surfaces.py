@@ -215,11 +215,16 @@ class Surface:
         """Mass of the points' nodes [kg], shape (p,). Collective."""
         return self.nodal(self.body.nodal_mass)
 
+    @cached_property
+    def _dealt(self) -> IntArray:
+        """Shares of all ranks one after another. Collective."""
+        return gather_rows(self.body.comm, self.share)
+
     def at_own(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values at the points of `rows` from those at the points of `share`. Collective."""
         comm = self.body.comm
         table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
-        table[gather_rows(comm, self.share)] = gather_rows(comm, values)
+        table[self._dealt] = gather_rows(comm, values)
         start = comm.exscan(len(self.rows)) or 0
         return table[start : start + len(self.rows)]
 

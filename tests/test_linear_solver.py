@@ -150,6 +150,22 @@ def test_schur_complement_saves_iterations():
     assert 0 < counts[0] < 0.85 * counts[1]
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("condense", [False, True])
+def test_contact_part_by_a_solver_of_the_user(condense):
+    """LU of the first approximation alone: zeros on its diagonal need MUMPS unless condensed."""
+    tables = []
+    for options in (None, {"fieldsplit_contact_pc_type": "lu"}):
+        newton = nts.Newton(linear_solver="krylov", condense=condense, max_retries=0)
+        run = nts.simulate(
+            pressed_block(0.3), nts.EnergyMomentum(), dt=1e-3, t_end=0.02, newton=newton,
+            petsc_options=options,
+        )  # fmt: skip
+        assert run.status == "completed" and run.balance["active"].max() > 0
+        tables.append(run.balance)
+    assert difference(*tables) < 1e-9
+
+
 @pytest.mark.parametrize(
     ("given", "ours"),
     [
