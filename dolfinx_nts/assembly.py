@@ -1,6 +1,6 @@
 """The PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> solvers.
 
-No other file creates any. Fields of the step problem are the bodies, then (with the energy-momentum
+Fields of the step problem are the bodies, then (with the energy-momentum
 scheme) the augmented unknowns (d, f), then the multipliers. A rank's unknowns are contiguous: its
 part of body 1, body 2, .., (d, f), multipliers.
 """
@@ -16,6 +16,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import node_blocks
+from dolfinx_nts.schur import SchurApproximation
 
 #: Coordinates of the busiest rank over the mean; parts of the mesh with their overlap come to more.
 _EVENLY = 1.25
@@ -83,6 +84,60 @@ class ElementBlocks(NamedTuple):
     pattern: npt.NDArray[np.bool_]
 
 
+class Entries(NamedTuple):
+    """Entries of a batch of contact tangents, and where they stand in a matrix.
+
+    Attributes:
+        batch: Number of the batch.
+        rows: In an element's tangent, shape (k,).
+        cols: Likewise.
+        row_numbers: In the matrix, shape (n, k); negative ones are left out.
+        col_numbers: Likewise.
+    """
+
+    batch: int
+    rows: IntArray
+    cols: IntArray
+    row_numbers: IntArray
+    col_numbers: IntArray
+
+
+class Triplets:
+    """An AIJ matrix made of certain entries of the contact tangents, whoever owns their rows.
+
+    Args:
+        comm: MPI communicator.
+        size: Its rows and columns on this rank.
+        parts: The entries.
+
+    Attributes:
+        matrix: The PETSc matrix.
+    """
+
+    def __init__(self, comm: Any, size: tuple[int, int], parts: Sequence[Entries]) -> None:
+        self._entries = [(part.batch, part.rows, part.cols) for part in parts]
+        self.matrix = PETSc.Mat().create(comm)
+        self.matrix.setSizes(((size[0], None), (size[1], None)))
+        self.matrix.setType("aij")
+        none = np.empty(0, np.int64)
+        rows = np.concatenate([none, *(part.row_numbers.ravel() for part in parts)])
+        cols = np.concatenate([none, *(part.col_numbers.ravel() for part in parts)])
+        compat.set_preallocation_coo(self.matrix, rows, cols)
+
+    def set(self, tangents: Sequence[FloatArray]) -> None:
+        """Replace all values. Collective.
+
+        Args:
+            tangents: Of each batch of elements, shape (n, r, r).
+        """
+        values = [tangents[e][:, rows, cols].ravel() for e, rows, cols in self._entries]
+        compat.set_values_coo(self.matrix, np.concatenate([np.empty(0), *values]))
+
+    def destroy(self) -> None:
+        """Free the PETSc object."""
+        self.matrix.destroy()
+
+
 class StepMatrix:
     """Nested Jacobian of the step problem, and the form of it that the solvers see.
 
@@ -114,7 +169,7 @@ class StepMatrix:
     ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
         self._in_bodies: list[FloatArray] = []
-        self._in_operator: list[FloatArray] = []
+        self._corner_values: list[FloatArray] = []
         self._sources: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
         for e, element in enumerate(elements):
             for i, row in enumerate(element.fields):
@@ -122,11 +177,9 @@ class StepMatrix:
                     self._sources.setdefault((row, col), []).append((e, i, j))
         fields = range(layout.counts.shape[1])
         found = node_blocks.patterns(bodies) if blocked else None
-        self._by_nodes: node_blocks.NodeBlocks | None = None
         if found is not None:
             for key in [k for k in self._sources if max(k) < len(bodies)]:
                 del self._sources[key]
-        self._split = split and len(fields) > len(bodies)
         self._blocks = {
             key: self._new_block(*key)
             for key in self._sources
@@ -134,65 +187,56 @@ class StepMatrix:
         }
         grid = [[self._block(i, j) for j in fields] for i in fields]
         self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
-        self._parts = [self.nest]
-        halves = [list(fields)]
-        if self._split:
-            for k in range(len(bodies)):
-                for key in ((k, len(bodies)), (len(bodies), k)):
-                    if key not in self._blocks:
-                        grid[key[0]][key[1]] = self._blocks[key] = self._zero_block(*key)
-            halves = [list(fields[: len(bodies)]), list(fields[len(bodies) :])]
-            quarters = [[[grid[i][j] for j in b] for i in a] for a in halves for b in halves]
-            self._parts = [PETSc.Mat().createNest(q, comm=layout.comm) for q in quarters]
+        self._split = split and len(fields) > len(bodies)
+        halves = [fields[: len(bodies)], fields[len(bodies) :]] if self._split else [fields]
         local = layout.counts[layout.comm.rank]
         layouts = [Layout(layout.comm, local[half].tolist()) for half in halves]
         self._body_layout = layouts[0]
         numbers = [self._numbers(*each) for each in zip(halves, layouts, strict=True)]
+        # The operator's upper left corner: the bodies, or all that there is if it is not split. Of
+        # each batch the columns of its elements that are in it, and their numbers there.
+        self._corner_numbers = numbers[0]
+        quarters = [(i, j) for i in range(len(halves)) for j in range(len(halves))][1:]
+        self._contact = []
+        for i, j in quarters:
+            size = (layouts[i].num_owned, layouts[j].num_owned)
+            parts = [self._entries(e, numbers[i][e], numbers[j][e]) for e in range(len(elements))]
+            self._contact.append(Triplets(layout.comm, size, parts))
+        self._corner_source = self.nest
+        if self._split:
+            grid = [row[: len(bodies)] for row in grid[: len(bodies)]]
+            self._corner_source = PETSc.Mat().createNest(grid, comm=layout.comm)
+        self._by_nodes: node_blocks.NodeBlocks | None = None
+        self._corner = PETSc.Mat()
         if found is not None:
-            contact = [number for _, number in numbers[0]]
+            contact = [number for _, number in self._corner_numbers]
             self._by_nodes = node_blocks.NodeBlocks(bodies, found, layouts[0].to_system, contact)
-        self._part_numbers = [(a, b) for a in numbers for b in numbers]
-        self._converted = [PETSc.Mat() for _ in self._parts]
-        if self._by_nodes:
-            size = (self._by_nodes.size, None)
-            self._converted[0].createBAIJ(
-                (size, size), 3, nnz=self._by_nodes.room, comm=layout.comm
-            )
-        self._near: tuple[Any, ...] = ()
+            own = (self._by_nodes.size, None)
+            self._corner.createBAIJ((own, own), 3, nnz=self._by_nodes.room, comm=layout.comm)
+        self._schur: SchurApproximation | None = None
+        self._bodies_renewed = False
         self.operator: Any = None
 
     def _block(self, i: int, j: int) -> Any:
         if i == j and i < len(self._bodies):
             return self._bodies[i]
-        return self._blocks.get((i, j))
+        block = self._blocks.get((i, j))
+        return block.matrix if block else None
+
+    def _new_block(self, row: int, col: int) -> Triplets:
+        local, parts = self._layout.counts[self._layout.comm.rank], []
+        for e, i, j in self._sources[row, col]:
+            columns, numbers = self._elements[e].columns, self._elements[e].numbers
+            sides = [(np.arange(columns[k].start, columns[k].stop), numbers[k]) for k in (i, j)]
+            parts.append(self._entries(e, *sides))
+        return Triplets(self._layout.comm, (int(local[row]), int(local[col])), parts)
 
     def _entries(
-        self, source: tuple[int, int, int]
-    ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Element rows and columns of a block, and their numbers in the fields (n, entries)."""
-        e, i, j = source
-        element = self._elements[e]
-        rows, cols = np.nonzero(element.pattern[element.columns[i], element.columns[j]])
-        return rows, cols, element.numbers[i][:, rows], element.numbers[j][:, cols]
-
-    def _zero_block(self, row: int, col: int) -> Any:
-        """A body without contact still has its place in the nest of a split."""
-        local = self._layout.counts[self._layout.comm.rank]
-        sizes = ((int(local[row]), None), (int(local[col]), None))
-        a = PETSc.Mat().createAIJ(sizes, nnz=0, comm=self._layout.comm)
-        a.assemble()
-        return a
-
-    def _new_block(self, row: int, col: int) -> Any:
-        parts = [self._entries(s)[2:] for s in self._sources[row, col]]
-        rows = np.concatenate([p[0].ravel() for p in parts])
-        cols = np.concatenate([p[1].ravel() for p in parts])
-        local = self._layout.counts[self._layout.comm.rank]
-        a = PETSc.Mat().create(self._layout.comm)
-        a.setSizes(((int(local[row]), None), (int(local[col]), None)))
-        a.setType("aij")
-        compat.set_preallocation_coo(a, rows, cols)
-        return a
+        self, e: int, rows: tuple[IntArray, IntArray], cols: tuple[IntArray, IntArray]
+    ) -> Entries:
+        """Of a batch what can be non-zero in some rows and columns (r,), numbered as (n, r)."""
+        i, j = np.nonzero(self._elements[e].pattern[np.ix_(rows[0], cols[0])])
+        return Entries(e, rows[0][i], cols[0][j], rows[1][:, i], cols[1][:, j])
 
     def assemble(self, tangents: Sequence[FloatArray], *, fresh: bool = True) -> None:
         """Add the contact tangents (n, r, r); refresh nest and operator.
@@ -202,94 +246,81 @@ class StepMatrix:
             fresh: The bodies' matrices are without contact, newly assembled; else they are as the
                 last call left them, and only the operator is changed.
         """
-        if self.operator is not None and not fresh:
-            self._change_operator(tangents)
-            return
-        self._in_bodies = self._in_operator = list(tangents)
+        corner = [
+            t[:, c][:, :, c] for t, (c, _) in zip(tangents, self._corner_numbers, strict=True)
+        ]
+        if self.operator is None or fresh:
+            self._renew(tangents, corner)
+        else:
+            # On several ranks converting is slow.
+            self._change([a - b for a, b in zip(corner, self._corner_values, strict=True)])
+        self._corner_values = corner
+        for part in self._contact:
+            part.set(tangents)
+        if self.operator is None:
+            self.operator = self._corner
+            if self._split:
+                b, c, d = (part.matrix for part in self._contact)
+                grid = [[self._corner, b], [c, d]]
+                self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
+            self.operator.assemble()
+        # To assemble a nest is to assemble its blocks, each with a message from all to all.
+        self.operator.stateIncrease()
+
+    def _renew(self, tangents: Sequence[FloatArray], corner: Sequence[FloatArray]) -> None:
+        """Bring the nest and the operator's corner up to the bodies' matrices, with contact."""
+        self._bodies_renewed = True
+        self._in_bodies = list(tangents)
         for key, sources in self._sources.items():
             if key in self._blocks:
-                values = [self._values(s, tangents) for s in sources]
-                compat.set_values_coo(
-                    self._blocks[key], np.concatenate([v.ravel() for v in values])
-                )
+                self._blocks[key].set(tangents)
             else:
                 self._add_to_body(self._bodies[key[0]], sources, tangents)
-        for part in (self.nest, *self._parts):
-            part.assemble()
-        for k in range(len(self._parts)):
-            self._convert(k, tangents)
-        if self.operator is None:
-            self.operator = self._converted[0]
-            if self._split:
-                grid = [self._converted[:2], self._converted[2:]]
-                self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
-        self.operator.assemble()
+        self.nest.assemble()
+        if self._by_nodes:
+            self._by_nodes.fill(self._corner)
+            self._add(corner)
+            return
+        if self._split:
+            self._corner_source.assemble()
+        # Without `out` the nest itself is converted.
+        self._corner_source.convert("aij", out=self._corner)
+
+    def _change(self, change: Sequence[FloatArray]) -> None:
+        """Add to the contact tangents in the operator's corner."""
+        # Outside the pattern of an element its tangent is zero.
+        self._corner.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
+        self._add(change)
+
+    def _add(self, values: Sequence[FloatArray]) -> None:
+        for (_, number), each in zip(self._corner_numbers, values, strict=True):
+            if self._by_nodes:
+                node_blocks.add(self._corner, number, each)
+            else:
+                _add_block(self._corner, number, number, each)
+        self._corner.assemble()
 
     def outgrown(self) -> bool:
         """Whether the bodies' matrices have entries the operator has no room for. Collective."""
         return self._by_nodes is not None and self._by_nodes.outgrown()
 
-    def _convert(self, k: int, tangents: Sequence[FloatArray]) -> None:
-        """Bring what the solvers see of a part up to date."""
-        if k or not self._by_nodes:
-            # Without `out` the nest itself is converted.
-            self._parts[k].convert("aij", out=self._converted[k])
-            return
-        bodies = self._converted[0]
-        self._by_nodes.fill(bodies)
-        for (i, row), tangent in zip(self._part_numbers[0][0], tangents, strict=True):
-            _add(bodies, row, row, tangent[:, i][:, :, i])
-        bodies.assemble()
+    def schur(self) -> SchurApproximation:
+        """Approximate Schur complements of the contact unknowns, as the operator is. Collective.
 
-    def _change_operator(self, tangents: Sequence[FloatArray]) -> None:
-        """Put other contact tangents into the operator; on several ranks converting is slow."""
-        change = [a - b for a, b in zip(tangents, self._in_operator, strict=True)]
-        self._in_operator = list(tangents)
-        for a, (rows, cols) in zip(self._converted, self._part_numbers, strict=True):
-            # Outside the pattern of an element its tangent is zero.
-            a.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
-            for (i, row), (j, col), values in zip(rows, cols, change, strict=True):
-                _add(a, row, col, values[:, i][:, :, j])
-            a.assemble()
-        self.operator.assemble()
-
-    def schur(self) -> tuple[Any, Any]:
-        """Two approximate Schur complements of the contact unknowns in the bodies' coordinates.
-
-        They are D - C W B and D - C W A W B, of the coordinates in contact alone: the inverse of
-        their block A of the bodies' matrix is replaced by the diagonal matrix W of one over the
-        sums of the moduli of its rows, and by W A W. `linear_solver.SchurInverse` uses them. The
-        caller destroys the matrices. Collective.
+        What they take of the bodies is of the last fresh assembly.
         """
-        bodies, above, below, contact = self._converted
-        rows, cols, *kept = self._near or (*self._touched(), None, None, None, None)
-        near, first, back, second = kept
-        if self._by_nodes:
-            # PETSc has no product of the two formats, nor renews a part of MPIBAIJ.
-            square = bodies.createSubMatrix(rows, rows)
-            near = square.convert("aij", out=near or PETSc.Mat())
-            square.destroy()
-        else:
-            near = bodies.createSubMatrix(rows, rows, submat=near)
-        first = above.createSubMatrix(rows, cols, submat=first)
-        back = below.createSubMatrix(cols, rows, submat=back)
-        pointer, _, values = near.getValuesCSR()
-        inverse = near.createVecLeft()
-        inverse.array_w[:] = 1.0 / np.add.reduceat(np.abs(values), pointer[:-1])
-        first.diagonalScale(inverse, None)
-        second = near.matMult(first, result=second)
-        second.diagonalScale(inverse, None)
-        inverse.destroy()
-        self._near = (rows, cols, near, first, back, second)
-        result = back.matMult(first), back.matMult(second)
-        for product in result:
-            product.aypx(-1.0, contact, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        return result
+        if self._schur is None:
+            self._schur = SchurApproximation(*self._touched())
+        if self._bodies_renewed:
+            self._schur.renew_bodies(self._corner)
+            self._bodies_renewed = False
+        self._schur.renew(*(part.matrix for part in self._contact))
+        return self._schur
 
     def _touched(self) -> tuple[Any, Any]:
         """Index sets of this rank's coordinates in contact and of its contact unknowns."""
-        comm, mark = self._layout.comm, self._converted[0].createVecLeft()
-        for _, numbers in self._part_numbers[0][0]:
+        comm, mark = self._layout.comm, self._corner.createVecLeft()
+        for _, numbers in self._corner_numbers:
             index = numbers[numbers >= 0].astype(PETSc.IntType)
             mark.setValues(index, np.ones(len(index)), addv=PETSc.InsertMode.ADD_VALUES)
         mark.assemble()
@@ -300,7 +331,7 @@ class StepMatrix:
             touched = (3 * np.unique(touched // 3)[:, None] + np.arange(3)).ravel()
         touched = (start + touched).astype(PETSc.IntType)
         mark.destroy()
-        start, stop = self._converted[3].getOwnershipRange()
+        start, stop = self._contact[2].matrix.getOwnershipRange()
         cols = PETSc.IS().createStride(stop - start, start, 1, comm=comm)
         return PETSc.IS().createGeneral(touched, comm=comm), cols
 
@@ -311,13 +342,6 @@ class StepMatrix:
             if key not in self._blocks and change:
                 self._add_to_body(self._bodies[key[0]], sources, change)
         self._in_bodies = []
-
-    def _values(self, source: tuple[int, int, int], tangents: Sequence[FloatArray]) -> FloatArray:
-        e, i, j = source
-        rows, cols, _, _ = self._entries(source)
-        columns = self._elements[e].columns
-        values: FloatArray = tangents[e][:, columns[i], columns[j]][:, rows, cols]
-        return values
 
     def _numbers(self, fields: Sequence[int], own: Layout) -> list[tuple[IntArray, IntArray]]:
         """Each batch's columns in some fields, and their numbers in the layout of these alone."""
@@ -340,7 +364,7 @@ class StepMatrix:
         for e, i, j in sources:
             element = self._elements[e]
             values = tangents[e][:, element.columns[i], element.columns[j]]
-            _add(a, element.numbers[i], element.numbers[j], values)
+            _add_block(a, element.numbers[i], element.numbers[j], values)
         a.assemble()
 
     def whole_bodies(self) -> list[IntArray] | None:
@@ -377,19 +401,15 @@ class StepMatrix:
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
-        operator = [self.operator] if self._split and self.operator else []
-        nests = [self.nest, *(self._parts if self._split else [])]
-        for a in (
-            *operator,
-            *self._near,
-            *self._converted,
-            *nests,
-            *self._blocks.values(),
-        ):
+        made = [self.nest, self._corner, *self._contact, *self._blocks.values()]
+        if self._split:
+            made += [self._corner_source, *([self.operator] if self.operator else [])]
+        made += [self._schur] if self._schur else []
+        for a in made:
             a.destroy()
 
 
-def _add(a: Any, rows: IntArray, cols: IntArray, values: FloatArray) -> None:
+def _add_block(a: Any, rows: IntArray, cols: IntArray, values: FloatArray) -> None:
     """Add blocks (n, r, c) at rows (n, r) and columns (n, c); negative numbers are left out."""
     (n, num_rows), num_cols = rows.shape, cols.shape[1]
     a.setValuesIJV(

@@ -21,7 +21,6 @@ from dolfinx_nts.linear_solver import (
     choose,
     keep_bodies,
     most_iterations,
-    set_schur,
     take_bodies,
 )
 from dolfinx_nts.step import EQUAL, BodyTerms, Evaluation, StepProblem
@@ -308,10 +307,7 @@ class StepSolver:
         """Give the preset's field split the Schur complement of the matrix as it is now."""
         if self.problem.elements and self._options.schur:
             assert self.matrix is not None
-            pair = self.matrix.schur()
-            set_schur(self.snes, *pair)
-            for matrix in pair:
-                matrix.destroy()
+            self.matrix.schur().give(self.snes)
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:

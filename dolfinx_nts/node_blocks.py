@@ -173,6 +173,29 @@ class NodeBlocks:
         matrix.assemble(PETSc.Mat.AssemblyType.FLUSH)
 
 
+def add(matrix: Any, numbers: IntArray, values: npt.NDArray[np.float64]) -> None:
+    """Add blocks of elements to a BAIJ matrix, to be assembled.
+
+    Args:
+        matrix: The matrix.
+        numbers: Of the elements' coordinates in the matrix, three to a node, shape (n, 3 nodes);
+            negative ones are left out.
+        values: Shape (n, 3 nodes, 3 nodes).
+    """
+    n, count = len(numbers), numbers.shape[1] // 3
+    out = numbers < 0
+    if out.any():
+        values = np.where(out[:, :, None] | out[:, None], 0.0, values)
+    node = (numbers.reshape(n, count, 3).max(axis=2) // 3).astype(PETSc.IntType)
+    matrix.setValuesBlockedIJV(
+        np.arange(n * count + 1, dtype=PETSc.IntType) * count,
+        np.repeat(node, count, axis=0),
+        values.reshape(n, count, 3, count, 3).transpose(0, 1, 3, 2, 4),
+        addv=PETSc.InsertMode.ADD_VALUES,
+        rowmap=node,
+    )
+
+
 def _most_couplings(comm: Any, first: IntArray, contact: Sequence[IntArray]) -> IntArray:
     """Upper bound of the blocks that contact needs in each of this rank's rows. Collective.
 
