@@ -169,10 +169,12 @@ def tributary_areas(facets: IntArray, corners: FloatArray, num_points: int) -> F
 
 
 def _solve_2x2(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions (2, n) of symmetric 2 x 2 systems (11, 12, 22; n); not finite where singular."""
+    """Solutions (2, n) of symmetric 2 x 2 systems (11, 12, 22; n).
+
+    Not finite where singular, of which numpy warns.
+    """
     m11, m12, m22 = matrix
-    with np.errstate(divide="ignore", invalid="ignore"):
-        result = (matrix[::-2] * right - m12 * right[::-1]) / (m11 * m22 - m12 * m12)
+    result: FloatArray = (matrix[::-2] * right - m12 * right[::-1]) / (m11 * m22 - m12 * m12)
     return result
 
 
@@ -286,13 +288,13 @@ def _local(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatAr
     return corners[:, 0] - points, corners - corners[:, :1]
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _refine(start: FloatArray, spans: FloatArray, xi: FloatArray) -> tuple[FloatArray, BoolArray]:
     """The Newton iterations of `project`; start and spans as of `_local`."""
     xi = np.array(np.transpose(xi), dtype=np.float64)
     converged = np.zeros(xi.shape[1], dtype=bool)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # Rounding of `start` limits the step that a far point can reach.
-        far = np.abs(start).max(axis=1) / np.abs(spans).max(axis=(1, 2))
+    # Rounding of `start` limits the step that a far point can reach.
+    far = np.abs(start).max(axis=1) / np.abs(spans).max(axis=(1, 2))
     last_step = _LAST_STEP + 1e3 * EPS * far
     smooth = spans.shape[1] == patches.NUM_POINTS
     modes = None if smooth else _modes(start, spans)
@@ -391,6 +393,7 @@ def _closest_edge(start: FloatArray, spans: FloatArray) -> FloatArray:
     return (1.0 - tau_best) * corner[best] + tau_best * np.roll(corner, -1, 0)[best]
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _closest_triangle(start: FloatArray, spans: FloatArray) -> FloatArray:
     """Closest point on triangles [-], shape (n, 2)."""
     gradient, metric, _, _ = _bilinear(_modes(start, spans), np.zeros((2, len(start))))
@@ -451,6 +454,7 @@ def _slope(g: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
     return s, slope, in_t - np.where(raw == s, mixed**2 / square, 0.0)
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _closest_convex(g: FloatArray) -> FloatArray:
     """Closest point where |xbar - x|^2 is convex: the root of a monotone function of t.
 
@@ -474,8 +478,7 @@ def _closest_convex(g: FloatArray) -> FloatArray:
         old = t[active]
         _, slope, curvature = _slope(g_active, old)
         low, high = np.where(slope < 0.0, old, low), np.where(slope < 0.0, high, old)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            new = old - slope / curvature
+        new = old - slope / curvature
         newton = (new >= low) & (new <= high)
         t[active] = new = np.where(newton, new, 0.5 * (low + high))
         last = newton & (np.abs(new - old) <= _LAST_STEP)
