@@ -9,11 +9,14 @@ from typing import Any
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.assembly import StepMatrix, model_problem
-from dolfinx_nts.schur import FACTORS, SchurInverse
+from dolfinx_nts.assembly import SchurApproximation, StepMatrix, model_problem
 
 _BODIES = "fieldsplit_bodies_"
 _CONTACT = "fieldsplit_contact_"
+#: What `SchurInverse` factorises with.
+_FACTORS = "factors_"
+#: Name by which its matrix knows the second approximation.
+_SECOND = "dolfinx_nts_second"
 #: What `Newton.linear_solver` may be.
 SOLVERS = ("auto", "direct", "krylov")
 #: Presets; a user's `petsc_options` override them one by one.
@@ -46,9 +49,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         _BODIES + "sub_pc_type": "icc",
         _CONTACT + "ksp_type": "preonly",
         _CONTACT + "pc_type": "python",
-        _CONTACT + "pc_python_type": f"{SchurInverse.__module__}.SchurInverse",
-        _CONTACT + FACTORS + "pc_type": "lu",
-        _CONTACT + FACTORS + "pc_factor_mat_solver_type": "mumps",
+        _CONTACT + "pc_python_type": f"{__name__}.SchurInverse",
+        _CONTACT + _FACTORS + "pc_type": "lu",
+        _CONTACT + _FACTORS + "pc_factor_mat_solver_type": "mumps",
         # Of a user who takes LU for the first of the two approximations alone.
         _CONTACT + "pc_factor_mat_solver_type": "mumps",
     },
@@ -99,7 +102,7 @@ def most_iterations(size: int) -> int:
 #: In place of the preset's where the contact unknowns are condensed: without zeros on its diagonal
 #: their small block needs no pivoting, and starting MUMPS takes longer than all else.
 _CONDENSED: Mapping[str, Mapping[str, Any]] = {
-    "krylov": {_CONTACT + FACTORS + "pc_type": "redundant"},
+    "krylov": {_CONTACT + _FACTORS + "pc_type": "redundant"},
 }
 #: PETSc's errors "no support", "unknown type", "missing factor": an option has a wrong value.
 _WRONG_VALUE = (56, 86, 92)
@@ -132,7 +135,7 @@ class SolverOptions:
         if limit is not None:
             known["ksp_max_it"] = limit
         if condense and preset in _CONDENSED:
-            known = {k: v for k, v in known.items() if not k.startswith(_CONTACT + FACTORS)}
+            known = {k: v for k, v in known.items() if not k.startswith(_CONTACT + _FACTORS)}
             known |= _CONDENSED[preset]
         self._preset = known
         self._all = {**known, **given}
@@ -270,6 +273,66 @@ def _split(snes: Any, *parts: tuple[str, Any]) -> None:
     snes.getKSP().getPC().setFieldSplitIS(*parts)
     for _, index in parts:
         index.destroy()
+
+
+class SchurInverse:
+    """Preconditioner of the contact part: S^-1 ~ F^-1 M F^-1 from two approximations of S.
+
+    With F = D - C W B and M = D - C W A W B this is Newton's (Schulz's) step from F^-1 towards the
+    inverse of D - C (2 W - W A W) B. Where A W maps what B spans into itself, and D = 0, it is
+    exact (the least-squares commutator): about so with consistent mass, for which a polynomial in
+    A alone needs more terms. Without M it is F^-1.
+    """
+
+    def create(self, pc: Any) -> None:
+        """Called by PETSc, as the other methods are."""
+        self._factors = PETSc.PC().create(pc.comm)
+        self._between: Any = None
+        self._work: tuple[Any, ...] = ()
+
+    def setFromOptions(self, pc: Any) -> None:
+        """Options of the factorisation."""
+        self._factors.setOptionsPrefix(f"{pc.getOptionsPrefix() or ''}{_FACTORS}")
+        self._factors.setFromOptions()
+
+    def setUp(self, pc: Any) -> None:
+        """Factorise anew."""
+        _, first = pc.getOperators()
+        if self._between:
+            self._between.destroy()
+        self._between = first.query(_SECOND)
+        self._factors.setOperators(first)
+        self._factors.setUp()
+        if not self._work:
+            self._work = first.createVecs()
+
+    def apply(self, _pc: Any, x: Any, y: Any) -> None:
+        """Approximate S y = x."""
+        if not self._between:
+            self._factors.apply(x, y)
+            return
+        a, b = self._work
+        self._factors.apply(x, a)
+        self._between.mult(a, b)
+        self._factors.apply(b, y)
+
+    def destroy(self, _pc: Any) -> None:
+        """Free what `create` and `setUp` made."""
+        for each in (self._factors, self._between, *self._work):
+            if each:
+                each.destroy()
+
+
+def set_schur(snes: Any, approximation: SchurApproximation) -> None:
+    """Give a Schur field split what its contact part is preconditioned with.
+
+    Args:
+        snes: The SNES.
+        approximation: For `SchurInverse`, whose matrix is the first of the two.
+    """
+    approximation.first.compose(_SECOND, approximation.second)
+    user = PETSc.PC.SchurPreType.USER
+    snes.getKSP().getPC().setFieldSplitSchurPreType(user, approximation.first)
 
 
 def take_bodies(snes: Any, operator: Any, bodies: Sequence[Any], contact: bool) -> None:

@@ -21,6 +21,7 @@ from dolfinx_nts.linear_solver import (
     choose,
     keep_bodies,
     most_iterations,
+    set_schur,
     take_bodies,
 )
 from dolfinx_nts.step import EQUAL, BodyTerms, Evaluation, StepProblem
@@ -307,7 +308,7 @@ class StepSolver:
         """Give the preset's field split the Schur complement of the matrix as it is now."""
         if self.problem.elements and self._options.schur:
             assert self.matrix is not None
-            self.matrix.schur().give(self.snes)
+            set_schur(self.snes, self.matrix.schur())
 
     # ---- SNES callbacks
     def _at(self, x: Any) -> Evaluation:
