@@ -74,7 +74,8 @@ class ElementBlocks(NamedTuple):
         fields: Field of each part.
         columns: Slice of each part in the element's unknowns.
         numbers: Numbers in the field, shape (n, columns); negative ones are left out.
-        pattern: Which entries of an element's tangent can be non-zero, shape (r, r).
+        pattern: Which entries of an element's tangent can be non-zero, shape (r, r); all of those
+            that couple coordinates of bodies with anything.
     """
 
     fields: tuple[int, ...]
@@ -188,7 +189,8 @@ class SchurApproximation:
         self.first = self._below.matMult(self._above, result=self.first)
         self.second = self._below.matMult(self._between, result=self.second)
         for product in (self.first, self.second):
-            # What stands in D are the unknowns of one slave node, which share its coordinates.
+            # All coordinates of an element are coupled with all its unknowns (`ElementBlocks`), so
+            # that D's pattern lies in that of C W B.
             product.aypx(-1.0, contact, structure=PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
 
     def destroy(self) -> None:
@@ -216,8 +218,8 @@ class StepMatrix:
             contact it needs `split`.
 
     Attributes:
-        nest: Blocks of all fields, as of the last fresh assembly. Where the bodies' part is stored
-            in blocks of nodes, contact between coordinates is left to `operator`.
+        nest: Blocks of the fields, as of the last fresh assembly, that are converted to one matrix:
+            of all fields, or if split of the bodies; None if these are stored in blocks of nodes.
         operator: What the solvers see, after `assemble`.
     """
 
@@ -232,25 +234,26 @@ class StepMatrix:
     ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
         self._in_bodies: list[FloatArray] = []
-        self._corner_values: list[FloatArray] = []
+        self._in_operator: list[FloatArray] = []
+        fields = range(layout.counts.shape[1])
+        self._split = split and len(fields) > len(bodies)
+        found = node_blocks.patterns(bodies) if blocked else None
+        joined = fields[: len(bodies)] if self._split else fields
         self._sources: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
-        for e, element in enumerate(elements):
+        for e, element in enumerate(elements if found is None else ()):
             for i, row in enumerate(element.fields):
                 for j, col in enumerate(element.fields):
-                    self._sources.setdefault((row, col), []).append((e, i, j))
-        fields = range(layout.counts.shape[1])
-        found = node_blocks.patterns(bodies) if blocked else None
-        if found is not None:
-            for key in [k for k in self._sources if max(k) < len(bodies)]:
-                del self._sources[key]
+                    if row in joined and col in joined:
+                        self._sources.setdefault((row, col), []).append((e, i, j))
         self._blocks = {
             key: self._new_block(*key)
             for key in self._sources
             if key[0] != key[1] or key[0] >= len(bodies)
         }
-        grid = [[self._block(i, j) for j in fields] for i in fields]
-        self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
-        self._split = split and len(fields) > len(bodies)
+        self.nest: Any = None
+        if found is None:
+            grid = [[self._block(i, j) for j in joined] for i in joined]
+            self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
         halves = [fields[: len(bodies)], fields[len(bodies) :]] if self._split else [fields]
         local = layout.counts[layout.comm.rank]
         layouts = [Layout(layout.comm, local[half].tolist()) for half in halves]
@@ -265,10 +268,6 @@ class StepMatrix:
             size = (layouts[i].num_owned, layouts[j].num_owned)
             parts = [self._entries(e, numbers[i][e], numbers[j][e]) for e in range(len(elements))]
             self._contact.append(Triplets(layout.comm, size, parts))
-        self._corner_source = self.nest
-        if self._split:
-            grid = [row[: len(bodies)] for row in grid[: len(bodies)]]
-            self._corner_source = PETSc.Mat().createNest(grid, comm=layout.comm)
         self._by_nodes: node_blocks.NodeBlocks | None = None
         self._corner = PETSc.Mat()
         if found is not None:
@@ -309,15 +308,13 @@ class StepMatrix:
             fresh: The bodies' matrices are without contact, newly assembled; else they are as the
                 last call left them, and only the operator is changed.
         """
-        corner = [
-            t[:, c][:, :, c] for t, (c, _) in zip(tangents, self._corner_numbers, strict=True)
-        ]
         if self.operator is None or fresh:
-            self._renew(tangents, corner)
+            self._renew(tangents)
         else:
-            # On several ranks converting is slow.
-            self._change([a - b for a, b in zip(corner, self._corner_values, strict=True)])
-        self._corner_values = corner
+            # On several ranks converting is slow. Outside an element's pattern its tangent is zero.
+            self._corner.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
+            self._add([a - b for a, b in zip(tangents, self._in_operator, strict=True)])
+        self._in_operator = list(tangents)
         for part in self._contact:
             part.set(tangents)
         if self.operator is None:
@@ -330,9 +327,13 @@ class StepMatrix:
         # To assemble a nest is to assemble its blocks, each with a message from all to all.
         self.operator.stateIncrease()
 
-    def _renew(self, tangents: Sequence[FloatArray], corner: Sequence[FloatArray]) -> None:
-        """Bring the nest and the operator's corner up to the bodies' matrices, with contact."""
+    def _renew(self, tangents: Sequence[FloatArray]) -> None:
+        """Bring nest and operator's corner up to the bodies' matrices, with contact."""
         self._bodies_renewed = True
+        if self._by_nodes:
+            self._by_nodes.fill(self._corner)
+            self._add(tangents)
+            return
         self._in_bodies = list(tangents)
         for key, sources in self._sources.items():
             if key in self._blocks:
@@ -340,27 +341,17 @@ class StepMatrix:
             else:
                 self._add_to_body(self._bodies[key[0]], sources, tangents)
         self.nest.assemble()
-        if self._by_nodes:
-            self._by_nodes.fill(self._corner)
-            self._add(corner)
-            return
-        if self._split:
-            self._corner_source.assemble()
         # Without `out` the nest itself is converted.
-        self._corner_source.convert("aij", out=self._corner)
+        self.nest.convert("aij", out=self._corner)
 
-    def _change(self, change: Sequence[FloatArray]) -> None:
-        """Add to the contact tangents in the operator's corner."""
-        # Outside the pattern of an element its tangent is zero.
-        self._corner.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
-        self._add(change)
-
-    def _add(self, values: Sequence[FloatArray]) -> None:
-        for (_, number), each in zip(self._corner_numbers, values, strict=True):
+    def _add(self, tangents: Sequence[FloatArray]) -> None:
+        """Add contact tangents to the operator's corner."""
+        for (columns, numbers), tangent in zip(self._corner_numbers, tangents, strict=True):
+            values = tangent[:, columns][:, :, columns]
             if self._by_nodes:
-                node_blocks.add(self._corner, number, each)
+                node_blocks.add(self._corner, numbers, values)
             else:
-                _add_block(self._corner, number, number, each)
+                _add_block(self._corner, numbers, numbers, values)
         self._corner.assemble()
 
     def outgrown(self) -> bool:
@@ -464,10 +455,9 @@ class StepMatrix:
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
-        made = [self.nest, self._corner, *self._contact, *self._blocks.values()]
-        if self._split:
-            made += [self._corner_source, *([self.operator] if self.operator else [])]
-        made += [self._schur] if self._schur else []
+        made = [self._corner, *self._contact, *self._blocks.values()]
+        made += [self.operator] if self._split and self.operator else []
+        made += [a for a in (self.nest, self._schur) if a]
         for a in made:
             a.destroy()
 

@@ -190,7 +190,8 @@ def add(matrix: Any, numbers: IntArray, values: npt.NDArray[np.float64]) -> None
     matrix.setValuesBlockedIJV(
         np.arange(n * count + 1, dtype=PETSc.IntType) * count,
         np.repeat(node, count, axis=0),
-        values.reshape(n, count, 3, count, 3).transpose(0, 1, 3, 2, 4),
+        # petsc4py reads an array in Fortran's order as it lies in memory.
+        np.ascontiguousarray(values.reshape(n, count, 3, count, 3).transpose(0, 1, 3, 2, 4)),
         addv=PETSc.InsertMode.ADD_VALUES,
         rowmap=node,
     )

@@ -101,6 +101,48 @@ def test_schur_complement_is_the_same_on_all_ranks_and_when_made_again():
     assert np.all(np.ptp(norms, axis=0) <= 1e-9 * np.array(norms[0]))
 
 
+@pytest.mark.parametrize("condense", [True, False])
+@pytest.mark.parametrize("blocked", [True, False])
+def test_schur_complements_are_those_of_the_operator(blocked, condense):
+    """Against dense matrices; the bodies' part is that of the last fresh assembly."""
+    options = {} if blocked else {"fieldsplit_bodies_pc_type": "gamg"}
+    newton = nts.Newton(linear_solver="krylov", condense=condense)
+    stepper = nts.Stepper(
+        pressed_block(0.3), nts.EnergyMomentum(), newton=newton, petsc_options=options
+    )
+    while stepper.solution.rows[-1]["active"] < 30:
+        stepper.advance(1e-3)
+    problem, matrix = stepper.problem, stepper.solver.matrix
+    e = problem.evaluate(problem.x)
+    tangents = [c.tangent for c in e.contacts]
+    points = np.unique(np.concatenate([c.dofs()[0] for c in problem.contacts]))
+    rows = points[points >= 0]
+
+    def parts():
+        blocks = [matrix.operator.getNestSubMatrix(i, j) for i in range(2) for j in range(2)]
+        return [m.getValues(*map(range, m.getSize())) for m in blocks]
+
+    assert matrix.operator.getNestSubMatrix(0, 0).getType() == ("seqbaij" if blocked else "seqaij")
+    for _ in range(2):
+        for k in stepper.problem.awake:
+            problem.body_tangent(k, e.bodies[k].u1)
+        matrix.assemble(tangents, fresh=True)
+        a = parts()[0][np.ix_(rows, rows)]
+        w = 1.0 / np.abs(a).sum(axis=1)
+        for factor in (1.0, 1.7):
+            matrix.assemble([factor * t for t in tangents], fresh=factor == 1.0)
+            schur, (_, b, c, d) = matrix.schur(), parts()
+            b, c = w[:, None] * b[rows], c[:, rows]
+            for found, expected in (
+                (schur.first, d - c @ b),
+                (schur.second, d - c @ (w[:, None] * (a @ b))),
+            ):
+                values = found.getValues(*map(range, found.getSize()))
+                assert np.abs(values - expected).max() <= 1e-13 * np.abs(expected).max()
+                assert found.getInfo()["mallocs"] == 0
+    stepper.close()
+
+
 def test_schur_complement():
     """Against the exact one: positive, and nearer than that of the inverted diagonal."""
     stepper = touching(COMM)
@@ -204,8 +246,11 @@ def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(("cells", "contact"), [(1, False), (4, False), (4, True)])
-def test_matrix_in_blocks_of_nodes(cells, contact):
+@pytest.mark.parametrize(
+    ("cells", "masters"),
+    [(1, ()), (4, ()), (4, ("mesh",)), (4, ("sphere",)), (4, ("mesh", "sphere"))],
+)
+def test_matrix_in_blocks_of_nodes(cells, masters):
     """Against AIJ made by way of a nest, with nodes that are held along some axes.
 
     Of one cell some ranks own no node.
@@ -215,16 +260,21 @@ def test_matrix_in_blocks_of_nodes(cells, contact):
         nts.Dirichlet(lambda x: x[0] < 1e-9, components=(0,)),
         nts.Dirichlet(lambda x: x[1] < 1e-9, components=(0, 1)),
     ]
-    rubber, velocity = nts.NeoHookean(young=1e6, poisson=0.3), (0, 0, -0.1)
+    rubber, velocity = nts.NeoHookean(young=1e6, poisson=0.3), (0, 0, -0.5)
     block = nts.Continuum(mesh, rubber, density=1e3, velocity=velocity, bcs=held, name="block")
     top = create_box(COMM, [[0, 0, -1.0005], [1.1, 1.1, 0]], [5, 5, 5], CellType.hexahedron)
     other = nts.Continuum(top, rubber, density=1e3, name="other")
-    slave, master = block.surface(lambda x: x[2] < 1e-9), other.surface(lambda x: x[2] > -1e-9)
-    pairs = [nts.ContactPair(slave, master, friction=0.3)] if contact else []
+    slave = block.surface(lambda x: x[2] < 1e-9)
+    master = {
+        "mesh": other.surface(lambda x: x[2] > -1e-9),
+        "sphere": nts.Sphere((0.4, 0.4, -4.001), 4.0),
+    }
+    pairs = [nts.ContactPair(slave, master[name], friction=0.3) for name in masters]
     stepper = stepper_of(nts.System([block, other], contacts=pairs), linear_solver="krylov")
     for _ in range(10):
         stepper.advance(1e-3)
-    assert contact == (stepper.solution.rows[-1]["active"] > 0)
+    contact = bool(masters)
+    assert contact == (stepper.solution.rows[-1]["active"] > 1)
     matrix = stepper.solver.matrix
     bodies = matrix.operator.getNestSubMatrix(0, 0) if contact else matrix.operator
     assert bodies.getType().endswith("baij") and bodies.getInfo()["mallocs"] == 0
@@ -300,6 +350,31 @@ def test_rows_that_are_whole_only_one_after_another():
             a.setValues(row, np.arange(3 * node, 3 * node + 3, dtype=PETSc.IntType), np.ones(3))
     a.assemble()
     assert node_blocks.patterns([a]) is None
+    a.destroy()
+
+
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("nodes", [1, 2, 3])
+def test_elements_are_added_whatever_the_order_of_their_values_in_memory(nodes, held):
+    """Of two elements, with or without a coordinate that is held, against a dense sum."""
+    rng = np.random.default_rng(nodes)
+    a = PETSc.Mat().createBAIJ(((24, None), (24, None)), 3, nnz=8, comm=MPI.COMM_SELF)
+    numbers = np.stack([3 * rng.permutation(8)[:nodes, None] + np.arange(3) for _ in range(2)])
+    numbers = numbers.reshape(2, -1)
+    numbers[1, 1] = -1 if held else numbers[1, 1]
+    values, expected = rng.uniform(1, 2, (2, 3 * nodes, 3 * nodes)), np.zeros((24, 24))
+    for number, value in zip(numbers, values, strict=True):
+        kept = np.flatnonzero(number >= 0)
+        expected[np.ix_(number[kept], number[kept])] += value[np.ix_(kept, kept)]
+    columns = np.arange(3 * nodes)
+    cut = np.pad(values, ((0, 0), (0, 1), (0, 1)))[:, columns][:, :, columns]
+    for each in (values, np.asfortranarray(values), cut):
+        assert np.array_equal(each, values)
+        if a.assembled:
+            a.zeroEntries()
+        node_blocks.add(a, numbers, each)
+        a.assemble()
+        assert np.array_equal(a.getValues(range(24), range(24)), expected)
     a.destroy()
 
 
