@@ -212,8 +212,8 @@ class StepSolver:
                 state = self.problem.state
                 raise StepFailedError(
                     f"step from t={state.time:.6g} with dt={self.problem.dt:.3g}: PETSc stopped "
-                    f"with error {error.ierr}; two contacts, or a contact and a support, may hold "
-                    "the same nodes"
+                    f"with error {error.ierr}{self._with_options()}; two contacts, or a contact "
+                    "and a support, may hold the same nodes"
                 ) from error
             last = self._at(self.problem.x)
             iterations += self.snes.getIterationNumber()
@@ -398,12 +398,17 @@ class StepSolver:
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
             ksp = self.snes.getKSP().getConvergedReason()
             why = f"the linear solver {self._presets[self._chosen]!r} failed, KSP reason {ksp}"
-            why += f", with petsc_options={dict(self._given)!r}" if self._given else ""
+            why += self._with_options()
+            if self._presets == ("krylov",):
+                why += "; linear_solver='auto' goes on with MUMPS where that happens"
         return (
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
             f"{iterations} iterations ({why}); worst block {worst!r} at "
             f"{ratio[worst]:.3g} times its tolerance; {'; '.join(top)}"
         )
+
+    def _with_options(self) -> str:
+        return f", with petsc_options={dict(self._given)!r}" if self._given else ""
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
