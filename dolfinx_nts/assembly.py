@@ -276,7 +276,6 @@ class StepMatrix:
             own = (self._by_nodes.size, None)
             self._corner.createBAIJ((own, own), 3, nnz=self._by_nodes.room, comm=layout.comm)
         self._schur: SchurApproximation | None = None
-        self._bodies_renewed = False
         self.operator: Any = None
 
     def _block(self, i: int, j: int) -> Any:
@@ -310,6 +309,8 @@ class StepMatrix:
         """
         if self.operator is None or fresh:
             self._renew(tangents)
+            if self._schur is not None:
+                self._schur.renew_bodies(self._corner)
         else:
             # On several ranks converting is slow. Outside an element's pattern its tangent is zero.
             self._corner.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
@@ -329,7 +330,6 @@ class StepMatrix:
 
     def _renew(self, tangents: Sequence[FloatArray]) -> None:
         """Bring nest and operator's corner up to the bodies' matrices, with contact."""
-        self._bodies_renewed = True
         if self._by_nodes:
             self._by_nodes.fill(self._corner)
             self._add(tangents)
@@ -361,13 +361,11 @@ class StepMatrix:
     def schur(self) -> SchurApproximation:
         """Approximate Schur complements of the contact unknowns, as the operator is. Collective.
 
-        What they take of the bodies is of the last fresh assembly.
+        What they take of the bodies is of the first call or, if later, the last fresh assembly.
         """
         if self._schur is None:
             self._schur = SchurApproximation(*self._touched())
-        if self._bodies_renewed:
             self._schur.renew_bodies(self._corner)
-            self._bodies_renewed = False
         self._schur.renew(*(part.matrix for part in self._contact))
         return self._schur
 

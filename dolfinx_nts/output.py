@@ -260,7 +260,7 @@ class Fields:
     def close(self, stepper: Stepper) -> None:
         """Write the last accepted state of a run that failed."""
         # Unlike an exception, a status is the same on all ranks, so that all come here.
-        failed = stepper.solution.status not in ("running", "completed")
+        failed = not stepper.solution.status.startswith(("running", "completed"))
         if self._series and failed and stepper.state.time > self._written:
             self._append(stepper)
 
@@ -282,6 +282,8 @@ _UNITS |= dict.fromkeys(("active", "stick", "slip", "newton_iterations"), "-")
 
 class BalanceCSV:
     """Writes the balance table: a row for the start and at once one per accepted step, all digits.
+
+    The run's warnings follow as lines that begin with "#".
 
     Args:
         path: File; its folder is made if missing, an existing file is replaced.
@@ -320,6 +322,7 @@ class BalanceCSV:
         if self._file is not None:
             with self._file:
                 self._append(stepper)
+                self._file.writelines(f"# {w}\n" for w in stepper.solution.warnings.lines)
             self._file = None
 
     def _append(self, stepper: Stepper) -> None:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
 from dolfinx_nts.newton import ACCURACY, Newton, StepSolver
+from dolfinx_nts.run_warnings import RunWarnings
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.step_size import Adapt, Pace
 from dolfinx_nts.system import State, System
@@ -41,13 +42,15 @@ class Solution:
 
     Attributes:
         system: The scene; its bodies hold the last accepted state.
-        status: "completed", or why the run stopped and what to do.
+        status: "completed"; "completed, but ..." with what may be wrong in it; or why the run
+            stopped and what to do.
         rows: Balance table, one row for the start and one per accepted step.
         retries: How often a step was dropped and halved.
         rejected: How often a step was dropped for its error and shortened, see `Adapt`.
         exceeded: Steps taken though their motion errs more than `Adapt` asks for: the shortest it
             may take, and those that move nodes out from behind their facets.
         switches: Changes of facet of nodes in contact.
+        warnings: What the run has to say against its result, by kind; see `RunWarning`.
     """
 
     system: System
@@ -57,6 +60,7 @@ class Solution:
     rejected: int = 0
     exceeded: int = 0
     switches: list[balance.Switch] = field(default_factory=list)
+    warnings: RunWarnings = field(default_factory=RunWarnings)
 
     @property
     def balance(self) -> dict[str, npt.NDArray[np.float64]]:
@@ -88,7 +92,17 @@ class Solution:
                 f"t = {worst.time:.6g} s ({worst.contact}, node {worst.node}, facet "
                 f"{worst.facets[0]} to {worst.facets[1]})"
             )
-        return "\n".join(lines)
+        return "\n".join([*lines, *self.warnings.lines])
+
+    def warn(self, kind: str, time: float, size: float, text: str, *, grave: bool = False) -> None:
+        """Add a warning; every rank must make the same call, see `RunWarnings.add`."""
+        root = self.system.comm.rank == 0
+        self.warnings.add(kind, time, size, text, grave=grave, speak=root)
+
+    def finish(self) -> None:
+        """Say in the status that the run is complete, and what may be wrong in it."""
+        grave = "; ".join(w.text for w in self.warnings.grave)
+        self.status = f"completed, but {grave}" if grave else "completed"
 
     def plot(self, path: str) -> None:
         """Write a picture of energies, ledger and momenta over time. Every rank must call it.
@@ -228,7 +242,7 @@ class Stepper:
                 dt *= part
                 self.problem.begin(self.state, dt)
             try:
-                step = self.solver.solve()
+                step, state = self._attempt(dt, end if dt == left else now + dt)
             except StepFailedError as failure:
                 if retries == self.newton.max_retries:
                     raise
@@ -242,7 +256,7 @@ class Stepper:
                 continue
             retries = 0
             self.solution.exceeded += pace.exceeds
-            self._take(step, dt, end if dt == left else now + dt)
+            self._take(step, state)
             yield
 
     def start(self, dt: float) -> None:
@@ -272,11 +286,19 @@ class Stepper:
 
     def _step(self, dt: float, time: float) -> None:
         self.problem.begin(self.state, dt)
-        self._take(self.solver.solve(), dt, time)
+        self._take(*self._attempt(dt, time))
 
-    def _take(self, step: Evaluation, dt: float, time: float) -> None:
-        state = self._accepted(step, dt, time)
-        rows = self.solution.rows
+    def _attempt(self, dt: float, time: float) -> tuple[Evaluation, State]:
+        """Solution of the step that `problem.begin` fixed and its state, if that may be accepted.
+
+        Raises:
+            StepFailedError: Not solved, or what came out cannot be.
+        """
+        step = self.solver.solve()
+        return step, self._accepted(step, dt, time)
+
+    def _take(self, step: Evaluation, state: State) -> None:
+        rows, time = self.solution.rows, state.time
         terms = balance.step_terms(self.problem, step)
         terms |= {"time": time, "newton_iterations": step.iterations}
         measured = balance.measure(self.system, state, self._measured)
@@ -286,13 +308,13 @@ class Stepper:
         gain = -terms["contact_defect"]
         if gain > _NOTABLE_GAIN * abs(rows[-1]["energy"]):
             where = balance.expelled(self.problem, step)
-            if self.system.comm.rank == 0:
-                logger.warning(
-                    "step to t=%.6g: nodes that start behind their facets bring %.3g J to %.3g J, "
-                    "most %s; after changes of facet use a finer or smoother master, or a smaller, "
-                    "constant dt; a master must reach beyond where slaves pass below its edge",
-                    time, gain, rows[-2]["energy"], where,
-                )  # fmt: skip
+            self.solution.warn(
+                "energy from behind facets", time, gain,
+                f"nodes that start behind their facets bring {gain:.3g} J to "
+                f"{rows[-2]['energy']:.3g} J, most {where}; after changes of facet use a finer or "
+                "smoother master, or a smaller, constant dt",
+                grave=True,
+            )  # fmt: skip
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
         """State at t_{n+1}."""
@@ -465,7 +487,7 @@ def run(
     try:
         try:
             _march(stepper, times, output, started, dt, adapt, bar)
-            solution.status = "completed"
+            solution.finish()
         except UserFunctionError as failure:
             _stop(stepper, str(failure), failure.__cause__)
         except StepFailedError as failure:
@@ -520,7 +542,7 @@ def _march(
 def _stop(stepper: Stepper, reason: str, cause: BaseException | None = None) -> None:
     """Keep in the status why a run ended, and log it where it is known best."""
     solution = stepper.solution
-    ended = solution.status not in ("running", "completed")
+    ended = not solution.status.startswith(("running", "completed"))
     solution.status = f"{solution.status}; {reason}" if ended else reason
     if stepper.system.comm.rank == 0 or cause is not None:
         logger.warning("%s", reason, exc_info=cause)

@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "dolfinx_nts"
 
 LEVELS = [
-    {"discrete_gradient", "nts", "friction", "facets", "patches", "validation", "dolfinx_compat"},
+    {"discrete_gradient", "nts", "friction", "facets", "patches", "validation", "dolfinx_compat"}
+    | {"run_warnings"},
     {
         "continuum",
         "rigid",

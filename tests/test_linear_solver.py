@@ -79,9 +79,11 @@ def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
     krylov.close()
 
 
-def touching(comm):
+def touching(comm, petsc_options=None, **options):
     """Stepper of a block in the first step with all its nodes on the floor."""
-    stepper = stepper_of(pressed_block(0.3, comm=comm), linear_solver="krylov")
+    newton = nts.Newton(linear_solver="krylov", **options)
+    system, scheme = pressed_block(0.3, comm=comm), nts.EnergyMomentum()
+    stepper = nts.Stepper(system, scheme, newton=newton, petsc_options=petsc_options)
     for _ in range(40):
         stepper.advance(1e-3)
         if stepper.solution.rows[-1]["active"] >= 30:
@@ -106,12 +108,7 @@ def test_schur_complement_is_the_same_on_all_ranks_and_when_made_again():
 def test_schur_complements_are_those_of_the_operator(blocked, condense):
     """Against dense matrices; the bodies' part is that of the last fresh assembly."""
     options = {} if blocked else {"fieldsplit_bodies_pc_type": "gamg"}
-    newton = nts.Newton(linear_solver="krylov", condense=condense)
-    stepper = nts.Stepper(
-        pressed_block(0.3), nts.EnergyMomentum(), newton=newton, petsc_options=options
-    )
-    while stepper.solution.rows[-1]["active"] < 30:
-        stepper.advance(1e-3)
+    stepper = touching(COMM, options, condense=condense)
     problem, matrix = stepper.problem, stepper.solver.matrix
     e = problem.evaluate(problem.x)
     tangents = [c.tangent for c in e.contacts]
@@ -124,8 +121,7 @@ def test_schur_complements_are_those_of_the_operator(blocked, condense):
 
     assert matrix.operator.getNestSubMatrix(0, 0).getType() == ("seqbaij" if blocked else "seqaij")
     for _ in range(2):
-        for k in stepper.problem.awake:
-            problem.body_tangent(k, e.bodies[k].u1)
+        problem.body_tangents(e)
         matrix.assemble(tangents, fresh=True)
         a = parts()[0][np.ix_(rows, rows)]
         w = 1.0 / np.abs(a).sum(axis=1)

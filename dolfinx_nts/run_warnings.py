@@ -1,0 +1,96 @@
+"""What a run has to say against its own result: kind, first time, count and worst case."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RunWarning:
+    """One kind of trouble in a run.
+
+    Attributes:
+        kind: What it is, e.g. "energy gain".
+        first: Time at which it was first seen [s].
+        count: In how many steps it was seen.
+        worst: Largest size, in the unit that `text` names.
+        text: Sentence about the worst case, with a remedy.
+        grave: Whether it may make the result wrong; a run with such a warning is not just
+            "completed".
+    """
+
+    kind: str
+    first: float
+    count: int
+    worst: float
+    text: str
+    grave: bool
+
+
+class RunWarnings(Mapping[str, RunWarning]):
+    """The warnings of a run by their kind, in the order in which they first came.
+
+    Each kind is logged once, when it is first seen; the same on all ranks.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[str, RunWarning] = {}
+
+    def __getitem__(self, kind: str) -> RunWarning:
+        return self._found[kind]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def __repr__(self) -> str:
+        return repr(list(self._found.values()))
+
+    def add(
+        self, kind: str, time: float, size: float, text: str, *, grave: bool, speak: bool = True
+    ) -> None:
+        """Note a warning; every rank must make the same call.
+
+        Args:
+            kind: What it is.
+            time: When [s].
+            size: How bad; the largest is kept.
+            text: Sentence with a remedy, kept with the largest size.
+            grave: Whether the result may be wrong.
+            speak: Whether this rank logs the first warning of a kind.
+        """
+        old = self._found.get(kind)
+        if old is None:
+            if speak:
+                logger.warning("t=%.6g: %s", time, text)
+            self._found[kind] = RunWarning(kind, time, 1, size, text, grave)
+            return
+        worse = size > old.worst
+        self._found[kind] = RunWarning(
+            kind,
+            old.first,
+            old.count + 1,
+            size if worse else old.worst,
+            text if worse else old.text,
+            old.grave or grave,
+        )
+
+    @property
+    def grave(self) -> list[RunWarning]:
+        """Those that may make the result wrong."""
+        return [w for w in self._found.values() if w.grave]
+
+    @property
+    def lines(self) -> list[str]:
+        """A line for each, for summaries and files."""
+        return [
+            f"warning, {w.kind}: {w.count} step{'s' if w.count > 1 else ''} from "
+            f"t = {w.first:.6g} s; {w.text}"
+            for w in self._found.values()
+        ]
