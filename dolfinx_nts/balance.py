@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from dolfinx_nts.inversion import smallest_dets
 from dolfinx_nts.system import State, System
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ COLUMNS = (
     "stick",
     "slip",
     "min_gap",
+    "min_det",
     "newton_iterations",
 )
 
@@ -103,7 +105,7 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
 
     Returns:
         external_work, friction_dissipation, contact_defect [J], active, stick, slip, min_gap [m]
-        (infinite without candidates).
+        (infinite without candidates), min_det (infinite without flexible bodies).
     """
     scale = 1.0 / problem.factor
     work = dissipation = defect = 0.0
@@ -129,6 +131,7 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     names = ("external_work", "friction_dissipation", "contact_defect", "active", "stick", "slip")
     return dict(zip(names, comm.allreduce(local).tolist(), strict=True)) | {
         "min_gap": float(comm.allreduce(smallest, op=MPI.MIN)),
+        "min_det": step.min_det,
     }
 
 
@@ -173,7 +176,7 @@ def first_row(system: System, state: State) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(COLUMNS, 0.0)
     row |= measure(system, state)
     row |= {"time": state.time, "energy": row["kinetic"] + row["potential"], "min_gap": np.inf}
-    return row
+    return row | {"min_det": float(smallest_dets(system, state.u).min())}
 
 
 def next_row(

@@ -21,6 +21,7 @@ from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.integrators import Static
+from dolfinx_nts.inversion import Determinants
 from dolfinx_nts.materials import misfit
 from dolfinx_nts.mesh_check import check_mesh
 from dolfinx_nts.surfaces import Surface, locate_facets
@@ -114,8 +115,12 @@ class Body(Protocol):
     def potential(self, u: FloatArray) -> float:
         """Stored energy on this rank [J]."""
 
-    def inverted(self, u: FloatArray) -> float:
-        """Volume that u turns inside out, on this rank [m^3]; statics alone asks for it."""
+    def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
+        """Smallest det F on this rank, inf without cells, and X of its cell [m], shape (3,).
+
+        A body may leave it out; else a step that ends with det F <= 0 is not accepted unless the
+        body's `allow_inversion` is True.
+        """
 
     def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum x cross p about the origin [kg m^2/s], shape (3,)."""
@@ -194,6 +199,9 @@ class Continuum:
         extra_form: Further virtual work as UFL, a callable (u_m, v_m, w) -> form of the midpoint
             displacement, velocity and test function (in statics the displacement at the end and
             zero); it is added to the internal virtual work and its work counts as external.
+        allow_inversion: Accept steps that turn a cell inside out, det F <= 0 at a corner or
+            quadrature point, with a warning in the Solution; else such a step is halved, and the
+            run stops where that does not help. W(C) cannot see it.
 
     Attributes:
         u: Displacement [m], dolfinx Function of the last accepted state.
@@ -220,6 +228,7 @@ class Continuum:
         traction: Sequence[Traction] = (),
         quadrature_degree: int | None = None,
         extra_form: Callable[[Any, Any, Any], Any] | None = None,
+        allow_inversion: bool = False,
     ) -> None:
         if not callable(material):
             raise TypeError(
@@ -234,6 +243,8 @@ class Continuum:
         require_name("name", name)
         if extra_form is not None and not callable(extra_form):
             raise TypeError(f"extra_form={extra_form!r}: pass a callable (u, v, w) -> UFL form")
+        require_bool("allow_inversion", allow_inversion)
+        self.allow_inversion = allow_inversion
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
         bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")
         check_mesh(mesh, name)
@@ -252,10 +263,10 @@ class Continuum:
         self.num_owned = 3 * self.space.dofmap.index_map.size_local
         self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
         self.body_force, self._traction, self._extra_form = body_force, traction, extra_form
-        self._dx = ufl.Measure(
-            "dx", mesh, metadata={"quadrature_degree": quadrature_degree or 2 * degree}
-        )
-        self._ds = self._boundary_measure(quadrature_degree or 2 * degree)
+        quadrature_degree = quadrature_degree or 2 * degree
+        self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
+        self._ds = self._boundary_measure(quadrature_degree)
+        self._determinants = Determinants(self.space, degree, quadrature_degree)
         self._loads_at(0.0)
         for k, condition in enumerate(bcs):
             self._at(f"Dirichlet.value of bcs[{k}]", condition.value, 0.0, "m")
@@ -375,14 +386,8 @@ class Continuum:
         energy = self._energy(f.T * f)
         if self._extra_form is not None:
             self._check_extra_form(self._extra_form, w)
-        inside_out = ufl.conditional(ufl.lt(ufl.det(f), 0.0), 1.0, 0.0)
-        mass, self._load_form, self._energy_form, self._inverted_form = compat.compile_forms(
-            [
-                self._rho * ufl.inner(v, w) * self._dx,
-                load,
-                energy * self._dx,
-                inside_out * self._dx,
-            ]
+        mass, self._load_form, self._energy_form = compat.compile_forms(
+            [self._rho * ufl.inner(v, w) * self._dx, load, energy * self._dx]
         )
         full = compat.create_matrix(mass)
         compat.assemble_matrix(full, mass, (), 0.0)
@@ -574,19 +579,18 @@ class Continuum:
 
     def potential(self, u: FloatArray) -> float:
         """Strain energy on this rank [J]."""
-        return self._integral(self._energy_form, u)
-
-    def inverted(self, u: FloatArray) -> float:
-        """Volume at whose quadrature points det F < 0, on this rank [m^3]."""
-        return self._integral(self._inverted_form, u)
-
-    def _integral(self, form: Any, u: FloatArray) -> float:
-        """This rank's part of the integral of a function of `self.u`, at u."""
         kept = self.u.x.array.copy()
         self._fill(self.u, u)
-        value = float(fem.assemble_scalar(form))
+        value = float(fem.assemble_scalar(self._energy_form))
         self.u.x.array[:] = kept
         return value
+
+    def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
+        """Smallest det F at corners and quadrature points on this rank, and X of its cell [m]."""
+        self._in.array_w[:] = u
+        self._in.ghostUpdate()
+        with self._in.localForm() as here:
+            return self._determinants.smallest(here.array_r)
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum p [kg m/s]."""

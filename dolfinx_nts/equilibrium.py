@@ -126,6 +126,7 @@ class _LoadStepper(Stepper):
         row = balance.next_row(rows[0], rows[-1], measured, terms)
         rows.append(row | resultants)
         self._accept(state)
+        self._tell_inversion(step)
         self.solution.state = state
 
     def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, float]:
@@ -148,7 +149,6 @@ class _LoadStepper(Stepper):
                     moved = (b - a for a, b in zip(kept.slip, reached.slip, strict=True))
                     total = tuple(a + b for a, b in zip(slipped, moved, strict=True))
                     reached = replace(reached, slip=total)
-                    self._check_inverted(reached)
                     self._check_missed(reached)
                 except UserFunctionError:
                     raise
@@ -190,16 +190,6 @@ class _LoadStepper(Stepper):
             "their contacts"
         )
 
-    def _check_inverted(self, state: State) -> None:
-        """Raise if a body is inside out somewhere, which W(C) cannot see and a long step may do."""
-        for body, u in zip(self.system.bodies, state.u, strict=True):
-            volume = self.system.comm.allreduce(body.inverted(u))
-            if volume > 0.0:
-                raise StepFailedError(
-                    f"step from t={self.state.time:.6g}: a volume of {volume:.3g} m^3 of body "
-                    f"{body.name!r} ends inside out"
-                )
-
     def _check_missed(self, state: State) -> None:
         """Raise if a slave went through a facet whose candidate it was not."""
         depths = self.system.penetration(state)
@@ -240,7 +230,7 @@ def _pseudo_times(load_steps: Any) -> list[float]:
 
 def _check_bodies(system: System) -> None:
     for body in system.bodies:
-        for name in ("nodal_stiffness", "reactions", "inverted"):
+        for name in ("nodal_stiffness", "reactions"):
             if not callable(getattr(body, name, None)):
                 raise TypeError(
                     f"body {body.name!r} has no {name}(): equilibrium needs it, see Body"

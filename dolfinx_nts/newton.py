@@ -15,6 +15,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts.assembly import StepMatrix
 from dolfinx_nts.contact_step import ContactStep, Contribution
+from dolfinx_nts.inversion import describe, forbidden, smallest_dets
 from dolfinx_nts.linear_solver import (
     SOLVERS,
     SolverOptions,
@@ -114,6 +115,15 @@ _AIM = 1e-3
 _FINE, _COARSE = 1e-12, 1e-5
 #: Its tolerance with kept matrices, with which an iteration gains two or three digits anyway.
 _KEPT = 1e-3
+#: An update that would leave less than this part of the smallest det F of a body is halved, ...
+_KEPT_DET = 0.1
+#: ... so often at most, ...
+_HALVINGS = 10
+#: ... and in so many iterations in a row before the step is dropped.
+_SHORTENED = 5
+#: From this iteration on an iterate that is inside out ends the attempt: Newton's method hardly
+#: ever comes back, and most steps never get there.
+_INSIDE_OUT = 5
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 
@@ -152,6 +162,8 @@ class StepSolver:
         self._assembled: Evaluation | None = None
         self._last: Evaluation | None = None
         self._passed: Evaluation | None = None
+        self._careful, self._shortened = False, 0
+        self._dets: dict[int, tuple[FloatArray, float]] = {}
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
 
@@ -192,6 +204,7 @@ class StepSolver:
         assert self.matrix is not None
         iterations, unsolved = 0, False
         for retry in (False, True):
+            self._careful, self._shortened = retry, 0
             if retry:
                 self._matrices_due = True
                 self.problem.guess(flight=False)
@@ -219,9 +232,12 @@ class StepSolver:
             iterations += self.snes.getIterationNumber()
             # A solver of the user's may stop SNES by its own tests; ours decide.
             solved = last is self._passed or self._worst(last) <= 1.0
-            if solved and self.snes.getConvergedReason() > 0:
-                return replace(last, iterations=iterations)
             reason = self.snes.getConvergedReason()
+            if solved and reason > 0:
+                dets = self._smallest_dets(self._displacements(last.x))
+                if (forbidden(self.problem.system, dets) > 0.0).all():
+                    return replace(last, iterations=iterations, min_det=float(dets.min()))
+                reason = PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN
             unsolved = reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
             if unsolved and self._chosen < len(self._presets) - 1:
                 return self._attempt_otherwise(iterations)
@@ -293,6 +309,7 @@ class StepSolver:
         self.snes.setFunction(self._function, self._f)
         self.snes.setJacobian(self._jacobian, self.matrix.operator, self.matrix.operator)
         self.snes.setConvergenceTest(self._converged)
+        self.snes.setLineSearchPreCheck(self._shorten)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
         contact = self.matrix if self.problem.elements else None
         self._solved = False
@@ -353,11 +370,54 @@ class StepSolver:
         if worst <= 1.0:
             self._passed = self._last
             return reasons.CONVERGED_FNORM_RELATIVE
+        if self._shortened >= _SHORTENED or (iteration >= _INSIDE_OUT and self._is_inside_out()):
+            return reasons.DIVERGED_FUNCTION_DOMAIN
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
         if self._presets[self._chosen] == "krylov":
             self._aim(worst)
         return reasons.ITERATING
+
+    # ---- cells inside out
+    def _displacements(self, x: FloatArray) -> list[FloatArray]:
+        """Of each body at an iterate [m]."""
+        u = list(self.problem.state.u)
+        for f, k in enumerate(self.problem.awake):
+            u[k] = x[self.problem.layout.owned(f)]
+        return u
+
+    def _smallest_dets(self, u: list[FloatArray]) -> FloatArray:
+        # An iterate that runs off may overflow.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return smallest_dets(self.problem.system, u, self._dets)
+
+    def _is_inside_out(self) -> bool:
+        assert self._last is not None
+        dets = self._smallest_dets(self._displacements(self._last.x))
+        return not (forbidden(self.problem.system, dets) > 0.0).all()
+
+    def _shorten(self, x: Any, y: Any) -> bool:
+        """Keep an update, which SNES subtracts from x, from turning cells inside out.
+
+        The first attempt at a step does without: where it ends well, Newton's path is of no matter.
+        """
+        if not self._careful:
+            return False
+        system, start, update = self.problem.system, x.array_r, y.array_r
+        dets = forbidden(system, self._smallest_dets(self._displacements(start)))
+        least = np.where(dets > 0.0, _KEPT_DET * dets, -np.inf)
+        part = 1.0
+        for _ in range(_HALVINGS):
+            dets = self._smallest_dets(self._displacements(start - part * update))
+            if (forbidden(system, dets) >= least).all():
+                break
+            part *= 0.5
+        if part == 1.0:
+            self._shortened = 0
+            return False
+        self._shortened += 1
+        y.scale(part)
+        return True
 
     def _aim(self, worst: float) -> None:
         """Let the linear solver of Krylov's preset go as far as is worth it at an iterate."""
@@ -401,10 +461,22 @@ class StepSolver:
             why += self._with_options()
             if self._presets == ("krylov",):
                 why += "; linear_solver='auto' goes on with MUMPS where that happens"
+        elif reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
+            why = self._inversion(e)
         return (
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
             f"{iterations} iterations ({why}); worst block {worst!r} at "
             f"{ratio[worst]:.3g} times its tolerance; {'; '.join(top)}"
+        )
+
+    def _inversion(self, e: Evaluation) -> str:
+        """Which body an iterate turns inside out, or is about to; every rank must call it."""
+        system, u = self.problem.system, self._displacements(e.x)
+        where = describe(system, u, forbidden(system, self._smallest_dets(u)))
+        return (
+            f"a cell turns inside out, which W(C) cannot see: {where}; a finer mesh, a smaller "
+            "load or an energy that resists compression may prevent it, "
+            "Continuum(..., allow_inversion=True) accepts it"
         )
 
     def _with_options(self) -> str:

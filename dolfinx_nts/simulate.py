@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
+from dolfinx_nts.inversion import describe, smallest_dets
 from dolfinx_nts.newton import ACCURACY, Newton, StepSolver
 from dolfinx_nts.run_warnings import RunWarnings
 from dolfinx_nts.step import Evaluation, StepProblem
@@ -305,6 +306,7 @@ class Stepper:
         rows.append(balance.next_row(rows[0], rows[-1], measured, terms))
         self.solution.switches += balance.switches(self.problem, step, time)
         self._accept(state)
+        self._tell_inversion(step)
         gain = -terms["contact_defect"]
         if gain > _NOTABLE_GAIN * abs(rows[-1]["energy"]):
             where = balance.expelled(self.problem, step)
@@ -315,6 +317,13 @@ class Stepper:
                 "smoother master, or a smaller, constant dt",
                 grave=True,
             )  # fmt: skip
+
+    def _tell_inversion(self, step: Evaluation) -> None:
+        if step.min_det <= 0.0:
+            u, time = self.state.u, self.state.time
+            where = describe(self.system, u, smallest_dets(self.system, u))
+            text = f"{where}, which W(C) cannot see; what comes after it may be wrong"
+            self.solution.warn("inversion", time, -step.min_det, text, grave=True)
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
         """State at t_{n+1}."""

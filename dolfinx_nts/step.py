@@ -72,6 +72,7 @@ class Evaluation:
         multipliers: Multipliers of each contact [kg m], shape (n, multipliers).
         iterations: Newton iterations it took.
         idle_gaps: Gaps [m] of the idle candidates of each contact, once solved.
+        min_det: Smallest det F of all bodies, once solved.
     """
 
     x: FloatArray
@@ -80,6 +81,7 @@ class Evaluation:
     multipliers: tuple[FloatArray, ...]
     iterations: int = 0
     idle_gaps: tuple[FloatArray, ...] = ()
+    min_det: float = np.inf
 
 
 class StepProblem:
