@@ -121,9 +121,9 @@ _KEPT_DET = 0.1
 _HALVINGS = 10
 #: ... and in so many iterations in a row before the step is dropped.
 _SHORTENED = 5
-#: From this iteration on an iterate that is inside out ends the attempt: Newton's method hardly
-#: ever comes back, and most steps never get there.
-_INSIDE_OUT = 5
+#: In every so many-th iteration an iterate that is inside out ends the attempt: Newton's method
+#: hardly ever comes back, and most steps never get there.
+_INSIDE_OUT = 8
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 
@@ -242,7 +242,7 @@ class StepSolver:
             if unsolved and self._chosen < len(self._presets) - 1:
                 return self._attempt_otherwise(iterations)
         self._matrices_due = True
-        message = self._diagnosis(last, reason, iterations)
+        message = self._failure(last, reason, iterations)
         if unsolved:
             self.destroy()
         raise StepFailedError(message)
@@ -370,7 +370,8 @@ class StepSolver:
         if worst <= 1.0:
             self._passed = self._last
             return reasons.CONVERGED_FNORM_RELATIVE
-        if self._shortened >= _SHORTENED or (iteration >= _INSIDE_OUT and self._is_inside_out()):
+        late = iteration > 0 and iteration % _INSIDE_OUT == 0
+        if self._shortened >= _SHORTENED or (late and self._is_inside_out()):
             return reasons.DIVERGED_FUNCTION_DOMAIN
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
@@ -432,6 +433,22 @@ class StepSolver:
         self.snes.getKSP().setTolerances(rtol=rtol, max_it=limit)
 
     # ---- failure
+    def _failure(self, e: Evaluation, reason: int, iterations: int) -> str:
+        """What failed, and where a body is inside out or nearly so; every rank must call it."""
+        problem, u = self.problem, self._displacements(e.x)
+        dets = forbidden(problem.system, self._smallest_dets(u))
+        if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
+            return (
+                f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
+                f"{iterations} iterations: {describe(problem.system, u, dets)}; smaller loads, a "
+                "finer mesh or another energy may prevent it, Continuum(..., allow_inversion=True) "
+                "accepts it"
+            )
+        message = self._diagnosis(e, reason, iterations)
+        if dets.min() > _KEPT_DET:
+            return message
+        return f"{message}; {describe(problem.system, u, dets)}"
+
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:
         """One sentence that names what failed and where; every rank must call it."""
         problem = self.problem
@@ -461,22 +478,10 @@ class StepSolver:
             why += self._with_options()
             if self._presets == ("krylov",):
                 why += "; linear_solver='auto' goes on with MUMPS where that happens"
-        elif reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
-            why = self._inversion(e)
         return (
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
             f"{iterations} iterations ({why}); worst block {worst!r} at "
             f"{ratio[worst]:.3g} times its tolerance; {'; '.join(top)}"
-        )
-
-    def _inversion(self, e: Evaluation) -> str:
-        """Which body an iterate turns inside out, or is about to; every rank must call it."""
-        system, u = self.problem.system, self._displacements(e.x)
-        where = describe(system, u, forbidden(system, self._smallest_dets(u)))
-        return (
-            f"a cell turns inside out, which W(C) cannot see: {where}; a finer mesh, a smaller "
-            "load or an energy that resists compression may prevent it, "
-            "Continuum(..., allow_inversion=True) accepts it"
         )
 
     def _with_options(self) -> str:

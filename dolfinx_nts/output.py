@@ -277,7 +277,7 @@ class Fields:
 # ---- balance table
 _UNITS = {"time": "s", "min_gap": "m"}
 _UNITS |= {"linear_momentum": "kg m/s", "angular_momentum": "kg m^2/s"}
-_UNITS |= dict.fromkeys(("active", "stick", "slip", "newton_iterations"), "-")
+_UNITS |= dict.fromkeys(("active", "stick", "slip", "min_det", "newton_iterations"), "-")
 
 
 class BalanceCSV:

@@ -321,8 +321,8 @@ class Stepper:
     def _tell_inversion(self, step: Evaluation) -> None:
         if step.min_det <= 0.0:
             u, time = self.state.u, self.state.time
-            where = describe(self.system, u, smallest_dets(self.system, u))
-            text = f"{where}, which W(C) cannot see; what comes after it may be wrong"
+            text = describe(self.system, u, smallest_dets(self.system, u))
+            text += "; what comes after it may be wrong"
             self.solution.warn("inversion", time, -step.min_det, text, grave=True)
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:

@@ -29,6 +29,7 @@ LEVELS = [
         "search",
         "surfaces",
         "materials",
+        "inversion",
         "mesh_check",
         "mesh_input",
         "integrators",
