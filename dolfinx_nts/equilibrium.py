@@ -31,8 +31,6 @@ FloatArray = npt.NDArray[np.float64]
 #: A load step is dropped if it leaves a slave this part of a facet behind one that it was no
 #: candidate of.
 _MISSED = 0.1
-#: Searches for contact, each for the motion that came of the one before.
-_SEARCHES = 4
 #: Relaxations of one load step before it counts as without equilibrium.
 _RELAXATIONS = 100
 #: From this part of the forces on, the stabilization's moves no node to another facet.
@@ -178,17 +176,9 @@ class _LoadStepper(Stepper):
 
     def _solve(self, state: State, dt: float, search: bool) -> Evaluation:
         """Solution from a state; contact is sought as far as the bodies turn out to move."""
-        motion = np.zeros(len(self.system.bodies))
-        for _ in range(_SEARCHES):
-            self.problem.begin(state, dt, motion, search=search)
-            step = self.solver.solve()
-            motion = self.problem.motion(step)
-            if not search or self.problem.covers(motion):
-                return step
-        raise StepFailedError(
-            f"step from t={state.time:.6g}: bodies move by {motion.max():.3g} m, too far to find "
-            "their contacts"
-        )
+        self.problem.begin(state, dt, search=search)
+        step = self.solver.solve()
+        return self._covered(step) if search else step
 
     def _check_inverted(self, state: State) -> None:
         """Raise if a body is inside out somewhere, which W(C) cannot see and a long step may do."""

@@ -6,13 +6,14 @@ import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
+from dolfinx_nts.guards import check_momentum
 from dolfinx_nts.newton import ACCURACY, Newton, StepSolver
 from dolfinx_nts.run_warnings import RunWarnings
 from dolfinx_nts.step import Evaluation, StepProblem
@@ -32,6 +33,8 @@ logger = logging.getLogger(__name__)
 
 #: Part of the energy by which changes of facet may raise it in a step without a warning.
 _NOTABLE_GAIN = 0.01
+#: Searches for contact, each along the motion that came of the one before.
+_SEARCHES = 4
 #: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
 _WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
 
@@ -115,6 +118,20 @@ class Solution:
 
         as_path("path", path)
         on_root(self.system.comm, f"path={path!r}", lambda: plot_balance(self.balance, path))
+
+
+class Trial(NamedTuple):
+    """A solved step that may be accepted.
+
+    Attributes:
+        step: Solution of its equations.
+        state: State at its end.
+        measured: `balance.measure` of that state.
+    """
+
+    step: Evaluation
+    state: State
+    measured: dict[str, Any]
 
 
 @known_options
@@ -242,7 +259,7 @@ class Stepper:
                 dt *= part
                 self.problem.begin(self.state, dt)
             try:
-                step, state = self._attempt(dt, end if dt == left else now + dt)
+                trial = self._attempt(dt, end if dt == left else now + dt)
             except StepFailedError as failure:
                 if retries == self.newton.max_retries:
                     raise
@@ -251,12 +268,12 @@ class Stepper:
                 pace.dt = 0.5 * dt
                 logger.info("%s; retrying with dt=%.3g", failure, pace.dt)
                 continue
-            if not pace.accepts(self.problem, step):
+            if not pace.accepts(self.problem, trial.step):
                 self.solution.rejected += 1
                 continue
             retries = 0
             self.solution.exceeded += pace.exceeds
-            self._take(step, state)
+            self._take(trial)
             yield
 
     def start(self, dt: float) -> None:
@@ -286,23 +303,46 @@ class Stepper:
 
     def _step(self, dt: float, time: float) -> None:
         self.problem.begin(self.state, dt)
-        self._take(*self._attempt(dt, time))
+        self._take(self._attempt(dt, time))
 
-    def _attempt(self, dt: float, time: float) -> tuple[Evaluation, State]:
-        """Solution of the step that `problem.begin` fixed and its state, if that may be accepted.
+    def _attempt(self, dt: float, time: float) -> Trial:
+        """Solution of the step that `problem.begin` fixed, if it may be accepted.
 
         Raises:
             StepFailedError: Not solved, or what came out cannot be.
         """
-        step = self.solver.solve()
-        return step, self._accepted(step, dt, time)
+        step = self._covered(self.solver.solve())
+        state = self._accepted(step, dt, time)
+        measured = balance.measure(self.system, state, self._measured)
+        check_momentum(self.problem, step, state, self.solution.rows[-1], measured)
+        return Trial(step, state, measured)
 
-    def _take(self, step: Evaluation, state: State) -> None:
-        rows, time = self.solution.rows, state.time
+    def _covered(self, step: Evaluation) -> Evaluation:
+        """The step itself, or solved again for as long as its motion may have passed by a contact.
+
+        Raises:
+            StepFailedError: No search found all contacts.
+        """
+        problem, iterations = self.problem, step.iterations
+        for _ in range(_SEARCHES):
+            if not problem.misses(step):
+                return replace(step, iterations=iterations)
+            problem.begin(problem.state, problem.dt, step)
+            step = self.solver.solve()
+            iterations += step.iterations
+        far = float(problem.motion(step).max())
+        raise StepFailedError(
+            f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
+            f"{far:.3g} m, too far to find their contacts"
+        )
+
+    def _take(self, trial: Trial) -> None:
+        """Accept a step: a row of the ledger, and the new state."""
+        step, state, rows = trial.step, trial.state, self.solution.rows
+        time = state.time
         terms = balance.step_terms(self.problem, step)
         terms |= {"time": time, "newton_iterations": step.iterations}
-        measured = balance.measure(self.system, state, self._measured)
-        rows.append(balance.next_row(rows[0], rows[-1], measured, terms))
+        rows.append(balance.next_row(rows[0], rows[-1], trial.measured, terms))
         self.solution.switches += balance.switches(self.problem, step, time)
         self._accept(state)
         gain = -terms["contact_defect"]
@@ -344,6 +384,7 @@ class Stepper:
             time=time,
             u=tuple(u),
             v=tuple(v),
+            followed=self.problem.followed,
             **{name: tuple(c[name] for c in contact) for name in names},
         )
 

@@ -34,7 +34,7 @@ LEVELS = [
         "integrators",
     },
     {"system", "balance"},
-    {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep"},
+    {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"},
     {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]

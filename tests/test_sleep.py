@@ -169,7 +169,7 @@ def test_a_sleeper_is_neither_evaluated_nor_assembled_nor_searched(monkeypatch):
     for _ in range(12):
         s.advance(DT)
         # Whether it rests is asked once.
-        assert calls == ["internal", "tangent", "inertia", "potential"]
+        assert sorted(calls) == ["inertia", "internal", "potential", "tangent"]
         assert s.state.u[3] is s.problem.state.u[3] and 3 not in s.problem.awake
         assert searched.count(system.contacts[2]) == 1 or 2 in s.problem.awake
     assert s.problem.awake == (0, 1, 2) and searched.count(system.contacts[2]) > 1
