@@ -24,6 +24,7 @@ COLUMNS = (
     "external_work",
     "friction_dissipation",
     "contact_defect",
+    "material_change",
     "ledger_residual",
     "linear_momentum",
     "angular_momentum",
@@ -188,13 +189,14 @@ def next_row(
         terms: `step_terms` of the step.
     """
     row = {**last, **measured, **terms}
-    for name in ("external_work", "friction_dissipation", "contact_defect"):
+    for name in ("external_work", "friction_dissipation", "contact_defect", "material_change"):
         row[name] = last[name] + terms[name]
     row["energy"] = row["kinetic"] + row["potential"]
     row["ledger_residual"] = (
         row["energy"]
         - first["energy"]
         - row["external_work"]
+        - row["material_change"]
         + row["friction_dissipation"]
         + row["contact_defect"]
     )

@@ -119,7 +119,8 @@ class _LoadStepper(Stepper):
                 times, comm = (old.time, time), self.system.comm
                 start, end = (pair.master.displacement(t, comm) for t in times)
                 terms["external_work"] += float(mean @ (end - start))
-        terms |= {"time": time, "newton_iterations": iterations, "contact_defect": 0.0}
+        terms |= {"time": time, "newton_iterations": iterations}
+        terms |= {"contact_defect": 0.0, "material_change": 0.0}
         rows, measured = self.solution.rows, balance.measure(self.system, state)
         row = balance.next_row(rows[0], rows[-1], measured, terms)
         rows.append(row | resultants)

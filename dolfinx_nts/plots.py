@@ -41,7 +41,7 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
         energy = _Panel("Energy", "[J]", lines)
     work = {
         name.replace("_", " "): balance[name]
-        for name in ("contact_defect", "external_work", "friction_dissipation")
+        for name in ("contact_defect", "external_work", "friction_dissipation", "material_change")
         if name == "contact_defect" or balance[name].any()
     }
     nodes = {

@@ -15,6 +15,7 @@ from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
 from dolfinx_nts.guards import check_momentum
 from dolfinx_nts.newton import ACCURACY, Newton, StepSolver
+from dolfinx_nts.promises import MaterialWatch, Promises
 from dolfinx_nts.run_warnings import RunWarnings
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.step_size import Adapt, Pace
@@ -197,6 +198,10 @@ class Stepper:
         self._measured: dict[str, balance.Measured] = {}
         self._accept(_first_state(system, start))
         self.solution = Solution(system, rows=[balance.first_row(system, self.state)])
+        self._promises = Promises(
+            self.solution, closes=integrator.closes_ledger, rtol=self.newton.rtol
+        )
+        self._materials, self._material_change = MaterialWatch(system), 0.0
 
     def advance(self, dt: float) -> State:
         """Advance by dt; a step that is not solved is halved, up to `newton.max_retries` times.
@@ -253,6 +258,7 @@ class Stepper:
             now = self.state.time
             left = end - now
             dt = pace.propose(left)
+            self._note_materials()
             self.problem.begin(self.state, dt)
             part = pace.first_touch(self.problem)
             if part < 1.0:
@@ -302,8 +308,24 @@ class Stepper:
         self.state = state
 
     def _step(self, dt: float, time: float) -> None:
+        self._note_materials()
         self.problem.begin(self.state, dt)
         self._take(self._attempt(dt, time))
+
+    def _note_materials(self) -> None:
+        """Name in the ledger what changed parameters of materials do to the stored energy."""
+        names = self._materials.changed()
+        if not names:
+            return
+        self._measured.clear()
+        stored = balance.measure(self.system, self.state, self._measured)["potential"]
+        change = stored - self.solution.rows[-1]["potential"] - self._material_change
+        self._material_change += change
+        self.solution.warn(
+            "material changed", self.state.time, abs(change),
+            f"a changed parameter of the material of {', '.join(map(repr, names))} adds "
+            f"{change:.3g} J to the stored energy without work; see material_change in the balance",
+        )  # fmt: skip
 
     def _attempt(self, dt: float, time: float) -> Trial:
         """Solution of the step that `problem.begin` fixed, if it may be accepted.
@@ -342,7 +364,9 @@ class Stepper:
         time = state.time
         terms = balance.step_terms(self.problem, step)
         terms |= {"time": time, "newton_iterations": step.iterations}
+        terms["material_change"], self._material_change = self._material_change, 0.0
         rows.append(balance.next_row(rows[0], rows[-1], trial.measured, terms))
+        self._promises.hold(self.problem, step)
         self.solution.switches += balance.switches(self.problem, step, time)
         self._accept(state)
         gain = -terms["contact_defect"]

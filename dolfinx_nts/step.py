@@ -202,7 +202,7 @@ class StepProblem:
 
         A diagonal of another step hardly allows more: it grows with the factor, but less than that.
         """
-        return float(self._rounding[k] / max(self.factor, self._diagonal_factor[k]))
+        return float(self.rounding[k] / max(self.factor, self._diagonal_factor[k]))
 
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
@@ -554,7 +554,7 @@ class StepProblem:
 
     # ---- convergence
     @property
-    def _rounding(self) -> FloatArray:
+    def rounding(self) -> FloatArray:
         """Of the forces on each body [kg m]: stiffness times position times machine precision."""
         rounding: FloatArray = _EPS * self._diagonal * self._extent
         return rounding
@@ -562,7 +562,7 @@ class StepProblem:
     @property
     def momentum_rounding(self) -> float:
         """Change of momentum in the step that is rounding [kg m/s]."""
-        return float(self._rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
+        return float(self.rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
 
     @property
     def extent(self) -> float:
@@ -647,7 +647,7 @@ class StepProblem:
             parts = (self._stabilization(body) * t.du, t.internal, t.external, t.contact)
             squares.append([float(p @ p) for p in parts])
         norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
-        limits = self.rtol * norms[:, 1:].max(axis=1) + self._rounding
+        limits = self.rtol * norms[:, 1:].max(axis=1) + self.rounding
         return max(_over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
@@ -660,7 +660,7 @@ class StepProblem:
         norms = np.sqrt(self.system.comm.allreduce(squares))
         ratio = {}
         for k, body in enumerate(self.system.bodies):
-            limit = self.rtol * norms[k, 1:].max() + self._rounding[k]
+            limit = self.rtol * norms[k, 1:].max() + self.rounding[k]
             ratio[body.name] = _over(norms[k, 0], limit)
         if self._fields:
             ratio |= self._contact_ratios(e)

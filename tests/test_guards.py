@@ -1,4 +1,4 @@
-"""No step is accepted that is none: rounding is that of accepted states, momentum needs impulses."""
+"""No step is accepted that is none: rounding is that of states, momentum needs impulses."""
 
 from dataclasses import replace
 

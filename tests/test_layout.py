@@ -34,7 +34,8 @@ LEVELS = [
         "integrators",
     },
     {"system", "balance"},
-    {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"},
+    {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"}
+    | {"promises"},
     {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]
