@@ -89,10 +89,12 @@ class Found(NamedTuple):
         candidates: Slave nodes that may touch.
         followed: Which of the rank's slave nodes are known not to have passed by the surface's
             edge, shape (share,).
+        cover: Relative motion [m] for which the search misses no contact, the same on all ranks.
     """
 
     candidates: Candidates
     followed: BoolArray
+    cover: float
 
 
 @known_options
@@ -197,14 +199,16 @@ class ContactPair:
         reach = 0.0 if motion is None else motion.reach
         every = np.ones(len(self.slave.share), dtype=bool)
         if moved is not None:
-            return Found(self._near_obstacle(positions[0], reach, moved), every)
+            cover = reach + _MARGIN * float(np.sqrt(self.slave.area.min()))
+            return Found(self._near_obstacle(positions[0], reach, moved), every, cover)
         known = every if followed is None else followed
         slaves, master = positions
         corners = master[self.master.facets]
-        radius = reach + _MARGIN * float(facets.size(corners).max())
+        sizes = facets.size(corners)
+        radius, cover = (reach + _MARGIN * float(s) for s in (sizes.max(), sizes.min()))
         # Positions of all points are known everywhere, so all ranks leave here or none.
         if search.apart(slaves, corners, radius):
-            return Found(_NO_CANDIDATES, ~every)
+            return Found(_NO_CANDIDATES, ~every, radius)
         x = slaves[self.slave.share]
         closest = search.closest_facets(x, corners, reach=radius, current=current)
         node = np.flatnonzero(closest.facet >= 0)
@@ -217,7 +221,7 @@ class ContactPair:
         stays[np.setdiff1d(node, lost)] = known[np.setdiff1d(node, lost)]
         found = found.part(~beside)
         stays[found.node] = True
-        return Found(found, stays)
+        return Found(found, stays, cover)
 
     def _along_paths(
         self, found: Candidates, x: FloatArray, master: FloatArray, motion: Motion
@@ -326,13 +330,6 @@ class ContactPair:
         node = np.flatnonzero(movable & (gap.value < reach + _MARGIN * length))
         only, xi = np.zeros(len(node), dtype=np.int64), np.zeros((len(node), 2))
         return Candidates(node, only, xi, gap.gradient[node, 0], gap.value[node], length[node])
-
-    def cover(self, u: Sequence[FloatArray], reach: float) -> float:
-        """Relative motion [m] for which `find` with this reach misses no contact. Collective."""
-        if self.rigid:
-            return reach + _MARGIN * float(np.sqrt(self.slave.area.min()))
-        corners = self.master.positions(u[1])[self.master.facets]
-        return reach + _MARGIN * float(facets.size(corners).min())
 
     def _crossings(
         self, c: Candidates, master: FloatArray, slave_motion: FloatArray, master_motion: FloatArray

@@ -125,6 +125,7 @@ class StepProblem:
         self._petsc: list[Any] = []
         self.version = 0
         self.stabilization = 0.0
+        self._cover = [0.0] * len(system.contacts)
         self._diagonal, self._diagonal_factor = np.zeros((2, len(system.bodies)))
 
     # ---- set-up of a step
@@ -295,7 +296,7 @@ class StepProblem:
         paths = [self._ahead[b] for b in self.system.contact_bodies[index]]
         moved = self._paths[index][0] if pair.rigid else None
         positions = pair.positions(u)
-        found, self._followed[index] = pair.find(
+        found, self._followed[index], self._cover[index] = pair.find(
             positions,
             state.facets[index],
             moved,
@@ -588,10 +589,9 @@ class StepProblem:
             StepFailedError: A node went through an obstacle and out of it again.
         """
         motion, missed = self.motion(e), False
-        if (motion > self._motion).any():
-            missed = not self._covers(motion)
         for k, pair in enumerate(self.system.contacts):
             reach = self._reach(k, motion)
+            missed |= reach > self._cover[k]
             if pair.rigid and reach > _PASSING * pair.master.width:
                 self._check_passed(k, e)
             elif not pair.rigid and pair.is_long(reach):
@@ -628,17 +628,6 @@ class StepProblem:
                 f"step from t={self.state.time:.6g} with dt={self.dt:.3g}: contact {pair.name!r}: "
                 f"node {node} passes through the obstacle within the step; use a smaller dt"
             )
-
-    def _covers(self, motion: FloatArray) -> bool:
-        """Whether the step's candidates are all that may touch in such a motion. Collective."""
-        reached = [
-            self._reach(k, motion)
-            <= pair.cover([self.state.u[b] for b in bodies], self._reach(k, self._motion))
-            for k, (pair, bodies) in enumerate(
-                zip(self.system.contacts, self.system.contact_bodies, strict=True)
-            )
-        ]
-        return all(reached)
 
     def unrest(self, e: Evaluation) -> float:
         """Force of the stabilization over what counts as converged, the largest of the bodies."""
