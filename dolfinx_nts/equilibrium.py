@@ -11,11 +11,13 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts import balance
+from dolfinx_nts.continuum import Body
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.newton import Newton
 from dolfinx_nts.simulate import Solution, Stepper, run, writers
 from dolfinx_nts.step import Evaluation
 from dolfinx_nts.system import State, System
+from dolfinx_nts.table import Table
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -71,13 +73,17 @@ class Equilibrium(Solution):
 
         A coordinate that two conditions prescribe counts with the later one.
         """
-        names = [b.name for b in self.system.bodies]
-        return {n: np.array([r["reactions"][k] for r in self.rows]) for k, n in enumerate(names)}
+        return {b.name: self.rows.column(_reactions(b)) for b in self.system.bodies}
 
     @property
     def contact_forces(self) -> FloatArray:
         """Resultant of each contact on its slave body [N], shape (rows, contacts, 3)."""
-        return np.array([row["contact_forces"] for row in self.rows])
+        return self.rows.column("contact_forces")
+
+
+def _reactions(body: Body) -> str:
+    """Column of the reactions of a body."""
+    return f"reactions of {body.name}"
 
 
 class _LoadStepper(Stepper):
@@ -92,9 +98,9 @@ class _LoadStepper(Stepper):
         self._forces = [np.zeros_like(u) for u in self.state.u]
         self._accept(replace(self.state, v=tuple(self._rates)))
         row = balance.first_row(system, self.state)
-        row["reactions"] = [b.reactions(np.zeros(b.num_owned)) for b in system.bodies]
+        row |= {_reactions(b): b.reactions(np.zeros(b.num_owned)) for b in system.bodies}
         row["contact_forces"] = np.zeros((len(system.contacts), 3))
-        self.solution = Equilibrium(system, rows=[row], state=self.state)
+        self.solution = Equilibrium(system, rows=Table([row]), state=self.state)
 
     def start(self, dt: float) -> None:
         """Nothing moves at the start."""
@@ -211,7 +217,7 @@ class _LoadStepper(Stepper):
         total = np.empty_like(local)
         self.system.comm.Allreduce(local, total, op=MPI.SUM)
         parts = np.split(total, np.cumsum([len(r) for r in reactions]))
-        return {"reactions": parts[:-1], "contact_forces": parts[-1]}
+        return dict(zip([*map(_reactions, bodies), "contact_forces"], parts, strict=True))
 
 
 def _pseudo_times(load_steps: Any) -> list[float]:

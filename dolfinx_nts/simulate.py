@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from dolfinx_nts.run_warnings import RunWarnings
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.step_size import Adapt, Pace
 from dolfinx_nts.system import State, System
+from dolfinx_nts.table import Table
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -31,6 +33,8 @@ from dolfinx_nts.validation import (
 )
 
 logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
 
 #: Part of the energy by which changes of facet may raise it in a step without a warning.
 _NOTABLE_GAIN = 0.01
@@ -48,28 +52,31 @@ class Solution:
         system: The scene; its bodies hold the last accepted state.
         status: "completed"; "completed, but ..." with what may be wrong in it; or why the run
             stopped and what to do.
-        rows: Balance table, one row for the start and one per accepted step.
+        rows: Balance table, one row for the start and one per accepted step; some 150 B each.
         retries: How often a step was dropped and halved.
         rejected: How often a step was dropped for its error and shortened, see `Adapt`.
         exceeded: Steps taken though their motion errs more than `Adapt` asks for: the shortest it
             may take, and those that move nodes out from behind their facets.
-        switches: Changes of facet of nodes in contact.
+        switches: Changes of facet of nodes in contact: the newest 10,000, and sums over all.
         warnings: What the run has to say against its result, by kind; see `RunWarning`.
     """
 
     system: System
     status: str = "running"
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    rows: Table = field(default_factory=Table)
     retries: int = 0
     rejected: int = 0
     exceeded: int = 0
-    switches: list[balance.Switch] = field(default_factory=list)
+    switches: balance.Switches = field(default_factory=balance.Switches)
     warnings: RunWarnings = field(default_factory=RunWarnings)
 
     @property
     def balance(self) -> dict[str, npt.NDArray[np.float64]]:
-        """Columns of the balance table, shape (rows,) or (rows, 3), identical on all ranks."""
-        return {name: np.array([row[name] for row in self.rows]) for name in balance.COLUMNS}
+        """Columns of the balance table, shape (rows,) or (rows, 3), identical on all ranks.
+
+        They are read-only and hold the rows up to now.
+        """
+        return {name: self.rows.column(name) for name in balance.COLUMNS}
 
     @property
     def summary(self) -> str:
@@ -87,14 +94,13 @@ class Solution:
         ]
         if self.exceeded:
             lines.append(f"{self.exceeded} steps taken though they err more than their tolerance")
-        if self.switches:
-            defects = np.array([s.defect for s in self.switches])
-            worst = self.switches[int(np.abs(defects).argmax())]
+        found, worst = self.switches, self.switches.worst
+        if worst is not None:
             lines.append(
-                f"{len(defects)} changes of facet: contact defect {defects.sum():.3g} J in all, "
-                f"{np.abs(defects).mean():.3g} J each; most {worst.defect:.3g} J at "
-                f"t = {worst.time:.6g} s ({worst.contact}, node {worst.node}, facet "
-                f"{worst.facets[0]} to {worst.facets[1]})"
+                f"{found.number} changes of facet: contact defect {found.defect:.3g} J in all, "
+                f"mean of absolute values {found.size / found.number:.3g} J; most "
+                f"{worst.defect:.3g} J at t = {worst.time:.6g} s ({worst.contact}, node "
+                f"{worst.node}, facet {worst.facets[0]} to {worst.facets[1]})"
             )
         return "\n".join([*lines, *self.warnings.lines])
 
@@ -196,8 +202,9 @@ class Stepper:
         self.system = system
         self._started = False
         self._measured: dict[str, balance.Measured] = {}
+        self._recent: deque[tuple[float, tuple[FloatArray, ...]]] = deque(maxlen=2)
         self._accept(_first_state(system, start))
-        self.solution = Solution(system, rows=[balance.first_row(system, self.state)])
+        self.solution = Solution(system, rows=Table([balance.first_row(system, self.state)]))
         self._promises = Promises(
             self.solution, closes=integrator.closes_ledger, rtol=self.newton.rtol
         )
@@ -300,7 +307,7 @@ class Stepper:
             values[body.fixed] = (4.0 * (p1 - p0) - (p2 - p0)) / dt
         self._accept(replace(self.state, v=tuple(v)))
         self._started = True
-        self.solution.rows[:] = [balance.first_row(self.system, self.state)]
+        self.solution.rows = Table([balance.first_row(self.system, self.state)])
 
     def _accept(self, state: State) -> None:
         for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
@@ -367,7 +374,8 @@ class Stepper:
         terms["material_change"], self._material_change = self._material_change, 0.0
         rows.append(balance.next_row(rows[0], rows[-1], trial.measured, terms))
         self._promises.hold(self.problem, step)
-        self.solution.switches += balance.switches(self.problem, step, time)
+        self.solution.switches.extend(balance.switches(self.problem, step, time))
+        self._recent.append((time - self.state.time, state.force))
         self._accept(state)
         gain = -terms["contact_defect"]
         if gain > _NOTABLE_GAIN * abs(rows[-1]["energy"]):
@@ -411,6 +419,24 @@ class Stepper:
             followed=self.problem.followed,
             **{name: tuple(c[name] for c in contact) for name in names},
         )
+
+    def mean_force(self, k: int) -> FloatArray:
+        """Contact force p_N of the last two steps in the mean over their time [N].
+
+        That of a single step alternates about it; after one step, or a load step of `equilibrium`,
+        it is that step's.
+
+        Args:
+            k: Number of the contact.
+
+        Returns:
+            At this rank's slave nodes, as in `state.force`.
+        """
+        if not self._recent:
+            return self.state.force[k]
+        steps, forces = zip(*self._recent, strict=True)
+        mean: FloatArray = np.average([force[k] for force in forces], axis=0, weights=steps)
+        return mean
 
     def close(self) -> None:
         """Free the PETSc objects of the last step."""
@@ -598,9 +624,8 @@ def _march(
             raise UserFunctionError(problem) from cause
         if bar is not None:
             row = stepper.solution.rows[-1]
-            bar.set_postfix(
-                active=int(row["active"]), newton=row["newton_iterations"], refresh=False
-            )
+            active, newton = int(row["active"]), int(row["newton_iterations"])
+            bar.set_postfix(active=active, newton=newton, refresh=False)
             bar.update()
 
 

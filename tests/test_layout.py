@@ -17,7 +17,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 LEVELS = [
     {"discrete_gradient", "nts", "friction", "facets", "patches", "validation", "dolfinx_compat"}
-    | {"run_warnings"},
+    | {"run_warnings", "table", "whole_files"},
     {
         "continuum",
         "rigid",

@@ -127,7 +127,7 @@ def test_contact_fields(mpi_tmp_path):
     writer.start(run)
     steps(run, writer, 4)
     file = read(mpi_tmp_path / "left.xdmf")
-    names = ("force", "pressure", "gap", "status")
+    names = ("force", "pressure", "gap", "status", "force_mean", "pressure_mean")
     first, last = (
         {n: fields[f"contact_{n}_left-the_right_one"] for n in names}
         for fields in (file.fields[0], file.fields[-1])
@@ -142,11 +142,41 @@ def test_contact_fields(mpi_tmp_path):
 
     surface = file.points[:, 0] > 1 - 1e-9
     assert surface.sum() == 9
+    mean = run.mean_force(0)
+    assert np.array_equal(last["force_mean"][row], mean) and not np.array_equal(mean, force)
+    assert np.allclose(last["pressure_mean"][row] * slave.area[slave.share], mean, rtol=1e-14)
     assert not last["force"][~surface].any() and not last["pressure"][~surface].any()
     assert np.isnan(last["gap"][~surface]).all() and (last["status"][~surface] == -1).all()
     assert np.isnan(first["gap"]).all() and (first["status"][surface] == 0).all()
     assert set(read(mpi_tmp_path / "the_right_one.xdmf").fields[0]) == {"displacement", "velocity"}
     run.close()
+
+
+@mpi
+def test_mean_force_of_two_steps():
+    """A bar that hits a wall: rho c v of its section, about which single steps alternate."""
+    young, density, speed, n = 1e6, 1e3, 0.01, 30
+    wave = np.sqrt(young / density)
+    dt = 1 / (n * wave)
+    bar = nts.Continuum(
+        box([0.0, 0, 0], [1.0, 1 / n, 1 / n], [n, 1, 1]),
+        nts.StVenantKirchhoff(young, 0.0),
+        density=density,
+        velocity=(-speed, 0, 0),
+    )
+    wall = nts.Plane(point=(-0.3 * speed * dt, 0, 0), normal=(1, 0, 0))
+    pair = nts.ContactPair(slave=bar.surface(lambda x: x[0] < 1e-9), master=wall)
+    run = nts.Stepper(nts.System([bar], contacts=[pair]), nts.EnergyMomentum())
+    force = []
+    for _ in range(36):
+        # Two steps of other lengths than the rest: the mean is that over time.
+        run.advance(0.5 * dt if len(force) in (20, 21) else dt)
+        force.append((run.state.force[0], run.mean_force(0)))
+    run.close()
+    single, mean = COMM.allreduce(np.array(force).sum(axis=2)).T
+    right = density * wave * speed / n**2
+    assert np.abs(single[6:] / right - 1).min() > 0.15
+    assert np.abs(mean[6:] / right - 1).max() < 0.015
 
 
 @mpi
