@@ -204,6 +204,7 @@ def test_constraint_gradient(nc):
 
 
 @pytest.mark.parametrize("nc", KINDS)
+@pytest.mark.fast("3", "4")
 def test_constraint_curvature(nc):
     rng = np.random.default_rng(7)
     rows = 10 if nc < 16 else 1
@@ -246,6 +247,7 @@ def random_gaps(rng, n, nc):
 
 
 @pytest.mark.parametrize("nc", KINDS)
+@pytest.mark.fast("3", "4")
 def test_gap_and_its_derivatives(nc):
     rows = 8 if nc < 16 else 1
     x, xi = random_gaps(np.random.default_rng(8), rows, nc)

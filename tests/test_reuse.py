@@ -29,6 +29,7 @@ def run(integrator, dt=2e-3, steps=30, system=None, **newton):
 @pytest.mark.mpi
 @pytest.mark.parametrize("solver", ["direct", "krylov"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("energy-momentum-direct", "midpoint-krylov")
 def test_reuse_changes_no_solution(integrator, solver):
     table, every = run(integrator, linear_solver=solver, condense=True)
     again, some = run(integrator, linear_solver=solver, condense=True, reuse=True)
@@ -51,6 +52,7 @@ def test_without_condensing_too():
 
 
 @pytest.mark.parametrize("metre", [1e3, 1e6])
+@pytest.mark.fast("1000.0")
 def test_units_change_no_decision(metre):
     table, some = run("energy-momentum", reuse=True, rtol=1e-9)
     again, same = run(
@@ -130,6 +132,7 @@ def test_steps_that_differ_by_rounding_share_their_matrices():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
+@pytest.mark.fast("True")
 def test_a_body_without_contact_beside_two_with(condense):
     """The blocks of a split have a place for it."""
 
