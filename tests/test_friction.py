@@ -171,8 +171,7 @@ def difference(a, b):
 @pytest.mark.parametrize("friction", [0.1, 0.3, math.inf])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.fast(
-    "midpoint-0.3-hexahedron", "energy-momentum-0.3-hexahedron", "energy-momentum-inf-tetrahedron",
-    "gonzalez contact-0.1-hexahedron",
+    "midpoint-0.1-hexahedron", "energy-momentum-0.3-hexahedron", "energy-momentum-inf-tetrahedron",
 )  # fmt: skip
 def test_friction_keeps_the_momenta_and_the_ledger(integrator, friction, cell):
     table = run(rubbing_blocks(friction, cell=cell), integrator).balance
@@ -280,6 +279,7 @@ def test_units_change_nothing(integrator, metre):
     assert difference(a, b) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_condensing_changes_nothing():
     a, b = (

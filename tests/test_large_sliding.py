@@ -483,6 +483,7 @@ def falling_cube(tilt, velocity):
         (0.832, (0.945, -0.749, 0.72, 2.205, 2.502, -1.122, -4.424)),
     ],
 )
+@pytest.mark.fast("0.191-velocity0")
 def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(tilt, velocity):
     """Stuck it would be drawn down, free it would pass the plane, and Newton flips between them."""
     newton = nts.Newton(max_retries=0)

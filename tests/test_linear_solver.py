@@ -53,6 +53,7 @@ def test_more_iterations_are_worth_it_on_larger_meshes():
     assert limits[:2] == [60, 60] and limits == sorted(limits) and limits[-1] < 1_000
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
     """A nearly incompressible block at steps in which waves pass it ten times, then at short ones.
@@ -456,6 +457,7 @@ def test_bodies_are_dealt_to_ranks_where_they_divide_evenly(cells, ranks):
     stepper.close()
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_a_pattern_that_grows_under_another_run_of_the_same_scene():
     """MUMPS adds the contact of a smooth master's nodes to the matrices that both runs share."""
@@ -507,7 +509,7 @@ def test_the_choice_changes_no_solution(condense):
     ("integrator", "fine"),
     [(nts.Midpoint(), 1), (nts.EnergyMomentum(), 1), (nts.EnergyMomentum(), 2)],
 )
-@pytest.mark.fast("integrator0-1-friction2", "integrator1-1-friction0", "integrator2-2-friction1")
+@pytest.mark.fast("integrator0-1-friction2", "integrator1-1-friction0")
 def test_nodes_with_more_constraints_than_coordinates(integrator, fine, friction):
     """A block slides along a floor into a wall: nodes of its edge stick to one and touch both.
 

@@ -386,7 +386,7 @@ def block(low=(0.1, 0.1, 0.005), size=0.8, n=2, velocity=(0.3, 0.0, -1.0), name=
         COMM, [low, low + size], [n, n, n], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
     )
     body = nts.Continuum(
-        mesh, nts.NeoHookean(young=1e5, poisson=0.3), density=1e3, velocity=velocity, name=name
+        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e4, velocity=velocity, name=name
     )
     return body, body.surface(lambda x: x[2] < low[2] + 1e-9)
 

@@ -55,8 +55,8 @@ def flying_block():
 
     body = nts.Continuum(
         box([0, 0, 0], [2, 1, 1], (2, 1, 1)),
-        nts.NeoHookean(20.0, 0.3),
-        density=1.0,
+        nts.NeoHookean(1e6, 0.3),
+        density=5e4,
         velocity=velocity,
         name="block",
     )

@@ -74,8 +74,8 @@ def test_ledger_closes_for(variant):
     assert 0.04 < result["energy_lost"] < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steepness", [30.0, 100.0])
-@pytest.mark.fast("100.0")
 def test_ledger_closes_for_a_steep_energy(steepness):
     """Stiffening makes the impact harder, so activation costs more than in the variants above."""
     result = two_blocks.figures(impact(material=fung(steepness)))
