@@ -43,8 +43,14 @@ def assert_as_coulomb_says(figures):
     assert figures["iterations"] < 3
 
 
-@pytest.mark.mpi
-def test_all_parts_on_a_plane(mpi_tmp_path):
+ranks = pytest.param(
+    "ranks",
+    marks=[pytest.mark.mpi, pytest.mark.slow, pytest.mark.skipif(COMM.size == 1, reason="serial")],
+)
+
+
+@pytest.mark.parametrize("where", ["serial", ranks])
+def test_all_parts_on_a_plane(where, mpi_tmp_path):
     results = demo.main(
         floors=("plane",), integrators=("energy-momentum",), dt=4e-3, cells=SMALL,
         output=str(mpi_tmp_path),
@@ -71,6 +77,7 @@ def test_all_parts(floor, integrator):
     assert integrator == "midpoint" or figures["ledger"] < 1e-11
 
 
+@pytest.mark.mpi
 @pytest.mark.parametrize("integrator", demo.INTEGRATORS)
 @pytest.mark.fast("energy-momentum")
 def test_rest_on_an_elastic_plate(integrator):
