@@ -179,6 +179,7 @@ def bumpy(comm, smoothing):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("smoothing", [False, True])
+@pytest.mark.fast("True")
 def test_momentum_and_energy_on_any_number_of_ranks(smoothing):
     tables = []
     for comm in (COMM, MPI.COMM_SELF):

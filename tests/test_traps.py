@@ -187,7 +187,7 @@ def test_held_slaves_driven_against_a_held_master_have_nothing_to_solve(integrat
 
 @pytest.mark.parametrize("place", ["inside", "corner"])
 @rubbing
-@pytest.mark.fast("midpoint-0.0-corner", "energy-momentum-0.3-inside")
+@pytest.mark.fast("energy-momentum-0.3-corner")
 def test_contact_comes_and_goes(place, integrator, friction):
     """Two bounces under gravity on a plate that is held below."""
     held = [nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)]

@@ -187,10 +187,10 @@ def assert_same_as_serial(integrator, t_end, **scene):
     assert np.array_equal(table["newton_iterations"], serial["newton_iterations"])
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 @pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
 @pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.fast("energy-momentum")
 def test_ranks_agree_with_a_serial_run(integrator):
     assert_same_as_serial(integrator, 0.2)
 
@@ -238,7 +238,7 @@ def test_field_split_finds_the_same_solution():
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.fast("midpoint-False", "energy-momentum-True")
+@pytest.mark.fast("energy-momentum-True")
 def test_krylov_follows_the_direct_solver(integrator, condense):
     steppers = [
         nts.Stepper(
@@ -266,6 +266,7 @@ def test_krylov_follows_the_direct_solver(integrator, condense):
         s.close()
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_krylov_in_metres_and_micrometres():
     newton, runs = nts.Newton(linear_solver="krylov"), []
