@@ -19,6 +19,7 @@ image = pytest.importorskip("matplotlib.image")
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 mpi = pytest.mark.mpi
+CELLS = {"hexahedron": CellType.hexahedron, "tetrahedron": CellType.tetrahedron}
 
 
 def box(low, high, n, cell=CellType.hexahedron):
@@ -100,7 +101,7 @@ def vertex_blocks(body):
 
 # ---- fields
 @mpi
-@pytest.mark.parametrize("cell", [CellType.hexahedron, CellType.tetrahedron])
+@pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 def test_fields_are_the_functions(cell, mpi_tmp_path):
     run, writer = stepper(cell=cell), output.Fields(mpi_tmp_path / "new" / "folder")
     writer.start(run)
@@ -180,7 +181,7 @@ def test_mean_force_of_two_steps():
 
 
 @mpi
-@pytest.mark.parametrize("cell", [CellType.hexahedron, CellType.tetrahedron])
+@pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 def test_cells_of_the_file_fill_the_body(cell, mpi_tmp_path):
     run, writer = stepper(cell=cell), output.Fields(mpi_tmp_path)
     writer.start(run)
@@ -398,7 +399,7 @@ def neo_hooke(f):
 
 @mpi
 @pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("cell", [CellType.hexahedron, CellType.tetrahedron])
+@pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 def test_von_mises_of_a_homogeneous_deformation(cell, degree):
     stress = pictures.von_mises(homogeneous(RUBBER, degree, cell))
     assert np.allclose(stress.x.array, equivalent(neo_hooke(SHEAR)), rtol=1e-12)
@@ -426,7 +427,8 @@ def coloured(pixels):
 
 @mpi
 @pytest.mark.parametrize("colour", ["speed", "stress"])
-@pytest.mark.parametrize("cell", [CellType.hexahedron, CellType.tetrahedron])
+@pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
+@pytest.mark.fast("hexahedron-speed", "tetrahedron-stress")
 def test_picture(colour, cell, mpi_tmp_path):
     system = scene(cell=cell)
     for body in system.bodies:
