@@ -1,16 +1,18 @@
 # Each target alone takes a fresh clone on a fresh Debian 12 (root or sudo) to a finished run.
 # PYTEST_ARGS="-k friction -x" goes to pytest; DEMO=name chooses a demo; see scripts/ for the rest.
-.PHONY: help setup test lint demo test-debian13 test-sid clean distclean
+.PHONY: help setup test test-all lint demo test-debian13 test-sid clean distclean
 SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 DEMO ?= two_blocks
 export PYTEST_ARGS
 
 help:
-	@echo 'make test           lint, all tests in serial, the parallel ones on 2 ranks'
+	@echo 'make test           lint, the fast tests in serial, the parallel ones of them on 2 ranks'
+	@echo 'make test-all       what make test leaves out: the tests marked slow, likewise'
+	@echo '                    (.venv/bin/python -m pytest runs both in serial; -m "not slow" the fast)'
 	@echo 'make demo           demos/$(DEMO).py on 2 ranks, output in out/$(DEMO) (DEMO=name for another)'
 	@echo 'make lint           ruff and mypy'
-	@echo 'make test-debian13  the tests on Debian 13 in a chroot (made once, some minutes)'
+	@echo 'make test-debian13  the fast tests on Debian 13 in a chroot (made once, some minutes)'
 	@echo 'make test-sid       the same on Debian sid'
 	@echo 'make clean          remove .venv, caches and out/; the chroots stay (make distclean)'
 
@@ -19,6 +21,9 @@ setup:
 
 test: setup
 	@scripts/test.sh
+
+test-all: setup
+	@scripts/test.sh --slow
 
 demo: setup
 	@scripts/demo.sh $(DEMO)

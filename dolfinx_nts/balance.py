@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +27,7 @@ COLUMNS = (
     "external_work",
     "friction_dissipation",
     "contact_defect",
+    "material_change",
     "ledger_residual",
     "linear_momentum",
     "angular_momentum",
@@ -53,6 +56,46 @@ class Switch(NamedTuple):
     node: int
     facets: tuple[int, int]
     defect: float
+
+
+class Switches(Sequence[Switch]):
+    """The newest changes of facet of a run, at most `KEPT` of them, and sums over all.
+
+    Attributes:
+        number: How many there were.
+        defect: What all of them add to contact_defect [J].
+        size: The same of absolute values [J].
+        worst: The one with the largest absolute value, the first of several.
+    """
+
+    #: How many are kept; a run of a million steps may have many millions.
+    KEPT = 10_000
+
+    def __init__(self) -> None:
+        self._newest: deque[Switch] = deque(maxlen=self.KEPT)
+        self.number = 0
+        self.defect = self.size = 0.0
+        self.worst: Switch | None = None
+
+    def extend(self, found: Iterable[Switch]) -> None:
+        """Add changes of facet in the order in which they came."""
+        for switch in found:
+            self._newest.append(switch)
+            self.number += 1
+            self.defect += switch.defect
+            self.size += abs(switch.defect)
+            if self.worst is None or abs(switch.defect) > abs(self.worst.defect):
+                self.worst = switch
+
+    def __len__(self) -> int:
+        return len(self._newest)
+
+    @overload
+    def __getitem__(self, index: int) -> Switch: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Switch]: ...
+    def __getitem__(self, index: int | slice) -> Switch | list[Switch]:
+        return list(self._newest)[index] if isinstance(index, slice) else self._newest[index]
 
 
 #: Of a body: u and v, and its part of the energies and momenta on this rank, shape (8,).
@@ -191,13 +234,14 @@ def next_row(
         terms: `step_terms` of the step.
     """
     row = {**last, **measured, **terms}
-    for name in ("external_work", "friction_dissipation", "contact_defect"):
+    for name in ("external_work", "friction_dissipation", "contact_defect", "material_change"):
         row[name] = last[name] + terms[name]
     row["energy"] = row["kinetic"] + row["potential"]
     row["ledger_residual"] = (
         row["energy"]
         - first["energy"]
         - row["external_work"]
+        - row["material_change"]
         + row["friction_dissipation"]
         + row["contact_defect"]
     )

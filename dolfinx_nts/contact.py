@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numbers
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,8 @@ _OVERHANG = 0.05
 #: ... and this far beyond an edge shared with another facet, between the normal cones of a convex
 #: edge, and further by what the node may be away.
 _WEDGE = 0.5
+#: A node this part of a facet behind it, or less, is outside.
+_OUTSIDE = 1e-6
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 _MARGIN = 0.5
 
@@ -62,6 +65,36 @@ _NO_CANDIDATES = Candidates(
     np.empty(0, np.int64), np.empty(0, np.int64),
     np.empty((0, 2)), np.empty((0, 3)), np.empty(0), np.empty(0),
 )  # fmt: skip
+
+
+class Motion(NamedTuple):
+    """How slaves and masters are expected to move in a step.
+
+    Attributes:
+        reach: Bound on the motion of slaves relative to the master [m].
+        paths: Displacement of each of a pair's bodies over the step [m], owned coordinates.
+        aimed: Facet that a path of an earlier attempt at the step met, or -1, of each of the rank's
+            slave nodes.
+    """
+
+    reach: float
+    paths: Sequence[FloatArray]
+    aimed: IntArray
+
+
+class Found(NamedTuple):
+    """What a search found.
+
+    Attributes:
+        candidates: Slave nodes that may touch.
+        followed: Which of the rank's slave nodes are known not to have passed by the surface's
+            edge, shape (share,).
+        cover: Relative motion [m] for which the search misses no contact, the same on all ranks.
+    """
+
+    candidates: Candidates
+    followed: BoolArray
+    cover: float
 
 
 @known_options
@@ -147,44 +180,118 @@ class ContactPair:
         self,
         positions: Sequence[FloatArray],
         current: IntArray,
-        reach: float,
         moved: FloatArray | None,
-        ahead: Sequence[FloatArray] | None = None,
-    ) -> Candidates:
+        motion: Motion | None = None,
+        followed: BoolArray | None = None,
+    ) -> Found:
         """Search for this rank's candidates; every rank must call it.
+
+        A node is a candidate behind its facet only if it has come there through the surface. One
+        that has passed by the surface's edge is let through, and followed again once it is outside.
 
         Args:
             positions: Of all points at t_n [m], as from `positions`.
             current: Facet of each of the rank's slave nodes in the last step or -1.
-            reach: Bound on the relative motion of slave and master in the step [m].
             moved: Displacement of an obstacle at t_n [m], shape (3,); None of a surface.
-            ahead: Displacements of each of `bodies` expected until the middle of the step [m].
+            motion: Expected in the step; None: only what touches already.
+            followed: Which of the rank's nodes were followed in the last step; None: all.
         """
+        reach = 0.0 if motion is None else motion.reach
+        every = np.ones(len(self.slave.share), dtype=bool)
         if moved is not None:
-            return self._near_obstacle(positions[0], reach, moved)
+            cover = reach + _MARGIN * float(np.sqrt(self.slave.area.min()))
+            return Found(self._near_obstacle(positions[0], reach, moved), every, cover)
+        known = every if followed is None else followed
         slaves, master = positions
         corners = master[self.master.facets]
-        radius = reach + _MARGIN * float(facets.size(corners).max())
+        sizes = facets.size(corners)
+        radius, cover = (reach + _MARGIN * float(s) for s in (sizes.max(), sizes.min()))
         # Positions of all points are known everywhere, so all ranks leave here or none.
         if search.apart(slaves, corners, radius):
-            return _NO_CANDIDATES
+            return Found(_NO_CANDIDATES, ~every, radius)
         x = slaves[self.slave.share]
         closest = search.closest_facets(x, corners, reach=radius, current=current)
         node = np.flatnonzero(closest.facet >= 0)
-        found = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
-        if ahead is None:
-            return found
-        motion = self.slave.gather(ahead[0])[self.slave.share], self.master.gather(ahead[1])
-        change, facet = self._crossings(found, master, *motion)
-        if not len(change):
-            return found
-        start, _ = facets.closest_point(x[found.node[change]], corners[facet])
-        other = self._measure(x, master, found.node[change], facet, start, reach)
-        stay = ~np.isin(found.node, other.node)
-        order = np.argsort(np.concatenate([found.node[stay], other.node]))
-        return Candidates(
-            *(np.concatenate([a[stay], b])[order] for a, b in zip(found, other, strict=True))
-        )
+        found, lost = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
+        if motion is not None:
+            found = self._along_paths(found, x, master, motion)
+        beside = (found.gap < -_OUTSIDE * found.length) & ~known[found.node]
+        # What was followed and is out of reach is sought anew from either side.
+        stays = np.zeros_like(every)
+        stays[np.setdiff1d(node, lost)] = known[np.setdiff1d(node, lost)]
+        found = found.part(~beside)
+        stays[found.node] = True
+        return Found(found, stays, cover)
+
+    def _along_paths(
+        self, found: Candidates, x: FloatArray, master: FloatArray, motion: Motion
+    ) -> Candidates:
+        """Candidates with the facets that their paths lead to in place of the closest. Collective.
+
+        Args:
+            found: Candidates of the closest facets.
+            x: This rank's slaves at t_n [m], shape (share, 3).
+            master: Points of the master at t_n [m].
+            motion: Expected in the step.
+        """
+        slave_path, master_path = self._gather_paths(motion.paths)
+        change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
+        corners, node = master[self.master.facets], found.node[change]
+        if len(node):
+            start, _ = facets.closest_point(x[node], corners[facet])
+            other, _ = self._measure(x, master, node, facet, start, motion.reach)
+            found = _replace(found, other)
+        aimed = motion.aimed
+        if self.is_long(motion.reach):
+            hit, _ = search.first_hits(
+                x, slave_path, corners, master_path[self.master.facets]
+            )
+            aimed = np.where(hit >= 0, hit, aimed)
+        node = np.flatnonzero(aimed >= 0)
+        if len(node):
+            start, _ = facets.closest_point(x[node], corners[aimed[node]])
+            other, _ = self._measure(x, master, node, aimed[node], start, None)
+            found = _replace(found, other)
+        return found
+
+    def _gather_paths(self, paths: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Displacements of this rank's slaves and of all points of the master [m]. Collective."""
+        slave = self.slave.gather(paths[0])[self.slave.share]
+        return slave, self.master.gather(paths[1])
+
+    def is_long(self, reach: float) -> bool:
+        """Whether a motion may carry a node through a facet that is not the closest."""
+        return reach > _MARGIN * self._smallest
+
+    @cached_property
+    def _smallest(self) -> float:
+        """Size of the master's smallest facet in the reference [m]."""
+        return float(facets.size(self.master.reference[self.master.facets]).min())
+
+    def missed(
+        self, positions: Sequence[FloatArray], paths: Sequence[FloatArray], held: IntArray
+    ) -> IntArray:
+        """Facet that each of the rank's slaves has come through unseen, or -1. Collective.
+
+        Args:
+            positions: Of all points at t_n [m].
+            paths: Displacement of each of `bodies` in the solved step [m], owned coordinates.
+            held: Facet that each of the rank's slaves is held at in the end, or -1, shape (share,).
+        """
+        slaves, master = positions
+        x, corners = slaves[self.slave.share], master[self.master.facets]
+        slave_path, master_path = self._gather_paths(paths)
+        hit, _ = search.first_hits(x, slave_path, corners, master_path[self.master.facets])
+        node = np.flatnonzero((hit >= 0) & (hit != held))
+        control = self.master.control_points(master + master_path, hit[node])
+        end = (x + slave_path)[node]
+        xi, converged = facets.project(end, control, np.zeros((len(node), 2)))
+        foot, _, normal = facets.frame(control, xi)
+        depth = np.einsum("ni,ni->n", normal, foot - end) / facets.size(control)
+        # A node that is held at another facet ends behind this one by what they differ in height.
+        deep = depth > np.where(held[node] >= 0, _MARGIN, _OUTSIDE)
+        hit[np.setdiff1d(np.arange(len(hit)), node[deep | ~converged])] = -1
+        return hit
 
     def _measure(
         self,
@@ -193,19 +300,26 @@ class ContactPair:
         node: IntArray,
         facet: IntArray,
         start: FloatArray,
-        reach: float,
-    ) -> Candidates:
-        """Those of the pairs (node, facet) that may touch; projected from `start`."""
+        reach: float | None,
+    ) -> tuple[Candidates, IntArray]:
+        """Those of the pairs (node, facet) that may touch, and nodes beyond the surface's edge.
+
+        Projected from `start`; with reach None all may touch whose projection is found.
+        """
         pair = self.master.control_points(master, facet)
         xi, converged = facets.project(x[node], pair, start)
         foot, _, normal = facets.frame(pair, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
         length = facets.size(pair)
-        legal = converged & self._over_facet(facet, xi, reach / length) & self._movable(node, facet)
-        legal &= (gap > -_MARGIN * length) & (gap < reach + _MARGIN * length)
-        return Candidates(
+        legal = converged & self._movable(node, facet)
+        beyond = np.zeros_like(legal)
+        if reach is not None:
+            over, beyond = self._over_facet(facet, xi, reach / length)
+            legal &= over & (gap > -_MARGIN * length) & (gap < reach + _MARGIN * length)
+        found = Candidates(
             node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
         )
+        return found, node[beyond]
 
     def _near_obstacle(self, slaves: FloatArray, reach: float, moved: FloatArray) -> Candidates:
         """Candidates of an obstacle. Nothing limits the depth: what is behind it is inside."""
@@ -216,13 +330,6 @@ class ContactPair:
         node = np.flatnonzero(movable & (gap.value < reach + _MARGIN * length))
         only, xi = np.zeros(len(node), dtype=np.int64), np.zeros((len(node), 2))
         return Candidates(node, only, xi, gap.gradient[node, 0], gap.value[node], length[node])
-
-    def cover(self, u: Sequence[FloatArray], reach: float) -> float:
-        """Relative motion [m] for which `find` with this reach misses no contact. Collective."""
-        if self.rigid:
-            return reach + _MARGIN * float(np.sqrt(self.slave.area.min()))
-        corners = self.master.positions(u[1])[self.master.facets]
-        return reach + _MARGIN * float(facets.size(corners).min())
 
     def _crossings(
         self, c: Candidates, master: FloatArray, slave_motion: FloatArray, master_motion: FloatArray
@@ -249,19 +356,33 @@ class ContactPair:
         change = np.flatnonzero(over & (joined >= 0))
         return change, joined[change] // nc
 
-    def _over_facet(self, facet: IntArray, xi: FloatArray, reach: FloatArray) -> BoolArray:
-        """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide."""
-        beyond = facets.edge_excess(xi, self.master.facets.shape[1])
+    def _over_facet(
+        self, facet: IntArray, xi: FloatArray, reach: FloatArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide.
+
+        And whether they are beyond an edge that the surface ends at.
+        """
+        excess, free = facets.edge_excess(xi, self.master.facets.shape[1]), self._free_edges[facet]
         wedge = _WEDGE + 2.0 * (reach + _MARGIN)
-        limit = np.where(self._free_edges[facet], _OVERHANG, wedge[:, None])
-        inside: BoolArray = (beyond <= limit).all(axis=1)
-        return inside
+        beyond: BoolArray = (free & (excess > _OVERHANG)).any(axis=1)
+        inside: BoolArray = (free | (excess <= wedge[:, None])).all(axis=1) & ~beyond
+        return inside, beyond
 
     def _movable(self, node: IntArray, facet: IntArray) -> BoolArray:
         """Whether any coordinate of a pair is free; without one there is nothing to solve for."""
         slave = self.slave.fixed[self.slave.share[node]].all(axis=1)
         master = self.master.fixed[self.master.patches[facet]].all(axis=(1, 2))
         return ~(slave & master)
+
+
+def _replace(found: Candidates, other: Candidates) -> Candidates:
+    """Candidates with the others in place of those of the same nodes, in the order of the nodes."""
+    stay = ~np.isin(found.node, other.node)
+    order = np.argsort(np.concatenate([found.node[stay], other.node]))
+    return Candidates(
+        *(np.concatenate([a[stay], b])[order] for a, b in zip(found, other, strict=True))
+    )
 
 
 def _check_friction(friction: Any) -> None:

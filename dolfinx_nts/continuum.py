@@ -18,6 +18,7 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.integrators import Static
@@ -384,6 +385,11 @@ class Continuum:
             load += ufl.inner(value, w) * self._ds(k)
         f = ufl.Identity(3) + ufl.grad(self.u)
         energy = self._energy(f.T * f)
+        self._parameters = [
+            t
+            for t in traverse_unique_terminals(energy)
+            if isinstance(t, fem.Constant | fem.Function) and t is not self.u
+        ]
         if self._extra_form is not None:
             self._check_extra_form(self._extra_form, w)
         mass, self._load_form, self._energy_form = compat.compile_forms(
@@ -584,6 +590,13 @@ class Continuum:
         value = float(fem.assemble_scalar(self._energy_form))
         self.u.x.array[:] = kept
         return value
+
+    def parameters(self) -> FloatArray:
+        """Values of the Constants and Functions in W(C), which a caller may change, shape (n,)."""
+        values = [
+            t.value if isinstance(t, fem.Constant) else t.x.array for t in self._parameters
+        ]
+        return np.concatenate([np.empty(0), *map(np.ravel, values)])
 
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
         """Smallest det F at corners and quadrature points on this rank, and X of its cell [m]."""

@@ -11,11 +11,13 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts import balance
+from dolfinx_nts.continuum import Body
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.newton import Newton
 from dolfinx_nts.simulate import Solution, Stepper, run, writers
 from dolfinx_nts.step import Evaluation
 from dolfinx_nts.system import State, System
+from dolfinx_nts.table import Table
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -31,8 +33,6 @@ FloatArray = npt.NDArray[np.float64]
 #: A load step is dropped if it leaves a slave this part of a facet behind one that it was no
 #: candidate of.
 _MISSED = 0.1
-#: Searches for contact, each for the motion that came of the one before.
-_SEARCHES = 4
 #: Relaxations of one load step before it counts as without equilibrium.
 _RELAXATIONS = 100
 #: From this part of the forces on, the stabilization's moves no node to another facet.
@@ -73,13 +73,17 @@ class Equilibrium(Solution):
 
         A coordinate that two conditions prescribe counts with the later one.
         """
-        names = [b.name for b in self.system.bodies]
-        return {n: np.array([r["reactions"][k] for r in self.rows]) for k, n in enumerate(names)}
+        return {b.name: self.rows.column(_reactions(b)) for b in self.system.bodies}
 
     @property
     def contact_forces(self) -> FloatArray:
         """Resultant of each contact on its slave body [N], shape (rows, contacts, 3)."""
-        return np.array([row["contact_forces"] for row in self.rows])
+        return self.rows.column("contact_forces")
+
+
+def _reactions(body: Body) -> str:
+    """Column of the reactions of a body."""
+    return f"reactions of {body.name}"
 
 
 class _LoadStepper(Stepper):
@@ -94,9 +98,9 @@ class _LoadStepper(Stepper):
         self._forces = [np.zeros_like(u) for u in self.state.u]
         self._accept(replace(self.state, v=tuple(self._rates)))
         row = balance.first_row(system, self.state)
-        row["reactions"] = [b.reactions(np.zeros(b.num_owned)) for b in system.bodies]
+        row |= {_reactions(b): b.reactions(np.zeros(b.num_owned)) for b in system.bodies}
         row["contact_forces"] = np.zeros((len(system.contacts), 3))
-        self.solution = Equilibrium(system, rows=[row], state=self.state)
+        self.solution = Equilibrium(system, rows=Table([row]), state=self.state)
 
     def start(self, dt: float) -> None:
         """Nothing moves at the start."""
@@ -121,7 +125,8 @@ class _LoadStepper(Stepper):
                 times, comm = (old.time, time), self.system.comm
                 start, end = (pair.master.displacement(t, comm) for t in times)
                 terms["external_work"] += float(mean @ (end - start))
-        terms |= {"time": time, "newton_iterations": iterations, "contact_defect": 0.0}
+        terms |= {"time": time, "newton_iterations": iterations}
+        terms |= {"contact_defect": 0.0, "material_change": 0.0}
         rows, measured = self.solution.rows, balance.measure(self.system, state)
         row = balance.next_row(rows[0], rows[-1], measured, terms)
         rows.append(row | resultants)
@@ -178,17 +183,9 @@ class _LoadStepper(Stepper):
 
     def _solve(self, state: State, dt: float, search: bool) -> Evaluation:
         """Solution from a state; contact is sought as far as the bodies turn out to move."""
-        motion = np.zeros(len(self.system.bodies))
-        for _ in range(_SEARCHES):
-            self.problem.begin(state, dt, motion, search=search)
-            step = self.solver.solve()
-            motion = self.problem.motion(step)
-            if not search or self.problem.covers(motion):
-                return step
-        raise StepFailedError(
-            f"step from t={state.time:.6g}: bodies move by {motion.max():.3g} m, too far to find "
-            "their contacts"
-        )
+        self.problem.begin(state, dt, search=search)
+        step = self.solver.solve()
+        return self._covered(step) if search else step
 
     def _check_missed(self, state: State) -> None:
         """Raise if a slave went through a facet whose candidate it was not."""
@@ -210,7 +207,7 @@ class _LoadStepper(Stepper):
         total = np.empty_like(local)
         self.system.comm.Allreduce(local, total, op=MPI.SUM)
         parts = np.split(total, np.cumsum([len(r) for r in reactions]))
-        return {"reactions": parts[:-1], "contact_forces": parts[-1]}
+        return dict(zip([*map(_reactions, bodies), "contact_forces"], parts, strict=True))
 
 
 def _pseudo_times(load_steps: Any) -> list[float]:

@@ -27,9 +27,11 @@ class _InTime:
     Attributes:
         inertia: Whether there are inertial forces.
         theta: Where between t_n and t_{n+1} loads and the direct rule's contact forces are taken.
+        closes_ledger: Whether the ledger closes to the tolerance of the solver.
     """
 
     inertia: ClassVar[bool] = True
+    closes_ledger: ClassVar[bool] = False
     theta: ClassVar[float] = 0.5
 
     def factor(self, dt: float) -> float:
@@ -78,6 +80,8 @@ class EnergyMomentum(_InTime):
         ValueError: Unknown rule or number of points.
     """
 
+    closes_ledger: ClassVar[bool] = True
+
     stress: str = "gonzalez"
     contact_gradient: str = "mean-value"
     quadrature_points: int = 3
@@ -104,6 +108,7 @@ class Static:
 
     contact_gradient: ClassVar[str] = "direct"
     inertia: ClassVar[bool] = False
+    closes_ledger: ClassVar[bool] = False
     theta: ClassVar[float] = 1.0
 
     def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:

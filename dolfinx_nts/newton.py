@@ -108,6 +108,9 @@ ACCURACY: Mapping[str, Newton] = {
 }
 #: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
 _SLOW = 0.05
+#: A residual that hardly falls, this many times its tolerance or less, may be rounding of forces
+#: that have grown since rounding was measured.
+_STALLED, _NEAR = 0.5, 1e4
 #: Of the tolerance, what an iteration aims at that could be the last: a step that only just
 #: converges would leave its whole tolerance to the ledger, where factors leave rounding.
 _AIM = 1e-3
@@ -260,6 +263,7 @@ class StepSolver:
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
         self._last = self._passed = None
+        self._measured = False
         self._flips = [np.zeros(c.num_pairs, dtype=int) for c in self.problem.contacts]
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
@@ -359,10 +363,14 @@ class StepSolver:
     def _converged(self, _snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
         assert self._last is not None
         reasons = PETSc.SNES.ConvergedReason
-        # After the Jacobian of the same iterate rounding may be known better than before.
         worst = self._worst(self._last)
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
             return reasons.DIVERGED_FNORM_NAN
+        stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
+        if stalls and worst < _NEAR and not self._measured:
+            self.problem.measure_rounding()
+            self._measured = self._matrices_due = True
+            worst = self._worst(self._last)
         unchanged = self.problem.system.comm.allreduce(self._rests, op=MPI.LAND)
         self._solved |= iteration > 0
         self._matrices_due |= unchanged and worst > max(1.0, _SLOW * self._before)

@@ -59,6 +59,15 @@ class Obstacle:
         """Signed distance of points (n, 3) with its derivatives, an element without corners."""
         raise NotImplementedError
 
+    @property
+    def width(self) -> float:
+        """Radius of what a node could pass within a step [m]; infinite where it cannot."""
+        return np.inf
+
+    def lowest_gap(self, x0: FloatArray, x1: FloatArray) -> FloatArray:
+        """Smallest gap on straight paths from x0 to x1 [m], (n, 3) each -> (n,)."""
+        raise NotImplementedError
+
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Discrete gradient of the gap in the invariant y . y, and its derivative by x1.
 
@@ -148,6 +157,10 @@ class Plane(Obstacle):
         value = x @ normal - self._height
         return Gap(value, np.tile(normal, (n, 1, 1)), np.zeros((n, 3, 3)))
 
+    def lowest_gap(self, x0: FloatArray, x1: FloatArray) -> FloatArray:
+        """That of one of the ends: the gap is linear."""
+        return np.minimum(self.gap(x0).value, self.gap(x1).value)
+
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The normal: the gap is linear."""
         n = len(x0)
@@ -190,6 +203,24 @@ class _Round(Obstacle):
         hessian = side * per_r[:, None, None] * bend
         return Gap(side * (r - self.radius), side * unit[:, None], hessian)
 
+    @property
+    def width(self) -> float:
+        """The radius; a hollow is left on no straight path that ends inside."""
+        return np.inf if self.inside else self.radius
+
+    def lowest_gap(self, x0: FloatArray, x1: FloatArray) -> FloatArray:
+        """Smallest gap on straight paths [m]: of a hollow at an end, else next to the centre."""
+        y0, r0, _, side = self._radial(x0)
+        y1, r1, _, _ = self._radial(x1)
+        if side < 0.0:
+            return self.radius - np.maximum(r0, r1)
+        path = y1 - y0
+        square = np.einsum("ni,ni->n", path, path)
+        part = -np.einsum("ni,ni->n", y0, path) * inverse(square)
+        nearest = y0 + part.clip(0.0, 1.0)[:, None] * path
+        lowest: FloatArray = np.linalg.norm(nearest, axis=1) - self.radius
+        return lowest
+
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(y_0 + y_1) / (|y_0| + |y_1|): the discrete gradient of the root of y . y."""
         y0, r0, projection, side = self._radial(x0)
@@ -211,9 +242,6 @@ def inverse(r: FloatArray) -> FloatArray:
 @dataclass(frozen=True)
 class Sphere(_Round):
     """A rigid ball, or a hollow in the shape of one.
-
-    A step's motion should stay below the radius: a node that passes a ball within one step is not
-    seen.
 
     Args:
         centre: Its centre [m].
@@ -247,9 +275,6 @@ class Sphere(_Round):
 @dataclass(frozen=True)
 class Cylinder(_Round):
     """A rigid circular cylinder without ends, or a bore.
-
-    A step's motion should stay below the radius: a node that passes a cylinder within one step is
-    not seen.
 
     Args:
         point: Any point of its axis [m].

@@ -13,7 +13,7 @@ from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.discrete_gradient import strain_derivative
-from dolfinx_nts.output import StrPath, as_path, gather, node_blocks, on_root
+from dolfinx_nts.output import StrPath, as_path, gather, node_blocks, on_root, save_figure
 from dolfinx_nts.surfaces import oriented_nodes
 from dolfinx_nts.validation import floats, items, require_bool, require_positive
 
@@ -88,12 +88,11 @@ def picture(
         drawn.append(_Drawn(body.name, gather(comm, corners), gather(comm, values)))
 
     def draw() -> None:
-        file.parent.mkdir(parents=True, exist_ok=True)
         figure, axes = _figure(drawn, width, title)
         scale = _colour_scale(drawn, colour, limits)
         axes.add_collection(_painted(drawn, scale))
         _furnish(figure, axes, scale, _COLOURS[colour][1], view, drawn if labels else ())
-        figure.savefig(file, dpi=200, bbox_inches="tight", pad_inches=0.05)
+        save_figure(figure, file, dpi=200, bbox_inches="tight", pad_inches=0.05)
 
     on_root(comm, f"path={str(path)!r}", draw)
 

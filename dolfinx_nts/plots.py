@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import balance as ledger
-from dolfinx_nts.output import StrPath
+from dolfinx_nts.output import StrPath, save_figure
 
 FloatArray = npt.NDArray[np.float64]
 Balance = Mapping[str, FloatArray]
@@ -41,7 +41,7 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
         energy = _Panel("Energy", "[J]", lines)
     work = {
         name.replace("_", " "): balance[name]
-        for name in ("contact_defect", "external_work", "friction_dissipation")
+        for name in ("contact_defect", "external_work", "friction_dissipation", "material_change")
         if name == "contact_defect" or balance[name].any()
     }
     nodes = {
@@ -110,8 +110,7 @@ def _plot(balances: Mapping[str, Balance], path: StrPath) -> None:
             axes.legend(fontsize=8, frameon=False)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]", fontsize=9)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    save_figure(figure, Path(path), dpi=150)
 
 
 def _lines(axes: Any, panel: _Panel, time: FloatArray, run: str, number: int | None) -> None:

@@ -31,6 +31,12 @@ _SIZE_RATIO = 4.0
 _MAX_SIZES = 12
 _MAX_PAIRS = 1 << 18
 
+_TRIANGLES = {3: ((0, 1, 2),), 4: ((0, 1, 2), (0, 2, 3))}
+# Weights of corners beyond which a path is not near its triangle.
+_NEARBY = 2.0
+# Paths that are compared with the facets around them at a time.
+_PORTION = 4096
+
 
 class Closest(NamedTuple):
     """Closest facet of each point.
@@ -114,6 +120,91 @@ def closest_facets(
         _choose(scene, limit, point, facet, result)
     _prefer(scene, kept, preference, result)
     return result
+
+
+def first_hits(
+    points: FloatArray, motion: FloatArray, corners: FloatArray, corner_motion: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """The facet whose front each point's path meets first, and where.
+
+    Points and corners move evenly. A path meets a facet, a quadrilateral being two triangles, where
+    it comes through it from the side that the normal points to. Exact for facets that do not turn.
+
+    Args:
+        points: Points at the start [m], shape (n, 3).
+        motion: Their motion [m], shape (n, 3).
+        corners: Facet corners at the start [m], shape (m, nc, 3).
+        corner_motion: Their motion [m], shape (m, nc, 3).
+
+    Returns:
+        Facet of each point or -1, shape (n,), and the part of the motion after which it is met [-],
+        inf where there is none, shape (n,).
+    """
+    hit, when = np.full(len(points), -1), np.full(len(points), np.inf)
+    if not (len(points) and len(corners)):
+        return hit, when
+    # What all facets share of their motion makes no path longer.
+    common = corner_motion.mean(axis=(0, 1))
+    motion, corner_motion = motion - common, corner_motion - common
+    for point, facet in _near_paths(points, motion, corners, corner_motion):
+        x, d = points[point], motion[point]
+        for a, b, c in _TRIANGLES[corners.shape[1]]:
+            start = corners[facet][:, [a, b, c]]
+            moved = corner_motion[facet][:, [a, b, c]]
+            # The motion of the corners where the path comes through: met with their mean first.
+            weight, _ = _through(x, d - moved.mean(axis=1), start)
+            near = np.isfinite(weight).all(axis=1) & (np.abs(weight).max(axis=1) < _NEARBY)
+            carried = np.einsum("pk,pki->pi", np.where(near[:, None], weight, 1.0 / 3.0), moved)
+            weight, part = _through(x, d - carried, start)
+            met = (weight >= -ROUNDING).all(axis=1) & (part >= -ROUNDING) & (part <= 1.0)
+            order = np.lexsort((facet[met], part[met]))
+            who, first = np.unique(point[met][order], return_index=True)
+            found, time = facet[met][order][first], part[met][order][first]
+            sooner = time < when[who]
+            hit[who[sooner]], when[who[sooner]] = found[sooner], time[sooner]
+    return hit, when
+
+
+def _through(
+    x: FloatArray, d: FloatArray, triangle: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where lines x + t d meet the front of triangles (p, 3, 3): weights (p, 3) and t (p,).
+
+    NaN where a line is parallel to its triangle or comes from behind.
+    """
+    one, two = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
+    normal, offset = np.cross(one, two), x - triangle[:, 0]
+    fall = -np.einsum("pi,pi->p", d, normal)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(fall > 0.0, 1.0 / fall, np.nan)
+        turn = np.cross(offset, d)
+        second = np.einsum("pi,pi->p", two, turn) * inverse
+        third = -np.einsum("pi,pi->p", one, turn) * inverse
+        part = np.einsum("pi,pi->p", offset, normal) * inverse
+    return np.column_stack([1.0 - second - third, second, third]), part
+
+
+def _near_paths(
+    points: FloatArray, motion: FloatArray, corners: FloatArray, corner_motion: FloatArray
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs (point, facet) whose boxes over the motion overlap, in portions."""
+    low = np.minimum(points, points + motion)
+    high = np.maximum(points, points + motion)
+    ends = np.concatenate([corners, corners + corner_motion], axis=1)
+    facet_low, facet_high = ends.min(axis=1), ends.max(axis=1)
+    centre, radius = 0.5 * (facet_low + facet_high), 0.5 * (facet_high - facet_low)
+    tree = cKDTree(centre)
+    reach = np.linalg.norm(0.5 * (high - low), axis=1) + np.linalg.norm(radius, axis=1).max()
+    inside = (high >= facet_low.min(axis=0)).all(axis=1)
+    inside &= (low <= facet_high.max(axis=0)).all(axis=1)
+    who = np.flatnonzero(inside)
+    for part in np.array_split(who, 1 + len(who) // _PORTION):
+        balls = tree.query_ball_point(0.5 * (low + high)[part], reach[part])
+        point = np.repeat(part, [len(b) for b in balls])
+        facet = np.fromiter(chain.from_iterable(balls), np.int_, len(point))
+        meets = (low[point] <= facet_high[facet]) & (high[point] >= facet_low[facet])
+        meets = meets.all(axis=1)
+        yield point[meets], facet[meets]
 
 
 def apart(points: FloatArray, corners: FloatArray, reach: float) -> bool:

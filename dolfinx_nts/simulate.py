@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
+from dolfinx_nts.guards import check_momentum
 from dolfinx_nts.inversion import describe, smallest_dets
 from dolfinx_nts.newton import ACCURACY, Newton, StepSolver
+from dolfinx_nts.promises import MaterialWatch, Promises
 from dolfinx_nts.run_warnings import RunWarnings
 from dolfinx_nts.step import Evaluation, StepProblem
 from dolfinx_nts.step_size import Adapt, Pace
 from dolfinx_nts.system import State, System
+from dolfinx_nts.table import Table
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -31,8 +35,12 @@ from dolfinx_nts.validation import (
 
 logger = logging.getLogger(__name__)
 
+FloatArray = npt.NDArray[np.float64]
+
 #: Part of the energy by which changes of facet may raise it in a step without a warning.
 _NOTABLE_GAIN = 0.01
+#: Searches for contact, each along the motion that came of the one before.
+_SEARCHES = 4
 #: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
 _WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
 
@@ -45,28 +53,31 @@ class Solution:
         system: The scene; its bodies hold the last accepted state.
         status: "completed"; "completed, but ..." with what may be wrong in it; or why the run
             stopped and what to do.
-        rows: Balance table, one row for the start and one per accepted step.
+        rows: Balance table, one row for the start and one per accepted step; some 150 B each.
         retries: How often a step was dropped and halved.
         rejected: How often a step was dropped for its error and shortened, see `Adapt`.
         exceeded: Steps taken though their motion errs more than `Adapt` asks for: the shortest it
             may take, and those that move nodes out from behind their facets.
-        switches: Changes of facet of nodes in contact.
+        switches: Changes of facet of nodes in contact: the newest 10,000, and sums over all.
         warnings: What the run has to say against its result, by kind; see `RunWarning`.
     """
 
     system: System
     status: str = "running"
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    rows: Table = field(default_factory=Table)
     retries: int = 0
     rejected: int = 0
     exceeded: int = 0
-    switches: list[balance.Switch] = field(default_factory=list)
+    switches: balance.Switches = field(default_factory=balance.Switches)
     warnings: RunWarnings = field(default_factory=RunWarnings)
 
     @property
     def balance(self) -> dict[str, npt.NDArray[np.float64]]:
-        """Columns of the balance table, shape (rows,) or (rows, 3), identical on all ranks."""
-        return {name: np.array([row[name] for row in self.rows]) for name in balance.COLUMNS}
+        """Columns of the balance table, shape (rows,) or (rows, 3), identical on all ranks.
+
+        They are read-only and hold the rows up to now.
+        """
+        return {name: self.rows.column(name) for name in balance.COLUMNS}
 
     @property
     def summary(self) -> str:
@@ -84,14 +95,13 @@ class Solution:
         ]
         if self.exceeded:
             lines.append(f"{self.exceeded} steps taken though they err more than their tolerance")
-        if self.switches:
-            defects = np.array([s.defect for s in self.switches])
-            worst = self.switches[int(np.abs(defects).argmax())]
+        found, worst = self.switches, self.switches.worst
+        if worst is not None:
             lines.append(
-                f"{len(defects)} changes of facet: contact defect {defects.sum():.3g} J in all, "
-                f"{np.abs(defects).mean():.3g} J each; most {worst.defect:.3g} J at "
-                f"t = {worst.time:.6g} s ({worst.contact}, node {worst.node}, facet "
-                f"{worst.facets[0]} to {worst.facets[1]})"
+                f"{found.number} changes of facet: contact defect {found.defect:.3g} J in all, "
+                f"mean of absolute values {found.size / found.number:.3g} J; most "
+                f"{worst.defect:.3g} J at t = {worst.time:.6g} s ({worst.contact}, node "
+                f"{worst.node}, facet {worst.facets[0]} to {worst.facets[1]})"
             )
         return "\n".join([*lines, *self.warnings.lines])
 
@@ -116,6 +126,20 @@ class Solution:
 
         as_path("path", path)
         on_root(self.system.comm, f"path={path!r}", lambda: plot_balance(self.balance, path))
+
+
+class Trial(NamedTuple):
+    """A solved step that may be accepted.
+
+    Attributes:
+        step: Solution of its equations.
+        state: State at its end.
+        measured: `balance.measure` of that state.
+    """
+
+    step: Evaluation
+    state: State
+    measured: dict[str, Any]
 
 
 @known_options
@@ -179,8 +203,13 @@ class Stepper:
         self.system = system
         self._started = False
         self._measured: dict[str, balance.Measured] = {}
+        self._recent: deque[tuple[float, tuple[FloatArray, ...]]] = deque(maxlen=2)
         self._accept(_first_state(system, start))
-        self.solution = Solution(system, rows=[balance.first_row(system, self.state)])
+        self.solution = Solution(system, rows=Table([balance.first_row(system, self.state)]))
+        self._promises = Promises(
+            self.solution, closes=integrator.closes_ledger, rtol=self.newton.rtol
+        )
+        self._materials, self._material_change = MaterialWatch(system), 0.0
 
     def advance(self, dt: float) -> State:
         """Advance by dt; a step that is not solved is halved, up to `newton.max_retries` times.
@@ -237,13 +266,14 @@ class Stepper:
             now = self.state.time
             left = end - now
             dt = pace.propose(left)
+            self._note_materials()
             self.problem.begin(self.state, dt)
             part = pace.first_touch(self.problem)
             if part < 1.0:
                 dt *= part
                 self.problem.begin(self.state, dt)
             try:
-                step, state = self._attempt(dt, end if dt == left else now + dt)
+                trial = self._attempt(dt, end if dt == left else now + dt)
             except StepFailedError as failure:
                 if retries == self.newton.max_retries:
                     raise
@@ -252,12 +282,12 @@ class Stepper:
                 pace.dt = 0.5 * dt
                 logger.info("%s; retrying with dt=%.3g", failure, pace.dt)
                 continue
-            if not pace.accepts(self.problem, step):
+            if not pace.accepts(self.problem, trial.step):
                 self.solution.rejected += 1
                 continue
             retries = 0
             self.solution.exceeded += pace.exceeds
-            self._take(step, state)
+            self._take(trial)
             yield
 
     def start(self, dt: float) -> None:
@@ -278,7 +308,7 @@ class Stepper:
             values[body.fixed] = (4.0 * (p1 - p0) - (p2 - p0)) / dt
         self._accept(replace(self.state, v=tuple(v)))
         self._started = True
-        self.solution.rows[:] = [balance.first_row(self.system, self.state)]
+        self.solution.rows = Table([balance.first_row(self.system, self.state)])
 
     def _accept(self, state: State) -> None:
         for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
@@ -286,25 +316,67 @@ class Stepper:
         self.state = state
 
     def _step(self, dt: float, time: float) -> None:
+        self._note_materials()
         self.problem.begin(self.state, dt)
-        self._take(*self._attempt(dt, time))
+        self._take(self._attempt(dt, time))
 
-    def _attempt(self, dt: float, time: float) -> tuple[Evaluation, State]:
-        """Solution of the step that `problem.begin` fixed and its state, if that may be accepted.
+    def _note_materials(self) -> None:
+        """Name in the ledger what changed parameters of materials do to the stored energy."""
+        names = self._materials.changed()
+        if not names:
+            return
+        self._measured.clear()
+        stored = balance.measure(self.system, self.state, self._measured)["potential"]
+        change = stored - self.solution.rows[-1]["potential"] - self._material_change
+        self._material_change += change
+        self.solution.warn(
+            "material changed", self.state.time, abs(change),
+            f"a changed parameter of the material of {', '.join(map(repr, names))} adds "
+            f"{change:.3g} J to the stored energy without work; see material_change in the balance",
+        )  # fmt: skip
+
+    def _attempt(self, dt: float, time: float) -> Trial:
+        """Solution of the step that `problem.begin` fixed, if it may be accepted.
 
         Raises:
             StepFailedError: Not solved, or what came out cannot be.
         """
-        step = self.solver.solve()
-        return step, self._accepted(step, dt, time)
+        step = self._covered(self.solver.solve())
+        state = self._accepted(step, dt, time)
+        measured = balance.measure(self.system, state, self._measured)
+        check_momentum(self.problem, step, state, self.solution.rows[-1], measured)
+        return Trial(step, state, measured)
 
-    def _take(self, step: Evaluation, state: State) -> None:
-        rows, time = self.solution.rows, state.time
+    def _covered(self, step: Evaluation) -> Evaluation:
+        """The step itself, or solved again for as long as its motion may have passed by a contact.
+
+        Raises:
+            StepFailedError: No search found all contacts.
+        """
+        problem, iterations = self.problem, step.iterations
+        for _ in range(_SEARCHES):
+            if not problem.misses(step):
+                return replace(step, iterations=iterations)
+            problem.begin(problem.state, problem.dt, step)
+            step = self.solver.solve()
+            iterations += step.iterations
+        far = float(problem.motion(step).max())
+        raise StepFailedError(
+            f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
+            f"{far:.3g} m, too far to find their contacts"
+        )
+
+    def _take(self, trial: Trial) -> None:
+        """Accept a step: a row of the ledger, and the new state."""
+        step, state, rows = trial.step, trial.state, self.solution.rows
+        time = state.time
         terms = balance.step_terms(self.problem, step)
         terms |= {"time": time, "newton_iterations": step.iterations}
-        measured = balance.measure(self.system, state, self._measured)
-        rows.append(balance.next_row(rows[0], rows[-1], measured, terms))
-        self.solution.switches += balance.switches(self.problem, step, time)
+        terms["material_change"], self._material_change = self._material_change, 0.0
+        rows.append(balance.next_row(rows[0], rows[-1], trial.measured, terms))
+        self._promises.hold(self.problem, step)
+        self.solution.switches.extend(balance.switches(self.problem, step, time))
+        self._recent.append((time - self.state.time, state.force))
         self._accept(state)
         self._tell_inversion(step)
         gain = -terms["contact_defect"]
@@ -353,8 +425,27 @@ class Stepper:
             time=time,
             u=tuple(u),
             v=tuple(v),
+            followed=self.problem.followed,
             **{name: tuple(c[name] for c in contact) for name in names},
         )
+
+    def mean_force(self, k: int) -> FloatArray:
+        """Contact force p_N of the last two steps in the mean over their time [N].
+
+        That of a single step alternates about it; after one step, or a load step of `equilibrium`,
+        it is that step's.
+
+        Args:
+            k: Number of the contact.
+
+        Returns:
+            At this rank's slave nodes, as in `state.force`.
+        """
+        if not self._recent:
+            return self.state.force[k]
+        steps, forces = zip(*self._recent, strict=True)
+        mean: FloatArray = np.average([force[k] for force in forces], axis=0, weights=steps)
+        return mean
 
     def close(self) -> None:
         """Free the PETSc objects of the last step."""
@@ -542,9 +633,8 @@ def _march(
             raise UserFunctionError(problem) from cause
         if bar is not None:
             row = stepper.solution.rows[-1]
-            bar.set_postfix(
-                active=int(row["active"]), newton=row["newton_iterations"], refresh=False
-            )
+            active, newton = int(row["active"]), int(row["newton_iterations"])
+            bar.set_postfix(active=active, newton=newton, refresh=False)
             bar.update()
 
 

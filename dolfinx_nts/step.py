@@ -19,10 +19,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.assembly import ElementBlocks, Layout
+from dolfinx_nts.contact import Motion
 from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.obstacle_contact import ObstacleStep
 from dolfinx_nts.sleep import Sleepers
 from dolfinx_nts.system import State, System
+from dolfinx_nts.validation import StepFailedError
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -33,8 +35,11 @@ _EPS = float(np.finfo(float).eps)
 _TOUCHING = 1e-6
 #: Relative difference of the factors of two equal steps, which differ by rounding.
 EQUAL = 1e-6
-#: Distance from the origin over that of the expected motion, of an iterate that has run off.
-_RUN_OFF = 2.0
+#: Path of a node over an obstacle's radius, and depth below both ends, from which on it passes
+#: through.
+_PASSING = 0.1
+#: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
+_ANOTHER_STEP = 4.0
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
 _ONE = 1e-6
 
@@ -104,6 +109,7 @@ class StepProblem:
         x: PETSc vector of the unknowns, holding the first guess after `begin`.
         version: Changes whenever layout and elements do.
         factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
+        rtol: As given.
         stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
     """
 
@@ -111,7 +117,7 @@ class StepProblem:
         self, system: System, integrator: Any, *, rtol: float, condense: bool, sleep: bool = False
     ) -> None:
         self.system, self.integrator = system, integrator
-        self._rtol, self.condense = rtol, condense
+        self.rtol, self.condense = rtol, condense
         self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
         self._asleep: dict[int, BodyTerms] = {}
         self.awake: tuple[int, ...] = ()
@@ -121,18 +127,20 @@ class StepProblem:
         self._petsc: list[Any] = []
         self.version = 0
         self.stabilization = 0.0
+        self._cover = [0.0] * len(system.contacts)
         self._diagonal, self._diagonal_factor = np.zeros((2, len(system.bodies)))
 
     # ---- set-up of a step
     def begin(
-        self, state: State, dt: float, motion: FloatArray | None = None, *, search: bool = True
+        self, state: State, dt: float, again: Evaluation | None = None, *, search: bool = True
     ) -> None:
         """Fix the state at t_n and the step: loads, candidates, layout, first guess.
 
         Args:
             state: State at t_n.
             dt: Step [s].
-            motion: Motion of each body [m] that contact is sought for at least, as from `motion`.
+            again: Solution of this step whose motion the candidates did not cover, see `misses`:
+                contact is sought along that motion in place of the one that velocities predict.
             search: Seek candidates; False keeps those of the last step, for statics only.
         """
         system = self.system
@@ -156,9 +164,17 @@ class StepProblem:
             self._inertial(b, momentum * v) if top > 0.0 else np.zeros_like(v)
             for b, v, top in zip(system.bodies, state.v, speed, strict=True)
         ]
-        if motion is not None:
-            self._motion = np.maximum(self._motion, motion)
+        self._ahead = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
+        if again is None:
+            self._aimed = [np.full(len(c.slave.share), -1) for c in system.contacts]
+        else:
+            self._motion = np.maximum(self._motion, self.motion(again))
+            self._ahead = [terms.du for terms in again.bodies]
+        for k, factor in enumerate(self._diagonal_factor):
+            if not factor / _ANOTHER_STEP <= self.factor <= factor * _ANOTHER_STEP:
+                self._measure_rounding(k)
         if search:
+            self._followed = list(state.followed)
             self._found = [self._search(k) for k in range(len(system.contacts))]
             self._drop_doubles()
             self._with_unknowns = [self._may_touch(k, c) for k, c in enumerate(self._found)]
@@ -189,9 +205,7 @@ class StepProblem:
 
         A diagonal of another step hardly allows more: it grows with the factor, but less than that.
         """
-        if not self._diagonal[k]:
-            self.body_tangent(k, self.state.u[k])
-        return float(self._rounding[k] / max(self.factor, self._diagonal_factor[k]))
+        return float(self.rounding[k] / max(self.factor, self._diagonal_factor[k]))
 
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
@@ -281,10 +295,17 @@ class StepProblem:
 
     def _contact_step(self, index: int, u: list[FloatArray], reach: float) -> ContactStep:
         pair, state = self.system.contacts[index], self.state
-        ahead = [0.5 * (self.first[b] - state.u[b]) for b in self.system.contact_bodies[index]]
+        paths = [self._ahead[b] for b in self.system.contact_bodies[index]]
         moved = self._paths[index][0] if pair.rigid else None
         positions = pair.positions(u)
-        found = pair.find(positions, state.facets[index], reach, moved, ahead)
+        found, self._followed[index], self._cover[index] = pair.find(
+            positions,
+            state.facets[index],
+            moved,
+            Motion(reach, paths, self._aimed[index]),
+            # In statics steps may be of any length, and what they carry inside is looked for.
+            state.followed[index] if self.integrator.inertia else None,
+        )
         slave, x0, theta = pair.slave, pair.points(positions, found), self.integrator.theta
         scale = slave.mass if self.integrator.inertia else slave.nodal(slave.body.nodal_stiffness())
         scale = scale[slave.share[found.node]]
@@ -515,45 +536,100 @@ class StepProblem:
             held.array_w[:] = self._stabilization(self.system.bodies[k])
             a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
             held.destroy()
-        known = abs(self.factor - self._diagonal_factor[k]) <= EQUAL * self.factor
-        known &= self.integrator.inertia and np.array_equal(u1, self.first[k])
-        # At the first guess of an equal step the last one's diagonal is as good; a body that has
-        # stiffened needs more than one iteration.
-        if not self.system.comm.allreduce(known, op=MPI.LAND):
-            self._measure_rounding(k, a, u1)
         return a
 
-    def _measure_rounding(self, k: int, a: Any, u1: FloatArray) -> None:
-        """Note the diagonal of a body's matrix at a displacement. Collective."""
-        reached = np.abs(self.system.bodies[k].reference + u1).max(initial=0.0)
-        # An iterate that runs off may be stiffer by any factor; its rounding excuses no residual.
-        if _global_max(self.system.comm, np.array([reached]))[0] <= _RUN_OFF * self._extent[k]:
-            diagonal = a.getDiagonal()
-            self._diagonal[k], self._diagonal_factor[k] = diagonal.norm(), self.factor
-            diagonal.destroy()
+    def measure_rounding(self) -> None:
+        """Measure the rounding of the forces anew, for bodies that have stiffened. Collective.
+
+        The bodies' matrices are not those of an iterate any more.
+        """
+        for k in self.awake:
+            self._measure_rounding(k)
+
+    def _measure_rounding(self, k: int) -> None:
+        """Note the diagonal of a body's matrix in the accepted state, never in an iterate.
+
+        An iterate that runs off may be stiffer by any factor; its rounding excuses no residual.
+        """
+        diagonal = self.body_tangent(k, self.state.u[k]).getDiagonal()
+        self._diagonal[k], self._diagonal_factor[k] = diagonal.norm(), self.factor
+        diagonal.destroy()
 
     # ---- convergence
     @property
-    def _rounding(self) -> FloatArray:
+    def rounding(self) -> FloatArray:
         """Of the forces on each body [kg m]: stiffness times position times machine precision."""
         rounding: FloatArray = _EPS * self._diagonal * self._extent
         return rounding
+
+    @property
+    def momentum_rounding(self) -> float:
+        """Change of momentum in the step that is rounding [kg m/s]."""
+        return float(self.rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
+
+    @property
+    def extent(self) -> float:
+        """Distance of the bodies' farthest coordinate from the origin [m]."""
+        return float(self._extent.max())
 
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
         local = [np.abs(b.du).max(initial=0.0) for b in e.bodies]
         return _global_max(self.system.comm, np.array(local))
 
-    def covers(self, motion: FloatArray) -> bool:
-        """Whether the step's candidates are all that may touch in such a motion. Collective."""
-        reached = [
-            self._reach(k, motion)
-            <= pair.cover([self.state.u[b] for b in bodies], self._reach(k, self._motion))
-            for k, (pair, bodies) in enumerate(
-                zip(self.system.contacts, self.system.contact_bodies, strict=True)
+    @property
+    def followed(self) -> tuple[BoolArray, ...]:
+        """Of each contact, which of the rank's slave nodes have not passed by the surface."""
+        return tuple(self._followed)
+
+    def misses(self, e: Evaluation) -> bool:
+        """Whether a solved step may have passed by a contact that was no candidate. Collective.
+
+        If so, `begin` is to be called again with it.
+
+        Raises:
+            StepFailedError: A node went through an obstacle and out of it again.
+        """
+        motion, missed = self.motion(e), False
+        for k, pair in enumerate(self.system.contacts):
+            reach = self._reach(k, motion)
+            missed |= reach > self._cover[k]
+            if pair.rigid and reach > _PASSING * pair.master.width:
+                self._check_passed(k, e)
+            elif not pair.rigid and pair.is_long(reach):
+                missed |= self._met(k, e)
+        return missed
+
+    def _met(self, index: int, e: Evaluation) -> bool:
+        """Whether nodes have come through facets unseen, which are noted. Collective."""
+        pair, bodies = self.system.contacts[index], self.system.contact_bodies[index]
+        positions = pair.positions([self.state.u[b] for b in bodies])
+        held = np.full(len(pair.slave.share), -1)
+        c, active = self.contacts[index].candidates, e.contacts[index].active
+        held[c.node[active]] = c.facet[active]
+        hit = pair.missed(positions, [e.bodies[b].du for b in bodies], held)
+        new = hit >= 0
+        self._aimed[index] = np.where(new, hit, self._aimed[index])
+        # What is held at a facet that its path led to is to be so again.
+        at = np.where(self._aimed[index] >= 0, held, -1)
+        self._aimed[index] = np.where(new | (at < 0), self._aimed[index], at)
+        return bool(self.system.comm.allreduce(bool(new.any()), op=MPI.LOR))
+
+    def _check_passed(self, index: int, e: Evaluation) -> None:
+        """Raise on every rank if a node has gone through an obstacle and out of it again."""
+        pair, (body,) = self.system.contacts[index], self.system.contact_bodies[index]
+        start, end = self._paths[index]
+        u0 = self.state.u[body]
+        x0, x1 = (pair.positions([u])[0] for u in (u0, u0 + e.bodies[body].du))
+        x0, x1 = x0 - start, x1 - end
+        ends = np.minimum(pair.master.gap(x0).value, pair.master.gap(x1).value)
+        passed = pair.master.lowest_gap(x0, x1) < ends - _PASSING * pair.master.width
+        if passed.any():
+            node = int(pair.slave.original[np.flatnonzero(passed)[0]])
+            raise StepFailedError(
+                f"step from t={self.state.time:.6g} with dt={self.dt:.3g}: contact {pair.name!r}: "
+                f"node {node} passes through the obstacle within the step; use a smaller dt"
             )
-        ]
-        return all(reached)
 
     def unrest(self, e: Evaluation) -> float:
         """Force of the stabilization over what counts as converged, the largest of the bodies."""
@@ -562,7 +638,7 @@ class StepProblem:
             parts = (self._stabilization(body) * t.du, t.internal, t.external, t.contact)
             squares.append([float(p @ p) for p in parts])
         norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
-        limits = self._rtol * norms[:, 1:].max(axis=1) + self._rounding
+        limits = self.rtol * norms[:, 1:].max(axis=1) + self.rounding
         return max(_over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
@@ -575,7 +651,7 @@ class StepProblem:
         norms = np.sqrt(self.system.comm.allreduce(squares))
         ratio = {}
         for k, body in enumerate(self.system.bodies):
-            limit = self._rtol * norms[k, 1:].max() + self._rounding[k]
+            limit = self.rtol * norms[k, 1:].max() + self.rounding[k]
             ratio[body.name] = _over(norms[k, 0], limit)
         if self._fields:
             ratio |= self._contact_ratios(e)
@@ -591,13 +667,13 @@ class StepProblem:
             local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
         top = _global_max(self.system.comm, np.array(local))
         motion = max(top[0], float(self._motion.max()))
-        length = self._rtol * motion + 8 * _EPS * float(self._extent.max())
+        length = self.rtol * motion + 8 * _EPS * float(self._extent.max())
         ratio: dict[str, float] = {}
         for c, (a, g, force, scale) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
             broken = np.inf if top[1] else 0.0
             parts = {"constraints": _over(g, length + 8 * _EPS * c.extent)}
             if c.num_augmented:
-                parts["(d, f)"] = _over(a, self._rtol * max(force, scale * motion))
+                parts["(d, f)"] = _over(a, self.rtol * max(force, scale * motion))
             for part, value in parts.items():  # several contacts of two bodies have one name
                 name = f"{c.pair.name} {part}"
                 ratio[name] = max(value, broken, ratio.get(name, 0.0))

@@ -35,6 +35,7 @@ class State:
         tangential: Friction force on the same nodes [N], shape (n, 3).
         stick: Which of the same nodes stick.
         slip: Distance that the same nodes have slipped since the start [m].
+        followed: Which of the same nodes are not known to have passed by the surface's edge.
     """
 
     time: float
@@ -46,6 +47,7 @@ class State:
     tangential: tuple[FloatArray, ...]
     stick: tuple[npt.NDArray[np.bool_], ...]
     slip: tuple[FloatArray, ...]
+    followed: tuple[npt.NDArray[np.bool_], ...]
 
 
 @known_options
@@ -122,6 +124,7 @@ class System:
             tangential=tuple(np.zeros((n, 3)) for n in nodes),
             stick=tuple(np.zeros(n, dtype=bool) for n in nodes),
             slip=tuple(np.zeros(n) for n in nodes),
+            followed=tuple(np.ones(n, dtype=bool) for n in nodes),
         )
 
     def state_from(self, other: System, state: State) -> State:
@@ -152,7 +155,8 @@ class System:
         for k, pair in enumerate(self.contacts):
             for j, known in enumerate(other.contacts):
                 if pair.is_like(known):
-                    for name in ("facets", "force", "gap", "tangential", "stick", "slip"):
+                    names = ("facets", "force", "gap", "tangential", "stick", "slip", "followed")
+                    for name in names:
                         getattr(start, name)[k][:] = getattr(state, name)[j]
         self._check_penetration(self.penetration(start))
         return start
@@ -211,7 +215,7 @@ class System:
         ):
             moved = pair.master.displacement(state.time, self.comm) if pair.rigid else None
             positions = pair.positions([state.u[b] for b in bodies])
-            found = pair.find(positions, facets, 0.0, moved)
+            found = pair.find(positions, facets, moved).candidates
             depth = np.zeros(len(pair.slave.points))
             depth[pair.slave.share[found.node]] = np.maximum(-found.gap, 0.0) / found.length
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)

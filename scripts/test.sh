@@ -1,6 +1,9 @@
 #!/bin/bash
-# The whole test suite: lint, then pytest in serial (a process on each core, a test file at a time),
-# then the tests marked mpi on 2 ranks.
+# The tests: pytest in serial (a process on each core, a test file at a time), then the tests marked
+# mpi on 2 ranks.
+#   test.sh          lint and the fast tests
+#   test.sh --slow   the tests marked slow, which the fast ones leave out; those that start 3 or 4
+#                    ranks of their own come last and one by one, as waiting ranks take a core each
 # A failing stage does not stop the later ones. PYTEST_ARGS is given to pytest ("-n0 --pdb ..." for
 # those that need its terminal, with one process); NO_LINT=1 skips lint.
 set -uo pipefail
@@ -8,24 +11,43 @@ set -uo pipefail
 cd "$REPO" || exit 1
 failed=()
 
+case ${1:-} in
+  '') name=fast which='not slow' ;;
+  --slow) name=slow which=slow NO_LINT=1 ;;
+  *) die "unknown argument: $1" ;;
+esac
 if [ -z "${NO_LINT:-}" ]; then
   scripts/lint.sh || failed+=(lint)
 fi
 clean_environment
 read -r -a args <<<"${PYTEST_ARGS:-}"
 
-say "pytest, serial"
-"$PYTHON" -m pytest -q -n auto --dist loadfile "${args[@]}" </dev/null || failed+=("serial tests")
+# finished STAGE STATUS: pytest's status 5 says that PYTEST_ARGS selected no test of this stage.
+finished() {
+  if [ "$2" = 5 ] && [ ${#args[@]} != 0 ]; then
+    say "$1: no test was selected"
+  elif [ "$2" != 0 ]; then
+    failed+=("$1 (exit status $2)")
+  fi
+}
 
-say "pytest, 2 ranks, the tests marked mpi"
+stage="$name tests, serial"
+say "$stage"
+"$PYTHON" -m pytest -q -n auto --dist loadfile -m "$which and not on_ranks" "${args[@]}" </dev/null
+finished "$stage" $?
+
+stage="$name tests marked mpi, 2 ranks"
+say "$stage"
 color=no # mpirun gives every rank a terminal, so pytest cannot tell
 [ ! -t 1 ] || color=yes
-mpi 2 "$PYTHON" -m pytest -q -m mpi -p no:cacheprovider --color="$color" "${args[@]}"
-status=$?
-if [ $status = 5 ]; then
-  say "no test marked mpi was selected"
-elif [ $status != 0 ]; then
-  failed+=("tests on 2 ranks (exit status $status)")
+mpi 2 "$PYTHON" -m pytest -q -m "mpi and $which" -p no:cacheprovider --color="$color" "${args[@]}"
+finished "$stage" $?
+
+if [ "$which" = slow ]; then
+  stage="tests on 3 and 4 ranks"
+  say "$stage"
+  "$PYTHON" -m pytest -q -m on_ranks "${args[@]}" </dev/null
+  finished "$stage" $?
 fi
 
 if [ ${#failed[@]} != 0 ]; then

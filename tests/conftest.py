@@ -85,6 +85,32 @@ def pytest_runtest_makereport(item, call):
         report.longrepr = f"{item.nodeid} failed on rank(s) {ranks}: their report is further up"
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """Before -m selects: mark what `fast` leaves out, and tests that start ranks of their own."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        # A process takes a file at a time: backwards, because a long one (test_two_blocks) as the
+        # last would leave the others idle.
+        items.sort(key=lambda item: item.path.name, reverse=True)
+    unknown: dict[str, set[str]] = {}
+    for item in items:
+        if "on_ranks" in item.fixturenames:
+            item.add_marker(pytest.mark.on_ranks)
+            item.add_marker(pytest.mark.slow)
+        if (fast := item.get_closest_marker("fast")) is None:
+            continue
+        test = item.nodeid.removesuffix(f"[{item.callspec.id}]")
+        unknown.setdefault(test, set(fast.args)).discard(item.callspec.id)
+        if item.callspec.id not in fast.args:
+            item.add_marker(pytest.mark.slow)
+    # Of a test that is named with its parameters the others are not collected; an error in a
+    # process of xdist reaches no one, and the tests on 2 ranks are collected without it.
+    named = any("[" in argument for argument in config.args)
+    if not named and "PYTEST_XDIST_WORKER" not in os.environ and any(unknown.values()):
+        missing = [f"{test}: {sorted(ids)}" for test, ids in unknown.items() if ids]
+        raise pytest.UsageError("pytest.mark.fast names no test: " + "; ".join(missing))
+
+
 def pytest_collectreport(report):
     if report.failed:
         NOT_COLLECTED.append(f"NOT COLLECTED {report.nodeid}\n{report.longreprtext}")

@@ -80,6 +80,7 @@ def test_impact_is_the_same_on_two_ranks():
     assert results["energy-momentum"]["ledger"] < 1e-12
 
 
+@pytest.mark.slow
 def test_bar_follows_the_linear_bar():
     elements, t_end = 20, 1.3
     results = demo.main(elements=elements, t_end=t_end)

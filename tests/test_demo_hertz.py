@@ -83,12 +83,14 @@ def check(result, tolerance):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", REFERENCE)
+@pytest.mark.fast("friction")
 def test_coarse_mesh_meets_the_closed_form(name):
     result = demo.main(problems=(name,), scales=(0.01,), refinement=0.8)[name][0.01]
     check(result, 0.02)
     assert abs(result["error"]["force"]) < 1e-3
 
 
+@pytest.mark.slow
 def test_what_the_prescribed_load_misses_is_strain():
     runs = demo.main(problems=("spheres",), scales=(1.0, 0.5, 0.01), refinement=0.5)["spheres"]
     whole, half, none = (run["error"]["p0"] for run in runs.values())

@@ -25,6 +25,21 @@ def test_disc_is_a_regular_polygon_of_convex_quadrilaterals():
     assert area == pytest.approx(8 * np.sin(2 * np.pi / 16), rel=1e-12)
 
 
+@pytest.mark.mpi
+def test_friction_turns_the_wheel_while_it_slides():
+    """Ten steps of a coarse wheel: mu g brakes it and spins it up, as the rigid one.
+
+    The mean of friction's arm is a little less than the radius, that of a polygon.
+    """
+    r = demo.main(facets=24, duration=0.04, integrators=("energy-momentum",))["energy-momentum"]
+    assert r["status"] == "completed" and r["retries"] == 0
+    h, weight = r["history"], demo.FRICTION * demo.GRAVITY
+    loss, gain = demo.SPEED - h["speed"][-1], r["kappa"] * h["spin"][-1] * demo.RADIUS
+    assert loss == pytest.approx(gain, rel=0.05)
+    assert loss == pytest.approx(weight * h["time"][-1], rel=0.05)
+    assert 0.0 < r["dissipated"] and r["ledger"] <= 1e-11
+
+
 @pytest.mark.slow
 def test_slips_until_it_rolls():
     """24 facets: the wheel drops by 1 % of its radius between corners, which costs speed."""

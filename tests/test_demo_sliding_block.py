@@ -43,8 +43,14 @@ def assert_as_coulomb_says(figures):
     assert figures["iterations"] < 3
 
 
-@pytest.mark.mpi
-def test_all_parts_on_a_plane(mpi_tmp_path):
+ranks = pytest.param(
+    "ranks",
+    marks=[pytest.mark.mpi, pytest.mark.slow, pytest.mark.skipif(COMM.size == 1, reason="serial")],
+)
+
+
+@pytest.mark.parametrize("where", ["serial", ranks])
+def test_all_parts_on_a_plane(where, mpi_tmp_path):
     results = demo.main(
         floors=("plane",), integrators=("energy-momentum",), dt=4e-3, cells=SMALL,
         output=str(mpi_tmp_path),
@@ -71,7 +77,9 @@ def test_all_parts(floor, integrator):
     assert integrator == "midpoint" or figures["ledger"] < 1e-11
 
 
+@pytest.mark.mpi
 @pytest.mark.parametrize("integrator", demo.INTEGRATORS)
+@pytest.mark.fast("energy-momentum")
 def test_rest_on_an_elastic_plate(integrator):
     mesh, floor = demo.block_mesh(COMM, SMALL), {"floor": "elastic"}
     figures, motion = demo.level(mesh, floor, dt=4e-3, integrator=integrator)
@@ -84,6 +92,7 @@ def test_rest_on_an_elastic_plate(integrator):
 @pytest.mark.parametrize(
     ("dt", "young", "elastic"), [(0.064, 5e7, 1e-6), (0.016, 5e7, 2e-6), (0.002, 5e8, 1e-7)]
 )
+@pytest.mark.fast("0.064-50000000.0-1e-06-midpoint", "0.016-50000000.0-2e-06-energy-momentum")
 def test_what_is_missing_at_rest(integrator, dt, young, elastic):
     """A mass loses mu g h per step and sticks when the next one would turn it: r is left."""
     mesh = demo.block_mesh(COMM, SMALL)

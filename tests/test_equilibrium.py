@@ -270,6 +270,7 @@ def test_patch_with_other_meshes_fails_as_one_pass_must(meshes):
     assert abs(force[2] - 1) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metre", [1e3, 1e6])
 def test_patch_in_other_units(metre):
     first, _, _, iterations = patch(3, 2, comm=MPI.COMM_SELF)
@@ -280,6 +281,7 @@ def test_patch_in_other_units(metre):
 
 # ---- one result, whatever the units and the ranks
 @pytest.mark.parametrize("stabilization", [None, 0.1])
+@pytest.mark.fast("0.1")
 def test_metres_millimetres_micrometres(stabilization):
     gap = 0.0 if stabilization is None else 0.04
     runs = [

@@ -169,6 +169,7 @@ SCENES = {
 
 
 @pytest.mark.mpi
+@pytest.mark.fast("squeeze-balanced", "spin-exact", "1e6 g-balanced")
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("name", SCENES)
 def test_no_step_ends_inside_out(name, accuracy, evaluations):

@@ -165,6 +165,10 @@ def block_errors(found, expected, blocks):
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize(("cell", "friction", "active"), SCENES)
 @pytest.mark.parametrize("rule", EQUATIONS)
+@pytest.mark.fast(
+    "energy-momentum-hex-none-mixed", "midpoint-hex-mixed-all", "condensed-hex-stick-all",
+    "gonzalez contact-hex-slip-all",
+)  # fmt: skip
 def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active):
     system = two_blocks(cell, friction=FRICTION[friction])
     at = Linearised(system, rule, active, rotated_state(system))
@@ -187,6 +191,7 @@ def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("rule", EQUATIONS)
+@pytest.mark.fast("energy-momentum", "static")
 def test_prescribed_coordinates_hold_only_a_diagonal(rule):
     bcs = [nts.Dirichlet(lambda x: x[0] > 1 - 1e-9, components=(0, 2))]
     system = two_blocks("hex", bcs=bcs)
@@ -215,6 +220,7 @@ def test_prescribed_coordinates_hold_only_a_diagonal(rule):
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("rule", EQUATIONS)
+@pytest.mark.fast("energy-momentum", "static")
 def test_nest_and_aij_are_the_same_matrix(rule):
     system = two_blocks("hex")
     at = Linearised(system, rule, "mixed", rotated_state(system))
@@ -266,6 +272,12 @@ def test_contact_changes_beside_matrices_that_are_kept(rule, solver):
 @pytest.mark.parametrize("rule", EQUATIONS)
 @pytest.mark.parametrize("friction", ["none", "mixed"])
 @pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.fast(
+    "hex-none-midpoint", "hex-mixed-energy-momentum", "hex-mixed-mean-value stress",
+    "hex-mixed-gonzalez contact", "hex-none-static", "tet-mixed-energy-momentum",
+    "tet-none-condensed", "smooth-none-energy-momentum", "smooth-mixed-condensed",
+    "smooth-mixed-midpoint",
+)  # fmt: skip
 def test_jacobian_along_directions(cell, friction, rule):
     """As above on any number of ranks: matrix times direction, through AIJ and nest."""
     system = two_blocks(cell, friction=FRICTION[friction])
@@ -325,6 +337,10 @@ def last_change(sets):
 @pytest.mark.parametrize("turned", [False, pytest.param(True, marks=pytest.mark.mpi)])
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.fast(
+    "hex-midpoint-False", "hex-mean-value stress-False", "hex-energy-momentum-True",
+    "tet-energy-momentum-True", "smooth-gonzalez contact-True", "smooth-condensed-True",
+)  # fmt: skip
 def test_newton_converges_quadratically(cell, rule, turned):
     """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""
     system = two_blocks(cell, gap=0.02, speed=6.0)
@@ -346,6 +362,10 @@ def test_newton_converges_quadratically(cell, rule, turned):
 )
 @pytest.mark.parametrize("rule", ["midpoint", "energy-momentum", "condensed"])
 @pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.fast(
+    "hex-midpoint-stick", "hex-energy-momentum-both", "tet-condensed-slip",
+    "smooth-energy-momentum-both",
+)  # fmt: skip
 def test_newton_converges_quadratically_with_friction(cell, rule, friction, changes, reached):
     """An oblique impact: once stick and slip rest, the distance to the solution is squared."""
     system = two_blocks(cell, gap=0.02, speed=6.0, friction=friction)

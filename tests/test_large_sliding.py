@@ -126,6 +126,10 @@ def assert_slides_straight(h, velocity, tolerance, mu=MU):
 # ---- over facets
 @pytest.mark.parametrize("facets", FACETS)
 @pytest.mark.parametrize("integrator", ALL)
+@pytest.mark.fast(
+    "midpoint-squares", "energy-momentum-quads", "energy-momentum-triangles",
+    "gonzalez-parallelograms",
+)  # fmt: skip
 def test_slip_and_traction_survive_changes_of_facet(integrator, facets):
     """Every facet starts at another corner than its neighbour."""
     body, face = plate(facets)
@@ -144,6 +148,10 @@ def test_slip_and_traction_survive_changes_of_facet(integrator, facets):
 )
 @pytest.mark.parametrize("facets", ["squares", "diagonals"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast(
+    "midpoint-squares-along diagonals and over corners", "energy-momentum-squares-along edges",
+    "energy-momentum-diagonals-over corners",
+)  # fmt: skip
 def test_along_edges_and_over_corners(integrator, facets, start, velocity):
     """Two to six facets are equally near all the time, or again and again."""
     h = follow(scene((*start, 0.0), (*velocity, 0.0), plate(facets)), integrator, 40)
@@ -153,6 +161,9 @@ def test_along_edges_and_over_corners(integrator, facets, start, velocity):
 @pytest.mark.parametrize("place", [(0.1, 0.1), (0.25, 0.1), (0.25, 0.25)])
 @pytest.mark.parametrize("facets", ["squares", "diagonals"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast(
+    "midpoint-squares-place2", "energy-momentum-squares-place0", "energy-momentum-diagonals-place1",
+)  # fmt: skip
 def test_stuck_inside_on_an_edge_and_on_a_corner(integrator, facets, place):
     """Pulled aside with 0.99 mu m g it stays; of the plate it takes all of the pull."""
     pull = 0.99 * MU * GRAVITY * np.array([0.6, -0.8, 0.0])
@@ -208,6 +219,7 @@ def on_saddle(height, place, velocity, end):
 
 
 @pytest.mark.parametrize("integrator", ALL)
+@pytest.mark.fast("energy-momentum")
 def test_sliding_over_a_saddle_is_of_second_order(integrator):
     """Against the equations of motion on the surface, solved without this package."""
     height, (x, y), (vx, vy), end, errors = 0.25, (-0.6, -0.5), (1.5, 0.9), 0.6, []
@@ -248,6 +260,7 @@ def settled_block(facets, friction):
     return on_plate(()), nts.equilibrium(on_plate((0, 1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "facets", "friction"),
     [
@@ -298,6 +311,7 @@ def assert_coulomb(h, acceleration, mu=MU):
 
 @pytest.mark.parametrize("facets", ["squares", "triangles"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("energy-momentum-squares")
 def test_slides_off_and_lands_on_another_plate(integrator, facets):
     """Two masters, one lower and beside the other: slide, flight, bounces, slide."""
     upper = plate(facets, (-1, -1), (0, 1), 0.0, (4, 8), "upper")
@@ -320,6 +334,7 @@ def test_slides_off_and_lands_on_another_plate(integrator, facets):
 
 @pytest.mark.parametrize("start", [-0.505, -0.5, -0.49])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("midpoint--0.505", "energy-momentum--0.5")
 def test_two_masters_side_by_side_are_one(integrator, start):
     """Over their seam the gap is closed twice, and carries once."""
     plates = [plate("squares", (k - 1, -1), (k, 1), n=(4, 8), name=f"plate{k}") for k in (0, 1)]
@@ -346,6 +361,7 @@ class Crane(PointMass):
 
 @pytest.mark.parametrize("facets", ["squares", "triangles"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("energy-momentum-squares")
 def test_leaves_the_surface_beyond_its_rim_and_comes_back(integrator, facets):
     body, face = plate(facets)
     start = (0.3, 0.17, 0.0)
@@ -389,6 +405,7 @@ def test_friction_does_the_work_of_drawing(integrator):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("energy-momentum")
 def test_drawn_along_it_loses_its_motion_across(integrator):
     """v_y' = -mu g v_y / |v| with v_x prescribed, at second order; one direction of slip is."""
     across, end, errors = 0.7, 0.4, []
@@ -466,6 +483,7 @@ def falling_cube(tilt, velocity):
         (0.832, (0.945, -0.749, 0.72, 2.205, 2.502, -1.122, -4.424)),
     ],
 )
+@pytest.mark.fast("0.191-velocity0")
 def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(tilt, velocity):
     """Stuck it would be drawn down, free it would pass the plane, and Newton flips between them."""
     newton = nts.Newton(max_retries=0)

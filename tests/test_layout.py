@@ -17,7 +17,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 LEVELS = [
     {"discrete_gradient", "nts", "friction", "facets", "patches", "validation", "dolfinx_compat"}
-    | {"run_warnings"},
+    | {"run_warnings", "table", "whole_files"},
     {
         "continuum",
         "rigid",
@@ -35,7 +35,8 @@ LEVELS = [
         "integrators",
     },
     {"system", "balance"},
-    {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep"},
+    {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"}
+    | {"promises"},
     {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]

@@ -53,6 +53,7 @@ def test_more_iterations_are_worth_it_on_larger_meshes():
     assert limits[:2] == [60, 60] and limits == sorted(limits) and limits[-1] < 1_000
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
     """A nearly incompressible block at steps in which waves pass it ten times, then at short ones.
@@ -189,6 +190,7 @@ def test_schur_complement_saves_iterations():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
+@pytest.mark.fast("True")
 def test_contact_part_by_a_solver_of_the_user(condense):
     """LU of the first approximation alone: zeros on its diagonal need MUMPS unless condensed."""
     tables = []
@@ -246,6 +248,7 @@ def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
     ("cells", "masters"),
     [(1, ()), (4, ()), (4, ("mesh",)), (4, ("sphere",)), (4, ("mesh", "sphere"))],
 )
+@pytest.mark.fast("1-masters0", "4-masters1", "4-masters2", "4-masters3")
 def test_matrix_in_blocks_of_nodes(cells, masters):
     """Against AIJ made by way of a nest, with nodes that are held along some axes.
 
@@ -414,6 +417,7 @@ def thrown_cubes(comm, *cells):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("reuse", [False, True])
+@pytest.mark.fast("True")
 def test_as_many_bodies_as_ranks_need_no_more_iterations_than_one_rank(reuse):
     counts, energy = [], []
     for comm in (COMM, MPI.COMM_SELF):
@@ -449,6 +453,7 @@ def test_bodies_are_dealt_to_ranks_where_they_divide_evenly(cells, ranks):
     stepper.close()
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_a_pattern_that_grows_under_another_run_of_the_same_scene():
     """MUMPS adds the contact of a smooth master's nodes to the matrices that both runs share."""
@@ -480,6 +485,7 @@ def test_a_pattern_that_grows_under_another_run_of_the_same_scene():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
+@pytest.mark.fast("True")
 def test_the_choice_changes_no_solution(condense):
     tables = []
     for solver, condensed in (("auto", condense), ("direct", False)):
@@ -499,6 +505,7 @@ def test_the_choice_changes_no_solution(condense):
     ("integrator", "fine"),
     [(nts.Midpoint(), 1), (nts.EnergyMomentum(), 1), (nts.EnergyMomentum(), 2)],
 )
+@pytest.mark.fast("integrator0-1-friction2", "integrator1-1-friction0")
 def test_nodes_with_more_constraints_than_coordinates(integrator, fine, friction):
     """A block slides along a floor into a wall: nodes of its edge stick to one and touch both.
 

@@ -29,6 +29,7 @@ def run(integrator, dt=2e-3, steps=30, system=None, **newton):
 @pytest.mark.mpi
 @pytest.mark.parametrize("solver", ["direct", "krylov"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("energy-momentum-direct", "midpoint-krylov")
 def test_reuse_changes_no_solution(integrator, solver):
     table, every = run(integrator, linear_solver=solver, condense=True)
     again, some = run(integrator, linear_solver=solver, condense=True, reuse=True)
@@ -42,6 +43,7 @@ def test_reuse_changes_no_solution(integrator, solver):
     assert again["newton_iterations"].sum() < 2 * table["newton_iterations"].sum()
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_without_condensing_too():
     table, every = run("energy-momentum")
@@ -51,6 +53,7 @@ def test_without_condensing_too():
 
 
 @pytest.mark.parametrize("metre", [1e3, 1e6])
+@pytest.mark.fast("1000.0")
 def test_units_change_no_decision(metre):
     table, some = run("energy-momentum", reuse=True, rtol=1e-9)
     again, same = run(
@@ -72,11 +75,12 @@ def test_a_changed_step_makes_new_matrices():
 
 
 @pytest.mark.parametrize("solver", ["direct", "krylov"])
+@pytest.mark.fast("krylov")
 def test_a_step_without_its_last_contact_takes_the_matrices_on(solver):
     """The new layout gets its operator from the matrices kept."""
     mesh = create_box(COMM, [[0, 0, 0.05], [1, 1, 1]], [1] * 3, CellType.hexahedron)
     cube = nts.Continuum(
-        mesh, nts.NeoHookean(1e5, 0.3), density=1e3, name="cube", velocity=(0, 0, -1)
+        mesh, nts.NeoHookean(1e6, 0.3), density=1e4, name="cube", velocity=(0, 0, -1)
     )
     bottom = cube.surface(lambda x: x[2] < 0.05 + 1e-9)
     pair = nts.ContactPair(bottom, nts.Plane((0, 0, 0), (0, 0, 1)))
@@ -116,8 +120,8 @@ def test_steps_that_differ_by_rounding_share_their_matrices():
     mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron)
     body = nts.Continuum(
         mesh,
-        nts.NeoHookean(1e4, 0.3),
-        density=1e3,
+        nts.NeoHookean(1e6, 0.3),
+        density=1e5,
         name="cube",
         velocity=lambda x: 0.1 * x[[1, 2, 0]],
     )
@@ -130,13 +134,14 @@ def test_steps_that_differ_by_rounding_share_their_matrices():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
+@pytest.mark.fast("True")
 def test_a_body_without_contact_beside_two_with(condense):
     """The blocks of a split have a place for it."""
 
     def scene():
         bodies = list((pair := rubbing_blocks(0.3)).bodies)
         mesh = create_box(COMM, [[9, 0, 0], [10, 1, 1]], [2, 2, 2], CellType.hexahedron)
-        free = nts.Continuum(mesh, nts.NeoHookean(1e4, 0.3), density=1e3, name="free")
+        free = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3, name="free")
         return nts.System([bodies[0], free, bodies[1]], contacts=pair.contacts)
 
     krylov = nts.Newton(linear_solver="krylov", condense=condense)
@@ -179,6 +184,7 @@ def test_a_failed_step_leaves_no_trace(monkeypatch):
 @pytest.mark.parametrize(
     ("accuracy", "ledger"), [("exact", 1e-11), ("balanced", 1e-8), ("fast", 1e-5)]
 )
+@pytest.mark.fast("balanced-1e-08", "fast-1e-05")
 def test_levels_of_accuracy_close_the_ledger_as_they_say(accuracy, ledger):
     scene, rule = rubbing_blocks(0.3), nts.EnergyMomentum()
     run = nts.simulate(scene, rule, dt=2e-3, t_end=0.08, accuracy=accuracy)

@@ -40,6 +40,7 @@ def test_midpoint_blows_up_with_large_steps():
     assert large["energy_drift"] > 1 and large["status"] != "completed"
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_nearly_rigid_cube_turns_by_two_arctan_a_step():
     comm, omega, dt, steps = MPI.COMM_WORLD, 1.0, 0.1, 100

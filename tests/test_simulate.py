@@ -180,6 +180,7 @@ def test_free_fall(integrator):
     assert np.allclose(momentum, [0, 0, -mass * gravity * time], rtol=1e-12, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_extra_form_is_external_work():
     """Mass-proportional drag on a rigid flight: v' = -c v by the midpoint rule, in closed form."""

@@ -21,8 +21,8 @@ def cube(low, name, *, cells=2, metre=1.0, **options):
         COMM, [low, low + metre], [cells] * 3, CellType.hexahedron,
         ghost_mode=GhostMode.shared_facet,
     )  # fmt: skip
-    rubber = nts.NeoHookean(young=1e7 / metre, poisson=0.3)
-    return nts.Continuum(mesh, rubber, density=1e3 / metre**3, name=name, **options)
+    rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
+    return nts.Continuum(mesh, rubber, density=1e2 / metre**3, name=name, **options)
 
 
 def face(body, end):
@@ -101,6 +101,7 @@ def assert_same(a, b, dt=DT):
     ids=["exact", "reuse"],
 )
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("midpoint-reuse", "energy-momentum-exact")
 def test_cubes_sleep_until_they_are_reached(integrator, newton):
     a, b, awake = both(row, 12, integrator=integrator, **newton)
     assert awake[0] == "a" and awake[-1] == "abc" and sorted(awake) == awake
@@ -119,6 +120,7 @@ def test_friction_beside_a_sleeper():
 
 
 @pytest.mark.parametrize("metre", [1e3, 1e6])
+@pytest.mark.fast("1000.0")
 def test_units_change_nothing(metre):
     one, awake = run(row(), 7, sleep=True)
     other, same = run(row(metre), 7, sleep=True)
@@ -169,7 +171,7 @@ def test_a_sleeper_is_neither_evaluated_nor_assembled_nor_searched(monkeypatch):
     for _ in range(12):
         s.advance(DT)
         # Whether it rests is asked once.
-        assert calls == ["internal", "tangent", "inertia", "potential"]
+        assert sorted(calls) == ["inertia", "internal", "potential", "tangent"]
         assert s.state.u[3] is s.problem.state.u[3] and 3 not in s.problem.awake
         assert searched.count(system.contacts[2]) == 1 or 2 in s.problem.awake
     assert s.problem.awake == (0, 1, 2) and searched.count(system.contacts[2]) > 1
@@ -198,7 +200,7 @@ def test_a_strained_body_between_its_supports_sleeps():
         assert np.array_equal(s.state.u[1], settled.state.u[1]) or not sleep
         steppers.append(s)
         s.close()
-    assert strained > 100.0
+    assert strained > 10.0
     for s in steppers:
         assert s.solution.balance["potential"][-1] == pytest.approx(strained, rel=1e-12)
     assert_same(*steppers)
@@ -247,10 +249,10 @@ STEPS = 6
 #: First step in which something acts that begins with the fourth one.
 BEGIN = 3 * DT
 MOVERS = {
-    "body force": {"body_force": (0, 0, -10.0)},
-    "later body force": {"body_force": lambda t: (0, 0, -1e3 * max(t - BEGIN, 0.0))},
-    "traction": {"traction": [nts.Traction(right, (1.0, 0, 0))]},
-    "later traction": {"traction": [nts.Traction(right, lambda t: (1e3 * (t > BEGIN), 0, 0))]},
+    "body force": {"body_force": (0, 0, -1.0)},
+    "later body force": {"body_force": lambda t: (0, 0, -1e2 * max(t - BEGIN, 0.0))},
+    "traction": {"traction": [nts.Traction(right, (0.1, 0, 0))]},
+    "later traction": {"traction": [nts.Traction(right, lambda t: (1e2 * (t > BEGIN), 0, 0))]},
     "later support": {
         "bcs": [nts.Dirichlet(right, value=lambda t: (0, 0, max(t - BEGIN, 0.0) ** 2))]
     },
@@ -260,6 +262,7 @@ MOVERS = {
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", MOVERS)
+@pytest.mark.fast("later body force", "later traction", "later support", "extra form")
 def test_loads_wake_in_the_step_in_which_they_act(name):
     a, b, awake = both(beside(**MOVERS[name]), STEPS)
     assert awake == (["a"] * 3 + ["ab"] * 3 if "later" in name else ["ab"] * STEPS)
@@ -277,6 +280,7 @@ def test_loads_wake_in_the_step_in_which_they_act(name):
     ],
     ids=["support", "held everywhere", "spring and damper", "force of zero"],
 )
+@pytest.mark.fast("support", "spring and damper")
 def test_what_does_not_move_a_body_does_not_wake_it(options, expected):
     a, b, awake = both(beside(**options), 3)
     assert awake == [expected] * 3
@@ -321,10 +325,10 @@ def pushed(gap, force):
 def test_a_motion_that_was_not_predicted_wakes_in_the_same_step(integrator):
     """The step is solved again with the sleeper, whose candidates were idle."""
     dt, gap = 0.02, 0.02
-    s, awake = run(pushed(gap, (1.2e5, 0, 0)), 1, sleep=True, integrator=integrator, dt=dt)
+    s, awake = run(pushed(gap, (1.2e4, 0, 0)), 1, sleep=True, integrator=integrator, dt=dt)
     assert awake == ["ab"] and s.solution.rows[-1]["active"] > 0
     assert s.solution.rows[-1]["min_gap"] > -1e-10
-    a, b, awake = both(lambda: pushed(gap, (1.2e5, 0, 0)), 3, integrator=integrator, dt=dt)
+    a, b, awake = both(lambda: pushed(gap, (1.2e4, 0, 0)), 3, integrator=integrator, dt=dt)
     assert_same(a, b, dt)
 
 
@@ -332,7 +336,7 @@ def test_a_motion_that_was_not_predicted_wakes_in_the_same_step(integrator):
 def test_a_motion_beyond_the_search_ends_as_without_sleep():
     """Both miss the contact, as they search the same way; the next step finds it, and wakes."""
     dt, gap = 0.2, 0.2
-    force = lambda t: (1.05 * gap * 1e3 / (0.5 * dt**2) * (t < dt), 0, 0)  # noqa: E731
+    force = lambda t: (1.05 * gap * 1e2 / (0.5 * dt**2) * (t < dt), 0, 0)  # noqa: E731
     a, b, awake = both(lambda: pushed(gap, force), 2, dt=dt)
     assert awake == ["a", "ab"]
     assert a.solution.balance["active"][1] == 0 < a.solution.balance["active"][-1]

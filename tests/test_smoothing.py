@@ -114,6 +114,7 @@ def assert_closed(table, changes, count):
 @pytest.mark.parametrize(
     "variant", [pytest.param("middle", marks=pytest.mark.mpi), "start", "smooth"]
 )
+@pytest.mark.fast("middle", "smooth")
 def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
     changes, others, table = slide("flat", variant, 0.45, facets=80, uneven=0.25)
     assert_closed(table, changes, 50)
@@ -124,6 +125,7 @@ def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
 
 @pytest.mark.parametrize("part", [0.2137, 0.1137])
 @pytest.mark.parametrize("shape", ["convex", "concave"])
+@pytest.mark.fast("convex-0.2137", "concave-0.1137")
 def test_what_a_change_of_facet_costs_on_a_cylinder(shape, part):
     """At a slope of the angle between facets, the way beyond an edge is a height."""
     angle = 2 * END / FACETS / RADIUS
@@ -145,6 +147,7 @@ def test_what_a_change_of_facet_costs_on_a_cylinder(shape, part):
 
 
 @pytest.mark.parametrize("shape", ["convex", "concave"])
+@pytest.mark.fast("convex")
 def test_smoothing_of_uneven_facets(shape):
     """Their patches have one normal but not one curvature along an edge."""
     mean = {}
@@ -164,11 +167,11 @@ def bumpy(comm, smoothing):
     tags = nts.continuum.dolfinx_mesh.meshtags(mesh, 2, np.sort(top), one)
     x, y, z = mesh.geometry.x.T
     mesh.geometry.x[:, 2] += 0.03 * np.sin(6 * x) * np.cos(4 * y) * z / 0.3
-    rubber = nts.NeoHookean(young=1e4, poisson=0.3)
-    plate = nts.Continuum(mesh, rubber, density=1e2, name="plate")
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    plate = nts.Continuum(mesh, rubber, density=1e4, name="plate")
     low = 0.335
     mesh = create_box(comm, [[0.21, 0.23, low], [0.61, 0.63, low + 0.3]], [2, 2, 1], **cells)
-    block = nts.Continuum(mesh, rubber, density=1e2, velocity=(2.0, 0.7, -1.0), name="block")
+    block = nts.Continuum(mesh, rubber, density=1e4, velocity=(2.0, 0.7, -1.0), name="block")
     slave = block.surface(lambda x: x[2] < low + 1e-9)
     pair = nts.ContactPair(slave, plate.surface(tags, 1, smoothing=smoothing))
     return nts.System([block, plate], contacts=[pair])
@@ -176,6 +179,7 @@ def bumpy(comm, smoothing):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("smoothing", [False, True])
+@pytest.mark.fast("True")
 def test_momentum_and_energy_on_any_number_of_ranks(smoothing):
     tables = []
     for comm in (COMM, MPI.COMM_SELF):

@@ -78,9 +78,9 @@ def test_error_of_a_step_is_that_of_the_trapezoidal_rule():
     pace = Pace(adapt, stepper.system, stepper.state, h, span)
     for k in range(100):
         stepper.problem.begin(stepper.state, h)
-        step, state = stepper._attempt(h, (k + 1) * h)
-        assert pace.accepts(stepper.problem, step)
-        stepper._take(step, state)
+        trial = stepper._attempt(h, (k + 1) * h)
+        assert pace.accepts(stepper.problem, trial.step)
+        stepper._take(trial)
         if k:
             expected = h**3 / 12 * RATE**3 * abs(np.cos(RATE * k * h)) / (1e-2 * RATE * span)
             assert abs(pace._error - expected) < 0.01 * h**3 / 12 * RATE**3 / (1e-2 * RATE * span)

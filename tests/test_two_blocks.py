@@ -11,6 +11,7 @@ import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
 ENERGY_MOMENTUM = nts.EnergyMomentum()
+INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": ENERGY_MOMENTUM}
 #: Energy lost to activation in B1 (benchmarks.md).
 REFERENCE_LOSS = 0.051
 
@@ -65,6 +66,7 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.fast("Mooney-Rivlin", "tetrahedra")
 def test_ledger_closes_for(variant):
     integrator, scene = VARIANTS[variant]
     result = two_blocks.figures(impact(integrator=integrator, **scene))
@@ -72,6 +74,7 @@ def test_ledger_closes_for(variant):
     assert 0.04 < result["energy_lost"] < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steepness", [30.0, 100.0])
 def test_ledger_closes_for_a_steep_energy(steepness):
     """Stiffening makes the impact harder, so activation costs more than in the variants above."""
@@ -80,6 +83,7 @@ def test_ledger_closes_for_a_steep_energy(steepness):
     assert result["energy_lost"] > 0.06
 
 
+@pytest.mark.slow
 def test_tetrahedra_agree_with_hexahedra():
     """Same blocks, other cells: the first one hands over nearly the same momentum."""
     handed = []
@@ -94,6 +98,7 @@ def test_tetrahedra_agree_with_hexahedra():
     assert abs(handed[0] / handed[1] - 1) < 0.02
 
 
+@pytest.mark.slow
 def test_mean_value_stress_closes_to_quadrature_error():
     result = two_blocks.figures(impact(integrator=nts.EnergyMomentum(stress="mean-value")))
     assert_conserved(result)
@@ -123,8 +128,9 @@ def test_bodies_of_a_micrometre():
         assert np.allclose(run["energy"] / metre**3, runs[0]["energy"], rtol=1e-9, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", [nts.Midpoint(), ENERGY_MOMENTUM])
+@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
 def test_metres_millimetres_micrometres(integrator):
     """Mass in kg and time in s stay; lengths, and with them pressure and density, are converted."""
     runs = [
@@ -181,14 +187,14 @@ def assert_same_as_serial(integrator, t_end, **scene):
     assert np.array_equal(table["newton_iterations"], serial["newton_iterations"])
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 @pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
-@pytest.mark.parametrize("integrator", [nts.Midpoint(), ENERGY_MOMENTUM])
+@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
 def test_ranks_agree_with_a_serial_run(integrator):
     assert_same_as_serial(integrator, 0.2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ranks", [3, 4])
 def test_more_ranks_agree_with_a_serial_run(on_ranks, ranks):
     """On 3 ranks one owns no slave node, on 4 the contact zone is cut by the partition."""
@@ -231,7 +237,8 @@ def test_field_split_finds_the_same_solution():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
-@pytest.mark.parametrize("integrator", [nts.Midpoint(), ENERGY_MOMENTUM])
+@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.fast("energy-momentum-True")
 def test_krylov_follows_the_direct_solver(integrator, condense):
     steppers = [
         nts.Stepper(
@@ -259,6 +266,7 @@ def test_krylov_follows_the_direct_solver(integrator, condense):
         s.close()
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_krylov_in_metres_and_micrometres():
     newton, runs = nts.Newton(linear_solver="krylov"), []

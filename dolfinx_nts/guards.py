@@ -1,0 +1,65 @@
+"""What a solved step must satisfy before it is accepted, whatever its residual says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dolfinx_nts.step import Evaluation, StepProblem
+from dolfinx_nts.system import State
+from dolfinx_nts.validation import StepFailedError
+
+#: Part of the momenta and impulses of a step by which momentum may change without an impulse ...
+_MOMENTUM = 1e-6
+#: ... and how many times the tolerance of Newton's method, where that is larger.
+_TOLERANCES = 1e3
+
+
+def check_momentum(
+    problem: StepProblem,
+    step: Evaluation,
+    state: State,
+    before: Mapping[str, Any],
+    after: Mapping[str, Any],
+) -> None:
+    """Refuse a step whose momentum changes by more than its impulses. Every rank must call it.
+
+    Linear momentum changes by the impulses of loads, supports and obstacles alone, angular
+    momentum by their moments at the middle of the step. The momenta are those of the states, so
+    that the check depends neither on the residual nor on its tolerances.
+
+    Args:
+        problem: Equations of the step.
+        step: Their solution.
+        state: The state it leads to.
+        before: `balance.measure` of the state at t_n.
+        after: `balance.measure` of `state`.
+
+    Raises:
+        StepFailedError: The step is wrong.
+    """
+    local = np.zeros(7)
+    for body, terms, u0, v0, v1 in zip(
+        problem.system.bodies, step.bodies, problem.state.u, problem.state.v, state.v, strict=True
+    ):
+        force = terms.external - terms.internal - terms.contact
+        force[body.fixed] += terms.residual[body.fixed]
+        local[:3] += body.linear_momentum(force)
+        local[3:6] += body.angular_momentum(u0 + 0.5 * terms.du, force)
+        moved = 0.5 * problem.dt * body.nodal_mass * (np.abs(v0) + np.abs(v1))
+        parts = (moved, terms.internal, terms.external, terms.contact)
+        local[6] += sum(float(np.abs(p).sum()) for p in parts)
+    total = problem.system.comm.allreduce(local) / (0.5 * problem.dt)
+    allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * total[6] + problem.momentum_rounding
+    arms = {"linear": 1.0, "angular": problem.extent}
+    for k, (name, arm) in enumerate(arms.items()):
+        change = after[f"{name}_momentum"] - before[f"{name}_momentum"]
+        off = float(np.abs(change - total[3 * k : 3 * k + 3]).max())
+        if not off <= arm * allowed:
+            raise StepFailedError(
+                f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: {name} momentum "
+                f"changes by {off:.3g} more than the impulses of the step; its equations are not "
+                "solved, whatever their residual says"
+            )

@@ -1,0 +1,97 @@
+"""What a run promises of its energy, held against every accepted step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from dolfinx_nts.system import System
+
+if TYPE_CHECKING:
+    from dolfinx_nts.simulate import Solution
+    from dolfinx_nts.step import Evaluation, StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+#: What the ledger may miss of the energy, over the tolerance of Newton's method ...
+_PER_TOLERANCE = 10.0
+#: ... and at least, as rounding adds up over the steps.
+_LEAST = 1e-11
+#: Part of the energy whose loss from the ledger makes a result doubtful, with a rule that closes
+#: it and with one that does not.
+_DOUBTFUL, _OPEN = 1e-3, 1e-2
+#: Rounding of a step's energy over that of its forces times its motion.
+_ROUNDING = 10.0
+
+
+class Promises:
+    """Compares the ledger of a run with what its integrator and its accuracy promise.
+
+    Args:
+        solution: Where warnings go.
+        closes: Whether the integrator closes the ledger.
+        rtol: Tolerance of Newton's method.
+    """
+
+    def __init__(self, solution: Solution, *, closes: bool, rtol: float) -> None:
+        self._solution, self._closes = solution, closes
+        self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if closes else _OPEN
+        self._largest, self._rounding = 0.0, 0.0
+
+    def hold(self, problem: StepProblem, step: Evaluation) -> None:
+        """Warn if the ledger of the last accepted row misses too much. Collective.
+
+        Args:
+            problem: Equations of the step.
+            step: Their solution.
+        """
+        row = self._solution.rows[-1]
+        names = ("kinetic", "potential", "external_work", "friction_dissipation")
+        self._largest = max(self._largest, *(abs(row[name]) for name in names))
+        squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
+        moved = np.sqrt(problem.system.comm.allreduce(squares))
+        self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
+        missing = abs(row["ledger_residual"])
+        if missing <= self._promise * self._largest + self._rounding:
+            return
+        part = missing / self._largest if self._largest else np.inf
+        if self._closes:
+            text = (
+                f"the ledger misses {missing:.3g} J, {part:.2g} of the largest energy, where this "
+                f'accuracy promises {self._promise:.0e}; pass accuracy="exact", or a smaller dt'
+            )
+        else:
+            text = (
+                f"the energy is {missing:.3g} J, {part:.2g} of the largest, off what work, "
+                "friction and contact account for; this integrator does not keep it: use "
+                "EnergyMomentum(), or a smaller dt"
+            )
+        doubtful = part > (_DOUBTFUL if self._closes else _OPEN)
+        self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
+
+
+class MaterialWatch:
+    """Notices that a caller has changed parameters of materials between steps.
+
+    Args:
+        system: The scene; bodies without a method `parameters` are left alone.
+    """
+
+    def __init__(self, system: System) -> None:
+        self._comm = system.comm
+        self._bodies = [b for b in system.bodies if hasattr(b, "parameters")]
+        self._known = self._values()
+
+    def _values(self) -> list[FloatArray]:
+        return [body.parameters() for body in self._bodies]
+
+    def changed(self) -> list[str]:
+        """Names of the bodies whose parameters differ from those of the last call. Collective."""
+        last, self._known = self._known, self._values()
+        differ = [not np.array_equal(a, b) for a, b in zip(last, self._known, strict=True)]
+        flags = np.array(differ, dtype=bool)
+        self._comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.LOR)
+        return [body.name for body, flag in zip(self._bodies, flags, strict=True) if flag]

@@ -1,0 +1,68 @@
+"""No step is accepted that is none: rounding is that of states, momentum needs impulses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import two_blocks
+from mpi4py import MPI
+from test_single_mass import STEP, mass_on_wall
+from test_two_blocks import fung
+
+import dolfinx_nts as nts
+from dolfinx_nts import balance
+from dolfinx_nts.guards import check_momentum
+
+COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("accuracy", ["balanced", "exact"])
+@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()], ids=["em", "mp"])
+def test_momentum_is_not_reversed_by_a_very_steep_material(integrator, accuracy):
+    """A diverged iterate of stiffness 1e55 excused du = 0 by its rounding, so that v_1 = -v_0."""
+    system = two_blocks.scene(COMM, cells=(3, 2), material=fung(1000.0), speed=20.0)
+    run = nts.simulate(system, integrator, dt=2e-3, t_end=6e-3, accuracy=accuracy)
+    momentum = run.balance["linear_momentum"]
+    # 20 m/s of a cube of 1000 kg, whatever the run's end.
+    assert np.allclose(momentum, [2e4, 0, 0], rtol=0, atol=1e-5 * 2e4)
+
+
+@pytest.mark.mpi
+def test_a_step_without_an_impulse_keeps_its_momentum():
+    """The check itself: v_1 = -v_0 in free flight, and an angular momentum out of nothing."""
+    system, _ = mass_on_wall(1.0, velocity=(1.0, 0.0, 0.0))
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    stepper.start(STEP)
+    stepper.problem.begin(stepper.state, STEP)
+    step, before = stepper.solver.solve(), stepper.solution.rows[-1]
+    good = stepper._accepted(step, STEP, STEP)
+    after = balance.measure(system, good)
+    check_momentum(stepper.problem, step, good, before, after)
+    reversed_ = replace(good, v=(-good.v[0], good.v[1]))
+    with pytest.raises(nts.StepFailedError, match="linear momentum changes by 5 more than"):
+        check_momentum(
+            stepper.problem, step, reversed_, before, balance.measure(system, reversed_)
+        )
+    turned = {**after, "angular_momentum": after["angular_momentum"] + [0.0, 0.0, 1.0]}
+    with pytest.raises(nts.StepFailedError, match="angular momentum changes by 1 more than"):
+        check_momentum(stepper.problem, step, good, before, turned)
+    stepper.close()
+
+
+@pytest.mark.mpi
+def test_no_tolerance_comes_from_an_iterate():
+    """Evaluating a far iterate and its matrix leaves every tolerance as it was."""
+    system = two_blocks.scene(COMM, cells=(2, 1))
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    stepper.start(STEP)
+    problem = stepper.problem
+    problem.begin(stepper.state, 2e-3)
+    before = problem.momentum_rounding
+    far = problem.x.duplicate()
+    far.array_w[:] = 1e3 * (1 + np.arange(len(far.array_r)))
+    with np.errstate(all="ignore"):
+        problem.body_tangents(problem.evaluate(far))
+    assert problem.momentum_rounding == before
+    far.destroy()
+    stepper.close()

@@ -1,0 +1,97 @@
+"""What accuracy promises of the energy is held against each step; what breaks it is named."""
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from test_single_mass import PointMass
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+
+
+class Sprung(PointMass):
+    """A mass on a spring to the origin whose stored energy is told `claim` times too large."""
+
+    def __init__(self, claim):
+        super().__init__(COMM, 1.0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self.claim = claim
+        self._first = None
+
+    def begin_step(self, integrator, u0, v0, time, dt):
+        self._u0, self._half = u0, 0.5 * dt**2
+
+    def internal(self, u1):
+        return 0.5 * (self._u0 + u1) + self.reference
+
+    def tangent(self, u1):
+        matrix = super().tangent(u1)
+        matrix.shift(0.5 * self._half)
+        return matrix
+
+    def potential(self, u):
+        x = self.reference + u
+        return 0.5 * self.claim * float(x @ x)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("integrator", "words"),
+    [(nts.EnergyMomentum(), "this accuracy promises 1e-11"), (nts.Midpoint(), "does not keep it")],
+    ids=["energy-momentum", "midpoint"],
+)
+def test_a_ledger_that_stays_open_is_told(integrator, words):
+    """Of 0.75 J that are claimed at the start 0.5 J turn into kinetic energy."""
+    run = nts.simulate(nts.System([Sprung(1.5)]), integrator, dt=0.05, t_end=1.5)
+    warning = run.warnings["ledger"]
+    assert warning.grave and words in warning.text
+    assert np.isclose(warning.worst, np.abs(run.balance["ledger_residual"]).max(), rtol=1e-12)
+    assert run.status == f"completed, but {warning.text}"
+    assert "warning, ledger" in run.summary
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
+@pytest.mark.parametrize("accuracy", ["exact", "balanced"])
+def test_a_closed_ledger_says_nothing(integrator, accuracy):
+    run = nts.simulate(
+        nts.System([Sprung(1.0)]), integrator, dt=0.05, t_end=1.5, accuracy=accuracy
+    )
+    assert run.status == "completed" and not run.warnings
+
+
+def vibrating(stiffness):
+    """A stretched cube that is let go, of a stiffness that may change."""
+    mesh = create_box(
+        COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    factor = fem.Constant(mesh, float(stiffness))
+    base = nts.StVenantKirchhoff(young=1e4, poisson=0.3)
+    body = nts.Continuum(
+        mesh, lambda c: factor * base(c), density=1e3, velocity=lambda x: 0.3 * x * [[1], [-1], [0]]
+    )
+    return body, factor
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("sleep", [False, True])
+def test_a_stiffness_that_changes_in_time_is_named_in_the_ledger(sleep):
+    body, factor = vibrating(1.0)
+    stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum(), sleep=sleep)
+    for _ in range(5):
+        stepper.advance(0.02)
+    stored = stepper.solution.rows[-1]["potential"]
+    factor.value = 1.75
+    for _ in range(5):
+        stepper.advance(0.02)
+    stepper.close()
+    table = stepper.solution.balance
+    assert np.array_equal(table["material_change"][:6], np.zeros(6))
+    assert np.allclose(table["material_change"][6:], 0.75 * stored, rtol=1e-12)
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"].max()
+    warning = stepper.solution.warnings["material changed"]
+    assert warning.count == 1 and not warning.grave and "'body'" in warning.text
+    assert "ledger" not in stepper.solution.warnings

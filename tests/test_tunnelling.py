@@ -1,0 +1,209 @@
+"""No node passes through a master within a step, and none that passed beside one is moved out."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from test_single_mass import INTEGRATORS, MASS, PointMass, PointSurface
+
+import dolfinx_nts as nts
+from dolfinx_nts import search
+
+COMM = MPI.COMM_WORLD
+RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
+
+
+def box(low, high, cells):
+    kind, ghosts = CellType.hexahedron, GhostMode.shared_facet
+    return create_box(COMM, [np.array(low, float), np.array(high, float)], cells, kind, ghosts)
+
+
+def plate(value=(0.0, 0.0, 0.0), *, width=4.0, thickness=0.02, cells=8):
+    """A plate below z = 0 that moves as prescribed everywhere, and its top."""
+    half = 0.5 * width
+    body = nts.Continuum(
+        box([-half, -half, -thickness], [half, half, 0], [cells, cells, 1]),
+        nts.StVenantKirchhoff(young=1.0, poisson=0.3),
+        density=1.0,
+        name="plate",
+        bcs=[nts.Dirichlet(lambda x: np.full(x.shape[1], True), value)],
+    )
+    return body, body.surface(lambda x: x[2] > -1e-9)
+
+
+def shot(position, velocity, master, bodies=(), gravity=(0.0, 0.0, 0.0)):
+    """A point mass that flies at a master."""
+    mass = PointMass(COMM, MASS, position, velocity)
+    pair = nts.ContactPair(slave=PointSurface(mass, position), master=master)
+    return nts.System([mass, *bodies], contacts=[pair], gravity=gravity)
+
+
+# ---- paths and facets
+def through(x, d, triangle):
+    """The part of the way after which a line meets a triangle from its front, or inf."""
+    a, b, c = triangle
+    normal = np.cross(b - a, c - a)
+    if d @ normal >= 0.0:
+        return np.inf
+    part = (a - x) @ normal / (d @ normal)
+    weights = np.linalg.lstsq(np.stack([b - a, c - a], axis=1), x + part * d - a, rcond=None)[0]
+    inside = weights.min() >= 0.0 and weights.sum() <= 1.0
+    return part if inside and 0.0 <= part <= 1.0 else np.inf
+
+
+@pytest.mark.parametrize("corners", [3, 4])
+@pytest.mark.parametrize("seed", range(3))
+def test_first_hits_against_all_pairs(corners, seed):
+    random = np.random.default_rng(seed)
+    origin, side = random.uniform(-1, 1, (40, 3)), 0.5 * random.normal(size=(40, 2, 3))
+    shape = [(0, 0), (1, 0), (1, 1), (0, 1)] if corners == 4 else [(0, 0), (1, 0), (0, 1)]
+    facets = np.stack([origin + a * side[:, 0] + b * side[:, 1] for a, b in shape], axis=1)
+    shift = random.normal(size=(40, 1, 3))
+    points, motion = random.uniform(-1.5, 1.5, (80, 3)), 1.5 * random.normal(size=(80, 3))
+    found, when = search.first_hits(points, motion, facets, np.tile(shift, (1, corners, 1)))
+    parts = [[0, 1, 2], [0, 2, 3]][: corners - 2]
+    for x, d, f, t in zip(points, motion, found, when, strict=True):
+        times = [
+            min(through(x, d - s[0], facet[p]) for p in parts)
+            for facet, s in zip(facets, shift, strict=True)
+        ]
+        assert np.isclose(t, min(times), rtol=1e-9) or t == min(times)
+        assert f == (-1 if np.isinf(t) else int(np.argmin(times)))
+    assert 5 < (found >= 0).sum() < 75
+
+
+def test_hits_on_a_facet_that_turns():
+    """A facet swings by a right angle about its edge and meets a point at rest half-way."""
+    corners = np.array([[[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0]]], dtype=float)[:, ::-1]
+    end = corners.copy()
+    end[..., 0], end[..., 2] = corners[..., 2], corners[..., 0]
+    # The corners move evenly, so that after a part t the facet lies along (1 - t, 0, t).
+    points = np.array([[0.3, 0.5, 0.3], [0.3, 0.5, -0.3]])
+    found, when = search.first_hits(points, np.zeros((2, 3)), corners, end - corners)
+    assert found.tolist() == [0, -1]
+    assert abs(when[0] - 0.5) < 0.05
+
+
+# ---- masses
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("obstacle", [False, True])
+def test_a_mass_at_rest_that_falls_far_in_a_step(obstacle, integrator):
+    """Nothing at its start tells that it will move: v = 0, g = 9.81, h = 0.5, 0.2 m above."""
+    body, top = plate()
+    master = nts.Plane((0, 0, 0), (0, 0, 1)) if obstacle else top
+    bodies = [] if obstacle else [body]
+    system = shot((0.3, 0.2, 0.2), (0, 0, 0), master, bodies, gravity=(0, 0, -9.81))
+    run = nts.simulate(system, INTEGRATORS[integrator], dt=0.5, t_end=0.5)
+    assert run.status == "completed" and run.balance["active"].tolist() == [0, 1]
+    # It ends on the plate: v_1 = 2 du/h - v_0, and what the gap costs is force x gap.
+    speed = COMM.bcast(system.bodies[0].v)[2]
+    assert np.isclose(speed, -2 * 0.2 / 0.5, rtol=1e-12)
+    force = MASS * (speed / 0.5 + 9.81)
+    assert np.isclose(run.balance["contact_defect"][-1], 0.2 * force, rtol=1e-12)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("aim", [(0.0, 0.0), (150.0, 60.0), (-290.0, 10.0)])
+def test_a_shot_at_a_thin_plate(aim, integrator):
+    """Through several facets a step, from beside the plate, too: it bounces as at a plane (B6)."""
+    speed, dt = 300.0, 0.01
+    height = 0.2 * speed * dt
+    # Where the path meets the plate, whatever its direction.
+    start = (0.3 - 0.2 * dt * aim[0], 0.1 - 0.2 * dt * aim[1], height)
+    body, top = plate()
+    system = shot(start, (*aim, -speed), top, [body])
+    run = nts.simulate(system, INTEGRATORS[integrator], dt=dt, t_end=2 * dt)
+    assert run.status == "completed" and run.balance["active"].tolist() == [0, 1, 0]
+    v = COMM.bcast(system.bodies[0].v)
+    assert np.allclose(v, [*aim, (1 - 2 * 0.2) * speed], rtol=0, atol=1e-9 * speed)
+
+
+@pytest.mark.parametrize("miss", [(2.5, 0.0), (0.0, -2.2)])
+def test_a_shot_beside_a_plate_flies_on(miss):
+    body, top = plate()
+    system = shot((*miss, 0.5), (0, 0, -300.0), top, [body])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.02)
+    assert run.status == "completed" and run.balance["active"].max() == 0
+    assert run.retries == 0
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    "obstacle", [nts.Sphere((0, 0, 0), 0.1), nts.Cylinder((0, 0, 0), (0, 1, 0), 0.1)]
+)
+def test_a_shot_at_a_small_obstacle(obstacle):
+    """Whose ends lie outside of it: the step is cut until the node meets the obstacle."""
+    system = shot((0.0, 0.0, 0.53), (0, 0, -100.0), obstacle)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.02)
+    assert run.status == "completed" and run.retries > 0
+    assert run.balance["active"].max() == 1
+    x = COMM.bcast(system.bodies[0].u) + [0, 0, 0.53]
+    assert x[2] > 0.1
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator):
+    """It passes the plate's edge, sinks below its top, and the plate moves over it and away."""
+    def sideways(t):
+        return (0.6 * np.sin(np.pi * t), 0.0, 0.0)
+
+    body, top = plate(sideways, thickness=1.0, width=4.0, cells=4)
+    start = (2.3, 0.1, 0.02)
+    system = shot(start, (0.0, 0.0, -0.2), top, [body])
+    run = nts.simulate(system, INTEGRATORS[integrator], dt=0.02, t_end=1.0)
+    table = run.balance
+    v = COMM.bcast(system.bodies[0].v)
+    assert np.allclose(v, [0, 0, -0.2], rtol=0, atol=1e-12)
+    assert table["active"].max() == 0 and np.abs(table["contact_defect"]).max() == 0.0
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("dt", [2e-3, 1e-3])
+def test_cubes_off_centre_win_no_energy(dt):
+    """Slaves at the rim pass below the master's rim and come back: half the energy was won."""
+    bodies = [
+        nts.Continuum(box([0, 0, 0], [1, 1, 1], [4] * 3), RUBBER, density=1e3, name="left",
+                      velocity=(2, 0, 0)),
+        nts.Continuum(box([1.05, 0.01, 0.01], [2.05, 1.01, 1.01], [4] * 3), RUBBER, density=1e3,
+                      name="right"),
+    ]  # fmt: skip
+    pair = nts.ContactPair(
+        slave=bodies[0].surface(lambda x: x[0] > 1 - 1e-9),
+        master=bodies[1].surface(lambda x: x[0] < 1.05 + 1e-9),
+    )
+    system = nts.System(bodies, contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=0.12, accuracy="balanced")
+    energy = run.balance["energy"]
+    assert run.status == "completed" and run.balance["active"].max() == 16
+    assert np.diff(energy).max() <= 1e-3 * energy[0]
+    assert 0.9 * energy[0] < energy[-1] < energy[0]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+def test_a_block_at_rest_over_a_soft_plate(integrator):
+    """6 mm above facets of 1 cm, in steps of 50 ms: the first steps see no motion to come."""
+    size, gap = 0.02, 6e-3
+    soft = nts.StVenantKirchhoff(young=1e6, poisson=0.3)
+    floor = nts.Continuum(
+        box([-0.04, -0.04, -0.01], [0.04, 0.04, 0], [8, 8, 1]), soft, density=1e3, name="floor",
+        bcs=[nts.Dirichlet(lambda x: x[2] < -0.01 + 1e-9)],
+    )  # fmt: skip
+    block = nts.Continuum(
+        box([0.001, 0.001, gap], [0.001 + size, 0.001 + size, gap + size], [2] * 3), soft,
+        density=1e3, name="block",
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        slave=block.surface(lambda x: x[2] < gap + 1e-9),
+        master=floor.surface(lambda x: x[2] > -1e-9),
+    )
+    system = nts.System([block, floor], contacts=[pair], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, INTEGRATORS[integrator], dt=0.05, t_end=0.25)
+    assert run.status == "completed" and run.balance["active"].max() == 9
+    lowest = float((block.reference + block.u.x.array[: block.num_owned])[2::3].min(initial=1.0))
+    assert COMM.allreduce(lowest, op=MPI.MIN) > -1e-3 * size
+    energy, work = run.balance["energy"], run.balance["external_work"]
+    assert (energy <= work + 1e-9 * work.max()).all()
