@@ -31,12 +31,14 @@ BoolArray = npt.NDArray[np.bool_]
 #: Depth in facet sizes that is reported. What contact of nodes leaves by its nature is a few
 #: hundredths: a master that bulges between two slave nodes, a slave's edge over a convex master.
 LEAST = 0.2
-#: Relative motion, in facet sizes, after which bodies are looked at again.
-_LOOK = 0.25
+#: Bodies whose boxes meet are looked at again after a relative motion of this many facet sizes,
+#: but only after so many steps, which resolve a crossing at all, unless they have moved by a facet.
+_LOOK, _STEPS = 0.25, 4
 #: Closest points this near to the border of a facet (in convective coordinates) are on it.
 _ON_BORDER = 1e-9
-#: The deepest point of an edge is sought in so many halvings, until its depth is known to a part.
-_HALVINGS, _PRECISE = 14, 0.01
+#: The deepest point of an edge is sought by so many divisions into so many parts, until its depth
+#: is known to this part of it.
+_ROUNDS, _PARTS, _PRECISE = 7, 4, 0.01
 #: A body is thin where its sides have normals with a cosine below this; an edge that sticks out on
 #: both sides counts from this part of `LEAST` on.
 _OPPOSITE, _THIN = -0.9, 0.01
@@ -296,7 +298,7 @@ def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
 def _deepest(
     ends: FloatArray, start: FloatArray, limit: FloatArray, b: Placed, chosen: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Deepest points of edges in a body, by halving what may hold a deeper one.
+    """Deepest points of edges in a body, by dividing what may hold a deeper one.
 
     Args:
         ends: Ends of the edges [m], shape (n, 2, 3).
@@ -314,27 +316,28 @@ def _deepest(
     length = np.linalg.norm(span, axis=1)
     place, best, facet = ends[:, 0].copy(), np.full(n, -np.inf), np.full(n, -1)
     edge, s, d = np.arange(n), np.tile([0.0, 1.0], (n, 1)), start
-    for _ in range(_HALVINGS):
+    for _ in range(_ROUNDS):
         way = (s[:, 1] - s[:, 0]) * length[edge]
         known = np.maximum(limit, (1.0 + _PRECISE) * best)[edge]
         open_ = np.flatnonzero(d.sum(axis=1) + way > 2.0 * known)
         if not open_.size:
             break
         edge, s, d, way = edge[open_], s[open_], d[open_], way[open_]
-        middle = s.mean(axis=1)
-        points = ends[edge, 0] + middle[:, None] * span[edge]
+        at = s[:, :1] + np.linspace(0.0, 1.0, _PARTS + 1) * (s[:, 1:] - s[:, :1])
+        points = ends[edge, None, 0] + at[:, 1:-1, None] * span[edge, None]
         reach = np.maximum(d.max(axis=1), limit[edge]) + 0.5 * way
-        found = b.depth(points, reach, chosen)
-        order = np.lexsort((-found.value, edge))
-        first = order[np.unique(edge[order], return_index=True)[1]]
-        better = first[found.value[first] > best[edge[first]]]
-        k = edge[better]
-        place[k], best[k], facet[k] = points[better], found.value[better], found.facet[better]
-        edge = np.tile(edge, 2)
-        s = np.concatenate([np.column_stack([s[:, 0], middle]), np.column_stack([middle, s[:, 1]])])
-        d = np.concatenate(
-            [np.column_stack([d[:, 0], found.value]), np.column_stack([found.value, d[:, 1]])]
-        )
+        found = b.depth(points.reshape(-1, 3), np.repeat(reach, _PARTS - 1), chosen)
+        value = found.value.reshape(-1, _PARTS - 1)
+        order = np.lexsort((-found.value, np.repeat(edge, _PARTS - 1)))
+        of = np.repeat(edge, _PARTS - 1)[order]
+        first = order[np.unique(of, return_index=True)[1]]
+        better = first[found.value[first] > best[edge[first // (_PARTS - 1)]]]
+        k = edge[better // (_PARTS - 1)]
+        place[k], best[k] = points.reshape(-1, 3)[better], found.value[better]
+        facet[k] = found.facet[better]
+        known_at = np.column_stack([d[:, 0], value, d[:, 1]])
+        s, d = (np.stack([v[:, :-1], v[:, 1:]], axis=-1).reshape(-1, 2) for v in (at, known_at))
+        edge = np.repeat(edge, _PARTS)
     return place, best, facet
 
 
@@ -360,6 +363,18 @@ class Finding(NamedTuple):
     text: str
 
 
+class Pause(NamedTuple):
+    """How far two bodies may move relative to each other until the next look.
+
+    Attributes:
+        least: [m] At least; a look is due after it and `_STEPS` steps.
+        most: [m] At most, in however few steps.
+    """
+
+    least: float
+    most: float
+
+
 class _Watched:
     """Two boundaries that must not cross.
 
@@ -375,17 +390,20 @@ class _Watched:
     ) -> None:
         self.surfaces, self._whole = surfaces, whole
         self.needed = [*surfaces, *([whole] if whole else [])]
+        self._turn = 0
         self._boundaries = [Boundary(s.facets) for s in surfaces]
         self._roles = [
             {role: _belong(s, [getattr(c, role) for c in contacts]) for role in ("slave", "master")}
             for s in surfaces
         ]
 
-    def look(self, positions: dict[int, FloatArray]) -> tuple[list[Finding], float]:
-        """What is inside, and the relative motion [m] until something else may be.
+    def look(self, positions: dict[int, FloatArray], both: bool) -> tuple[list[Finding], Pause]:
+        """What is inside, and how long nothing else may be.
 
         Args:
             positions: Points of each of the surfaces `needed` [m], by its id.
+            both: Look at the nodes and edges of both; else of one and the other in turn. Where
+                edges cross, those of either show it.
         """
         sides = [
             Placed(b, positions[id(s)])
@@ -396,8 +414,10 @@ class _Watched:
         findings: list[Finding] = []
         # Boxes of open surfaces do not hold what is behind them.
         if gap > 0.0 and self._whole is None:
-            return findings, gap + _LOOK * max(float(s.sizes.min()) for s in sides)
-        for k in (0, 1):
+            far = gap + _LOOK * max(float(s.sizes.min()) for s in sides)
+            return findings, Pause(far, far)
+        self._turn = 1 - self._turn
+        for k in (0, 1) if both else (self._turn,):
             found = intrusions(sides[k], sides[1 - k])
             if self._whole is not None:
                 found = self._enclosed(found, k, positions[id(self._whole)])
@@ -405,7 +425,8 @@ class _Watched:
         common = np.array([np.maximum(*(b[0] for b in boxes)), np.minimum(*(b[1] for b in boxes))])
         near = [s.sizes[s.facets_near(common)] for s in sides]
         smallest = [n.min() if n.size else s.sizes.min() for n, s in zip(near, sides, strict=True)]
-        return findings, _LOOK * float(max(smallest))
+        facet = float(max(smallest))
+        return findings, Pause(_LOOK * facet, facet)
 
     def _enclosed(self, found: Found, k: int, x: FloatArray) -> Found:
         """Those that the body's whole boundary (p, 3) encloses beside the part they lie on.
@@ -479,8 +500,8 @@ class OverlapWatch:
     """Looks whether bodies that are in a contact with each other end up inside each other.
 
     Bodies of which no contact is declared may pass through each other, and obstacles are not
-    looked at. A look is due when the bodies have moved relative to each other by a quarter of a
-    facet, or so far that their boxes can touch, since the last one.
+    looked at. A look is due when the bodies have moved relative to each other so far that their
+    boxes can touch; then by a quarter of a facet since the last one, and four steps or a facet.
 
     Args:
         system: The scene.
@@ -492,7 +513,8 @@ class OverlapWatch:
         for contact, bodies in zip(system.contacts, system.contact_bodies, strict=True):
             if len(bodies) == 2 and all(hasattr(b, "mesh") for b in contact.bodies):
                 self._contacts.setdefault(tuple(sorted(bodies)), []).append(contact)
-        self._allowed = dict.fromkeys(self._contacts, -np.inf)
+        self._pause: dict[tuple[int, ...], Pause] = {}
+        self._steps = dict.fromkeys(self._contacts, 0)
         self._last: dict[tuple[int, ...], list[FloatArray]] = {}
         self._watched: dict[tuple[int, ...], list[_Watched]] = {}
         self._surfaces: dict[int, Surface] = {}
@@ -506,16 +528,15 @@ class OverlapWatch:
         """
         findings: list[Finding] = []
         for key in self._due(u, last):
-            self._last[key] = [u[k] for k in key]
-            self._allowed[key] = np.inf
+            both = last or key not in self._last
+            self._last[key], self._steps[key] = [u[k] for k in key], 0
             watched = self._watched_of(key)
             of = {id(self._bodies[k]): u[k] for k in key}
             needed = {id(s): s for w in watched for s in w.needed}
             positions = {i: s.positions(of[id(s.body)]) for i, s in needed.items()}
-            for each in watched:
-                found, allowed = each.look(positions)
-                findings += found
-                self._allowed[key] = min(self._allowed[key], allowed)
+            looks = [each.look(positions, both) for each in watched]
+            findings += [f for found, _ in looks for f in found]
+            self._pause[key] = min(pause for _, pause in looks)
         worst: dict[str, Finding] = {}
         for f in findings:
             if f.kind not in worst or f.size > worst[f.kind].size:
@@ -536,12 +557,14 @@ class OverlapWatch:
                 moved[i, j] = d.max(axis=0, initial=-np.inf), (-d).max(axis=0, initial=-np.inf)
         self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
         apart = np.maximum(moved[:, 0, 0] + moved[:, 1, 1], moved[:, 1, 0] + moved[:, 0, 1])
-        way = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
-        due = [
-            key
-            for key, w in zip(known, way.tolist(), strict=True)
-            if w > (0.0 if last else self._allowed[key])
-        ]
+        ways = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+        due = []
+        for key, way in zip(known, ways.tolist(), strict=True):
+            self._steps[key] += 1
+            least, most = self._pause[key]
+            enough = way > (least if self._steps[key] >= _STEPS else most)
+            if enough or (last and way > 0.0):
+                due.append(key)
         return fresh + due
 
     def _watched_of(self, key: tuple[int, ...]) -> list[_Watched]:
