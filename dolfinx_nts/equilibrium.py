@@ -133,6 +133,7 @@ class _LoadStepper(Stepper):
         self._accept(state)
         self._tell_inversion(step)
         self.solution.state = state
+        self.look()
 
     def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, float]:
         """Solution of a load step, its state, Newton iterations, earlier relaxations' dissipation.
@@ -244,6 +245,7 @@ def equilibrium(
     petsc_options: Mapping[str, Any] | None = None,
     output: Sequence[Any] = (),
     progress: bool = False,
+    watch_overlap: bool = True,
 ) -> Equilibrium:
     """Equilibrium of a system under its loads, reached in load steps of a pseudo time from 0.
 
@@ -286,6 +288,7 @@ def equilibrium(
         output: Writers of `dolfinx_nts.output`; each is called after every load step that its
             cadence asks for.
         progress: Show a progress line on rank 0.
+        watch_overlap: Look whether bodies of a contact end up inside each other, as in `simulate`.
 
     Returns:
         The Equilibrium; the bodies' u hold it. A run that fails says so in `status` and keeps
@@ -303,7 +306,8 @@ def equilibrium(
     if isinstance(system, System):
         _check_bodies(system)
     stepper = _LoadStepper(
-        system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options
-    )
+        system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options,
+        watch_overlap=watch_overlap,
+    )  # fmt: skip
     run(stepper, times, output, dt=times[0], progress=progress, remedy=_REMEDY)
     return stepper.solution

@@ -259,10 +259,10 @@ class Surface:
         behind[mine] = (side < 0.0) & (distance[mine] > 1e-3)
         mesh.comm.Allreduce(MPI.IN_PLACE, behind, op=MPI.MAX)
         near, distance = near[behind > 0], distance[behind > 0]
-        winding = np.array([_winding(p, corners) for p in x[near]])
-        mesh.comm.Allreduce(MPI.IN_PLACE, winding, op=MPI.SUM)
+        turns = np.array([winding(p, corners) for p in x[near]])
+        mesh.comm.Allreduce(MPI.IN_PLACE, turns, op=MPI.SUM)
         depth = np.zeros(len(x))
-        depth[near] = np.where(winding > 0.5, distance, 0.0)
+        depth[near] = np.where(turns > 0.5, distance, 0.0)
         return depth
 
     def positions(self, u: FloatArray) -> FloatArray:
@@ -294,7 +294,7 @@ def flux(corners: FloatArray) -> FloatArray:
     return volume if nc == 3 else 0.5 * volume
 
 
-def _winding(x: FloatArray, corners: FloatArray) -> float:
+def winding(x: FloatArray, corners: FloatArray) -> float:
     """How often facets (m, nc, 3) enclose a point: 1 inside a closed surface, 0 outside."""
     total = 0.0
     for k in range(1, corners.shape[1] - 1):

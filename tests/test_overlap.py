@@ -1,0 +1,400 @@
+"""Bodies inside each other: depths against brute force, edges that cross, scenes that are right."""
+
+import itertools
+import logging
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from scipy import ndimage
+
+import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import overlap
+
+COMM = MPI.COMM_WORLD
+INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
+CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
+#: Cyclic facets of a cube of 8 corners as in `CORNERS`, seen from outside.
+CUBE = np.array(
+    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+)
+
+
+def rotation(rng):
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def well_joined(filled):
+    """Whether cells, and the space between them, are joined by facets around every corner."""
+    padded = np.pad(filled, 1)
+    for window in np.lib.stride_tricks.sliding_window_view(padded, (2, 2, 2)).reshape(-1, 2, 2, 2):
+        if ndimage.label(window)[1] > 1 or ndimage.label(~window)[1] > 1:
+            return False
+    return True
+
+
+class Heap:
+    """A rotated heap of cubic cells, of which any side tells what is inside; h is their size."""
+
+    def __init__(self, rng, n, nc, h, centre):
+        while True:
+            self.filled = rng.random((n, n, n)) < 0.6
+            if self.filled.any() and well_joined(self.filled):
+                break
+        self.n, self.h, self.turn, self.centre = n, h, rotation(rng), centre
+        quads = (np.argwhere(self.filled)[:, None] + CORNERS)[:, CUBE].reshape(-1, 4, 3)
+        number = quads @ [(n + 1) ** 2, n + 1, 1]
+        _, inverse, count = np.unique(
+            np.sort(number, axis=1), axis=0, return_inverse=True, return_counts=True
+        )
+        outer = count[inverse.ravel()] == 1
+        self.squares, facets = quads[outer], number[outer]
+        if nc == 3:
+            facets = np.concatenate([facets[:, [0, 1, 2]], facets[:, [0, 2, 3]]])
+        used, inverse = np.unique(facets, return_inverse=True)
+        grid = np.array(list(itertools.product(range(n + 1), repeat=3)))[used]
+        self.x = self.place(grid)
+        self.boundary = overlap.Boundary(inverse.reshape(facets.shape))
+        self.placed = overlap.Placed(self.boundary, self.x)
+        # Of a square, or of the triangle that is half of it.
+        self.size = h if nc == 4 else h * (2 + np.sqrt(2)) / 3
+
+    def place(self, grid):
+        """Points [m] from coordinates in cells."""
+        return (self.h * (grid - self.n / 2)) @ self.turn.T + self.centre
+
+    def depth(self, points):
+        """Distance from the nearest square, negative outside all cells."""
+        x = (points - self.centre) @ self.turn / self.h + self.n / 2
+        low, high = self.squares.min(axis=1), self.squares.max(axis=1)
+        distance = np.full(len(x), np.inf)
+        for one, two in zip(low, high, strict=True):
+            distance = np.minimum(distance, np.linalg.norm(x - x.clip(one, two), axis=1))
+        cell = np.floor(x).astype(int)
+        within = ((cell >= 0) & (cell < self.n)).all(axis=1)
+        inside = np.zeros(len(x), dtype=bool)
+        inside[within] = self.filled[tuple(cell[within].T)]
+        return self.h * np.where(inside, distance, -distance)
+
+
+def heaps(seed, nc):
+    rng = np.random.default_rng(seed)
+    return Heap(rng, 2, nc, 0.5, np.zeros(3)), Heap(rng, 3, nc, 0.25, 0.3 * rng.normal(size=3))
+
+
+@pytest.mark.parametrize("nc", [3, 4])
+@pytest.mark.parametrize("seed", range(3))
+def test_depth_of_points_is_that_of_a_heap_of_cells(seed, nc):
+    rng = np.random.default_rng(seed + 100)
+    for heap in heaps(seed, nc):
+        grid = rng.uniform(-0.5, heap.n + 0.5, size=(400, 3))
+        points = heap.place(grid)
+        found = heap.placed.depth(points, np.inf)
+        assert np.abs(found.value - heap.depth(points)).max() < 1e-13
+        near, seen = heap.placed.depth(points, 0.1), np.abs(found.value) <= 0.1
+        assert np.array_equal(near.value[seen], found.value[seen])
+        assert (near.value[~seen] == -np.inf).all()
+
+
+def test_points_in_the_plane_of_a_facet_beside_it_are_outside():
+    """Rounding tells the side of that facet; the sum of the normals on its edge does not ask it."""
+    rng = np.random.default_rng(7)
+    for nc in (3, 4):
+        cube = Heap(rng, 1, nc, 1.0, rng.normal(size=3))
+        grid = rng.uniform(1.1, 1.5, size=(300, 3))
+        grid[np.arange(300), rng.integers(3, size=300)] = rng.integers(2, size=300)
+        assert (cube.placed.depth(cube.place(grid), np.inf).value < -0.09).all()
+
+
+@pytest.mark.parametrize("nc", [3, 4])
+@pytest.mark.parametrize("seed", range(4))
+def test_nodes_and_edges_inside_are_those_of_brute_force(seed, nc):
+    """Edges are sampled densely; those within a hundredth of the least depth may be told or not."""
+    heap = heaps(seed, nc)
+    least, found_any = 0.1, 0
+    scale = max(h.size for h in heap)
+    for a, b in (heap, heap[::-1]):
+        found = overlap.intrusions(a.placed, b.placed, least)
+        assert np.abs(found.depth - b.depth(found.place)).max(initial=0.0) < 1e-13
+        assert np.allclose(found.size, found.depth / scale)
+        node = found.part(found.is_node)
+        deep = b.depth(a.x)
+        assert sorted(node.nodes[:, 0]) == np.flatnonzero(deep > least * scale).tolist()
+        edges = a.boundary.edges[(deep[a.boundary.edges] <= least * scale).all(axis=1)]
+        t = np.linspace(0, 1, 401)[:, None]
+        most = np.array([b.depth((1 - t) * a.x[i] + t * a.x[j]).max() for i, j in edges])
+        told = {tuple(e): d for e, d in zip(*found.part(~found.is_node)[:3:2], strict=True)}
+        for edge, depth in zip(map(tuple, edges), most, strict=True):
+            if abs(depth / (least * scale) - 1) > 0.02:
+                assert (edge in told) == (depth > least * scale)
+            if edge in told:
+                assert abs(told.pop(edge) / depth - 1) < 0.02
+        assert not told
+        found_any += len(found.depth)
+    assert found_any > 0
+
+
+def box(low, high, cells):
+    """Boundary facets and points of a box."""
+    n = np.array(cells)
+    grid = np.array(list(itertools.product(*(range(k) for k in n))))
+    step = [(n[1] + 1) * (n[2] + 1), n[2] + 1, 1]
+    facets = ((grid[:, None] + CORNERS) @ step)[:, CUBE].reshape(-1, 4)
+    key = np.sort(facets, axis=1)
+    _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    points = np.array(list(itertools.product(*(range(k + 1) for k in n)))) / n
+    used, number = np.unique(facets[count[inverse.ravel()] == 1], return_inverse=True)
+    x = np.array(low) + points[used] * np.subtract(high, low)
+    return overlap.Placed(overlap.Boundary(number.reshape(-1, 4)), x)
+
+
+def count(a, b):
+    return len(overlap.intrusions(a, b).depth)
+
+
+def test_a_plate_too_thin_to_be_deep_in_it():
+    """A plate of 1 cm with facets of 0.25 m: a post through it, one on it, posts beside it."""
+    plate = box((-1, -1, -0.005), (1, 1, 0.005), (8, 8, 1))
+    found = overlap.intrusions(box((-0.1, -0.1, -0.3), (0.11, 0.12, 0.6), (1, 1, 1)), plate)
+    assert len(found.depth) == 4 and not found.is_node.any()
+    assert np.allclose(found.depth, 0.005, rtol=0.02)
+    assert count(box((-0.1, -0.1, 0.0049), (0.1, 0.1, 0.6), (1, 1, 1)), plate) == 0
+    for beside in (1.0, 1.0 - 1e-4):
+        assert count(box((beside, -0.1, -0.3), (beside + 0.2, 0.1, 0.3), (1, 1, 1)), plate) == 0
+
+
+def test_a_body_wholly_inside_is_found():
+    big, small = box((0, 0, 0), (1, 1, 1), (2, 2, 2)), box((0.4,) * 3, (0.55,) * 3, (1, 1, 1))
+    found = overlap.intrusions(small, big)
+    assert len(found.depth) == 8 and np.isclose(found.depth.max(), 0.45)
+    assert count(big, small) == 0
+
+
+@pytest.mark.parametrize("metre", [1.0, 1e-6])
+@pytest.mark.parametrize("distance", [-0.5, -1e-3, 0.0, 1e-3])
+def test_touching_faces_are_no_overlap(metre, distance):
+    """Nodes of both halfway between each other's, up to rounding or a little inside."""
+    turn, shift = rotation(np.random.default_rng(3)), np.array([5.0, -3.0, 2.0])
+
+    def placed(*arguments):
+        body = box(*arguments)
+        return overlap.Placed(body.boundary, metre * (body.x @ turn.T + shift))
+
+    lower = placed((0, 0, 0), (1, 1, 1), (4, 4, 4))
+    upper = placed((0.1, 0.1, 1 + distance / 4), (0.9, 0.9, 1.8), (3, 3, 3))
+    found = count(lower, upper), count(upper, lower)
+    assert (min(found) > 0) if distance == -0.5 else found == (0, 0)
+
+
+ROOT = np.sqrt(0.5)
+
+
+def cube(axis, lift, cells, comm=COMM):
+    """Mesh of a unit cube that stands on an edge along the axis (0, 1), and its centre's height."""
+    mesh = create_box(
+        comm, [[-0.5] * 3, [0.5] * 3], [cells] * 3,
+        cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    turn = np.array([[[1, 0, 0], [0, ROOT, -ROOT], [0, ROOT, ROOT]],
+                     [[ROOT, 0, ROOT], [0, 1, 0], [-ROOT, 0, ROOT]]])[axis]  # fmt: skip
+    mesh.geometry.x[:] = mesh.geometry.x @ turn.T + [0, 0, lift]
+    return mesh
+
+
+def edge_on_edge(cells=3, gap=0.01, speed=2.0, contact=True, bcs=((), ())):
+    """Two cubes that meet edge on edge, the upper one's along y, the lower one's along x."""
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    upper = nts.Continuum(
+        cube(1, ROOT + gap, cells), rubber,
+        density=1e3, velocity=(0, 0, -speed), bcs=bcs[0], name="upper",
+    )  # fmt: skip
+    lower = nts.Continuum(cube(0, -ROOT, cells), rubber, density=1e3, bcs=bcs[1], name="lower")
+    pair = nts.ContactPair(
+        slave=upper.surface(lambda x: np.isclose(x[2] - gap, np.abs(x[0]))),
+        master=lower.surface(lambda x: np.isclose(-x[2], np.abs(x[1]))),
+    )
+    return nts.System([upper, lower], contacts=[pair] if contact else [])
+
+
+def moved(system, *translations):
+    """Displacements of the bodies by translations."""
+    return [
+        np.tile(np.array(t, dtype=float), b.num_owned // 3)
+        for b, t in zip(system.bodies, translations, strict=True)
+    ]
+
+
+@pytest.mark.mpi
+def test_edges_that_cross_are_told_with_place_and_depth():
+    system = edge_on_edge()
+    crossing, aside = 0.15, np.array([0.02, -0.03, 0.0])
+    down = np.array([0.0, 0.0, -0.01 - crossing])
+    (found,) = overlap.OverlapWatch(system).look(moved(system, aside + down, (0, 0, 0)))
+    assert found.kind == "edge through a body"
+    # The deepest point of an edge lies under the other edge, whose flanks stand at 45 degrees.
+    assert abs(found.depth - crossing * ROOT) < 0.01 * crossing
+    assert abs(found.size - 3 * found.depth) < 1e-9
+    over = [0.02, 0.0, -crossing] if found.bodies == ("upper", "lower") else [0.02, 0.0, 0.0]
+    assert np.abs(found.place - over).max() < 0.02 * crossing
+    body = next(b for b in system.bodies if b.name == found.bodies[0])
+    number = np.asarray(body.mesh.geometry.input_global_indices)
+    x = body.mesh.geometry.x[np.isin(number, found.nodes)]
+    ends = np.unique(np.concatenate(COMM.allgather(x)).round(9), axis=0)
+    along = 1 if body.name == "upper" else 0
+    assert np.allclose(ends[:, along], [-1 / 6, 1 / 6]) and len(found.nodes) == 2
+    assert all(text in found.text for text in ("'upper'", "'lower'", "finer mesh of the slave"))
+
+
+def fly(t_end=0.06, scene=None, integrator=INTEGRATORS["energy-momentum"], **options):
+    """Free flight until then: no node has touched anything, and the edges cross by 0.11 m."""
+    return nts.simulate(scene or edge_on_edge(), integrator, dt=5e-3, t_end=t_end, **options)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+def test_a_run_in_which_edges_cross_says_so(integrator, caplog):
+    caplog.set_level(logging.CRITICAL)
+    run = fly(integrator=integrator)
+    assert run.balance["active"].max() == 0
+    assert run.status.startswith("completed, but the edge between nodes")
+    (kind,) = run.warnings
+    assert kind == "edge through a body" and run.warnings[kind].grave
+    assert abs(run.warnings[kind].worst - 0.11 * ROOT) < 0.0011
+
+
+def test_adapted_steps_are_watched_and_the_watch_can_be_switched_off(caplog):
+    caplog.set_level(logging.CRITICAL)
+    run = fly(adapt=nts.Adapt())
+    assert abs(run.warnings["edge through a body"].worst - 0.11 * ROOT) < 0.0011
+    assert fly(watch_overlap=False).status == "completed"
+    with pytest.raises(TypeError, match="^watch_overlap=1: pass True or False"):
+        fly(watch_overlap=1)
+
+
+def test_bodies_without_a_contact_may_pass(caplog):
+    assert fly(scene=edge_on_edge(contact=False)).status == "completed"
+
+
+@pytest.mark.mpi
+def test_load_steps_are_watched(caplog):
+    caplog.set_level(logging.CRITICAL)
+    down = nts.Dirichlet(lambda x: x[0] < 9, value=lambda t: (0.0, 0.0, -0.12 * t))
+    stay = nts.Dirichlet(lambda x: x[0] < 9)
+    run = nts.equilibrium(edge_on_edge(speed=0.0, bcs=([down], [stay])), load_steps=3)
+    assert run.status.startswith("completed, but the edge between nodes")
+    assert abs(run.warnings["edge through a body"].worst - 0.11 * ROOT) < 0.0011
+
+
+def blocks(above, *, slave=None, master=None, offset=(0.0, 0.0, 0.0)):
+    """Two cubes with a surface each; of the upper one the nodes are held out of the lower one."""
+    rubber, meshes = nts.NeoHookean(young=1e6, poisson=0.3), []
+    for n, corner in ((2, np.add([0.2, 0.2, 1 + above], offset)), (3, np.zeros(3))):
+        ends = [corner, corner + (0.6 if n == 2 else 1.0)]
+        kind = dict(cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
+        meshes.append(create_box(COMM, ends, [n] * 3, **kind))
+    upper, lower = (
+        nts.Continuum(m, rubber, density=1e3, name=name)
+        for m, name in zip(meshes, ("upper", "lower"), strict=True)
+    )
+    pair = nts.ContactPair(
+        slave=upper.surface(slave or (lambda x: x[2] < 1 + above + 1e-9)),
+        master=lower.surface(master or (lambda x: x[2] > 1 - 1e-9)),
+    )
+    return nts.System([upper, lower], contacts=[pair])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("slave", "master", "remedy"),
+    [
+        (None, None, "did not hold it: use a smaller dt"),
+        (None, lambda x: x[0] < 1e-9, "extend the markers of the contact's surfaces to both"),
+        (lambda x: x[2] > 1.6, None, "extend the markers of the contact's surfaces to both"),
+    ],
+)
+def test_a_node_inside_is_told_with_what_to_do(slave, master, remedy):
+    system = blocks(0.1, slave=slave, master=master)
+    found = overlap.OverlapWatch(system).look(moved(system, (0, 0, -0.25), (0, 0, 0)))
+    (node,) = [f for f in found if f.kind == "node inside a body"]
+    assert abs(node.depth - 0.15) < 1e-12 and abs(node.place[2] - 0.85) < 1e-12
+    assert node.bodies == ("upper", "lower") and len(node.nodes) == 1
+    assert abs(node.size - 0.15 / (1 / 3)) < 1e-12
+    assert remedy in node.text
+
+
+@pytest.mark.mpi
+def test_bodies_that_pass_or_touch_are_not_warned_of():
+    """Past each other at a distance of 1e-3 facets and flush, beside each other on edge."""
+    for aside in (0.0, 3e-4):
+        system = blocks(0.1, offset=(0.0, 0.0, aside - 0.1))
+        watch = overlap.OverlapWatch(system)
+        for x in np.linspace(-1.5, 1.5, 13):
+            assert watch.look(moved(system, (x, 0.1 * x, 0), (0, 0, 0))) == []
+    system = edge_on_edge()
+    watch = overlap.OverlapWatch(system)
+    beside = moved(system, (0.0, 2 * ROOT + 0.01, -0.6), (0.0, 0.0, 0.0))
+    assert watch.look(beside) == []
+
+
+@pytest.mark.mpi
+def test_looks_are_as_rare_as_the_motion_allows(monkeypatch):
+    """Not while nothing moves relatively or boxes are apart; else 4 a facet (of 1/3 m)."""
+    system, looks = blocks(0.1), []
+    true = overlap.intrusions
+    monkeypatch.setattr(overlap, "intrusions", lambda *a: looks.append(len(looks)) or true(*a))
+    watch = overlap.OverlapWatch(system)
+
+    def look(x, z, **options):
+        watch.look(moved(system, (x, 0, z), (30, 0, 0)), **options)
+        done = len(looks)
+        looks.clear()
+        return done
+
+    for x in np.linspace(0.0, 30.0, 31):
+        watch.look(moved(system, (x, 0, 0.5), (x, 0, 0)))
+    assert not looks
+    assert look(30.0, -0.2) == 1
+    assert sum(look(30 + x, -0.2) for x in np.linspace(0.0, 0.3, 31)) == 3
+    # The last of these three was five steps ago. In fewer than four only if it is a facet.
+    way = (0.1, 0.2, 0.3, 0.0, 0.4, 0.04)
+    assert [look(30.3 + x, -0.2) for x in way] == [1, 0, 0, 0, 1, 1]
+    assert [look(30.35, -0.2, last=True) for _ in range(2)] == [2, 0]
+
+
+def two_in_one(low):
+    """One body of two cubes, one above the other by 0.2 m, and the contact between them."""
+    cells = np.array([[0, 4, 2, 6, 1, 5, 3, 7]])
+    cells = np.concatenate([cells, cells + 8]) if COMM.rank == 0 else cells[:0]
+    x = np.concatenate([CORNERS, CORNERS + [0, 0, 1.2]]) if COMM.rank == 0 else np.empty((0, 3))
+    mesh = compat.create_mesh(COMM, cells, x.astype(float), "hexahedron")
+    body = nts.Continuum(mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, name="two")
+    pair = nts.ContactPair(
+        slave=body.surface(lambda x: np.isclose(x[2], 1.2)),
+        master=body.surface(lambda x: np.isclose(x[2], low)),
+    )
+    return nts.System([body], contacts=[pair])
+
+
+@pytest.mark.mpi
+def test_a_body_inside_itself_is_found():
+    system = two_in_one(low=1.0)
+    body = system.bodies[0]
+    watch = overlap.OverlapWatch(system)
+    above = body.reference.reshape(-1, 3)[:, 2] > 1.1
+    motion = np.array([0.3, 0.2, -1.0]) * above[:, None]
+    assert watch.look([0.19 * motion.ravel()]) == []
+    found = watch.look([0.5 * motion.ravel()], last=True)
+    assert {f.bodies for f in found} == {("two", "two")}
+    (node,) = [f for f in found if f.kind == "node inside a body"]
+    assert abs(node.depth - 0.1) < 1e-12 or abs(node.depth - 0.3) < 1e-12
+
+
+@pytest.mark.mpi
+def test_what_is_behind_an_open_surface_but_outside_is_no_overlap():
+    """The bottom of a cube lies behind the facets that face the other way, beyond the body."""
+    system = two_in_one(low=2.2)
+    assert overlap.OverlapWatch(system).look(moved(system, (0.0, 0.0, 0.0))) == []
