@@ -66,10 +66,9 @@ class EnergyMomentum(_InTime):
     """Energy-momentum scheme (61)-(66): keeps both momenta and closes the energy ledger.
 
     Attributes:
-        stress: Discrete derivative of the strain energy, "gonzalez" (exact; for increments below
-            1 % by five-point quadrature, exact to rounding for W as steep as exp(100 tr C)) or
-            "mean-value" (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to
-            quadrature error otherwise).
+        stress: Discrete derivative of the strain energy, "gonzalez" (exact) or "mean-value"
+            (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to quadrature
+            error otherwise).
         contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit
             independent) or "gonzalez" (the paper's (67), for comparison).
         quadrature_points: Gauss points in time of the mean-value stress, 1 to 7.
