@@ -16,7 +16,17 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "dolfinx_nts"
 
 LEVELS = [
-    {"discrete_gradient", "nts", "friction", "facets", "patches", "validation", "dolfinx_compat"},
+    {
+        "discrete_gradient",
+        "strain_energy",
+        "precise",
+        "nts",
+        "friction",
+        "facets",
+        "patches",
+        "validation",
+        "dolfinx_compat",
+    },
     {
         "continuum",
         "rigid",
