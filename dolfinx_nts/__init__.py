@@ -12,6 +12,7 @@ from dolfinx_nts.newton import Newton
 from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
 from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.step_size import Adapt
+from dolfinx_nts.strain_energy import Isotropic
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
@@ -26,6 +27,7 @@ __all__ = [
     "Dirichlet",
     "EnergyMomentum",
     "Equilibrium",
+    "Isotropic",
     "Midpoint",
     "MooneyRivlin",
     "NeoHookean",

@@ -25,6 +25,7 @@ from dolfinx_nts.integrators import Static
 from dolfinx_nts.inversion import Determinants
 from dolfinx_nts.materials import misfit
 from dolfinx_nts.mesh_check import check_mesh
+from dolfinx_nts.strain_energy import green_strain, strain_energy
 from dolfinx_nts.surfaces import Surface, locate_facets
 from dolfinx_nts.validation import (
     at_points,
@@ -185,8 +186,8 @@ class Continuum:
 
     Args:
         mesh: 3D hexahedral or tetrahedral mesh.
-        material: Strain energy W(C) [J/m^3]: a material of this package or any callable C -> UFL
-            scalar.
+        material: Strain energy W(C) [J/m^3]: a material of this package, an `Isotropic` of one's
+            own, or any callable C -> UFL scalar.
         density: Reference density [kg/m^3], > 0.
         velocity: Initial velocity [m/s]: a vector, or a callable x (3, n) -> (3, n) as in DOLFINx's
             interpolate.
@@ -383,8 +384,7 @@ class Continuum:
         load = ufl.inner(self._loads[0], w) * self._dx
         for k, value in enumerate(self._loads[1:]):
             load += ufl.inner(value, w) * self._ds(k)
-        f = ufl.Identity(3) + ufl.grad(self.u)
-        energy = self._energy(f.T * f)
+        energy = self._energy(green_strain(ufl.grad(self.u)))
         self._parameters = [
             t
             for t in traverse_unique_terminals(energy)
@@ -404,11 +404,11 @@ class Continuum:
         self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
         self.nodal_mass = self.inertia(np.ones(self.num_owned))
 
-    def _energy(self, c: Any) -> Any:
-        """W(C) in UFL; what is wrong with it raises on every rank."""
+    def _energy(self, e: Any) -> Any:
+        """W at a strain in UFL; what is wrong with it raises on every rank."""
         problem, cause, energy = None, None, None
         try:
-            energy = ufl.as_ufl(self.material(c))
+            energy = ufl.as_ufl(strain_energy(self.material)(e))
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
             problem, cause = f"raised {error!r}; return a UFL scalar", error
         else:
@@ -450,8 +450,8 @@ class Continuum:
                 self._u0, self._u1, self._v0 = (fem.Function(self.space) for _ in range(3))
                 self._factor, self._rate = (fem.Constant(self.mesh, 1.0) for _ in range(2))
             du, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
-            f0, f1 = (ufl.Identity(3) + ufl.grad(u) for u in (self._u0, self._u1))
-            work = ufl.inner(integrator.piola(self.material, f0, f1), ufl.grad(w)) * self._dx
+            energy, h0, h1 = strain_energy(self.material), ufl.grad(self._u0), ufl.grad(self._u1)
+            work = ufl.inner(integrator.piola(energy, h0, h1), ufl.grad(w)) * self._dx
             virtual, extra = work, None
             if self._extra_form is not None:
                 moved, theta = self._u1 - self._u0, integrator.theta

@@ -13,7 +13,19 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 
+from dolfinx_nts.strain_energy import StrainEnergy
+
 FloatArray = npt.NDArray[np.float64]
+
+_EPS = float(np.finfo(float).eps)
+
+
+def _legendre(degree: int, points: int) -> FloatArray:
+    """Legendre's polynomial at the Gauss points, shape (points,)."""
+    x = np.polynomial.legendre.leggauss(points)[0]
+    values: FloatArray = np.polynomial.legendre.legval(x, np.eye(degree + 1)[degree])
+    return values
+
 
 #: Gauss points and weights on [0, 1].
 _GAUSS = {
@@ -22,51 +34,53 @@ _GAUSS = {
     )
     for n in range(1, 8)
 }
-#: Relative strain increment below which W(C_1) - W(C_0) is taken from quadrature: there the
-#: five-point rule is exact to rounding (error ~ (b x)^11 for W ~ exp(b tr C)), while the plain
-#: difference would leave rounding noise ~ eps / x in the stress.
-_SMALL_STRAIN = 1e-2
-_SMALL_STRAIN_POINTS = 5
-#: Relative strain increment whose square is below rounding.
-_REST_STRAIN = 1e-8
+_POINTS = 5
+#: Legendre coefficients of an integrand from its values at these points, shape (2, points). Where
+#: coefficients fall like r^k the rule's error falls like r^10, so the last two tell it ...
+_LAST = {k: (2 * k + 1) * _GAUSS[_POINTS][1] * _legendre(k, _POINTS) for k in (3, 4)}
+#: ... and these parts of the integrand's size stand for an error of machine precision.
+_RESOLVED = {k: _EPS ** (k / 10) for k in _LAST}
+#: Relative strain increment below which the coefficients of a W(C) may hold nothing but rounding.
+_SMALL_STRAIN = 1e-7
 
 
-def strain_derivative(energy: Callable[[Any], Any], strain: Any) -> Any:
-    """dW/dC at the right Cauchy-Green tensor, symmetric (UFL)."""
-    c = ufl.variable(strain)
-    return ufl.sym(ufl.diff(energy(c), c))
-
-
-def mean_value_stress(energy: Callable[[Any], Any], c0: Any, c1: Any, points: int) -> Any:
-    """S = 2 int_0^1 dW(C_0 + tau (C_1 - C_0)) dtau by Gauss points (UFL)."""
+def mean_value_stress(energy: StrainEnergy, e0: Any, e1: Any, points: int) -> Any:
+    """S = int_0^1 dW/dE(E_0 + tau (E_1 - E_0)) dtau by Gauss points (UFL)."""
     tau, weight = _GAUSS[points]
-    stress = [
-        w * strain_derivative(energy, c0 + t * (c1 - c0))
-        for t, w in zip(tau.tolist(), weight.tolist(), strict=True)
-    ]
-    return 2 * sum(stress[1:], start=stress[0])
+    return _combine(weight, [energy.stress(e0 + t * (e1 - e0)) for t in tau.tolist()])
 
 
-def gonzalez_stress(energy: Callable[[Any], Any], c0: Any, c1: Any) -> Any:
-    """Discrete derivative of W between C_0 and C_1 after Gonzalez (2000) (UFL).
+def gonzalez_stress(energy: StrainEnergy, e0: Any, e1: Any) -> Any:
+    """Discrete derivative of W between E_0 and E_1 after Gonzalez (2000) (UFL).
 
-    S = 2 dW(Cm) + 2 [W(C_1) - W(C_0) - dW(Cm) : DC] / (DC : DC) DC. The bracket is O(DC^3); for
-    small DC it is taken from five-point quadrature, which is as exact and free of the cancellation
-    that makes the plain form 0/0 at rest.
+    S = dW(Em) + [W(E_1) - W(E_0) - dW(Em) : DE] / (DE : DE) DE. The bracket is O(DE^3). It is taken
+    from five-point quadrature, which is free of the cancellation that makes the plain form 0/0 at
+    rest, wherever the samples say that the quadrature is exact to rounding. Elsewhere W changes so
+    much within DE that the plain form cancels little.
     """
-    cm, dc = 0.5 * (c0 + c1), c1 - c0
-    middle = strain_derivative(energy, cm)
-    by_quadrature = -ufl.inner(middle, dc)
-    for tau, weight in zip(*_GAUSS[_SMALL_STRAIN_POINTS], strict=True):
-        t = ufl.variable(ufl.as_ufl(float(tau)))  # dW : DC, without a derivative by a tensor
-        by_quadrature += float(weight) * ufl.diff(energy(c0 + t * dc), t)
-    by_difference = energy(c1) - energy(c0) - ufl.inner(middle, dc)
-    size, scale = ufl.inner(dc, dc), ufl.inner(cm, cm)
-    bracket = ufl.conditional(ufl.lt(size, _SMALL_STRAIN**2 * scale), by_quadrature, by_difference)
-    # Next to rest the term is below rounding, but its derivative would be rounding noise over DC.
-    bracket = ufl.conditional(ufl.lt(size, _REST_STRAIN**2 * scale), 0.0, bracket)
-    # The addend is far below any increment that rounding lets exist; it keeps 0/0 away at rest.
-    return 2 * (middle + bracket / (size + 1e-60 * scale) * dc)
+    em, de = 0.5 * (e0 + e1), e1 - e0
+    path = energy.along(e0, e1)
+    tau, weight = _GAUSS[_POINTS]
+    samples = [path.power(t) for t in tau.tolist()]
+    middle = samples[_POINTS // 2]
+    size, argument = ufl.inner(de, de), energy.argument(em)
+    scale = ufl.inner(argument, argument)
+    left = -_combine(weight, [f**2 for f in samples])
+    for k in _LAST:
+        left += (_combine(_LAST[k], samples) / _RESOLVED[k]) ** 2
+    left *= ufl.conditional(ufl.lt(size, _SMALL_STRAIN**2 * scale), 0.0, 1.0)
+    by_quadrature = _combine(weight, samples) - middle
+    bracket = ufl.conditional(ufl.le(left, 0.0), by_quadrature, path.difference - middle)
+    # Next to rest the term is below rounding, but its derivative would be rounding noise over DE.
+    bracket = ufl.conditional(ufl.lt(size**2, _EPS**2 * scale), 0.0, bracket)
+    # The addend is far below any increment that counts; it keeps 0/0 away at rest.
+    return path.middle + bracket / (size + 1e-200) * de
+
+
+def _combine(weights: FloatArray, values: list[Any]) -> Any:
+    """Weighted sum of UFL expressions."""
+    first, *rest = (w * v for w, v in zip(weights.tolist(), values, strict=True))
+    return sum(rest, start=first)
 
 
 def mean_value(

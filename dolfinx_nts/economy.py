@@ -32,6 +32,7 @@ import dolfinx_nts as nts
 from dolfinx_nts import balance, output
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.linear_solver import SolverOptions
+from dolfinx_nts.strain_energy import strain_energy
 from dolfinx_nts.validation import known_options, require_positive
 
 FloatArray = npt.NDArray[np.float64]
@@ -189,10 +190,10 @@ class PlainBody:
         self._u0, self._u1 = fem.Function(space), fem.Function(space)
         self.u, self.v, self._dt = np.zeros_like(v), v.copy(), dt
         dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 2})
-        f0, f1 = (ufl.Identity(3) + ufl.grad(a) for a in (self._u0, self._u1))
+        h0, h1 = ufl.grad(self._u0), ufl.grad(self._u1)
         rho, factor = fem.Constant(mesh, float(density)), fem.Constant(mesh, 0.5 * dt**2)
         du, w = ufl.TrialFunction(space), ufl.TestFunction(space)
-        stress = nts.EnergyMomentum().piola(material, f0, f1)
+        stress = nts.EnergyMomentum().piola(strain_energy(material), h0, h1)
         work = ufl.inner(stress, ufl.grad(w)) * dx
         inertia = rho * ufl.inner(du, w) * dx
         tangent = factor * ufl.derivative(work, self._u1, du) + inertia

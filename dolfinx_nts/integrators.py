@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 
-from dolfinx_nts.discrete_gradient import gonzalez_stress, mean_value_stress, strain_derivative
+from dolfinx_nts.discrete_gradient import gonzalez_stress, mean_value_stress
+from dolfinx_nts.strain_energy import StrainEnergy, green_strain
 from dolfinx_nts.validation import is_whole, known_options
 
 FloatArray = npt.NDArray[np.float64]
-Energy = Callable[[Any], Any]
 
 
 def _choose(name: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
         raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, known))}")
+
+
+def _stress_of(energy: StrainEnergy, h: Any) -> Any:
+    """P = F S of one displacement gradient in UFL [Pa]."""
+    return (ufl.Identity(3) + h) * energy.stress(green_strain(h))
 
 
 class _InTime:
@@ -56,10 +61,9 @@ class Midpoint(_InTime):
     #: unknown.
     contact_gradient: ClassVar[str] = "direct"
 
-    def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:
-        """First Piola-Kirchhoff stress P = F_m 2 dW(C(F_m)) in UFL [Pa]."""
-        fm = 0.5 * (f0 + f1)
-        return fm * (2 * strain_derivative(energy, fm.T * fm))
+    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+        """First Piola-Kirchhoff stress P = F_m S(E(F_m)) in UFL [Pa] of F = 1 + H."""
+        return _stress_of(energy, 0.5 * (h0 + h1))
 
 
 @known_options
@@ -68,10 +72,9 @@ class EnergyMomentum(_InTime):
     """Energy-momentum scheme (61)-(66): keeps both momenta and closes the energy ledger.
 
     Attributes:
-        stress: Discrete derivative of the strain energy, "gonzalez" (exact; for increments below
-            1 % by five-point quadrature, exact to rounding for W as steep as exp(100 tr C)) or
-            "mean-value" (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to
-            quadrature error otherwise).
+        stress: Discrete derivative of the strain energy, "gonzalez" (exact) or "mean-value"
+            (Gauss points in time: exact for polynomial W such as StVenantKirchhoff, to quadrature
+            error otherwise).
         contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit
             independent) or "gonzalez" (the paper's (67), for comparison).
         quadrature_points: Gauss points in time of the mean-value stress, 1 to 7.
@@ -92,14 +95,14 @@ class EnergyMomentum(_InTime):
         if not (is_whole(self.quadrature_points) and 1 <= self.quadrature_points <= 7):
             raise ValueError(f"quadrature_points={self.quadrature_points!r}: choose 1 to 7")
 
-    def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:
-        """First Piola-Kirchhoff stress P = F_m S(C_0, C_1) in UFL [Pa]."""
-        c0, c1 = f0.T * f0, f1.T * f1
+    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+        """First Piola-Kirchhoff stress P = F_m S(E_0, E_1) in UFL [Pa] of F = 1 + H."""
+        e0, e1 = green_strain(h0), green_strain(h1)
         if self.stress == "gonzalez":
-            stress = gonzalez_stress(energy, c0, c1)
+            stress = gonzalez_stress(energy, e0, e1)
         else:
-            stress = mean_value_stress(energy, c0, c1, self.quadrature_points)
-        return 0.5 * (f0 + f1) * stress
+            stress = mean_value_stress(energy, e0, e1, self.quadrature_points)
+        return (ufl.Identity(3) + 0.5 * (h0 + h1)) * stress
 
 
 @dataclass(frozen=True)
@@ -111,9 +114,9 @@ class Static:
     closes_ledger: ClassVar[bool] = False
     theta: ClassVar[float] = 1.0
 
-    def piola(self, energy: Energy, f0: Any, f1: Any) -> Any:
-        """First Piola-Kirchhoff stress P = F_1 2 dW(C_1) in UFL [Pa]."""
-        return f1 * (2 * strain_derivative(energy, f1.T * f1))
+    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+        """First Piola-Kirchhoff stress P = F_1 S(E_1) in UFL [Pa] of F = 1 + H."""
+        return _stress_of(energy, h1)
 
     def factor(self, dt: float) -> float:
         """Nothing: the equations are forces [N]."""

@@ -1,4 +1,20 @@
-"""Strain energies W(C) per reference volume in UFL; any callable C -> UFL scalar serves, too."""
+"""Strain energies W per reference volume in UFL; any callable C -> UFL scalar serves, too.
+
+C = 1 + 2 E is rounded at 1, so that at a strain of 1e-8 a W(C) knows half of its digits, and the
+ledger of such a motion half of them. An isotropic W that is to keep all digits at any strain is an
+`Isotropic` instead: a function of the invariants I_1, I_2, I_3 of C - 1, in which
+
+    tr C - 3 = I_1,   tr cof C - 3 = 2 I_1 + I_2,   det C - 1 = I_1 + I_2 + I_3.
+
+Terms that are linear in the strain must not be left to cancel each other. With d = det C - 1, what
+cancels in tr C - 3 - ln det C is gone from (d - ln(1 + d)) - I_2 - I_3; `precise` has the functions
+for this, here `log1p_remainder`. A rubber that stiffens exponentially:
+
+    class Fung(nts.Isotropic):
+        def of_invariants(self, i1, i2, i3):  # mu/2 ((exp(b (tr C - 3)) - 1)/b - ln det C)
+            d = i1 + i2 + i3
+            return mu / 2 * (expm1_remainder(b * i1) / b + log1p_remainder(d) - i2 - i3)
+"""
 
 from __future__ import annotations
 
@@ -11,6 +27,8 @@ import ufl
 from ufl.constantvalue import RealValue
 from ufl.corealg.traversal import traverse_unique_terminals
 
+from dolfinx_nts.precise import log1p, log1p_remainder
+from dolfinx_nts.strain_energy import Isotropic
 from dolfinx_nts.validation import is_finite, known_options, require_positive
 
 
@@ -43,7 +61,7 @@ def misfit(expressions: Iterable[Any], domain: Any) -> str | None:
 
 @known_options
 @dataclass(frozen=True)
-class StVenantKirchhoff:
+class StVenantKirchhoff(Isotropic):
     """W = lam/2 (tr E)^2 + mu E : E with E = (C - 1)/2; for moderate strains only.
 
     Attributes:
@@ -60,16 +78,20 @@ class StVenantKirchhoff:
     def __post_init__(self) -> None:
         _check_elastic(self.young, self.poisson)
 
-    def __call__(self, c: Any) -> Any:
-        """W(C) [J/m^3]."""
+    def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
+        """W [J/m^3], with tr E = I_1/2 and E : E = (I_1^2 - 2 I_2)/4."""
         mu, lam = _lame(self.young, self.poisson)
-        e = 0.5 * (c - ufl.Identity(3))
-        return lam / 2 * ufl.tr(e) ** 2 + mu * ufl.inner(e, e)
+        return lam / 8 * i1**2 + mu / 4 * (i1**2 - 2 * i2)
+
+    def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
+        """Derivatives of W [Pa]."""
+        mu, lam = _lame(self.young, self.poisson)
+        return (lam / 4 + mu / 2) * i1, -mu / 2, ufl.as_ufl(0)
 
 
 @known_options
 @dataclass(frozen=True)
-class NeoHookean:
+class NeoHookean(Isotropic):
     """W = mu/2 (tr C - 3 - ln det C) + lam/8 (ln det C)^2.
 
     Attributes:
@@ -86,16 +108,23 @@ class NeoHookean:
     def __post_init__(self) -> None:
         _check_elastic(self.young, self.poisson)
 
-    def __call__(self, c: Any) -> Any:
-        """W(C) [J/m^3]."""
+    def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
+        """W [J/m^3]."""
         mu, lam = _lame(self.young, self.poisson)
-        log = ufl.ln(ufl.det(c))
-        return mu / 2 * (ufl.tr(c) - 3 - log) + lam / 8 * log**2
+        d = i1 + i2 + i3
+        return mu / 2 * (log1p_remainder(d) - i2 - i3) + lam / 8 * log1p(d) ** 2
+
+    def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
+        """Derivatives of W [Pa]."""
+        mu, lam = _lame(self.young, self.poisson)
+        d = i1 + i2 + i3
+        first = (mu / 2 * d + lam / 4 * log1p(d)) / (1 + d)
+        return first, first - mu / 2, first - mu / 2
 
 
 @known_options
 @dataclass(frozen=True)
-class MooneyRivlin:
+class MooneyRivlin(Isotropic):
     """W = a (tr C - 3) + b (tr cof C - 3) + c/2 (J - 1)^2 - d ln J, d = 2 (a + 2 b).
 
     This d makes the undeformed body free of stress.
@@ -124,9 +153,17 @@ class MooneyRivlin:
             raise ValueError(f"a + b={shear!r}: must be positive [Pa]: half the shear modulus")
         require_positive("c", self.c, "Pa")
 
-    def __call__(self, c: Any) -> Any:
-        """W(C) [J/m^3]."""
-        j2 = ufl.det(c)
-        second = (ufl.tr(c) ** 2 - ufl.tr(c * c)) / 2
-        volumetric = self.c / 2 * (ufl.sqrt(j2) - 1) ** 2 - (self.a + 2 * self.b) * ufl.ln(j2)
-        return self.a * (ufl.tr(c) - 3) + self.b * (second - 3) + volumetric
+    def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
+        """W [J/m^3]."""
+        d = i1 + i2 + i3
+        change = d / (1 + ufl.sqrt(1 + d))  # J - 1
+        linear = self.a + 2 * self.b
+        isochoric = linear * (log1p_remainder(d) - i3) - (self.a + self.b) * i2
+        return isochoric + self.c / 2 * change**2
+
+    def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
+        """Derivatives of W [Pa]."""
+        d = i1 + i2 + i3
+        j, linear = ufl.sqrt(1 + d), self.a + 2 * self.b
+        first = (linear + self.c / 2 * j / (1 + j)) * d / (1 + d)
+        return first, first - (self.a + self.b), first - linear

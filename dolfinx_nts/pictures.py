@@ -12,8 +12,8 @@ import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.discrete_gradient import strain_derivative
 from dolfinx_nts.output import StrPath, as_path, gather, node_blocks, on_root, save_figure
+from dolfinx_nts.strain_energy import green_strain, strain_energy
 from dolfinx_nts.surfaces import oriented_nodes
 from dolfinx_nts.validation import floats, items, require_bool, require_positive
 
@@ -21,7 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def von_mises(body: Any) -> Any:
-    """Von Mises measure of the Cauchy stress F 2 dW F^T / J at `body.u`, cell means; collective.
+    """Von Mises measure of the Cauchy stress F S F^T / J at `body.u`, cell means; collective.
 
     Args:
         body: Continuum with any material.
@@ -30,8 +30,9 @@ def von_mises(body: Any) -> Any:
         Function of degree 0 [Pa].
     """
     space = compat.scalar_space(body.mesh, "DG", 0)
-    f = ufl.Identity(3) + ufl.grad(body.u)
-    cauchy = f * (2 * strain_derivative(body.material, f.T * f)) * f.T / ufl.det(f)
+    h = ufl.grad(body.u)
+    f = ufl.Identity(3) + h
+    cauchy = f * strain_energy(body.material).stress(green_strain(h)) * f.T / ufl.det(f)
     deviator = ufl.dev(cauchy)
     q = ufl.TestFunction(space)
     dx = ufl.Measure("dx", body.mesh, metadata={"quadrature_degree": 2 * body.degree})

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import CellType, create_unit_cube
 from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts import discrete_gradient as dg
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.strain_energy import strain_energy
 
 YOUNG, POISSON = 1e6, 0.3
 MU, LAM = YOUNG / 2.6, YOUNG * POISSON / (1.3 * 0.4)
@@ -24,6 +26,21 @@ MATERIALS = {
     "neo-hooke": nts.NeoHookean(YOUNG, POISSON),
     "mooney-rivlin": nts.MooneyRivlin(A, B, C),
 }
+#: Exponents b of energies that stiffen exponentially.
+STEEP = {"exp-30": 30, "exp-100": 100, "exp-1000": 1000}
+
+
+def steep(b):
+    """The neo-Hookean energy with mu/2 (exp(b (tr C - 3)) - 1)/b in place of its linear term."""
+
+    def energy(c):
+        volume = ufl.ln(ufl.det(c))
+        stretch = (ufl.exp(b * (ufl.tr(c) - 3)) - 1) / b
+        return MU / 2 * (stretch - volume) + LAM / 8 * volume**2
+
+    return energy
+
+
 #: Lame parameters at small strain, (mu, lambda).
 LAME = {"stvk": (MU, LAM), "neo-hooke": (MU, LAM), "mooney-rivlin": (2 * (A + B), C + 4 * B)}
 STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
@@ -41,27 +58,34 @@ def unit_nodes(x):
 
 
 class Point:
-    """W and a stress at a point, for given C_0 and C_1."""
+    """W and a stress at a point, for given strains (C - 1)/2."""
 
     def __init__(self, material, stress):
         mesh = one_tetrahedron()
         space = compat.vector_space(mesh, 1)
-        self.c0, self.c1 = (fem.Constant(mesh, EYE.copy()) for _ in range(2))
+        energy = strain_energy(material)
+        self.e0, self.e1 = (fem.Constant(mesh, np.zeros((3, 3))) for _ in range(2))
         dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 0})
         w = ufl.TestFunction(space)
-        work = ufl.inner(stress(material, self.c0, self.c1), ufl.grad(w)) * dx
-        self.work, self.energy = compat.compile_forms([work, material(self.c1) * dx])
+        work = ufl.inner(stress(energy, self.e0, self.e1), ufl.grad(w)) * dx
+        self.work, self.energy = compat.compile_forms([work, energy(self.e1) * dx])
         self.nodes = unit_nodes(space.tabulate_dof_coordinates())
         self.vector = compat.create_vector(space)
 
     def stress(self, c0, c1):
-        self.c0.value[:], self.c1.value[:] = c0, c1
+        return self.stress_between((c0 - EYE) / 2, (c1 - EYE) / 2)
+
+    def stress_between(self, e0, e1):
+        self.e0.value[:], self.e1.value[:] = e0, e1
         compat.assemble_vector(self.vector, self.work)
         # grad N of the node at e_k is e_k, the volume is 1/6.
         return 6.0 * self.vector.array_r.reshape(-1, 3)[self.nodes].T
 
     def stored(self, c):
-        self.c1.value[:] = c
+        return self.stored_at((c - EYE) / 2)
+
+    def stored_at(self, e):
+        self.e1.value[:] = e
         return 6.0 * fem.assemble_scalar(self.energy)
 
 
@@ -74,9 +98,10 @@ def point(name, rule="gonzalez", quadrature=3):
         stress = {
             "gonzalez": dg.gonzalez_stress,
             "mean-value": lambda w, a, b: dg.mean_value_stress(w, a, b, quadrature),
-            "derivative": lambda w, a, b: 2 * dg.strain_derivative(w, b),
+            "derivative": lambda w, a, b: w.stress(b),
         }[rule]
-        _POINTS[key] = Point(MATERIALS[name], stress)
+        material = steep(STEEP[name]) if name in STEEP else MATERIALS[name]
+        _POINTS[key] = Point(material, stress)
     return _POINTS[key]
 
 
@@ -94,6 +119,9 @@ def exact_energy(name, c):
         c[0][i] * (c[1][(i + 1) % 3] * c[2][(i + 2) % 3] - c[1][(i + 2) % 3] * c[2][(i + 1) % 3])
         for i in range(3)
     )
+    if name in STEEP:
+        stretch = ((STEEP[name] * (trace - 3)).exp() - 1) / STEEP[name]
+        return mu / 2 * (stretch - det.ln()) + lam / 8 * det.ln() ** 2
     if name == "neo-hooke":
         return mu / 2 * (trace - 3 - det.ln()) + lam / 8 * det.ln() ** 2
     a, b, k = (Decimal(x) for x in (A, B, C))
@@ -220,11 +248,32 @@ def test_gonzalez_is_directional(name, size):
     rng = np.random.default_rng(2)
     c0 = random_strain(rng, 0.15)
     c1 = c0 + size * np.linalg.norm(c0) * random_increment(rng)
-    # The sizes lie on both sides of the switch between the two forms of the bracket.
-    strain = np.linalg.norm(c1 - c0) / np.linalg.norm(0.5 * (c0 + c1))
-    assert (strain < dg._SMALL_STRAIN) == (size < 1e-2)
     error, _ = directionality_error(name, "gonzalez", c0, c1)
     assert error < 1e-13
+
+
+@pytest.mark.parametrize("name", ["neo-hooke", "mooney-rivlin"])
+@pytest.mark.parametrize("low", [9e-3, 3e-3, 1e-3, 4e-4])
+def test_gonzalez_is_directional_next_to_collapse(name, low):
+    """An increment of 0.7 % takes det F from 0.1 to 0.02: next to it is the logarithm's pole."""
+    turn = rotation(0.7, (1, 2, 3))
+    c0, c1 = (turn.T @ np.diag([1.1, 0.9, x]) @ turn for x in (1e-2, low))
+    assert np.linalg.norm(c1 - c0) < 1e-2 * np.linalg.norm(c0)
+    # det C is a difference of terms of size 1.
+    assert directionality_error(name, "gonzalez", c0, c1)[0] < 2e-15 / low
+    assert directionality_error(name, "gonzalez", c1, c0)[0] < 2e-15 / low
+
+
+@pytest.mark.parametrize("name", STEEP)
+@pytest.mark.parametrize("size", [0.1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 1e-8, 1e-12])
+def test_gonzalez_is_directional_for_steep_energies(name, size):
+    rng = np.random.default_rng(20)
+    c0 = random_strain(rng, 0.01)
+    c1 = c0 + size * random_increment(rng)
+    error, s = directionality_error(name, "gonzalez", c0, c1)
+    work = 0.5 * np.linalg.norm(s) * np.linalg.norm(c1 - c0)
+    # The exponent b (tr C - 3) is rounded at b times machine precision, W at that of its terms.
+    assert error * work < (1e-14 + 4e-16 * STEEP[name]) * work + 1e-15 * MU
 
 
 @pytest.mark.parametrize("name", MATERIALS)
@@ -411,6 +460,43 @@ def test_gonzalez_tangent_near_rest_has_no_noise(size):
     rest = body.tangent(u0).getValues(everything, everything)
     near = body.tangent(u0 + size * w).getValues(everything, everything)
     assert np.abs(near - rest).max() < 1e-7 * np.abs(rest).max()
+
+
+def difference_tangent(body, u1, step):
+    """M + K/2 by central differences of fourth order of the internal forces."""
+    columns = [sum(w * body.internal(u1 + k * step * e) for k, w in STENCIL) / step
+               for e in np.eye(len(u1))]  # fmt: skip
+    mass = np.stack([body.inertia(e) for e in np.eye(len(u1))], axis=1)
+    return mass + 0.5 * np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("low", [0.09, 0.07, 0.05, 0.03, 0.02])
+def test_gonzalez_tangent_next_to_collapse(low):
+    """On both sides of the switch between the two forms, and at points on either in one cell."""
+    rng = np.random.default_rng(21)
+    body = body_of(MATERIALS["neo-hooke"], hexahedron(rng))
+    u0, u1 = (deformed(body, np.diag([1.1, 0.9, x])) for x in (0.1, low))
+    u1 += 0.002 * rng.uniform(-1, 1, len(u1))
+    body.begin_step(nts.EnergyMomentum(), u0, 0 * u0, 0.0, 1.0)
+    everything = np.arange(len(u0), dtype=np.int32)
+    found = body.tangent(u1).getValues(everything, everything)
+    expected = difference_tangent(body, u1, 1e-4 * low)
+    assert np.abs(found - expected).max() < 1e-7 * np.abs(expected).max()
+
+
+def test_ledger_of_a_body_that_nearly_collapses():
+    """A block is squashed to a quarter of its length in a few steps, and springs back."""
+    mesh = create_unit_cube(MPI.COMM_SELF, 2, 1, 1, CellType.hexahedron)
+    body = nts.Continuum(
+        mesh,
+        nts.NeoHookean(young=1e6, poisson=0.3),
+        density=1e3,
+        velocity=lambda x: np.stack([-800.0 * (x[0] - 0.5), 0 * x[0], 0 * x[0]]),
+    )
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=1e-4, t_end=3e-3)
+    assert run.status == "completed" and run.retries == 0
+    assert run.balance["potential"].max() > 0.2 * run.balance["energy"][0]
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * run.balance["energy"][0]
 
 
 @pytest.mark.parametrize("rule", INTEGRATORS)

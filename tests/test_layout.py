@@ -16,8 +16,20 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "dolfinx_nts"
 
 LEVELS = [
-    {"discrete_gradient", "nts", "friction", "facets", "patches", "validation", "dolfinx_compat"}
-    | {"run_warnings", "table", "whole_files"},
+    {
+        "discrete_gradient",
+        "strain_energy",
+        "precise",
+        "nts",
+        "friction",
+        "facets",
+        "patches",
+        "validation",
+        "dolfinx_compat",
+        "run_warnings",
+        "table",
+        "whole_files",
+    },
     {
         "continuum",
         "rigid",
@@ -30,6 +42,7 @@ LEVELS = [
         "surfaces",
         "materials",
         "inversion",
+        "overlap",
         "mesh_check",
         "mesh_input",
         "integrators",

@@ -1,0 +1,158 @@
+"""Energies, stresses and ledgers at strains far below 1e-8, where a W(C) holds only rounding."""
+
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType, create_unit_cube
+from mpi4py import MPI
+from ufl.algorithms.apply_derivatives import apply_derivatives
+
+import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import precise
+from dolfinx_nts.strain_energy import strain_energy
+
+YOUNG, POISSON, STEEPNESS = 1000.0, 0.3, 50.0
+MU, LAM = YOUNG / 2.6, YOUNG * POISSON / (1.3 * 0.4)
+A, B, C = 120.0, 70.0, 900.0
+
+
+class Fung(nts.Isotropic):
+    """Rubber that stiffens exponentially, written as `materials` tells."""
+
+    def of_invariants(self, i1, i2, i3):
+        d = i1 + i2 + i3
+        stretch = precise.expm1_remainder(STEEPNESS * i1) / STEEPNESS
+        deviator = stretch + precise.log1p_remainder(d) - i2 - i3
+        return MU / 2 * deviator + LAM / 8 * precise.log1p(d) ** 2
+
+
+MATERIALS = {
+    "stvk": nts.StVenantKirchhoff(YOUNG, POISSON),
+    "neo-hooke": nts.NeoHookean(YOUNG, POISSON),
+    "mooney-rivlin": nts.MooneyRivlin(A, B, C),
+    "fung": Fung(),
+}
+SIZES = [0.2, 1e-2, 3e-3, 1e-4, 3e-5, 1e-6, 1e-9, 1e-12]
+
+
+def energy(name, e):
+    """W at a strain of decimals, from the textbook's W(C)."""
+    mu, lam, a, b, k, steepness = (Decimal(x) for x in (MU, LAM, A, B, C, STEEPNESS))
+    c = [[(i == j) + 2 * e[i][j] for j in range(3)] for i in range(3)]
+    trace = sum(c[i][i] for i in range(3))
+    square = sum(c[i][j] * c[j][i] for i in range(3) for j in range(3))
+    det = sum(
+        c[0][i] * (c[1][(i + 1) % 3] * c[2][(i + 2) % 3] - c[1][(i + 2) % 3] * c[2][(i + 1) % 3])
+        for i in range(3)
+    )
+    if name == "stvk":
+        squares = sum(x * x for row in e for x in row)
+        return lam / 2 * sum(e[i][i] for i in range(3)) ** 2 + mu * squares
+    if name == "mooney-rivlin":
+        second = (trace**2 - square) / 2
+        volumetric = k / 2 * (det.sqrt() - 1) ** 2 - (a + 2 * b) * det.ln()
+        return a * (trace - 3) + b * (second - 3) + volumetric
+    linear = trace - 3
+    if name == "fung":
+        linear = ((steepness * linear).exp() - 1) / steepness
+    return mu / 2 * (linear - det.ln()) + lam / 8 * det.ln() ** 2
+
+
+def by_decimals(name, e):
+    """W and dW/dE at the doubles of a strain, by differences of 80-digit numbers."""
+    with localcontext() as context:
+        context.prec = 80
+        e = [[Decimal(float(x)) for x in row] for row in e]
+        step, stress = Decimal(10) ** -30, np.zeros((3, 3))
+        for i in range(3):
+            for j in range(3):
+                ends = []
+                for sign in (1, -1):
+                    moved = [list(row) for row in e]
+                    moved[i][j] += sign * step / 2
+                    moved[j][i] += sign * step / 2
+                    ends.append(energy(name, moved))
+                stress[i, j] = float((ends[0] - ends[1]) / (2 * step))
+        return float(energy(name, e)), stress
+
+
+def strain(size, seed=1):
+    e = np.random.default_rng(seed).uniform(-1, 1, (3, 3))
+    return 0.5 * size * (e + e.T)
+
+
+class Point:
+    """W and dW/dE of a material at a strain, compiled as in a body."""
+
+    def __init__(self, material):
+        mesh = create_unit_cube(MPI.COMM_SELF, 1, 1, 1, CellType.hexahedron)
+        self.e = fem.Constant(mesh, np.zeros((3, 3)))
+        w, dx = strain_energy(material), ufl.Measure("dx", mesh, metadata={"quadrature_degree": 1})
+        stress = w.stress(self.e)
+        parts = [w(self.e)] + [stress[i, j] for i in range(3) for j in range(i, 3)]
+        self.forms = compat.compile_forms([part * dx for part in parts])
+
+    def __call__(self, e):
+        self.e.value[:] = e
+        values = [fem.assemble_scalar(form) for form in self.forms]
+        stress = np.zeros((3, 3))
+        stress[np.triu_indices(3)] = values[1:]
+        return values[0], np.triu(stress) + np.triu(stress, 1).T
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_energy_and_stress_keep_their_digits(name):
+    point = Point(MATERIALS[name])
+    for size in SIZES:
+        for e in (strain(size), size * np.eye(3), np.diag([size, -size / 2, -size / 2])):
+            found, stress = point(e)
+            expected, slope = by_decimals(name, e)
+            # Above `precise`'s series a difference costs three digits.
+            assert abs(found - expected) < 4e-12 * expected, size
+            assert np.abs(stress - slope).max() < 4e-12 * np.abs(slope).max(), size
+
+
+@pytest.mark.parametrize("name", ["log1p", "log1p_remainder", "expm1", "expm1_remainder"])
+def test_precise_functions_and_their_derivatives(name):
+    for x in [s * 10.0**-k for k in range(0, 18) for s in (-0.7, 0.3, 0.999, 2.5)]:
+        if name.startswith("log") and x <= -1:
+            continue
+        v = ufl.variable(ufl.as_ufl(x))
+        f = getattr(precise, name)(v)
+        found = [f, ufl.diff(f, v), ufl.diff(ufl.diff(f, v), v)]
+        with localcontext() as context:
+            context.prec = 60
+            d = Decimal(x)
+            if name.startswith("log"):
+                log, one = (1 + d).ln(), 1 / (1 + d)
+                exact = {
+                    "log1p": (log, one, -one * one),
+                    "log1p_remainder": (d - log, d * one, one * one),
+                }
+            else:
+                power = d.exp()
+                exact = {
+                    "expm1": (power - 1, power, power),
+                    "expm1_remainder": (power - 1 - d, power - 1, power),
+                }
+        for order, (a, b) in enumerate(zip(found, exact[name], strict=True)):
+            value = apply_derivatives(a)(())
+            tolerance = 4e-12 if "remainder" in name else 1e-15
+            assert abs(value - float(b)) <= tolerance * abs(float(b)), (x, order)
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_ledger_of_a_body_that_hardly_moves(name):
+    """A ringing cube at 1e-6 m/s: its strains are of size 1e-8, its energy 1e-15 of its modulus."""
+    mesh = create_unit_cube(MPI.COMM_SELF, 2, 1, 1, CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, MATERIALS[name], density=1.0, velocity=lambda x: 1e-6 * np.sin(3 * x[[1, 2, 0]])
+    )
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=5e-3, t_end=0.2)
+    table = run.balance
+    assert run.status == "completed" and table["potential"].max() > 0.1 * table["energy"][0]
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
