@@ -114,6 +114,10 @@ _AIM = 1e-3
 _FINE, _COARSE = 1e-12, 1e-5
 #: Its tolerance with kept matrices, with which an iteration gains two or three digits anyway.
 _KEPT = 1e-3
+#: Residual over its tolerance from which an iteration may be the last.
+_LAST = 1e5
+#: The same above which one more iteration is worth it where residuals add up.
+_SURE = 0.05
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 
@@ -351,13 +355,25 @@ class StepSolver:
         self._matrices_due |= unchanged and worst > max(1.0, _SLOW * self._before)
         self._before = worst
         if worst <= 1.0:
+            enough = self._passed is not None or iteration >= self.newton.max_iterations
             self._passed = self._last
-            return reasons.CONVERGED_FNORM_RELATIVE
+            if enough or worst <= _SURE or not self._adds_up():
+                return reasons.CONVERGED_FNORM_RELATIVE
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
         if self._presets[self._chosen] == "krylov":
             self._aim(worst)
         return reasons.ITERATING
+
+    def _adds_up(self) -> bool:
+        """Whether what an iteration leaves adds up over steps; every rank must call it.
+
+        Kept matrices leave the same part of a smooth motion in each step, whose work has one sign;
+        where contact acts, the parts differ.
+        """
+        assert self._last is not None
+        acts = any(bool(k.active.any()) for k in self._last.contacts)
+        return self.newton.reuse and not self.problem.system.comm.allreduce(acts, op=MPI.LOR)
 
     def _aim(self, worst: float) -> None:
         """Let the linear solver of Krylov's preset go as far as is worth it at an iterate."""
@@ -365,7 +381,7 @@ class StepSolver:
             return
         aim, limit = _AIM / worst, self._options.most_iterations
         if self.newton.reuse:
-            rtol = _KEPT
+            rtol = aim if worst <= _LAST and self._adds_up() else _KEPT
         else:
             rtol = aim if _FINE <= aim <= _COARSE else _COARSE
             limit = int(limit * math.log(rtol) / math.log(_COARSE))
