@@ -127,6 +127,10 @@ _SHORTENED = 5
 #: In every so many-th iteration an iterate that is inside out ends the attempt: Newton's method
 #: hardly ever comes back, and most steps never get there.
 _INSIDE_OUT = 8
+#: Residual over its tolerance from which an iteration may be the last.
+_LAST = 1e5
+#: The same above which one more iteration is worth it where residuals add up.
+_SURE = 0.05
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 
@@ -376,8 +380,10 @@ class StepSolver:
         self._matrices_due |= unchanged and worst > max(1.0, _SLOW * self._before)
         self._before = worst
         if worst <= 1.0:
+            enough = self._passed is not None or iteration >= self.newton.max_iterations
             self._passed = self._last
-            return reasons.CONVERGED_FNORM_RELATIVE
+            if enough or worst <= _SURE or not self._adds_up():
+                return reasons.CONVERGED_FNORM_RELATIVE
         late = iteration > 0 and iteration % _INSIDE_OUT == 0
         if self._shortened >= _SHORTENED or (late and self._is_inside_out()):
             return reasons.DIVERGED_FUNCTION_DOMAIN
@@ -428,13 +434,23 @@ class StepSolver:
         y.scale(part)
         return True
 
+    def _adds_up(self) -> bool:
+        """Whether what an iteration leaves adds up over steps; every rank must call it.
+
+        Kept matrices leave the same part of a smooth motion in each step, whose work has one sign;
+        where contact acts, the parts differ.
+        """
+        assert self._last is not None
+        acts = any(bool(k.active.any()) for k in self._last.contacts)
+        return self.newton.reuse and not self.problem.system.comm.allreduce(acts, op=MPI.LOR)
+
     def _aim(self, worst: float) -> None:
         """Let the linear solver of Krylov's preset go as far as is worth it at an iterate."""
         if self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
             return
         aim, limit = _AIM / worst, self._options.most_iterations
         if self.newton.reuse:
-            rtol = _KEPT
+            rtol = aim if worst <= _LAST and self._adds_up() else _KEPT
         else:
             rtol = aim if _FINE <= aim <= _COARSE else _COARSE
             limit = int(limit * math.log(rtol) / math.log(_COARSE))

@@ -80,6 +80,7 @@ def test_memory_of_a_long_run():
     rubber = nts.StVenantKirchhoff(1e6, 0.3)
     body = nts.Continuum(mesh, rubber, density=1e3, velocity=(0.1, 0, 0), name="body")
     stepper, steps = nts.Stepper(nts.System([body]), nts.EnergyMomentum()), 1200
+    # Under way already: what replaces an object that is not traced would count as more.
     tracemalloc.start()
     for _ in range(300):
         stepper.advance(1e-3)
