@@ -26,6 +26,7 @@ LEVELS = [
         "contact_step",
         "obstacles",
         "obstacle_contact",
+        "overlap",
         "search",
         "surfaces",
         "materials",
