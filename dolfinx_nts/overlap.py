@@ -249,17 +249,10 @@ def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
         b: Boundary of the other body; of an open one, see `Placed.depth`.
         least: Depth to report, in facet sizes, > 0.
     """
-    floor = least * max(float(a.sizes.min()), float(b.sizes.min()))
-    ends = a.x[a.boundary.edges]
-    if b.boundary.closed:
-        shrink = np.minimum(floor, _SHRINK * (b.box[1] - b.box[0]))
-    else:  # what is inside need not be in the box
-        shrink = np.full(3, -float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max()))
-    inner = np.array([b.box[0] + shrink, b.box[1] - shrink])
-    near = np.flatnonzero(_meet(ends.min(axis=1), ends.max(axis=1), inner))
+    near = _edges_near(a, b, least)
     if not near.size:
         return _NOTHING
-    ends, size = ends[near], a.edge_sizes(near)
+    ends, size = a.x[a.boundary.edges[near]], a.edge_sizes(near)
     length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
     node, inverse = np.unique(a.boundary.edges[near], return_inverse=True)
     end = inverse.reshape(-1, 2)
@@ -281,10 +274,7 @@ def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
     nodes = np.column_stack([node[i], node[i]])
     inside = Found(nodes, a.x[node[i]], depth, depth / scale, at.facet[i])
     start, limit = at.value[end], least * np.maximum(size, b.sizes.min())
-    facing = np.einsum("ni,ni->n", at.normal[end[:, 0]], at.normal[end[:, 1]])
-    lengths = np.linalg.norm(at.normal[end], axis=2).prod(axis=1)
-    through = (facing < _OPPOSITE * lengths) & at.over[end].all(axis=1)
-    through &= (start < -limit[:, None]).all(axis=1)
+    through = _straddles(at, end) & (start < -limit[:, None]).all(axis=1)
     limit[through] *= _THIN
     kept = ~deep[end].any(axis=1) & (start.sum(axis=1) + length > 2.0 * limit)
     ends, size, start, limit, near = (v[kept] for v in (ends, size, start, limit, near))
@@ -293,6 +283,27 @@ def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
     deep = depth > np.where(through[kept], limit, least * size)
     crossing = Found(a.boundary.edges[near], place, depth, depth / size, facet).part(deep)
     return Found._make(np.concatenate(pair) for pair in zip(inside, crossing, strict=True))
+
+
+def _edges_near(a: Placed, b: Placed, least: float) -> IntArray:
+    """Edges of `a` that may be as deep in `b`, by boxes."""
+    ends = a.x[a.boundary.edges]
+    if b.boundary.closed:
+        floor = least * max(float(a.sizes.min()), float(b.sizes.min()))
+        shrink = np.minimum(floor, _SHRINK * (b.box[1] - b.box[0]))
+    else:  # what is inside need not be in the box
+        shrink = np.full(3, -float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max()))
+    inner = np.array([b.box[0] + shrink, b.box[1] - shrink])
+    return np.flatnonzero(_meet(ends.min(axis=1), ends.max(axis=1), inner))
+
+
+def _straddles(at: Depth, end: IntArray) -> BoolArray:
+    """Whether the ends (n, 2) of edges are over facets that face opposite ways, shape (n,)."""
+    normal = at.normal[end]
+    cosine = np.einsum("ni,ni->n", normal[:, 0], normal[:, 1])
+    opposite = cosine < _OPPOSITE * np.linalg.norm(normal, axis=2).prod(axis=1)
+    both: BoolArray = opposite & at.over[end].all(axis=1)
+    return both
 
 
 def _deepest(

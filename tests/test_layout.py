@@ -38,6 +38,7 @@ LEVELS = [
         "contact_step",
         "obstacles",
         "obstacle_contact",
+        "overlap",
         "search",
         "surfaces",
         "materials",
