@@ -144,10 +144,11 @@ class StepProblem:
         for body, u1 in zip(system.bodies, self.first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
         local = [
-            [np.abs(a).max(initial=0.0) for a in (u1 - u, b.reference + u1, v)]
+            [np.abs(a).max(initial=0.0) for a in (u1 - u, b.reference + u1, v, u)]
             for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
         ]
-        self._motion, self._extent, speed = _global_max(system.comm, np.array(local)).T
+        top = _global_max(system.comm, np.array(local)).T
+        self._motion, self._extent, speed, self._moved = top
         # In statics v only predicts the first guess.
         momentum = dt if self.integrator.inertia else 0.0
         self._inertia = [
@@ -189,7 +190,7 @@ class StepProblem:
         """
         if not self._diagonal[k]:
             self.body_tangent(k, self.state.u[k])
-        return float(self._rounding[k] / max(self.factor, self._diagonal_factor[k]))
+        return float(self._rounding(self.state.u)[k] / max(self.factor, self._diagonal_factor[k]))
 
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
@@ -531,10 +532,19 @@ class StepProblem:
             diagonal.destroy()
 
     # ---- convergence
-    @property
-    def _rounding(self) -> FloatArray:
-        """Of the forces on each body [kg m]: stiffness times position times machine precision."""
-        rounding: FloatArray = _EPS * self._diagonal * self._extent
+    def _rounding(self, u: Sequence[FloatArray]) -> FloatArray:
+        """Of the forces on each body at a displacement [kg m]. Collective.
+
+        Stiffness times length times machine precision. Forces come from displacement gradients, so
+        the length is that of the displacement, wherever the body lies and however large it is.
+        """
+        local = [np.abs(a).max(initial=0.0) for a in u]
+        reached = np.maximum(_global_max(self.system.comm, np.array(local)), self._moved)
+        # An iterate that runs off excuses no more than the positions would.
+        length = np.minimum(reached, self._extent + self._moved)
+        bodies = zip(self.system.bodies, self._extent, strict=True)
+        beside = np.array([getattr(body, "rounded", extent) for body, extent in bodies])
+        rounding: FloatArray = _EPS * self._diagonal * (length + beside)
         return rounding
 
     def motion(self, e: Evaluation) -> FloatArray:
@@ -560,7 +570,7 @@ class StepProblem:
             parts = (self._stabilization(body) * t.du, t.internal, t.external, t.contact)
             squares.append([float(p @ p) for p in parts])
         norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
-        limits = self._rtol * norms[:, 1:].max(axis=1) + self._rounding
+        limits = self._rtol * norms[:, 1:].max(axis=1) + self._rounding([t.u1 for t in e.bodies])
         return max(_over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
@@ -571,9 +581,9 @@ class StepProblem:
             parts = (free, self._inertia[k], t.internal, t.external, t.contact)
             squares[k] = [float(p @ p) for p in parts]
         norms = np.sqrt(self.system.comm.allreduce(squares))
-        ratio = {}
+        ratio, rounding = {}, self._rounding([t.u1 for t in e.bodies])
         for k, body in enumerate(self.system.bodies):
-            limit = self._rtol * norms[k, 1:].max() + self._rounding[k]
+            limit = self._rtol * norms[k, 1:].max() + rounding[k]
             ratio[body.name] = _over(norms[k, 0], limit)
         if self._fields:
             ratio |= self._contact_ratios(e)

@@ -156,3 +156,16 @@ def test_ledger_of_a_body_that_hardly_moves(name):
     table = run.balance
     assert run.status == "completed" and table["potential"].max() > 0.1 * table["energy"][0]
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+
+
+@pytest.mark.parametrize("dt", [1e-4, 1e-5])
+def test_floor_of_short_steps_is_rounding(dt):
+    """Where forces are rounded like displacements, not like positions, the ledger stays closed."""
+    mesh = create_unit_cube(MPI.COMM_SELF, 2, 1, 1, CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, MATERIALS["neo-hooke"], density=1.0, velocity=lambda x: 0.3 * np.sin(3 * x[[1, 2, 0]])
+    )
+    newton = nts.Newton(rtol=1e-15)
+    system = nts.System([body])
+    table = nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=60 * dt, newton=newton).balance
+    assert np.abs(table["ledger_residual"]).max() < 5e-13 * table["energy"][0]
