@@ -599,7 +599,7 @@ class StepProblem:
             local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
         top = _global_max(self.system.comm, np.array(local))
         motion = max(top[0], float(self._motion.max()))
-        length = self._rtol * motion + 8 * _EPS * float(self._extent.max())
+        length = self._rtol * motion + 8 * _EPS * (motion + float(self._moved.max()))
         ratio: dict[str, float] = {}
         for c, (a, g, force, scale) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
             broken = np.inf if top[1] else 0.0
