@@ -106,6 +106,10 @@ class ContactPair:
         master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
         friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact never slip.
 
+    Attributes:
+        origin: Point of space that positions of a pair of surfaces are relative to [m], shape (3,).
+        extent: Largest of the reference positions' components, relative to it [m].
+
     Raises:
         TypeError: `slave` is no Surface, or `master` neither that nor an obstacle.
         ValueError: friction is negative or no number, or the surfaces share nodes.
@@ -120,6 +124,7 @@ class ContactPair:
             raise TypeError(f"slave={slave!r}: pass a Surface, e.g. body.surface(marker){hint}")
         self.slave, self.friction = slave, float(friction)
         self.master: Any = master
+        self.origin, self.extent = np.zeros(3), float(np.abs(slave.reference).max())
         if isinstance(master, Obstacle):
             return
         if not isinstance(master, Surface):
@@ -132,6 +137,9 @@ class ContactPair:
                 f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
                 "choose disjoint markers"
             )
+        # What is near is small: gaps keep their digits wherever in space the bodies meet.
+        self.origin = slave.reference[0]
+        self.extent = max(float(np.abs(s.reference - self.origin).max()) for s in (slave, master))
         self._free_edges = master.boundary_edges
         self._joined = patches.neighbours(master.facets, master.reference[master.facets])
 
@@ -163,11 +171,14 @@ class ContactPair:
     def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
         """Positions of all points of the slave and of a master surface [m], (p, 3). Collective.
 
+        They are relative to `origin`.
+
         Args:
             u: Owned displacements of each of `bodies` [m].
         """
         surfaces = (self.slave,) if self.rigid else (self.slave, self.master)
-        return tuple(s.positions(each) for s, each in zip(surfaces, u, strict=True))
+        both = zip(surfaces, u, strict=True)
+        return tuple(s.reference - self.origin + s.gather(each) for s, each in both)
 
     def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
         """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""

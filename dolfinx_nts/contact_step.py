@@ -244,10 +244,11 @@ class ContactStep:
         return nts.gap(x, self._projection(x)).value
 
     def reference(self) -> FloatArray:
-        """Reference positions of slaves and corners [m], shape (n, nc + 1, 3)."""
+        """Reference positions of slaves and corners in the pair's frame [m], (n, nc + 1, 3)."""
         c, slave, master = self.candidates, self.pair.slave, self.pair.master
         nodes = slave.reference[slave.share[c.node]]
-        return np.concatenate([nodes[:, None], master.reference[master.patches[c.facet]]], axis=1)
+        both = np.concatenate([nodes[:, None], master.reference[master.patches[c.facet]]], axis=1)
+        return both - self.pair.origin
 
     def rows(self, k: Contribution, name: str) -> FloatArray:
         """The residual's rows of "augmented" unknowns or "multipliers", shape (n, width)."""
@@ -257,8 +258,8 @@ class ContactStep:
 
     @property
     def extent(self) -> float:
-        """Length beyond the bodies' positions whose rounding enters the gaps [m]."""
-        return 0.0
+        """Length beside the displacements whose rounding enters the gaps [m]."""
+        return self.pair.extent
 
     def external_work(self, part: Contribution) -> float:
         """Work that enters the bodies through the contact: none, as the master is one of them."""

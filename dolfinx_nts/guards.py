@@ -52,7 +52,8 @@ def check_momentum(
         parts = (moved, terms.internal, terms.external, terms.contact)
         local[6] += sum(float(np.abs(p).sum()) for p in parts)
     total = problem.system.comm.allreduce(local) / (0.5 * problem.dt)
-    allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * total[6] + problem.momentum_rounding
+    allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * total[6]
+    allowed += problem.momentum_rounding(step)
     arms = {"linear": 1.0, "angular": problem.extent}
     for k, (name, arm) in enumerate(arms.items()):
         change = after[f"{name}_momentum"] - before[f"{name}_momentum"]

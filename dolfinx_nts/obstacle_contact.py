@@ -81,8 +81,8 @@ class ObstacleStep(ContactStep):
 
     @property
     def extent(self) -> float:
-        """Of the obstacle and its path [m]."""
-        extent: float = self.pair.master.extent
+        """Of the slave, the obstacle and its path [m]."""
+        extent: float = self.pair.extent + self.pair.master.extent
         return extent + float(np.abs(self.displacement).max())
 
     def external_work(self, part: Contribution) -> float:

@@ -53,7 +53,8 @@ class Promises:
         self._largest = max(self._largest, *(abs(row[name]) for name in names))
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         moved = np.sqrt(problem.system.comm.allreduce(squares))
-        self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
+        rounding = problem.rounding([terms.u1 for terms in step.bodies])
+        self._rounding += _ROUNDING * float(rounding @ moved) / problem.factor
         missing = abs(row["ledger_residual"])
         if missing <= self._promise * self._largest + self._rounding:
             return

@@ -154,10 +154,11 @@ class StepProblem:
         for body, u1 in zip(system.bodies, self.first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
         local = [
-            [np.abs(a).max(initial=0.0) for a in (u1 - u, b.reference + u1, v)]
+            [np.abs(a).max(initial=0.0) for a in (u1 - u, b.reference + u1, v, u)]
             for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
         ]
-        self._motion, self._extent, speed = _global_max(system.comm, np.array(local)).T
+        top = _global_max(system.comm, np.array(local)).T
+        self._motion, self._extent, speed, self._moved = top
         # In statics v only predicts the first guess.
         momentum = dt if self.integrator.inertia else 0.0
         self._inertia = [
@@ -205,7 +206,7 @@ class StepProblem:
 
         A diagonal of another step hardly allows more: it grows with the factor, but less than that.
         """
-        return float(self.rounding[k] / max(self.factor, self._diagonal_factor[k]))
+        return float(self.rounding(self.state.u)[k] / max(self.factor, self._diagonal_factor[k]))
 
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
@@ -556,16 +557,25 @@ class StepProblem:
         diagonal.destroy()
 
     # ---- convergence
-    @property
-    def rounding(self) -> FloatArray:
-        """Of the forces on each body [kg m]: stiffness times position times machine precision."""
-        rounding: FloatArray = _EPS * self._diagonal * self._extent
+    def rounding(self, u: Sequence[FloatArray]) -> FloatArray:
+        """Of the forces on each body at a displacement [kg m]. Collective.
+
+        Stiffness times length times machine precision. Forces come from displacement gradients, so
+        the length is that of the displacement, wherever the body lies and however large it is.
+        """
+        local = [np.abs(a).max(initial=0.0) for a in u]
+        reached = np.maximum(_global_max(self.system.comm, np.array(local)), self._moved)
+        # An iterate that runs off excuses no more than the positions would.
+        length = np.minimum(reached, self._extent + self._moved)
+        bodies = zip(self.system.bodies, self._extent, strict=True)
+        beside = np.array([getattr(body, "rounded", extent) for body, extent in bodies])
+        rounding: FloatArray = _EPS * self._diagonal * (length + beside)
         return rounding
 
-    @property
-    def momentum_rounding(self) -> float:
-        """Change of momentum in the step that is rounding [kg m/s]."""
-        return float(self.rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
+    def momentum_rounding(self, e: Evaluation) -> float:
+        """Change of momentum in a solved step that is rounding [kg m/s]. Collective."""
+        rounding = self.rounding([t.u1 for t in e.bodies])
+        return float(rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
 
     @property
     def extent(self) -> float:
@@ -638,7 +648,7 @@ class StepProblem:
             parts = (self._stabilization(body) * t.du, t.internal, t.external, t.contact)
             squares.append([float(p @ p) for p in parts])
         norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
-        limits = self.rtol * norms[:, 1:].max(axis=1) + self.rounding
+        limits = self.rtol * norms[:, 1:].max(axis=1) + self.rounding([t.u1 for t in e.bodies])
         return max(_over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
@@ -649,9 +659,9 @@ class StepProblem:
             parts = (free, self._inertia[k], t.internal, t.external, t.contact)
             squares[k] = [float(p @ p) for p in parts]
         norms = np.sqrt(self.system.comm.allreduce(squares))
-        ratio = {}
+        ratio, rounding = {}, self.rounding([t.u1 for t in e.bodies])
         for k, body in enumerate(self.system.bodies):
-            limit = self.rtol * norms[k, 1:].max() + self.rounding[k]
+            limit = self.rtol * norms[k, 1:].max() + rounding[k]
             ratio[body.name] = _over(norms[k, 0], limit)
         if self._fields:
             ratio |= self._contact_ratios(e)
@@ -667,7 +677,7 @@ class StepProblem:
             local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
         top = _global_max(self.system.comm, np.array(local))
         motion = max(top[0], float(self._motion.max()))
-        length = self.rtol * motion + 8 * _EPS * float(self._extent.max())
+        length = self.rtol * motion + 8 * _EPS * (motion + float(self._moved.max()))
         ratio: dict[str, float] = {}
         for c, (a, g, force, scale) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
             broken = np.inf if top[1] else 0.0

@@ -43,7 +43,6 @@ LEVELS = [
         "surfaces",
         "materials",
         "inversion",
-        "overlap",
         "mesh_check",
         "mesh_input",
         "integrators",

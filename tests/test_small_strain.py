@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType, create_unit_cube
+from dolfinx.mesh import CellType, GhostMode, create_box, create_unit_cube
 from mpi4py import MPI
 from ufl.algorithms.apply_derivatives import apply_derivatives
 
@@ -15,6 +15,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import precise
 from dolfinx_nts.strain_energy import strain_energy
 
+COMM = MPI.COMM_WORLD
 YOUNG, POISSON, STEEPNESS = 1000.0, 0.3, 50.0
 MU, LAM = YOUNG / 2.6, YOUNG * POISSON / (1.3 * 0.4)
 A, B, C = 120.0, 70.0, 900.0
@@ -156,3 +157,58 @@ def test_ledger_of_a_body_that_hardly_moves(name):
     table = run.balance
     assert run.status == "completed" and table["potential"].max() > 0.1 * table["energy"][0]
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+
+
+@pytest.mark.parametrize("dt", [1e-4, 1e-5])
+def test_floor_of_short_steps_is_rounding(dt):
+    """Where forces are rounded like displacements, not like positions, the ledger stays closed."""
+    mesh = create_unit_cube(MPI.COMM_SELF, 2, 1, 1, CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, MATERIALS["neo-hooke"], density=1.0, velocity=lambda x: 0.3 * np.sin(3 * x[[1, 2, 0]])
+    )
+    newton = nts.Newton(rtol=1e-15)
+    system = nts.System([body])
+    table = nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=60 * dt, newton=newton).balance
+    assert np.abs(table["ledger_residual"]).max() < 5e-13 * table["energy"][0]
+
+
+def impact(speed, gap, away=0.0):
+    """A cube flies squarely into another one, which lies `away` from the origin in x, y and z."""
+    low = np.full(3, away)
+    near = 1e-3 * min(1.0, gap) + 4e-16 * away
+    box = dict(cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
+    corners = [low, low + 1], [low + [1 + gap, -0.1, -0.1], low + [2 + gap, 1.1, 1.1]]
+    left, right = (
+        nts.Continuum(
+            create_box(COMM, ends, [n] * 3, **box),
+            nts.NeoHookean(young=1e6, poisson=0.3),
+            density=1e3,
+            velocity=velocity,
+            name=name,
+        )
+        for ends, n, velocity, name in zip(
+            corners, (2, 1), ((speed, 0, 0), (0, 0, 0)), ("left", "right"), strict=True
+        )
+    )
+    pair = nts.ContactPair(
+        slave=left.surface(lambda x: x[0] > away + 1 - near),
+        master=right.surface(lambda x: x[0] < away + 1 + gap + near),
+    )
+    system = nts.System([left, right], contacts=[pair])
+    table = nts.simulate(system, nts.EnergyMomentum(), dt=4e-3, t_end=0.12).balance
+    assert table["active"].max() == 9
+    return np.abs(table["ledger_residual"]).max() / table["energy"][0]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("speed", [1e-3, 1e-6, 1e-9])
+def test_ledger_of_a_slow_impact(speed):
+    """The cubes' gap and strains scale with their speed: 1e-6 m/s leaves strains of 1e-8."""
+    assert impact(speed, 0.02 * speed) < 1e-11
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("away", [1e6, 1e10])
+def test_ledger_far_from_the_origin(away):
+    """What the mesh's own rounding leaves of the cubes is as exact as at the origin."""
+    assert impact(2.0, 0.05, away) < 1e-11
