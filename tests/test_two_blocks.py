@@ -201,6 +201,7 @@ def test_more_ranks_agree_with_a_serial_run(on_ranks, ranks):
     assert on_ranks(ranks, __file__).count("same as serial") == ranks
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_condensation_changes_nothing():
     full, condensed = (
