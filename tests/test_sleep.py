@@ -119,8 +119,8 @@ def test_friction_beside_a_sleeper():
     assert_same(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metre", [1e3, 1e6])
-@pytest.mark.fast("1000.0")
 def test_units_change_nothing(metre):
     one, awake = run(row(), 7, sleep=True)
     other, same = run(row(metre), 7, sleep=True)

@@ -66,7 +66,7 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.fast("Mooney-Rivlin", "tetrahedra")
+@pytest.mark.fast("tetrahedra")
 def test_ledger_closes_for(variant):
     integrator, scene = VARIANTS[variant]
     result = two_blocks.figures(impact(integrator=integrator, **scene))
