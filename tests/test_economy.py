@@ -179,7 +179,7 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("scene", ["smooth", "frictional"])
-@pytest.mark.fast("smooth-energy-momentum", "frictional-midpoint")
+@pytest.mark.fast("frictional-energy-momentum")
 def test_an_impact_is_the_same_as_with_all_candidates_awake(monkeypatch, integrator, scene):
     """Approach, impact and separation."""
     make = {

@@ -190,6 +190,7 @@ def test_friction_keeps_the_momenta_and_the_ledger(integrator, friction, cell):
     assert table["min_gap"].min() > -1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_stick_and_slip_occur_together_and_h_may_change():
     stepper = nts.Stepper(rubbing_blocks(0.3), nts.EnergyMomentum())

@@ -248,7 +248,7 @@ def test_blocks_are_for_preconditioners_that_take_them(preset, given, ours):
     ("cells", "masters"),
     [(1, ()), (4, ()), (4, ("mesh",)), (4, ("sphere",)), (4, ("mesh", "sphere"))],
 )
-@pytest.mark.fast("1-masters0", "4-masters1", "4-masters2", "4-masters3")
+@pytest.mark.fast("1-masters0", "4-masters2")
 def test_matrix_in_blocks_of_nodes(cells, masters):
     """Against AIJ made by way of a nest, with nodes that are held along some axes.
 
@@ -505,7 +505,7 @@ def test_the_choice_changes_no_solution(condense):
     ("integrator", "fine"),
     [(nts.Midpoint(), 1), (nts.EnergyMomentum(), 1), (nts.EnergyMomentum(), 2)],
 )
-@pytest.mark.fast("integrator0-1-friction2", "integrator1-1-friction0")
+@pytest.mark.fast("integrator1-1-friction2")
 def test_nodes_with_more_constraints_than_coordinates(integrator, fine, friction):
     """A block slides along a floor into a wall: nodes of its edge stick to one and touch both.
 

@@ -61,6 +61,7 @@ def test_friction_carries_the_shear(shift):
         assert -mu * force[2] < force[0] < 0
 
 
+@pytest.mark.slow
 def test_a_ball_is_pressed_into_a_block_and_let_go():
     """Statics with a moving ball, then a dynamic run that starts there: the ledger closes."""
     mesh = create_box(COMM, [[-1, -1, -1], [1, 1, 0]], [6, 6, 3], CellType.hexahedron)

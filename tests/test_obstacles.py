@@ -352,7 +352,7 @@ def test_a_rising_floor_lifts_a_mass(integrator):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", OBSTACLES)
-@pytest.mark.fast("plane", "bowl", "cylinder")
+@pytest.mark.fast("bowl", "cylinder")
 def test_ledger_closes_with_a_shaking_obstacle(name):
     """Hit, lifted and dropped by an obstacle that shakes: every loss is an activation."""
     shaken = changed(

@@ -400,6 +400,7 @@ def neo_hooke(f):
 @mpi
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
+@pytest.mark.fast("hexahedron-2", "tetrahedron-1")
 def test_von_mises_of_a_homogeneous_deformation(cell, degree):
     stress = pictures.von_mises(homogeneous(RUBBER, degree, cell))
     assert np.allclose(stress.x.array, equivalent(neo_hooke(SHEAR)), rtol=1e-12)

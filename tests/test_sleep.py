@@ -101,7 +101,7 @@ def assert_same(a, b, dt=DT):
     ids=["exact", "reuse"],
 )
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.fast("midpoint-reuse", "energy-momentum-exact")
+@pytest.mark.fast("energy-momentum-reuse")
 def test_cubes_sleep_until_they_are_reached(integrator, newton):
     a, b, awake = both(row, 12, integrator=integrator, **newton)
     assert awake[0] == "a" and awake[-1] == "abc" and sorted(awake) == awake
@@ -119,8 +119,8 @@ def test_friction_beside_a_sleeper():
     assert_same(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metre", [1e3, 1e6])
-@pytest.mark.fast("1000.0")
 def test_units_change_nothing(metre):
     one, awake = run(row(), 7, sleep=True)
     other, same = run(row(metre), 7, sleep=True)
@@ -131,6 +131,7 @@ def test_units_change_nothing(metre):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(("reuse", "iterations"), [(False, 3), (True, 5)])
+@pytest.mark.fast("True-5")
 def test_a_step_that_fails_is_halved(reuse, iterations):
     """The impact takes more iterations than these."""
     newton = {"max_iterations": iterations, "reuse": reuse, "linear_solver": "direct"}
@@ -295,6 +296,7 @@ def test_gravity_keeps_awake_what_can_fall():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("energy-momentum")
 def test_an_obstacle_wakes_what_it_reaches(integrator):
     """A wall that touches, and sets out later."""
 
@@ -322,6 +324,7 @@ def pushed(gap, force):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("midpoint")
 def test_a_motion_that_was_not_predicted_wakes_in_the_same_step(integrator):
     """The step is solved again with the sleeper, whose candidates were idle."""
     dt, gap = 0.02, 0.02

@@ -144,6 +144,7 @@ def test_free_flight_takes_the_largest_steps_and_ends_on_time():
 @pytest.mark.mpi
 @pytest.mark.parametrize("theta", [0.1, 0.5, 0.75])
 @pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()])
+@pytest.mark.fast("integrator0-0.1", "integrator1-0.75")
 def test_a_mass_rebounds_from_a_wall_without_loss(integrator, theta):
     """Fixed steps leave |1 - 2 theta| of the speed; a step that ends at the wall leaves it all."""
     system, _ = mass_on_wall((3 + theta) * STEP * SPEED)
@@ -257,6 +258,7 @@ def test_ranks_take_the_steps_of_a_serial_run():
     assert np.abs(a["energy"] - b["energy"]).max() < 1e-9 * b["energy"][0]
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_metres_millimetres_micrometres():
     runs = [

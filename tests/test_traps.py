@@ -81,6 +81,7 @@ def run(system, integrator, dt=2e-3, steps=8):
 
 
 @pytest.mark.parametrize("place", PLACES)
+@pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 def test_touching_at_rest_stays_at_rest(place, integrator):
     table = run(scene(place), integrator)
     assert np.abs(table["energy"]).max() <= 1e-20
@@ -88,6 +89,7 @@ def test_touching_at_rest_stays_at_rest(place, integrator):
 
 
 @pytest.mark.parametrize("place", PLACES)
+@pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 def test_touching_and_leaving_takes_no_force(place, integrator):
     table = run(scene(place, velocity=(0.0, 0.0, 1.0)), integrator)
     assert table["active"].sum() == 0
@@ -96,6 +98,7 @@ def test_touching_and_leaving_takes_no_force(place, integrator):
 
 
 @pytest.mark.parametrize("place", PLACES)
+@pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 def test_touching_and_sliding_takes_no_force(place, integrator):
     """Frictionless sliding over edges of facets, at zero gap all the time."""
     table = run(scene(place, velocity=(-2.0, -1.0, 0.0)), integrator, dt=5e-3)
@@ -104,6 +107,7 @@ def test_touching_and_sliding_takes_no_force(place, integrator):
 
 
 @pytest.mark.parametrize("place", PLACES)
+@pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 def test_pressed_from_zero_gap(place, integrator):
     """A closed gap stays closed for a step, which throws the slaves back; nothing is lost by it."""
     table = run(scene(place, velocity=(0.0, 0.0, -1.0)), integrator)
@@ -169,6 +173,7 @@ def test_prescribed_slave_bottom_of_a_free_cube(integrator, friction):
 
 @pytest.mark.parametrize("components", [(2,), (0, 1)])
 @rubbing
+@pytest.mark.fast("midpoint-0.3-components1", "energy-momentum-0.0-components0")
 def test_slaves_held_in_some_components(components, integrator, friction):
     held = [nts.Dirichlet(lambda x: x[2] < 0.001 + 1e-9, components=components)]
     system = scene(gap=0.001, cube=held, plate_velocity=(0.1, 0.0, 1.0), friction=friction)

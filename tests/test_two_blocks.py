@@ -66,7 +66,7 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.fast("Mooney-Rivlin", "tetrahedra")
+@pytest.mark.fast("tetrahedra")
 def test_ledger_closes_for(variant):
     integrator, scene = VARIANTS[variant]
     result = two_blocks.figures(impact(integrator=integrator, **scene))
@@ -201,6 +201,7 @@ def test_more_ranks_agree_with_a_serial_run(on_ranks, ranks):
     assert on_ranks(ranks, __file__).count("same as serial") == ranks
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_condensation_changes_nothing():
     full, condensed = (
