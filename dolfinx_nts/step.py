@@ -31,6 +31,8 @@ BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
+#: Roundings of the positions within which a gap counts as closed by nothing.
+_TOUCH = 4.0
 #: Relative difference of the factors of two equal steps, which differ by rounding.
 EQUAL = 1e-6
 #: Distance from the origin over that of the expected motion, of an iterate that has run off.
@@ -284,13 +286,32 @@ class StepProblem:
         positions = pair.positions(u)
         found = pair.find(positions, state.facets[index], reach, moved, ahead)
         slave, x0, theta = pair.slave, pair.points(positions, found), self.integrator.theta
-        scale = slave.mass if self.integrator.inertia else slave.nodal(slave.body.nodal_stiffness())
-        scale = scale[slave.share[found.node]]
+        scale, extent = self._scale(slave)[slave.share[found.node]], self._contact_extent(index)
         rule, condense = self.integrator.contact_gradient, self.condense
         if pair.rigid:
-            path = self._paths[index]
-            return ObstacleStep(pair, found, rule, condense, x0 - path[0], scale, theta, path)
-        return ContactStep(pair, found, rule, condense, x0, scale, theta)
+            path, none = self._paths[index], np.empty((len(scale), 0))
+            step = ObstacleStep(
+                pair, found, rule, condense, x0 - path[0], scale, theta, path,
+                master_scale=none, rounding=0.0,
+            )  # fmt: skip
+            return replace(step, rounding=_TOUCH * _EPS * (extent + step.extent))
+        master = self._scale(pair.master)[pair.master.patches[found.facet]]
+        return ContactStep(
+            pair, found, rule, condense, x0, scale, theta,
+            master_scale=master, rounding=_TOUCH * _EPS * extent,
+        )  # fmt: skip
+
+    def _contact_extent(self, index: int) -> float:
+        """Largest coordinate of a contact's bodies in the expected motion [m]."""
+        return float(max(self._extent[b] for b in self.system.contact_bodies[index]))
+
+    def _scale(self, surface: Any) -> FloatArray:
+        """Force per motion of a surface's points, shape (p,), see `ContactStep`. Collective."""
+        if self.integrator.inertia:
+            mass: FloatArray = surface.mass
+            return mass
+        stiffness: FloatArray = surface.nodal(surface.body.nodal_stiffness())
+        return stiffness
 
     def _drop_doubles(self) -> None:
         """Of two pairs that keep a node out of the same fixed surface, leave one.
