@@ -6,7 +6,7 @@ energy-momentum scheme eleven (d, f and six multipliers). Friction adds two (lam
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from dolfinx_nts import facets, nts
 from dolfinx_nts.contact import Candidates, ContactPair
-from dolfinx_nts.friction import return_map
+from dolfinx_nts.friction import length, return_map
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -25,6 +25,11 @@ BoolArray = npt.NDArray[np.bool_]
 #: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which
 #: with a consistent mass matrix is a small part of the nodal mass.
 TANGENTIAL_SCALE = 0.05
+#: Coefficient that infinite friction, and any larger one, has in numbers. Where next to no normal
+#: force is left, no node can both stick and press, and this is the limit of large coefficients.
+_LARGEST = 1e8
+#: Pull over friction up to which a node that sticks is let slip before it is let go.
+_PULL = 0.01
 #: Square of the part of a motion that counts as none.
 _IMMOVABLE = 1e-12
 #: Prescribed slip over the size of the facet that counts as none.
@@ -77,6 +82,8 @@ class ContactStep:
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
             nodal mass [kg] in dynamics; scales multipliers and the active set.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
+        master_scale: `scale` of the points of the masters, shape (n, np); empty without.
+        rounding: Gap [m], and contact force over `scale`, that counts as none.
     """
 
     pair: ContactPair
@@ -86,6 +93,8 @@ class ContactStep:
     x0: FloatArray
     scale: FloatArray
     theta: float
+    master_scale: FloatArray = field(kw_only=True)
+    rounding: float = field(default=0.0, kw_only=True)
 
     @property
     def num_pairs(self) -> int:
@@ -95,7 +104,13 @@ class ContactStep:
     def part(self, chosen: BoolArray) -> ContactStep:
         """Some of the pairs, shape (n,)."""
         found = self.candidates.part(chosen)
-        return replace(self, candidates=found, x0=self.x0[chosen], scale=self.scale[chosen])
+        return replace(
+            self,
+            candidates=found,
+            x0=self.x0[chosen],
+            scale=self.scale[chosen],
+            master_scale=self.master_scale[chosen],
+        )
 
     @property
     def immovable(self) -> BoolArray:
@@ -168,14 +183,27 @@ class ContactStep:
         )
 
     @cached_property
+    def _free(self) -> BoolArray:
+        """Coordinates of slaves and masters that are not prescribed, shape (n, np + 1, 3)."""
+        numbers = np.concatenate(self.dofs(), axis=1)
+        free: BoolArray = numbers.reshape(self.num_pairs, self.num_corners + 1, 3) >= 0
+        return free
+
+    @cached_property
+    def _yielding(self) -> FloatArray:
+        """The part of `scale` that a slave and its foot move against each other, shape (n,).
+
+        A master that is much lighter than the slave gives way in its place.
+        """
+        ease = self._free[:, 1:].any(axis=2) * self._point_shape**2 / self.master_scale
+        together: FloatArray = self.scale / (1.0 + self.scale * ease.sum(axis=1))
+        return together
+
+    @cached_property
     def _prescribed(self) -> BoolArray:
         """Axes along which slave and foot move as prescribed, shape (n, 3)."""
-        shape, n = self._shape, self.num_pairs
-        if self._weights is not None:
-            shape = np.einsum("nk,nkp->np", shape, self._weights)
-        square = np.column_stack([np.ones(n), shape]) ** 2
-        free = np.concatenate(self.dofs(), axis=1).reshape(n, self.num_corners + 1, 3) >= 0
-        part = np.einsum("nk,nki->ni", square, free)
+        square = np.column_stack([np.ones(self.num_pairs), self._point_shape]) ** 2
+        part = np.einsum("nk,nki->ni", square, self._free)
         still: BoolArray = part <= _IMMOVABLE * square.sum(axis=1)[:, None]
         return still
 
@@ -226,18 +254,28 @@ class ContactStep:
 
     def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
         """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
-        c = TANGENTIAL_SCALE * self.scale
-        moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2)) & np.isfinite(bound)
+        c = TANGENTIAL_SCALE * self._yielding
+        if np.isinf(self.pair.friction):
+            return c
+        moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2))
         s = slip.value[moved]
-        length = np.sqrt(np.einsum("na,nab,nb->n", s, slip.metric[moved], s))
+        distance = np.sqrt(np.einsum("na,nab,nb->n", s, slip.metric[moved], s))
         # Where solved, trial and slip are parallel, whatever c: the tangent needs no slope of c.
-        c[moved] = np.maximum(c[moved], 2.0 * bound[moved] / length)
+        c[moved] = np.maximum(c[moved], 2.0 * bound[moved] / distance)
         return c
 
     @cached_property
     def _shape(self) -> FloatArray:
         """Weights of the control points in the foot at t_n, shape (n, nc)."""
         return facets.shape(self.candidates.xi, self.num_corners)[0]
+
+    @property
+    def _point_shape(self) -> FloatArray:
+        """Weights of the masters' points in the foot at t_n, shape (n, np)."""
+        if self._weights is None:
+            return self._shape
+        shape: FloatArray = np.einsum("nk,nkp->np", self._shape, self._weights)
+        return shape
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""
@@ -519,7 +557,7 @@ class ContactStep:
         g_N = 0 where active, else lambda_N = 0; there Coulomb's law, else lambda_T = 0.
         """
         gap, force, scale = gap.copy(), multiplier[:, 0], self.scale
-        active = -force - scale * gap > 0
+        active = -force - scale * gap > self._none(slip, multiplier)
         off = ~active
         row = residual.shape[1] - self.num_multipliers
         residual[off, row] = force[off] / scale[off]
@@ -541,6 +579,24 @@ class ContactStep:
             part.distance[active] = np.sqrt(square[active])
         return part
 
+    def _none(self, slip: Slip | None, multiplier: FloatArray) -> FloatArray:
+        """Contact force that counts as none [kg m], shape (n,).
+
+        A touch without force has rounding in both, and with strong friction more than one solution
+        (Painleve's paradox): so nodes carry where free motion would close their gaps, or did so in
+        the last step. Once a node sticks by strong friction, a small pull lets it slip, by the law
+        continued beyond zero force: to let it go would close its gap again. As the law drives such
+        a node along its slip where solved, which is excluded, this adds no solution.
+        """
+        none: FloatArray = self.scale * self.rounding
+        if slip is None:
+            return none
+        t, s = multiplier[:, -2:], TANGENTIAL_SCALE * self._yielding[:, None] * slip.value
+        friction = length(slip.metric, t)
+        resists = friction**2 + np.einsum("na,na->n", t, s) > 0.0
+        resists &= ~self.blocked.any(axis=(1, 2))
+        return none - np.where(resists, _PULL * friction, 0.0)
+
     def _tangential(self, x: FloatArray, force: FloatArray) -> FloatArray:
         """Force (n, 3) less its part along the normal where the contact force acts."""
         middle = self.x0 + self.theta * (x - self.x0)
@@ -559,13 +615,15 @@ class ContactStep:
     ) -> BoolArray:
         """Write the rows of lambda_T [m]; returns which pairs stick.
 
-        The slope of Coulomb's bound over lambda_N is mu for all active pairs, also at the kink: of
-        a pair that has just become active lambda_N is zero, and rounding has the sign.
+        Of a pair that carries nothing yet, Coulomb's bound is mu times the force that its depth
+        asks for, as in the active set: with none it would have to slip at first.
         """
-        mu, t, scale = self.pair.friction, multiplier[:, -2:], self.scale[:, None, None]
+        mu, t = min(self.pair.friction, _LARGEST), multiplier[:, -2:]
+        force, scale = multiplier[:, 0], self.scale[:, None, None]
         normal = residual.shape[1] - self.num_multipliers
-        bound = np.zeros_like(self.scale)
-        bound[active] = np.inf if np.isinf(mu) else mu * np.maximum(-multiplier[active, 0], 0.0)
+        new = active & (force >= 0.0)
+        bound = mu * np.where(active, -force, 0.0)
+        bound[new] -= mu * self.scale[new] * residual[new, normal]
         held = self._held(x)
         loose = np.eye(2) - held
         trial = np.einsum("nab,nb->na", loose, t)
@@ -574,8 +632,9 @@ class ContactStep:
         rows = np.einsum("nab,nbz->naz", law.d_slip, slip.gradient)
         rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)
         rows[:, :, -2:] += np.matmul(law.d_multiplier, loose)
-        if not np.isinf(mu):
-            rows[:, :, normal] -= mu * law.d_bound
+        rows[:, :, normal] -= mu * law.d_bound
+        by_gap = law.d_bound[new, :, None] * tangent[new, normal][:, None]
+        rows[new] -= mu * scale[new] * by_gap
         value, slipping = law.residual, ~stick
         value[slipping] /= scale[slipping, 0]
         rows[slipping] /= scale[slipping]

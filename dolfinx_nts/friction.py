@@ -43,6 +43,13 @@ def _raise(metric: FloatArray, covariant: FloatArray) -> FloatArray:
     return np.column_stack([d * t1 - b * t2, a * t2 - b * t1]) / (a * d - b * b)[:, None]
 
 
+def length(metric: FloatArray, covariant: FloatArray) -> FloatArray:
+    """||t|| of covariant components in the metric, shape (n,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square: FloatArray = np.einsum("na,na->n", covariant, _raise(metric, covariant))
+        return np.sqrt(square)
+
+
 def return_map(
     multiplier: FloatArray,
     slip: FloatArray,
@@ -58,18 +65,18 @@ def return_map(
         multiplier: Covariant lambda_T, shape (n, 2).
         slip: Contravariant slip f_1 - f_0, shape (n, 2).
         metric: m_ab = a_a . a_b, shape (n, 2, 2).
-        bound: mu p_N >= 0 in the units of ||lambda_T||, may be infinite, shape (n,).
+        bound: mu p_N in the units of ||lambda_T||, shape (n,).
         c: Algorithmic scale > 0, force per slip distance, shape (n,).
     """
     n = len(multiplier)
     one = np.broadcast_to(np.eye(2), (n, 2, 2))
     trial = multiplier + c[:, None] * np.einsum("nab,nb->na", metric, slip)
     with np.errstate(divide="ignore", invalid="ignore"):
-        length = np.sqrt(np.einsum("na,na->n", trial, _raise(metric, trial)))
-        stick = length <= bound
-        unit = trial / length[:, None]
+        size = length(metric, trial)
+        stick = size <= bound
+        unit = trial / size[:, None]
         raised = _raise(metric, unit)
-        across = (one - unit[:, :, None] * raised[:, None]) / length[:, None, None]
+        across = (one - unit[:, :, None] * raised[:, None]) / size[:, None, None]
         press = np.where(stick, 0.0, bound)[:, None]
         residual = multiplier - press * unit
         d_multiplier = one - press[:, :, None] * across

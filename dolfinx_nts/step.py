@@ -33,6 +33,8 @@ BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
+#: Roundings of the positions within which a gap counts as closed by nothing.
+_TOUCH = 4.0
 #: Relative difference of the factors of two equal steps, which differ by rounding.
 EQUAL = 1e-6
 #: Path of a node over an obstacle's radius, and depth below both ends, from which on it passes
@@ -308,13 +310,27 @@ class StepProblem:
             state.followed[index] if self.integrator.inertia else None,
         )
         slave, x0, theta = pair.slave, pair.points(positions, found), self.integrator.theta
-        scale = slave.mass if self.integrator.inertia else slave.nodal(slave.body.nodal_stiffness())
-        scale = scale[slave.share[found.node]]
+        scale = self._scale(slave)[slave.share[found.node]]
         rule, condense = self.integrator.contact_gradient, self.condense
+        step: ContactStep
         if pair.rigid:
-            path = self._paths[index]
-            return ObstacleStep(pair, found, rule, condense, x0 - path[0], scale, theta, path)
-        return ContactStep(pair, found, rule, condense, x0, scale, theta)
+            path, none = self._paths[index], np.empty((len(scale), 0))
+            step = ObstacleStep(
+                pair, found, rule, condense, x0 - path[0], scale, theta, path, master_scale=none
+            )
+        else:
+            master = self._scale(pair.master)[pair.master.patches[found.facet]]
+            step = ContactStep(pair, found, rule, condense, x0, scale, theta, master_scale=master)
+        way = max(self._moved[b] + self._motion[b] for b in self.system.contact_bodies[index])
+        return replace(step, rounding=_TOUCH * _EPS * (step.extent + float(way)))
+
+    def _scale(self, surface: Any) -> FloatArray:
+        """Force per motion of a surface's points, shape (p,), see `ContactStep`. Collective."""
+        if self.integrator.inertia:
+            mass: FloatArray = surface.mass
+            return mass
+        stiffness: FloatArray = surface.nodal(surface.body.nodal_stiffness())
+        return stiffness
 
     def _drop_doubles(self) -> None:
         """Of two pairs that keep a node out of the same fixed surface, leave one.
