@@ -18,7 +18,6 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
-from mpi4py import MPI
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts import dolfinx_compat as compat
@@ -177,12 +176,6 @@ class Traction:
     value: VectorInTime
 
 
-def _cell_size(mesh: Any) -> float:
-    """Largest side of the cells' boxes [m]: strains that are rounded at 1 move nodes by it."""
-    corners = mesh.geometry.x[compat.geometry_dofmap(mesh)]
-    return float(mesh.comm.allreduce(np.ptp(corners, axis=1).max(initial=0.0), op=MPI.MAX))
-
-
 def _facets(mesh: Any, where: Any, what: str) -> IntArray:
     if isinstance(where, tuple) and len(where) == 2:
         return locate_facets(mesh, *where, what)
@@ -272,7 +265,8 @@ class Continuum:
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
         self.num_owned = 3 * self.space.dofmap.index_map.size_local
-        self.rounded = 0.0 if isinstance(material, Isotropic) else _cell_size(mesh)
+        if isinstance(material, Isotropic):
+            self.rounded = 0.0
         self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
         self.body_force, self._traction, self._extra_form = body_force, traction, extra_form
         quadrature_degree = quadrature_degree or 2 * degree

@@ -39,14 +39,16 @@ class Determinants:
         element = basix.create_element(basix.ElementFamily.P, kind, degree, variant)
         gradients = element.tabulate(1, points)[1:, :, :, 0]
         self._table = np.ascontiguousarray(gradients.reshape(-1, gradients.shape[2]))
-        self._reference = space.tabulate_dof_coordinates().ravel()
+        nodes = space.tabulate_dof_coordinates()
+        # About a node of their own: differences of far positions would lose digits.
+        self._reference = (nodes - nodes[:1].sum(axis=0)).ravel()
         cells = compat.cell_dofs(space)[: space.mesh.topology.index_map(3).size_local]
-        middles = self._reference.reshape(-1, 3)[cells].sum(axis=1) / self._table.shape[1]
+        middles = nodes[cells].sum(axis=1) / self._table.shape[1]
         self._middles = np.concatenate([middles, np.full((1, 3), np.nan)])
         self._parts = []
         for first in range(0, len(cells), _CELLS):
-            nodes = 3 * cells[first : first + _CELLS].T
-            numbers = (nodes[:, None] + np.arange(3)[:, None]).reshape(len(nodes), -1)
+            of_cell = 3 * cells[first : first + _CELLS].T
+            numbers = (of_cell[:, None] + np.arange(3)[:, None]).reshape(len(of_cell), -1)
             self._parts.append((numbers, 1.0 / self._det(self._reference, numbers)))
 
     def _det(self, x: FloatArray, numbers: npt.NDArray[Any]) -> FloatArray:
@@ -66,6 +68,7 @@ class Determinants:
         det += minor
         return det
 
+    @np.errstate(over="ignore", invalid="ignore")  # an iterate may run off
     def smallest(self, u: FloatArray) -> tuple[float, FloatArray]:
         """The smallest det F on this rank and the middle X of its cell [m], shape (3,).
 

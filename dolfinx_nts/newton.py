@@ -402,9 +402,7 @@ class StepSolver:
         return u
 
     def _smallest_dets(self, u: list[FloatArray]) -> FloatArray:
-        # An iterate that runs off may overflow.
-        with np.errstate(over="ignore", invalid="ignore"):
-            return smallest_dets(self.problem.system, u, self._dets)
+        return smallest_dets(self.problem.system, u, self._dets)
 
     def _is_inside_out(self) -> bool:
         assert self._last is not None
