@@ -193,10 +193,13 @@ class StepSolver:
         self.prepare()
         assert self.matrix is not None
         iterations, unsolved = 0, False
-        for retry in (False, True):
+        for retry in range(3):
             if retry:
                 self._matrices_due = True
+                if retry == 2:
+                    self.problem.let_slip()
                 self.problem.guess(flight=False)
+                self._last = None
                 if unsolved:
                     # What failed to factorise once fails from then on.
                     self.destroy()

@@ -391,6 +391,10 @@ class StepProblem:
             blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
         return blocks
 
+    def let_slip(self) -> None:
+        """Solve this step with nodes that slip rather than leave, see `ContactStep`."""
+        self.contacts = [replace(c, lets_slip=True) for c in self.contacts]
+
     def guess(self, *, flight: bool) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 
