@@ -218,7 +218,19 @@ def first_row(system: System, state: State) -> dict[str, Any]:
     """Balance table row of the state a run starts from."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS, 0.0)
     row |= measure(system, state)
-    row |= {"time": state.time, "energy": row["kinetic"] + row["potential"], "min_gap": np.inf}
+    row |= {"time": state.time, "energy": row["kinetic"] + row["potential"]}
+    carrying = [force > 0.0 for force in state.force]
+    active = sum(int(on.sum()) for on in carrying)
+    stick = sum(int((on & held).sum()) for on, held in zip(carrying, state.stick, strict=True))
+    slip = sum(
+        int((on & ~held).sum())
+        for on, held, pair in zip(carrying, state.stick, system.contacts, strict=True)
+        if pair.friction
+    )
+    counts = system.comm.allreduce(np.array([active, stick, slip], dtype=float))
+    row |= dict(zip(("active", "stick", "slip"), counts.tolist(), strict=True))
+    smallest = min((float(gap.min(initial=np.inf)) for gap in state.gap), default=np.inf)
+    row["min_gap"] = float(system.comm.allreduce(smallest, op=MPI.MIN))
     return row | {"min_det": float(smallest_dets(system, state.u).min())}
 
 

@@ -25,9 +25,12 @@ BoolArray = npt.NDArray[np.bool_]
 #: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which
 #: with a consistent mass matrix is a small part of the nodal mass.
 TANGENTIAL_SCALE = 0.05
-#: Coefficient that infinite friction, and any larger one, has in numbers. Where next to no normal
-#: force is left, no node can both stick and press, and this is the limit of large coefficients.
+#: Largest coefficient of friction in numbers: larger ones are this one, but for infinite friction.
 _LARGEST = 1e8
+#: Pull over friction that counts as none.
+_NO_PULL = 1e-8
+#: Coefficient from which on friction counts as strong.
+_STRONG = 1.0
 #: Pull over friction up to which a node that sticks is let slip before it is let go.
 _PULL = 0.01
 #: Square of the part of a motion that counts as none.
@@ -84,6 +87,7 @@ class ContactStep:
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
         master_scale: `scale` of the points of the masters, shape (n, np); empty without.
         rounding: Gap [m], and contact force over `scale`, that counts as none.
+        lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
     """
 
     pair: ContactPair
@@ -95,6 +99,7 @@ class ContactStep:
     theta: float
     master_scale: FloatArray = field(kw_only=True)
     rounding: float = field(default=0.0, kw_only=True)
+    lets_slip: bool = field(default=False, kw_only=True)
 
     @property
     def num_pairs(self) -> int:
@@ -584,18 +589,21 @@ class ContactStep:
 
         A touch without force has rounding in both, and with strong friction more than one solution
         (Painleve's paradox): so nodes carry where free motion would close their gaps, or did so in
-        the last step. Once a node sticks by strong friction, a small pull lets it slip, by the law
-        continued beyond zero force: to let it go would close its gap again. As the law drives such
-        a node along its slip where solved, which is excluded, this adds no solution.
+        the last step. If no step comes of that (`lets_slip`), a small pull on a node that sticks
+        lets it slip, by the law continued beyond zero force: to let it go would close its gap
+        again. As the law drives such a node along its slip where solved, which is excluded, this
+        adds no solution.
         """
         none: FloatArray = self.scale * self.rounding
-        if slip is None:
+        endless = np.isinf(self.pair.friction)
+        if slip is None or not (self.lets_slip or endless):
             return none
         t, s = multiplier[:, -2:], TANGENTIAL_SCALE * self._yielding[:, None] * slip.value
         friction = length(slip.metric, t)
         resists = friction**2 + np.einsum("na,na->n", t, s) > 0.0
         resists &= ~self.blocked.any(axis=(1, 2))
-        return none - np.where(resists, _PULL * friction, 0.0)
+        # Without bound a node may stick by no normal force at all, whose rounding has any sign.
+        return none - np.where(resists, (_NO_PULL if endless else _PULL) * friction, 0.0)
 
     def _tangential(self, x: FloatArray, force: FloatArray) -> FloatArray:
         """Force (n, 3) less its part along the normal where the contact force acts."""
@@ -615,15 +623,18 @@ class ContactStep:
     ) -> BoolArray:
         """Write the rows of lambda_T [m]; returns which pairs stick.
 
-        Of a pair that carries nothing yet, Coulomb's bound is mu times the force that its depth
-        asks for, as in the active set: with none it would have to slip at first.
+        Of a pair that carries nothing yet, strong friction's bound is mu times the force that its
+        depth asks for, as in the active set: with none it would have to slip at first, by the slope
+        of the bound, which is mu for all active pairs.
         """
+        endless = np.isinf(self.pair.friction)
         mu, t = min(self.pair.friction, _LARGEST), multiplier[:, -2:]
         force, scale = multiplier[:, 0], self.scale[:, None, None]
         normal = residual.shape[1] - self.num_multipliers
-        new = active & (force >= 0.0)
-        bound = mu * np.where(active, -force, 0.0)
+        new = active & (force >= 0.0) & (mu > _STRONG)
+        bound = mu * np.where(active, -force if mu > _STRONG else np.maximum(-force, 0.0), 0.0)
         bound[new] -= mu * self.scale[new] * residual[new, normal]
+        bound[active & endless] = np.inf
         held = self._held(x)
         loose = np.eye(2) - held
         trial = np.einsum("nab,nb->na", loose, t)

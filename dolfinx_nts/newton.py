@@ -49,7 +49,7 @@ class Newton:
     Attributes:
         rtol: Largest residual of a block relative to the forces (or motions) of the step, > 0.
         max_iterations: Newton iterations before a step is dropped.
-        max_retries: How often a dropped step may be halved before the run stops.
+        max_retries: How often a dropped step may be cut (to less than half) before the run stops.
         condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
             lambda_N and lambda_T reach the linear solver: the same solution in fewer iterations.
         linear_solver: "direct" (MUMPS) or "krylov" (FGMRES with incomplete factors of the bodies
@@ -131,6 +131,8 @@ _INSIDE_OUT = 8
 _LAST = 1e5
 #: The same above which one more iteration is worth it where residuals add up.
 _SURE = 0.05
+#: Changes of one node's state in a step that are no search any more.
+_CYCLE = 8
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 
@@ -210,11 +212,15 @@ class StepSolver:
         self.prepare()
         assert self.matrix is not None
         iterations, unsolved = 0, False
-        for retry in (False, True):
-            self._careful, self._shortened = retry, 0
+        # Without friction there is nothing to let slip.
+        for retry in range(3 if self.problem.may_slip else 2):
+            self._careful, self._shortened = retry > 0, 0
             if retry:
                 self._matrices_due = True
+                if retry == 2:
+                    self.problem.let_slip()
                 self.problem.guess(flight=False)
+                self._last = None
                 if unsolved:
                     # What failed to factorise once fails from then on.
                     self.destroy()
@@ -268,7 +274,7 @@ class StepSolver:
         """Make SNES and matrices ready for the current step."""
         self._last = self._passed = None
         self._measured = False
-        self._flips = [np.zeros(c.num_pairs, dtype=int) for c in self.problem.contacts]
+        self._flips = [np.zeros((2, c.num_pairs), dtype=int) for c in self.problem.contacts]
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
         self._matrices_due |= not self.newton.reuse or changed > EQUAL
@@ -346,8 +352,9 @@ class StepSolver:
             self._rests = True
             if self._last is not None:
                 for count, a, b in zip(self._flips, self._last.contacts, new.contacts, strict=True):
-                    count += a.active != b.active
-                    self._rests &= bool((a.active == b.active).all() & (a.stick == b.stick).all())
+                    changes = np.stack([a.active != b.active, a.stick != b.stick])
+                    count += changes
+                    self._rests &= not changes.any()
             self._last = new
         assert self._last is not None
         return self._last
@@ -527,11 +534,21 @@ class StepSolver:
 def _contact_note(c: ContactStep, k: Contribution, flips: IntArray) -> tuple[str, float, str]:
     """Name, weight and text of the pair that flipped most or is worst solved."""
     rows = np.abs(k.residual[:, c.num_coordinates :]).max(axis=1)
-    weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips)
+    weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips.sum(axis=0))
     i = int(np.argmax(weight))
+    touch, slide = (int(n) for n in flips[:, i])
     facet = "" if c.pair.rigid else f" on facet {int(c.candidates.facet[i])}"
     where = f"contact {c.pair.name!r}: node {c.input_node(i)}{facet}"
-    return c.pair.name, float(weight[i]), f"{where}, {int(flips[i])} active-set flips"
+    text = f"{where}, {touch} active-set flips"
+    if slide:
+        text += f" and {slide} between stick and slip"
+    if max(touch, slide) >= _CYCLE:
+        states = "stick and slip" if slide > touch else "contact and none"
+        text += (
+            f": it flips between {states} and settles in neither; try another dt"
+            f"{', a smaller coefficient of friction' if c.pair.friction else ''} or a finer surface"
+        )
+    return c.pair.name, float(weight[i]), text
 
 
 def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:

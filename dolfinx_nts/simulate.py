@@ -217,7 +217,9 @@ class Stepper:
         self._materials, self._material_change = MaterialWatch(system), 0.0
 
     def advance(self, dt: float) -> State:
-        """Advance by dt; a step that is not solved is halved, up to `newton.max_retries` times.
+        """Advance by dt; a step that is not solved is cut, up to `newton.max_retries` times.
+
+        What is left is then cut into one part more than twice as many.
 
         Args:
             dt: Time to advance [s], > 0.
@@ -235,10 +237,9 @@ class Stepper:
         require_positive("dt", dt, "s")
         dt = float(dt)
         self.start(dt)
-        end, part, retries = self.state.time + dt, 1, 0
-        done = 0
-        while done < part:
-            target = end - dt * (part - done - 1) / part
+        end, parts, retries = self.state.time + dt, 1, 0
+        while parts:
+            target = end - (end - self.state.time) * (parts - 1) / parts
             try:
                 self._step(target - self.state.time, target)
             except UserFunctionError:
@@ -248,10 +249,12 @@ class Stepper:
                     raise
                 retries += 1
                 self.solution.retries += 1
-                part, done = 2 * part, 2 * done
-                logger.info("%s; retrying with dt=%.3g", failure, dt / part)
+                # An odd number: halves of halves would end where one of them has failed.
+                parts = 2 * parts + 1
+                smaller = (end - self.state.time) / parts
+                logger.info("%s; retrying with dt=%.3g", failure, smaller)
             else:
-                done += 1
+                parts -= 1
         return self.state
 
     def paced(self, pace: Pace, end: float) -> Iterator[None]:

@@ -410,6 +410,15 @@ class StepProblem:
             blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
         return blocks
 
+    @property
+    def may_slip(self) -> bool:
+        """Whether any contact has friction with a bound."""
+        return any(0.0 < pair.friction < np.inf for pair in self.system.contacts)
+
+    def let_slip(self) -> None:
+        """Solve this step with nodes that slip rather than leave, see `ContactStep`."""
+        self.contacts = [replace(c, lets_slip=True) for c in self.contacts]
+
     def guess(self, *, flight: bool) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 

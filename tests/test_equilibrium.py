@@ -451,6 +451,8 @@ def test_what_has_settled_stays(integrator):
     assert run.balance["time"][0] == 1.0 and abs(run.balance["time"][-1] - 1.02) < 1e-12
     assert np.all(run.balance["active"][1:] == 16)
     assert run.balance["potential"][0] == settled.balance["potential"][-1]
+    for name in ("active", "stick", "slip", "min_gap"):
+        assert run.balance[name][0] == settled.balance[name][-1]
     # A block of this height would have fallen by 2 mm and swung at 0.2 m/s.
     assert run.balance["kinetic"].max() < 1e-18 * 500 * 0.2**2
     for body, u in zip(system.bodies, settled.state.u, strict=True):

@@ -1,0 +1,134 @@
+"""Contacts that touch without force, and friction without bound: the same on any ranks."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from test_obstacle_friction import sliding
+from test_single_mass import INTEGRATORS, MASS
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+GRAVITY = 9.81
+SCHEMES = [nts.Midpoint(), nts.EnergyMomentum()]
+
+
+def box(low, high, parts, name, velocity=(0, 0, 0), bcs=()):
+    mesh = create_box(
+        COMM, [np.array(low, float), np.array(high, float)], parts, CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    rubber = nts.StVenantKirchhoff(young=1e6, poisson=0.3)
+    return nts.Continuum(mesh, rubber, density=1e3, name=name, velocity=velocity, bcs=bcs)
+
+
+# ---- a touch without force
+@pytest.mark.mpi
+@pytest.mark.parametrize("accuracy", ["exact", "balanced"])
+@pytest.mark.parametrize("friction", [50.0, 1e6, np.inf])
+@pytest.mark.parametrize("meshed", [False, True])
+def test_a_cube_flush_with_a_wall_falls_freely(meshed, friction, accuracy):
+    """No force presses it to the wall, so none of friction's acts: v = -g t."""
+    cube = box((0, 0, 0), (1, 1, 1), (2, 2, 2), "cube")
+    side, bodies = cube.surface(lambda x: x[0] < 1e-9), [cube]
+    master = nts.Plane((0, 0, 0), (1, 0, 0))
+    if meshed:
+        still = nts.Dirichlet(lambda x: x[0] < 1e-9)
+        wall = box((-0.5, -1, -1.1), (0, 2, 2.1), (1, 3, 3), "wall", bcs=[still])
+        master, bodies = wall.surface(lambda x: x[0] > -1e-9), [cube, wall]
+    pair = nts.ContactPair(side, master, friction=friction)
+    system = nts.System(bodies, contacts=[pair], gravity=(0, 0, -GRAVITY))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.02, accuracy=accuracy)
+    assert run.status == "completed" and run.retries == 0
+    momentum = run.balance["linear_momentum"]
+    assert momentum[-1, 2] == pytest.approx(-1e3 * GRAVITY * 0.02, rel=1e-9)
+    assert not run.balance["active"].any()
+    assert run.balance["friction_dissipation"][-1] == 0.0
+    assert run.balance["min_gap"].min() > -2e-15
+
+
+# ---- no normal force that friction could be in proportion to
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("name", ["sphere", "cylinder"])
+def test_a_bead_at_the_side_of_a_ring_hangs_by_infinite_friction(name, integrator):
+    """v_t = sqrt(g R / mu) is the speed at which m v^2 / R carries it: zero without bound."""
+    ring = {
+        "sphere": nts.Sphere((0, 0, 0), 1.0, inside=True),
+        "cylinder": nts.Cylinder((0, 0, 0), (0, 1, 0), 1.0, inside=True),
+    }[name]
+    gravity = (0, 0, -GRAVITY)
+    system = sliding(ring, np.inf, (1, 0, 0), (0, 0, 0), gravity)
+    run = nts.simulate(system, INTEGRATORS[integrator], dt=1e-2, t_end=0.2)
+    assert run.status == "completed" and run.retries == 0
+    assert run.balance["energy"][-1] < 1e-9 * MASS * GRAVITY
+    assert np.linalg.norm(run.balance["linear_momentum"][-1]) < 1e-4 * MASS
+
+
+@pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])
+def test_strong_friction_has_a_limit(integrator):
+    """A soft disc released at the side of a ring, whose nodes press next to nothing there."""
+
+    runs = [_disc(mu, integrator) for mu in (1e4, 1e6, 1e8)]
+    for run in runs:
+        assert run.status == "completed"
+    near, nearer, limit = (run.balance["energy"][-1] for run in runs)
+    assert abs(near - limit) < 2e-2 * limit and abs(nearer - limit) < 2e-2 * limit
+
+
+def _disc(friction, integrator):
+    mesh = create_box(
+        COMM, [np.array([-0.2, 0, -0.2]), np.array([0.2, 0.1, 0.2])], (8, 1, 8),
+        CellType.hexahedron, ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    x = mesh.geometry.x
+    radius = np.hypot(x[:, 0], x[:, 2])
+    x[:, ::2] *= (np.abs(x[:, ::2]).max(axis=1) / np.maximum(radius, 1e-9))[:, None]
+    x[:, 0] += 0.8
+    rubber = nts.StVenantKirchhoff(young=1e6, poisson=0.3)
+    disc = nts.Continuum(mesh, rubber, density=1e3, name="disc")
+    rim = disc.surface(lambda x: np.hypot(x[0] - 0.8, x[2]) > 0.2 - 1e-9)
+    ring = nts.Cylinder((0, 0, 0), (0, 1, 0), 1.0, inside=True)
+    pair = nts.ContactPair(rim, ring, friction=friction)
+    system = nts.System([disc], contacts=[pair], gravity=(0, 0, -GRAVITY))
+    return nts.simulate(system, integrator, dt=1e-2, t_end=0.2)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("accuracy", ["exact", "balanced"])
+@pytest.mark.parametrize("gap", [0.05, 0.0499])
+def test_cubes_that_meet_at_the_end_of_a_step(gap, accuracy):
+    """mu = 1e6 binds as no bound does; at 5 m/s a gap of 0.05 m closes after five steps."""
+    energies = []
+    for friction in (1e6, np.inf):
+        left = box((0, 0, 0), (1, 1, 1), (3, 3, 3), "left", (5, 0, 0))
+        right = box((1 + gap, 0, 0), (2 + gap, 1, 1), (2, 2, 2), "right")
+        slave = left.surface(lambda x: x[0] > 1 - 1e-9)
+        master = right.surface(lambda x: x[0] < 1 + gap + 1e-9)
+        pair = nts.ContactPair(slave, master, friction=friction)
+        system = nts.System([left, right], contacts=[pair])
+        run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.03, accuracy=accuracy)
+        assert run.status == "completed" and run.retries == 0
+        assert run.balance["linear_momentum"][-1, 0] == pytest.approx(5e3, rel=1e-9)
+        energies.append(run.balance["energy"][-1])
+    assert energies[0] == pytest.approx(energies[1], rel=1e-7)
+
+
+# ---- a heavy slave on a light master
+@pytest.mark.mpi
+@pytest.mark.parametrize("friction", [0.3, 5.0])
+def test_one_large_element_stands_on_small_facets(friction):
+    """Its nodes are 1e5 times heavier than the plate's: c belongs to what slips, the plate."""
+    fine = 1 / 50
+    still = nts.Dirichlet(lambda x: x[2] < -fine + 1e-9)
+    plate = box((0, 0, -fine), (10 * fine, 10 * fine, 0), (10, 10, 1), "plate", bcs=[still])
+    cube = box((0.062, 0.062, 0), (1.062, 1.062, 1), (1, 1, 1), "cube")
+    pair = nts.ContactPair(
+        cube.surface(lambda x: x[2] < 1e-9), plate.surface(lambda x: x[2] > -1e-9),
+        friction=friction,
+    )  # fmt: skip
+    system = nts.System([cube, plate], contacts=[pair], gravity=(0, 0, -GRAVITY))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=3e-3)
+    assert run.status == "completed"
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * run.balance["kinetic"].max()
