@@ -23,6 +23,7 @@ _LEAST = 1e-11
 #: Part of the energy whose loss from the ledger makes a result doubtful, with a rule that closes
 #: it and with one that does not.
 _DOUBTFUL, _OPEN = 1e-3, 1e-2
+_EPS = float(np.finfo(float).eps)
 #: Rounding of a step's energy over that of its forces times its motion.
 _ROUNDING = 10.0
 
@@ -41,12 +42,13 @@ class Promises:
         self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if closes else _OPEN
         self._largest, self._rounding = 0.0, 0.0
 
-    def hold(self, problem: StepProblem, step: Evaluation) -> None:
+    def hold(self, problem: StepProblem, step: Evaluation, impulses: float) -> None:
         """Warn if the ledger of the last accepted row misses too much. Collective.
 
         Args:
             problem: Equations of the step.
             step: Their solution.
+            impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
         """
         row = self._solution.rows[-1]
         names = ("kinetic", "potential", "external_work", "friction_dissipation")
@@ -55,6 +57,8 @@ class Promises:
         moved = np.sqrt(problem.system.comm.allreduce(squares))
         rounding = problem.rounding([terms.u1 for terms in step.bodies])
         self._rounding += _ROUNDING * float(rounding @ moved) / problem.factor
+        # Where nothing moves, the work of forces over the rounding of places is all there is.
+        self._rounding += _EPS * impulses / problem.dt * problem.extent
         missing = abs(row["ledger_residual"])
         if missing <= self._promise * self._largest + self._rounding:
             return

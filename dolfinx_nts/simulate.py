@@ -136,11 +136,13 @@ class Trial(NamedTuple):
         step: Solution of its equations.
         state: State at its end.
         measured: `balance.measure` of that state.
+        impulses: Of all forces in the step, see `check_momentum` [kg m/s].
     """
 
     step: Evaluation
     state: State
     measured: dict[str, Any]
+    impulses: float
 
 
 @known_options
@@ -364,8 +366,9 @@ class Stepper:
         step = self._covered(self.solver.solve())
         state = self._accepted(step, dt, time)
         measured = balance.measure(self.system, state, self._measured)
-        check_momentum(self.problem, step, state, self.solution.rows[-1], measured)
-        return Trial(step, state, measured)
+        last = self.solution.rows[-1]
+        impulses = check_momentum(self.problem, step, state, last, measured)
+        return Trial(step, state, measured, impulses)
 
     def _covered(self, step: Evaluation) -> Evaluation:
         """The step itself, or solved again for as long as its motion may have passed by a contact.
@@ -394,7 +397,7 @@ class Stepper:
         terms |= {"time": time, "newton_iterations": step.iterations}
         terms["material_change"], self._material_change = self._material_change, 0.0
         rows.append(balance.next_row(rows[0], rows[-1], trial.measured, terms))
-        self._promises.hold(self.problem, step)
+        self._promises.hold(self.problem, step, trial.impulses)
         self.solution.switches.extend(balance.switches(self.problem, step, time))
         self._recent.append((time - self.state.time, state.force))
         self._accept(state)

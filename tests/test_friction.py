@@ -223,19 +223,19 @@ def test_a_solution_is_one_for_any_algorithmic_scale(integrator, monkeypatch):
         rubbing_blocks(0.3), INTEGRATORS[integrator], newton=nts.Newton(rtol=1e-14)
     )
     problem, nominal = stepper.problem, contact_step.TANGENTIAL_SCALE
-    problem_rtol, both = problem._rtol, 0
+    problem_rtol, both = problem.rtol, 0
     for _ in range(40):
         stepper.advance(2e-3)
         own = problem.evaluate(problem.x).contacts[0]
         both += bool(own.stick.any() and (own.active & ~own.stick).any())
-        problem._rtol = 1e-10
+        problem.rtol = 1e-10
         for factor in 10.0 ** np.arange(-4, 5):
             monkeypatch.setattr(contact_step, "TANGENTIAL_SCALE", factor * nominal)
             other = problem.evaluate(problem.x)
             assert np.array_equal(other.contacts[0].stick, own.stick)
             assert max(problem.ratios(other).values()) <= 1.0
         monkeypatch.setattr(contact_step, "TANGENTIAL_SCALE", nominal)
-        problem._rtol = problem_rtol
+        problem.rtol = problem_rtol
     stepper.close()
     assert both >= 3
 
