@@ -334,6 +334,7 @@ def test_csv_has_the_steps_between_two_calls(mpi_tmp_path):
     writer.write(run)
     run.advance(1e-3)
     writer.close(run)
+    COMM.Barrier()  # rank 0 writes
     assert len((mpi_tmp_path / "b.csv").read_text().splitlines()) == 6
     run.close()
 
