@@ -60,7 +60,7 @@ def check_momentum(
     arms = {"linear": 1.0, "angular": problem.extent + math.sqrt(total[8])}
     total /= 0.5 * problem.dt
     allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * (total[6] + total[7])
-    allowed += problem.momentum_rounding(step)
+    allowed += problem.momentum_rounding
     for k, (name, arm) in enumerate(arms.items()):
         change = after[f"{name}_momentum"] - before[f"{name}_momentum"]
         off = float(np.abs(change - total[3 * k : 3 * k + 3]).max())

@@ -378,8 +378,9 @@ class StepSolver:
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
             return reasons.DIVERGED_FNORM_NAN
         stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
-        if stalls and worst < _NEAR and not self._measured:
-            self.problem.measure_rounding()
+        near = worst < _NEAR or not self.problem.knows_rounding
+        if stalls and near and not self._measured:
+            self.problem.measure_rounding(self._last)
             self._measured = self._matrices_due = True
             worst = self._worst(self._last)
         unchanged = self.problem.system.comm.allreduce(self._rests, op=MPI.LAND)

@@ -55,8 +55,7 @@ class Promises:
         self._largest = max(self._largest, *(abs(row[name]) for name in names))
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         moved = np.sqrt(problem.system.comm.allreduce(squares))
-        rounding = problem.rounding([terms.u1 for terms in step.bodies])
-        self._rounding += _ROUNDING * float(rounding @ moved) / problem.factor
+        self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
         # Where nothing moves, the work of forces over the rounding of places is all there is.
         self._rounding += _EPS * impulses / problem.dt * problem.extent
         missing = abs(row["ledger_residual"])

@@ -173,9 +173,11 @@ class StepProblem:
         else:
             self._motion = np.maximum(self._motion, self.motion(again))
             self._ahead = [terms.du for terms in again.bodies]
-        for k, factor in enumerate(self._diagonal_factor):
-            if not factor / _ANOTHER_STEP <= self.factor <= factor * _ANOTHER_STEP:
-                self._measure_rounding(k)
+        self._length = self._moved + self._motion
+        # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
+        old = self._diagonal_factor
+        other = (self.factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * self.factor)
+        self._diagonal[other] = 0.0
         if search:
             self._followed = list(state.followed)
             self._found = [self._search(k) for k in range(len(system.contacts))]
@@ -208,7 +210,10 @@ class StepProblem:
 
         A diagonal of another step hardly allows more: it grows with the factor, but less than that.
         """
-        return float(self.rounding(self.state.u)[k] / max(self.factor, self._diagonal_factor[k]))
+        if not self._diagonal[k]:
+            self._measure_rounding(k)
+        rounding = self._rounding_of(self._moved)[k]
+        return float(rounding / max(self.factor, self._diagonal_factor[k]))
 
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
@@ -564,11 +569,20 @@ class StepProblem:
             held.destroy()
         return a
 
-    def measure_rounding(self) -> None:
+    @property
+    def knows_rounding(self) -> bool:
+        """Whether the rounding of the forces on all bodies in the step has been measured."""
+        return bool((self._diagonal[list(self.awake)] > 0.0).all())
+
+    def measure_rounding(self, e: Evaluation) -> None:
         """Measure the rounding of the forces anew, for bodies that have stiffened. Collective.
 
         The bodies' matrices are not those of an iterate any more.
+
+        Args:
+            e: Iterate whose motion is longer than the one that was predicted, at most the extent.
         """
+        self._length = np.maximum(self._length, self._lengths(e))
         for k in self.awake:
             self._measure_rounding(k)
 
@@ -582,25 +596,34 @@ class StepProblem:
         diagonal.destroy()
 
     # ---- convergence
-    def rounding(self, u: Sequence[FloatArray]) -> FloatArray:
-        """Of the forces on each body at a displacement [kg m]. Collective.
+    @property
+    def rounding(self) -> FloatArray:
+        """Of the forces on each body [kg m]: stiffness times length times machine precision.
 
-        Stiffness times length times machine precision. Forces come from displacement gradients, so
-        the length is that of the displacement, wherever the body lies and however large it is.
+        Forces come from displacement gradients, so the length is that of the displacement, wherever
+        the body lies and however large it is.
         """
-        local = [np.abs(a).max(initial=0.0) for a in u]
-        reached = np.maximum(_global_max(self.system.comm, np.array(local)), self._moved)
-        # An iterate that runs off excuses no more than the positions would.
-        length = np.minimum(reached, self._extent + self._moved)
+        return self._rounding_of(self._length)
+
+    def _rounding_of(self, length: FloatArray) -> FloatArray:
+        """`rounding` at displacements of these lengths [m], shape (bodies,)."""
         bodies = zip(self.system.bodies, self._extent, strict=True)
         beside = np.array([getattr(body, "rounded", extent) for body, extent in bodies])
         rounding: FloatArray = _EPS * self._diagonal * (length + beside)
         return rounding
 
-    def momentum_rounding(self, e: Evaluation) -> float:
-        """Change of momentum in a solved step that is rounding [kg m/s]. Collective."""
-        rounding = self.rounding([t.u1 for t in e.bodies])
-        return float(rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
+    def _lengths(self, e: Evaluation) -> FloatArray:
+        """Largest displacement of each body in an evaluation [m]. Collective.
+
+        An iterate that runs off excuses no more than the positions would.
+        """
+        local = np.array([np.abs(terms.u1).max(initial=0.0) for terms in e.bodies])
+        return np.minimum(_global_max(self.system.comm, local), self._extent + self._moved)
+
+    @property
+    def momentum_rounding(self) -> float:
+        """Change of momentum in the step that is rounding [kg m/s]."""
+        return float(self.rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
 
     @property
     def extent(self) -> float:
@@ -673,7 +696,7 @@ class StepProblem:
             parts = (self._stabilization(body) * t.du, t.internal, t.external, t.contact)
             squares.append([float(p @ p) for p in parts])
         norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
-        limits = self.rtol * norms[:, 1:].max(axis=1) + self.rounding([t.u1 for t in e.bodies])
+        limits = self.rtol * norms[:, 1:].max(axis=1) + self._rounding_of(self._lengths(e))
         return max(_over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
@@ -684,7 +707,7 @@ class StepProblem:
             parts = (free, self._inertia[k], t.internal, t.external, t.contact)
             squares[k] = [float(p @ p) for p in parts]
         norms = np.sqrt(self.system.comm.allreduce(squares))
-        ratio, rounding = {}, self.rounding([t.u1 for t in e.bodies])
+        ratio, rounding = {}, self.rounding
         for k, body in enumerate(self.system.bodies):
             limit = self.rtol * norms[k, 1:].max() + rounding[k]
             ratio[body.name] = _over(norms[k, 0], limit)

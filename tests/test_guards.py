@@ -58,12 +58,11 @@ def test_no_tolerance_comes_from_an_iterate():
     stepper.start(STEP)
     problem = stepper.problem
     problem.begin(stepper.state, 2e-3)
-    here = problem.evaluate(problem.x)
-    before = problem.momentum_rounding(here)
+    before = problem.momentum_rounding
     far = problem.x.duplicate()
     far.array_w[:] = 1e3 * (1 + np.arange(len(far.array_r)))
     with np.errstate(all="ignore"):
         problem.body_tangents(problem.evaluate(far))
-    assert problem.momentum_rounding(here) == before
+    assert problem.momentum_rounding == before
     far.destroy()
     stepper.close()
