@@ -90,11 +90,14 @@ class Found(NamedTuple):
         followed: Which of the rank's slave nodes are known not to have passed by the surface's
             edge, shape (share,).
         cover: Relative motion [m] for which the search misses no contact, the same on all ranks.
+        beside: How deep, in facet sizes, the deepest node that is let through lies behind its
+            facet, and its input number; (0, -1) without one.
     """
 
     candidates: Candidates
     followed: BoolArray
     cover: float
+    beside: tuple[float, int] = (0.0, -1)
 
 
 @known_options
@@ -230,9 +233,14 @@ class ContactPair:
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
         stays[np.setdiff1d(node, lost)] = known[np.setdiff1d(node, lost)]
+        hidden, deepest = found.part(beside), (0.0, -1)
+        if len(hidden.node):
+            depth = -hidden.gap / hidden.length
+            node = self.slave.share[hidden.node[depth.argmax()]]
+            deepest = float(depth.max()), int(self.slave.original[node])
         found = found.part(~beside)
         stays[found.node] = True
-        return Found(found, stays, cover)
+        return Found(found, stays, cover, deepest)
 
     def _along_paths(
         self, found: Candidates, x: FloatArray, master: FloatArray, motion: Motion
@@ -299,7 +307,7 @@ class ContactPair:
         xi, converged = facets.project(end, control, np.zeros((len(node), 2)))
         foot, _, normal = facets.frame(control, xi)
         depth = np.einsum("ni,ni->n", normal, foot - end) / facets.size(control)
-        # A node that is held at another facet ends behind this one by what they differ in height.
+        # A node that is held at another facet may end a little behind this one.
         deep = depth > np.where(held[node] >= 0, _MARGIN, _OUTSIDE)
         hit[np.setdiff1d(np.arange(len(hit)), node[deep | ~converged])] = -1
         return hit

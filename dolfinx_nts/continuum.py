@@ -18,6 +18,7 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
+from mpi4py import MPI
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts import dolfinx_compat as compat
@@ -204,7 +205,7 @@ class Continuum:
             displacement, velocity and test function (in statics the displacement at the end and
             zero); it is added to the internal virtual work and its work counts as external.
         allow_inversion: Accept steps that turn a cell inside out, det F <= 0 at a corner or
-            quadrature point, with a warning in the Solution; else such a step is halved, and the
+            quadrature point, with a warning in the Solution; else such a step is cut, and the
             run stops where that does not help. W(C) cannot see it.
 
     Attributes:
@@ -265,9 +266,9 @@ class Continuum:
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
         self.num_owned = 3 * self.space.dofmap.index_map.size_local
-        if isinstance(material, Isotropic):
-            self.rounded = 0.0
         self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
+        # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
+        self.rounded = 0.0 if isinstance(material, Isotropic) else self._size()
         self.body_force, self._traction, self._extra_form = body_force, traction, extra_form
         quadrature_degree = quadrature_degree or 2 * degree
         self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
@@ -321,6 +322,13 @@ class Continuum:
         return Surface(self, found, smoothing)
 
     # ---- set-up
+    def _size(self) -> float:
+        """Largest side of the box around the body [m], the same on all ranks. Collective."""
+        x = self.reference.reshape(-1, 3)
+        ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
+        self.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+        return float(ends.sum(axis=0).max())
+
     def _boundary_measure(self, degree: int) -> Any:
         indices = [
             _facets(self.mesh, load.where, f"Traction.where of traction[{k}] of {self.name!r}")

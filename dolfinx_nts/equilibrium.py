@@ -252,7 +252,7 @@ def equilibrium(
     Constant loads (gravity, body forces, tractions) grow in proportion to the pseudo time and are
     complete at 1; loads and Dirichlet values given as functions of time are taken at the pseudo
     time; constant Dirichlet values hold from the start. Velocities and mass play no part. A load
-    step that is not solved is halved, up to `newton.max_retries` times.
+    step that is not solved is cut, up to `newton.max_retries` times.
 
     A body that nothing but contact holds has an equilibrium only once the contact is closed: nodes
     that touch at the start count as closed, so a block that stands on its support needs nothing

@@ -131,7 +131,8 @@ def describe(system: Any, u: Sequence[FloatArray], dets: FloatArray) -> str:
     found = system.comm.allgather(body.smallest_det(u[worst]))
     det, place = min(found, key=lambda one: one[0])
     x = ", ".join(f"{c:.4g}" for c in place)
+    turns = "is nearly" if det > 0.0 else "turns"
     return (
-        f"a cell of body {body.name!r} turns inside out, which W(C) cannot see: det F = {det:.3g} "
-        f"near X = ({x})"
+        f"a cell of body {body.name!r} {turns} inside out, which W(C) cannot see: det F = "
+        f"{det:.3g} near X = ({x})"
     )

@@ -36,7 +36,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "snes_linesearch_type": "basic",
         "ksp_type": "fgmres",
         "ksp_pc_side": "right",
-        # Looser costs Newton iterations, and their number then hangs on rounding and units.
+        # Looser costs Newton iterations, and their number then depends on rounding and units.
         "ksp_rtol": 1e-5,
         "ksp_gmres_restart": 60,
         "ksp_max_it": 300,

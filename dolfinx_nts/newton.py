@@ -108,9 +108,11 @@ ACCURACY: Mapping[str, Newton] = {
 }
 #: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
 _SLOW = 0.05
-#: A residual that hardly falls, this many times its tolerance or less, may be rounding of forces
-#: that have grown since rounding was measured.
-_STALLED, _NEAR = 0.5, 1e4
+#: A residual that keeps more than this part of itself in an iteration ...
+_STALLED = 0.5
+#: ... and is at most this many tolerances large may be the rounding of forces that have grown since
+#: rounding was measured.
+_NEAR = 1e4
 #: Of the tolerance, what an iteration aims at that could be the last: a step that only just
 #: converges would leave its whole tolerance to the ledger, where factors leave rounding.
 _AIM = 1e-3
@@ -127,9 +129,9 @@ _SHORTENED = 5
 #: In every so many-th iteration an iterate that is inside out ends the attempt: Newton's method
 #: hardly ever comes back, and most steps never get there.
 _INSIDE_OUT = 8
-#: Residual over its tolerance from which an iteration may be the last.
+#: An iteration from a residual of this many tolerances, or less, may be the last.
 _LAST = 1e5
-#: The same above which one more iteration is worth it where residuals add up.
+#: Where residuals add up over steps, one above this part of its tolerance gets one more iteration.
 _SURE = 0.05
 #: Changes of one node's state in a step that are no search any more.
 _CYCLE = 8
@@ -216,7 +218,7 @@ class StepSolver:
         for retry in range(3 if self.problem.may_slip else 2):
             self._careful, self._shortened = retry > 0, 0
             if retry:
-                self._matrices_due = True
+                self._matrices_due, self._passed = True, None
                 if retry == 2:
                     self.problem.let_slip()
                 self.problem.guess(flight=False)
@@ -241,7 +243,7 @@ class StepSolver:
                     f"with error {error.ierr}{self._with_options()}; two contacts, or a contact "
                     "and a support, may hold the same nodes"
                 ) from error
-            last = self._at(self.problem.x)
+            last = self._passed or self._at(self.problem.x)
             iterations += self.snes.getIterationNumber()
             # A solver of the user's may stop SNES by its own tests; ours decide.
             solved = last is self._passed or self._worst(last) <= 1.0
@@ -392,6 +394,9 @@ class StepSolver:
             self._passed = self._last
             if enough or worst <= _SURE or not self._adds_up():
                 return reasons.CONVERGED_FNORM_RELATIVE
+        elif self._passed is not None:
+            # One more iteration left rounding only: what it started from is the solution.
+            return reasons.CONVERGED_FNORM_RELATIVE
         late = iteration > 0 and iteration % _INSIDE_OUT == 0
         if self._shortened >= _SHORTENED or (late and self._is_inside_out()):
             return reasons.DIVERGED_FUNCTION_DOMAIN

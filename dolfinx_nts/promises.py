@@ -23,6 +23,8 @@ _LEAST = 1e-11
 #: Part of the energy whose loss from the ledger makes a result doubtful, with a rule that closes
 #: it and with one that does not.
 _DOUBTFUL, _OPEN = 1e-3, 1e-2
+#: Tolerance of Newton's method of accuracy="exact".
+_EXACT = 1e-12
 _EPS = float(np.finfo(float).eps)
 #: Rounding of a step's energy over that of its forces times its motion.
 _ROUNDING = 10.0
@@ -35,10 +37,14 @@ class Promises:
         solution: Where warnings go.
         closes: Whether the integrator closes the ledger.
         rtol: Tolerance of Newton's method.
+        exact: Whether its discrete gradient of the stored energy is exact for any W.
     """
 
-    def __init__(self, solution: Solution, *, closes: bool, rtol: float) -> None:
+    def __init__(self, solution: Solution, *, closes: bool, rtol: float, exact: bool) -> None:
         self._solution, self._closes = solution, closes
+        self._remedy = "use a smaller dt" if rtol <= _EXACT else 'pass accuracy="exact"'
+        if not exact:
+            self._remedy += ', or stress="gonzalez": a mean-value stress is exact for some W only'
         self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if closes else _OPEN
         self._largest, self._rounding = 0.0, 0.0
 
@@ -56,8 +62,8 @@ class Promises:
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         moved = np.sqrt(problem.system.comm.allreduce(squares))
         self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
-        # Where nothing moves, the work of forces over the rounding of places is all there is.
-        self._rounding += _EPS * impulses / problem.dt * problem.extent
+        # Where nothing moves, forces still do work over the rounding of positions.
+        self._rounding += _EPS * impulses / problem.dt * problem.rounded_length
         missing = abs(row["ledger_residual"])
         if missing <= self._promise * self._largest + self._rounding:
             return
@@ -65,7 +71,7 @@ class Promises:
         if self._closes:
             text = (
                 f"the ledger misses {missing:.3g} J, {part:.2g} of the largest energy, where this "
-                f'accuracy promises {self._promise:.0e}; pass accuracy="exact", or a smaller dt'
+                f"accuracy promises {self._promise:.0e}; {self._remedy}"
             )
         else:
             text = (

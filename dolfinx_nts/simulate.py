@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
@@ -40,6 +41,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Part of the energy by which changes of facet may raise it in a step without a warning.
 _NOTABLE_GAIN = 0.01
+#: Depth in facet sizes from which on a node behind a surface that it passed by is told.
+_BESIDE = 1e-3
 #: Searches for contact, each along the motion that came of the one before.
 _SEARCHES = 4
 #: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
@@ -55,7 +58,7 @@ class Solution:
         status: "completed"; "completed, but ..." with what may be wrong in it; or why the run
             stopped and what to do.
         rows: Balance table, one row for the start and one per accepted step; some 150 B each.
-        retries: How often a step was dropped and halved.
+        retries: How often a step was dropped and cut.
         rejected: How often a step was dropped for its error and shortened, see `Adapt`.
         exceeded: Steps taken though their motion errs more than `Adapt` asks for: the shortest it
             may take, and those that move nodes out from behind their facets.
@@ -214,7 +217,10 @@ class Stepper:
         self._accept(_first_state(system, start))
         self.solution = Solution(system, rows=Table([balance.first_row(system, self.state)]))
         self._promises = Promises(
-            self.solution, closes=integrator.closes_ledger, rtol=self.newton.rtol
+            self.solution,
+            closes=integrator.closes_ledger,
+            rtol=self.newton.rtol,
+            exact=getattr(integrator, "stress", "gonzalez") == "gonzalez",
         )
         self._materials, self._material_change = MaterialWatch(system), 0.0
 
@@ -377,16 +383,18 @@ class Stepper:
             StepFailedError: No search found all contacts.
         """
         problem, iterations = self.problem, step.iterations
-        for _ in range(_SEARCHES):
+        for k in range(_SEARCHES + 1):
             if not problem.misses(step):
                 return replace(step, iterations=iterations)
-            problem.begin(problem.state, problem.dt, step)
-            step = self.solver.solve()
-            iterations += step.iterations
+            if k < _SEARCHES:
+                problem.begin(problem.state, problem.dt, step)
+                step = self.solver.solve()
+                iterations += step.iterations
         far = float(problem.motion(step).max())
         raise StepFailedError(
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
-            f"{far:.3g} m, too far to find their contacts"
+            f"{far:.3g} m, and no search found all contacts on the way of their nodes; use a "
+            "smaller dt"
         )
 
     def _take(self, trial: Trial) -> None:
@@ -412,7 +420,25 @@ class Stepper:
                 "smoother master, or a smaller, constant dt",
                 grave=True,
             )  # fmt: skip
+        self._tell_beside()
         self.look()
+
+    def _tell_beside(self) -> None:
+        """Warn of nodes that have passed by a surface's edge and lie behind it."""
+        found = self.problem.beside
+        deepest = np.array([depth for depth, _ in found])
+        self.system.comm.Allreduce(MPI.IN_PLACE, deepest, op=MPI.MAX)
+        if deepest.max(initial=0.0) <= _BESIDE:
+            return
+        k = int(deepest.argmax())
+        nodes = self.system.comm.allgather(found[k])
+        depth, node = max(nodes)
+        self.solution.warn(
+            "node beside a surface", self.state.time, depth,
+            f"node {node} of contact {self.system.contacts[k].name!r} has passed the master's edge "
+            f"and lies {depth:.3g} of a facet behind its surface, where nothing holds it; let the "
+            "master's surface reach farther",
+        )  # fmt: skip
 
     def _tell_inversion(self, step: Evaluation) -> None:
         if step.min_det <= 0.0:

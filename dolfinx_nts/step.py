@@ -33,12 +33,13 @@ BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
-#: Roundings of the positions within which a gap counts as closed by nothing.
+#: A gap of this many roundings of positions, or of forces, that is closed without force is no
+#: contact.
 _TOUCH = 4.0
 #: Relative difference of the factors of two equal steps, which differ by rounding.
 EQUAL = 1e-6
-#: Path of a node over an obstacle's radius, and depth below both ends, from which on it passes
-#: through.
+#: A node passes through an obstacle if its path is longer than this part of the radius, and lies
+#: this part of it deeper than both ends.
 _PASSING = 0.1
 #: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
 _ANOTHER_STEP = 4.0
@@ -112,6 +113,7 @@ class StepProblem:
         version: Changes whenever layout and elements do.
         factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
         rtol: As given.
+        centre: Middle of all bodies in the reference [m], shape (3,).
         stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
     """
 
@@ -130,6 +132,8 @@ class StepProblem:
         self.version = 0
         self.stabilization = 0.0
         self._cover = [0.0] * len(system.contacts)
+        self._beside = [(0.0, -1)] * len(system.contacts)
+        self.centre, self._span = _box(system)
         self._diagonal, self._diagonal_factor = np.zeros((2, len(system.bodies)))
 
     # ---- set-up of a step
@@ -173,7 +177,8 @@ class StepProblem:
         else:
             self._motion = np.maximum(self._motion, self.motion(again))
             self._ahead = [terms.du for terms in again.bodies]
-        self._length = self._moved + self._motion
+        # Bodies at rest may fall.
+        self._length = self._moved + self._motion + dt**2 * float(np.linalg.norm(self._gravity))
         # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
         old = self._diagonal_factor
         other = (self.factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * self.factor)
@@ -306,7 +311,7 @@ class StepProblem:
         paths = [self._ahead[b] for b in self.system.contact_bodies[index]]
         moved = self._paths[index][0] if pair.rigid else None
         positions = pair.positions(u)
-        found, self._followed[index], self._cover[index] = pair.find(
+        found, self._followed[index], self._cover[index], self._beside[index] = pair.find(
             positions,
             state.facets[index],
             moved,
@@ -326,8 +331,16 @@ class StepProblem:
         else:
             master = self._scale(pair.master)[pair.master.patches[found.facet]]
             step = ContactStep(pair, found, rule, condense, x0, scale, theta, master_scale=master)
-        way = max(self._moved[b] + self._motion[b] for b in self.system.contact_bodies[index])
-        return replace(step, rounding=_TOUCH * _EPS * (step.extent + float(way)))
+        bodies = self.system.contact_bodies[index]
+        rounding = _EPS * (step.extent + float(max(self._length[b] for b in bodies)))
+        if pair.friction:
+            # A force that is rounding of the bodies' own would stick or slip by its sign.
+            for b in bodies:
+                if not self._diagonal[b]:
+                    self._measure_rounding(b)
+            forces = float(self.rounding[list(bodies)].sum())
+            rounding = max(rounding, forces / float(self._scale(slave).min()))
+        return replace(step, rounding=_TOUCH * rounding)
 
     def _scale(self, surface: Any) -> FloatArray:
         """Force per motion of a surface's points, shape (p,), see `ContactStep`. Collective."""
@@ -626,9 +639,22 @@ class StepProblem:
         return float(self.rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
 
     @property
-    def extent(self) -> float:
-        """Distance of the bodies' farthest coordinate from the origin [m]."""
-        return float(self._extent.max())
+    def span(self) -> float:
+        """Distance of the bodies' farthest coordinate from `centre` [m], at most."""
+        return self._span + float((self._moved + self._motion).max())
+
+    @property
+    def rounded_length(self) -> float:
+        """Largest length whose rounding enters forces and gaps [m]."""
+        return max(self.span, *(c.extent for c in self.contacts), 0.0)
+
+    @property
+    def beside(self) -> list[tuple[float, int]]:
+        """How deep in facet sizes nodes that passed a surface's edge lie behind it, and the node.
+
+        Of each contact this rank's deepest at t_n, in input numbers; see `ContactPair.find`.
+        """
+        return self._beside
 
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
@@ -755,6 +781,16 @@ def _global_max(comm: Any, values: FloatArray) -> FloatArray:
     out = np.array(values, dtype=np.float64)
     comm.Allreduce(MPI.IN_PLACE, out, op=MPI.MAX)
     return out
+
+
+def _box(system: System) -> tuple[FloatArray, float]:
+    """Middle of the box around all bodies' reference and half its diagonal [m]. Collective."""
+    ends = np.full((2, 3), -np.inf)
+    for body in system.bodies:
+        x = body.reference.reshape(-1, 3)
+        np.maximum(ends, [x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)], ends)
+    high, low = _global_max(system.comm, ends) * [[1.0], [-1.0]]
+    return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
 
 
 def _over(value: float, limit: float) -> float:

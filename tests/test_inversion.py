@@ -15,7 +15,7 @@ from dolfinx_nts.step import StepProblem
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
-SENTENCE = "a cell of body 'cube' turns inside out, which W(C) cannot see: det F = "
+SENTENCE = "inside out, which W(C) cannot see: det F = "
 
 
 def cube(n=2, size=(1.0, 1.0, 1.0), comm=COMM, cell=CellType.hexahedron, **options):
@@ -206,7 +206,8 @@ def test_on_request_it_goes_on_and_says_so(mpi_tmp_path):
     watch, path = Watch(), mpi_tmp_path / "balance.csv"
     output = [watch, BalanceCSV(path)]
     run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=5e-4, output=output)
-    assert run.status.startswith(f"completed, but {SENTENCE}-")
+    assert run.status.startswith("completed, but a cell of body 'cube' turns")
+    assert f"{SENTENCE}-" in run.status
     inverted = run.balance["min_det"] <= 0.0
     assert run.warnings["inversion"].count == inverted.sum() > 0
     assert run.warnings["inversion"].first == run.balance["time"][inverted][0]
@@ -224,7 +225,7 @@ def test_statics(allowed):
     system = squeezed(0.9, 3, allow_inversion=allowed)
     run = nts.equilibrium(system, load_steps=10, newton=nts.Newton(max_retries=2))
     if allowed:
-        assert run.status.startswith(f"completed, but {SENTENCE}-")
+        assert run.status.startswith("completed, but ") and f"{SENTENCE}-" in run.status
         assert run.balance["min_det"][-1] < 0.0 < run.balance["min_det"][1]
         assert run.balance["min_det"][-1] < corner_dets(system.bodies[0]) + 1e-12
     else:

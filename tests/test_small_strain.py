@@ -172,7 +172,10 @@ def test_floor_of_short_steps_is_rounding(dt):
     assert np.abs(table["ledger_residual"]).max() < 5e-13 * table["energy"][0]
 
 
-def impact(speed, gap, away=0.0):
+RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
+
+
+def impact(speed, gap, away=0.0, material=RUBBER):
     """A cube flies squarely into another one, which lies `away` from the origin in x, y and z."""
     low = np.full(3, away)
     near = 1e-3 * min(1.0, gap) + 4e-16 * away
@@ -181,7 +184,7 @@ def impact(speed, gap, away=0.0):
     left, right = (
         nts.Continuum(
             create_box(COMM, ends, [n] * 3, **box),
-            nts.NeoHookean(young=1e6, poisson=0.3),
+            material,
             density=1e3,
             velocity=velocity,
             name=name,
@@ -212,3 +215,9 @@ def test_ledger_of_a_slow_impact(speed):
 def test_ledger_far_from_the_origin(away):
     """What the mesh's own rounding leaves of the cubes is as exact as at the origin."""
     assert impact(2.0, 0.05, away) < 1e-11
+
+
+@pytest.mark.mpi
+def test_ledger_of_an_energy_of_c_far_from_the_origin():
+    """Nor does its floor grow with the distance: the same energy as a function of C."""
+    assert impact(2.0, 0.05, 1e10, lambda c: RUBBER(c)) < 1e-11

@@ -48,6 +48,25 @@ def test_a_cube_flush_with_a_wall_falls_freely(meshed, friction, accuracy):
     assert run.balance["min_gap"].min() > -2e-15
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("cells", [2, 4])
+def test_a_cube_of_steel_flush_with_a_wall_falls_freely(cells):
+    """Rounding of its own forces, a million times that of its weight, presses it to the wall."""
+    mesh = create_box(
+        COMM, [[0, 0, 0], [1, 1, 1]], [cells] * 3, CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    steel = nts.StVenantKirchhoff(young=2e11, poisson=0.3)
+    cube = nts.Continuum(mesh, steel, density=1e3)
+    wall = nts.Plane((0, 0, 0), (1, 0, 0))
+    pair = nts.ContactPair(cube.surface(lambda x: x[0] < 1e-9), wall, friction=50.0)
+    system = nts.System([cube], contacts=[pair], gravity=(0, 0, -GRAVITY))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.06)
+    assert run.status == "completed" and run.retries == 0
+    momentum = run.balance["linear_momentum"][-1]
+    assert np.allclose(momentum, [0, 0, -1e3 * GRAVITY * 0.06], rtol=0, atol=1e-9 * 1e3)
+
+
 # ---- no normal force that friction could be in proportion to
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
