@@ -15,7 +15,8 @@ RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 
 def box(low, high, cells):
     kind, ghosts = CellType.hexahedron, GhostMode.shared_facet
-    return create_box(COMM, [np.array(low, float), np.array(high, float)], cells, kind, ghosts)
+    ends = [np.array(low, float), np.array(high, float)]
+    return create_box(COMM, ends, cells, kind, ghost_mode=ghosts)
 
 
 def plate(value=(0.0, 0.0, 0.0), *, width=4.0, thickness=0.02, cells=8):
