@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -45,7 +46,7 @@ def check_momentum(
     Raises:
         StepFailedError: The step is wrong.
     """
-    local = np.zeros(8)
+    local = np.zeros(9)
     for body, terms, u0, v0, v1 in zip(
         problem.system.bodies, step.bodies, problem.state.u, problem.state.v, state.v, strict=True
     ):
@@ -56,7 +57,9 @@ def check_momentum(
         parts = (terms.internal, terms.external, terms.contact)
         local[6] += sum(float(np.abs(p).sum()) for p in parts)
         local[7] += 0.5 * problem.dt * float(body.nodal_mass @ (np.abs(v0) + np.abs(v1)))
+        local[8] += float(terms.du @ terms.du)
     total = problem.system.comm.allreduce(local)
+    arm = problem.span + math.sqrt(total[8])
     total /= 0.5 * problem.dt
     activity = total[6] + total[7]
     allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * activity + problem.momentum_rounding
@@ -65,7 +68,7 @@ def check_momentum(
     turn = after["angular_momentum"] - before["angular_momentum"] - total[3:6]
     turn -= np.cross(problem.centre, off)
     far = _FAR * float(np.linalg.norm(problem.centre)) * activity
-    checks = (("linear", off, allowed), ("angular", turn, problem.span * allowed + far))
+    checks = (("linear", off, allowed), ("angular", turn, arm * allowed + far))
     for name, error, limit in checks:
         size = float(np.abs(error).max())
         if not size <= limit:
