@@ -179,6 +179,9 @@ class StepProblem:
             self._ahead = [terms.du for terms in again.bodies]
         # Bodies at rest may fall.
         self._length = self._moved + self._motion + dt**2 * float(np.linalg.norm(self._gravity))
+        # A body at rest beside a moving one gets the rounding of the linear solve for both.
+        for bodies in map(list, system.contact_bodies):
+            self._length[bodies] = self._length[bodies].max()
         # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
         old = self._diagonal_factor
         other = (self.factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * self.factor)
