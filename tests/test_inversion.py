@@ -85,7 +85,8 @@ def test_a_corner_pushed_in(part):
         return np.where(np.isclose(x, far).all(axis=1)[:, None], part * far, x)
 
     det, place = body.smallest_det(displace(body, push))
-    assert det == pytest.approx(3 * part - 2, abs=1e-14)
+    # Coordinates that DOLFINx interpolates are rounded (0.9): by 3 edges times 2 eps and the slope.
+    assert det == pytest.approx(3 * part - 2, abs=1e-13)
     assert np.allclose(place, far / 2)
 
 
