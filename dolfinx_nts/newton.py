@@ -126,6 +126,7 @@ _KEPT_DET = 0.1
 _HALVINGS = 10
 #: ... and in so many iterations in a row before the step is dropped.
 _SHORTENED = 5
+_AGAINST_INVERSION = "smaller loads, a finer mesh or another energy may prevent it"
 #: In every so many-th iteration an iterate that is inside out ends the attempt: Newton's method
 #: hardly ever comes back, and most steps never get there.
 _INSIDE_OUT = 8
@@ -379,13 +380,14 @@ class StepSolver:
         worst = self._worst(self._last)
         if not np.isfinite(norms[2]) or not np.isfinite(worst):
             return reasons.DIVERGED_FNORM_NAN
+        unchanged = self.problem.system.comm.allreduce(self._rests, op=MPI.LAND)
         stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
-        near = worst < _NEAR or not self.problem.knows_rounding
+        # An active set that still changes stalls by itself, not by rounding.
+        near = worst < _NEAR or (unchanged and not self.problem.knows_rounding)
         if stalls and near and not self._measured:
             self.problem.measure_rounding(self._last)
             self._measured = self._matrices_due = True
             worst = self._worst(self._last)
-        unchanged = self.problem.system.comm.allreduce(self._rests, op=MPI.LAND)
         self._solved |= iteration > 0
         self._matrices_due |= unchanged and worst > max(1.0, _SLOW * self._before)
         self._before = worst
@@ -475,21 +477,20 @@ class StepSolver:
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
             return (
                 f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
-                f"{iterations} iterations: {describe(problem.system, u, dets)}; smaller loads, a "
-                "finer mesh or another energy may prevent it, Continuum(..., allow_inversion=True) "
-                "accepts it"
+                f"{iterations} iterations: {describe(problem.system, u, dets)}; "
+                f"{_AGAINST_INVERSION}, Continuum(..., allow_inversion=True) accepts it"
             )
         message = self._diagnosis(e, reason, iterations)
-        if dets.min() > _KEPT_DET:
+        if not dets.min() <= _KEPT_DET:
             return message
-        return f"{message}; {describe(problem.system, u, dets)}"
+        return f"{message}; {describe(problem.system, u, dets)}; {_AGAINST_INVERSION}"
 
     def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:
         """One sentence that names what failed and where; every rank must call it."""
         problem = self.problem
         with np.errstate(over="ignore", invalid="ignore"):
             found = problem.ratios(e)
-        ratio = {k: float(np.nan_to_num(r, nan=np.inf)) for k, r in found.items()}
+        ratio = {k: r if np.isfinite(r) else np.inf for k, r in found.items()}
         worst = max(ratio, key=lambda name: ratio[name])
         notes = [
             _contact_note(c, k, flips)
@@ -507,16 +508,27 @@ class StepSolver:
         trouble = {name: max(r for k, r in ratio.items() if k.startswith(name)) for name in best}
         top = [best[name] for name in sorted(best, key=lambda name: -trouble[name])[:4]]
         why = f"SNES reason {reason}"
+        endless = [
+            body.name
+            for body, terms in zip(problem.system.bodies, e.bodies, strict=True)
+            if not problem.system.comm.allreduce(np.isfinite(terms.internal).all(), op=MPI.LAND)
+        ]
+        if endless:
+            why += (
+                f"; the stresses of {', '.join(map(repr, endless))} are not finite: its W(C) may "
+                "not be defined for this strain"
+            )
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
             ksp = self.snes.getKSP().getConvergedReason()
             why = f"the linear solver {self._presets[self._chosen]!r} failed, KSP reason {ksp}"
             why += self._with_options()
             if self._presets == ("krylov",):
                 why += "; linear_solver='auto' goes on with MUMPS where that happens"
+        finite = ratio[worst] < np.inf
+        size = f"at {ratio[worst]:.3g} times its tolerance" if finite else "is not finite"
         return (
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
-            f"{iterations} iterations ({why}); worst block {worst!r} at "
-            f"{ratio[worst]:.3g} times its tolerance; {'; '.join(top)}"
+            f"{iterations} iterations ({why}); worst block {worst!r} {size}; {'; '.join(top)}"
         )
 
     def _with_options(self) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from dolfinx_nts import balance
 from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ _LEAST = 1e-11
 #: Part of the energy whose loss from the ledger makes a result doubtful, with a rule that closes
 #: it and with one that does not.
 _DOUBTFUL, _OPEN = 1e-3, 1e-2
+#: Part of the energy that contact may bring, in a step or in a run, without a warning.
+_GAIN = 0.01
 #: Tolerance of Newton's method of accuracy="exact".
 _EXACT = 1e-12
 _EPS = float(np.finfo(float).eps)
@@ -49,7 +52,7 @@ class Promises:
         self._largest, self._rounding = 0.0, 0.0
 
     def hold(self, problem: StepProblem, step: Evaluation, impulses: float) -> None:
-        """Warn if the ledger of the last accepted row misses too much. Collective.
+        """Warn if the last row's ledger misses too much, or contact brought energy. Collective.
 
         Args:
             problem: Equations of the step.
@@ -64,6 +67,7 @@ class Promises:
         self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
         # Where nothing moves, forces still do work over the rounding of positions.
         self._rounding += _EPS * impulses / problem.dt * problem.rounded_length
+        self._tell_gain(problem, step)
         missing = abs(row["ledger_residual"])
         if missing <= self._promise * self._largest + self._rounding:
             return
@@ -81,6 +85,27 @@ class Promises:
             )
         doubtful = part > (_DOUBTFUL if self._closes else _OPEN)
         self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
+
+    def _tell_gain(self, problem: StepProblem, step: Evaluation) -> None:
+        """Warn if contact has brought energy, in this step or in all. Collective."""
+        before, row = self._solution.rows[-2:]
+        total = -row["contact_defect"]
+        gain = total + before["contact_defect"]
+        remedy = "use a finer or smoother master, or a smaller, constant dt"
+        if gain > _GAIN * abs(row["energy"]):
+            where = balance.expelled(problem, step)
+            text = (
+                f"nodes that start behind their facets bring {gain:.3g} J to "
+                f"{before['energy']:.3g} J, most {where}; after changes of facet {remedy}"
+            )
+        elif total > _GAIN * self._largest:
+            gain, text = total, (
+                f"nodes that start steps behind their facets have brought {total:.3g} J in all, "
+                f"{total / self._largest:.2g} of the largest energy; {remedy}"
+            )
+        else:
+            return
+        self._solution.warn("energy from behind facets", row["time"], gain, text, grave=True)
 
 
 class MaterialWatch:

@@ -39,10 +39,10 @@ logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Part of the energy by which changes of facet may raise it in a step without a warning.
-_NOTABLE_GAIN = 0.01
 #: Depth in facet sizes from which on a node behind a surface that it passed by is told.
 _BESIDE = 1e-3
+#: What a step chosen by its error is cut to: halves would soon end where it has failed.
+_CUT = 0.4
 #: Searches for contact, each along the motion that came of the one before.
 _SEARCHES = 4
 #: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
@@ -273,7 +273,7 @@ class Stepper:
             end: Where to stop [s].
 
         Raises:
-            StepFailedError: Not solved even after `newton.max_retries` halvings in a row, or as in
+            StepFailedError: Not solved even after `newton.max_retries` cuts in a row, or as in
                 `advance`.
         """
         self.start(pace.dt)
@@ -295,7 +295,7 @@ class Stepper:
                     raise
                 retries += 1
                 self.solution.retries += 1
-                pace.dt = 0.5 * dt
+                pace.dt = _CUT * dt
                 logger.info("%s; retrying with dt=%.3g", failure, pace.dt)
                 continue
             if not pace.accepts(self.problem, trial.step):
@@ -410,16 +410,6 @@ class Stepper:
         self._recent.append((time - self.state.time, state.force))
         self._accept(state)
         self._tell_inversion(step)
-        gain = -terms["contact_defect"]
-        if gain > _NOTABLE_GAIN * abs(rows[-1]["energy"]):
-            where = balance.expelled(self.problem, step)
-            self.solution.warn(
-                "energy from behind facets", time, gain,
-                f"nodes that start behind their facets bring {gain:.3g} J to "
-                f"{rows[-2]['energy']:.3g} J, most {where}; after changes of facet use a finer or "
-                "smoother master, or a smaller, constant dt",
-                grave=True,
-            )  # fmt: skip
         self._tell_beside()
         self.look()
 

@@ -1,15 +1,63 @@
 """What accuracy promises of the energy is held against each step; what breaks it is named."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from test_single_mass import PointMass
 
 import dolfinx_nts as nts
+from dolfinx_nts.promises import Promises
 
 COMM = MPI.COMM_WORLD
+
+
+def limited(c):
+    """A material that is defined up to tr C = 3.05 only, as fibres that cannot be longer are."""
+    stretch, j = ufl.tr(c) - 3.0, ufl.det(c)
+    return -1e4 * ufl.ln(1.0 - stretch / 0.05) - 2e5 * ufl.ln(j) + 5e4 * ufl.ln(j) ** 2
+
+
+@pytest.mark.mpi
+def test_a_material_that_is_not_defined_is_named():
+    mesh = create_box(
+        COMM, [np.zeros(3), np.ones(3)], [2, 2, 2],
+        cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    body = nts.Continuum(mesh, limited, density=1e3, velocity=(0.0, 0.0, -20.0), name="fibres")
+    pair = nts.ContactPair(
+        slave=body.surface(lambda x: x[2] < 1e-9), master=nts.Plane((0, 0, 0), (0, 0, 1))
+    )
+    system = nts.System([body], contacts=[pair])
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=2e-3, t_end=0.05, newton=nts.Newton(max_retries=1)
+    )
+    assert "the stresses of 'fibres' are not finite: its W(C) may not be defined" in run.status
+
+
+def test_energy_that_contact_brings_in_small_parts_is_told():
+    """No step of ten wins 1 % of the energy, all of them together 5 %."""
+    told = []
+    solution = SimpleNamespace(warn=lambda kind, *rest, **_: told.append((kind, *rest)))
+    stepper = nts.Stepper(nts.System([Sprung(1.0)]), nts.EnergyMomentum())
+    stepper.problem.begin(stepper.state, 0.05)
+    step = stepper.solver.solve()
+    promises = Promises(solution, closes=True, rtol=1e-12, exact=True)
+    for k in range(1, 11):
+        row = dict(stepper.solution.rows[-1], energy=1.0, kinetic=1.0)
+        solution.rows = [
+            row | {"time": float(i), "contact_defect": -0.005 * i} for i in (k - 1, k)
+        ]
+        promises.hold(stepper.problem, step, 0.0)
+    stepper.close()
+    assert [(kind, time) for kind, time, *_ in told] == [
+        ("energy from behind facets", float(k)) for k in range(3, 11)
+    ]
+    assert "0.05 of the largest energy" in told[-1][-1]
 
 
 class Sprung(PointMass):
