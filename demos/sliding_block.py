@@ -114,7 +114,7 @@ def system(
     if spring:
         stiffness = DENSITY * FREQUENCY**2
         pulled["body_force"] = lambda t: (stiffness * spring_end(t - 1.0), 0.0, 0.0)
-        pulled["extra_form"] = lambda u, v, w: stiffness * u[0] * w[0] * ufl.dx
+        pulled["extra_form"] = lambda u, v, w, t: stiffness * u[0] * w[0] * ufl.dx
     block = nts.Continuum(
         mesh,
         nts.StVenantKirchhoff(young=young, poisson=0.0),

@@ -2,10 +2,17 @@
 
 from importlib.metadata import version
 
+from dolfinx_nts.body import Body, Moment
 from dolfinx_nts.contact import ContactPair
-from dolfinx_nts.continuum import Body, Continuum, Dirichlet, Traction
+from dolfinx_nts.continuum import Continuum, Dirichlet, Traction
 from dolfinx_nts.equilibrium import Equilibrium, equilibrium
-from dolfinx_nts.integrators import EnergyMomentum, Midpoint
+from dolfinx_nts.integrators import (
+    EnergyMomentum,
+    GeneralizedAlpha,
+    Integrator,
+    Midpoint,
+    Newmark,
+)
 from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.newton import Newton
@@ -27,10 +34,14 @@ __all__ = [
     "Dirichlet",
     "EnergyMomentum",
     "Equilibrium",
+    "GeneralizedAlpha",
+    "Integrator",
     "Isotropic",
     "Midpoint",
+    "Moment",
     "MooneyRivlin",
     "NeoHookean",
+    "Newmark",
     "Newton",
     "Plane",
     "Solution",

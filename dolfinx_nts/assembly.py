@@ -500,3 +500,24 @@ def model_problem(
     bodies = PETSc.IS().createStride(count, start, 1, comm=comm)
     contact = PETSc.IS().createStride(extra, start + count, 1, comm=comm)
     return a, (("bodies", bodies), ("contact", contact))
+
+
+def solve_mass(mass: Any, right: FloatArray) -> FloatArray:
+    """Solution of M x = right, owned entries. Collective.
+
+    Args:
+        mass: PETSc matrix of one body, positive definite.
+        right: Owned entries.
+    """
+    x, b = mass.createVecs()
+    b.array_w[:] = right
+    ksp = PETSc.KSP().create(mass.getComm())
+    ksp.setType("cg")
+    ksp.getPC().setType("jacobi")
+    ksp.setTolerances(rtol=1e-14, max_it=1000)
+    ksp.setOperators(mass)
+    ksp.solve(b, x)
+    solution: FloatArray = x.array_r.copy()
+    for a in (x, b, ksp):
+        a.destroy()
+    return solution

@@ -1,8 +1,4 @@
-"""Flexible bodies: hexahedral or tetrahedral DOLFINx meshes with a strain energy in UFL.
-
-`Body` is the protocol a System accepts; `Continuum` is the flexible body. All arrays cover the
-coordinates this rank owns.
-"""
+"""Flexible bodies: hexahedral or tetrahedral DOLFINx meshes with a strain energy in UFL."""
 
 from __future__ import annotations
 
@@ -11,7 +7,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +18,8 @@ from mpi4py import MPI
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.integrators import Static
+from dolfinx_nts.body import Moment
+from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.inversion import Determinants
 from dolfinx_nts.materials import misfit
 from dolfinx_nts.mesh_check import check_mesh
@@ -52,89 +49,6 @@ VectorInTime = Vector | Callable[[float], Vector]
 _STRESS_FREE = 1e-6
 #: Strain that tells the stiffness: of the size that leaves linear terms and rounding far apart.
 _SMALL_STRAIN = 1e-4
-
-
-class Body(Protocol):
-    """What a System asks of a body with coordinates q = X + u and a constant mass matrix (39).
-
-    Attributes:
-        name: Unique in a system.
-        comm: MPI communicator.
-        num_owned: Coordinates this rank owns; the global numbering is contiguous by rank.
-        reference: X [m], shape (num_owned,).
-        initial_velocity: v at the start [m/s], shape (num_owned,).
-        nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
-        fixed: Positions of the prescribed coordinates among the owned ones.
-        rounded: Length [m], the same on all ranks, whose rounding the forces hold beside that of u;
-            may be missing, and is that of the positions then.
-    """
-
-    name: str
-    comm: Any
-    num_owned: int
-    reference: FloatArray
-    initial_velocity: FloatArray
-    nodal_mass: FloatArray
-    fixed: IntArray
-
-    def begin_step(
-        self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float
-    ) -> None:
-        """Fix what a step from `time` over `dt` does not change."""
-
-    def inertia(self, v: FloatArray) -> FloatArray:
-        """M v."""
-
-    def internal(self, u1: FloatArray) -> FloatArray:
-        """Discrete gradient of the potential between t_n and t_{n+1} [N]."""
-
-    def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
-        """External forces of the step [N]; their work is f . (u_1 - u_0)."""
-
-    def tangent(self, u1: FloatArray) -> Any:
-        """PETSc matrix M + factor d(internal - external)/du_1, without M in statics.
-
-        The same matrix in each call, with the same pattern. Rows and columns of `fixed` hold only a
-        diagonal.
-        """
-
-    def nodal_stiffness(self) -> FloatArray:
-        """Stiffness of each node's neighbourhood at rest [N/m], > 0, shape (num_owned,).
-
-        What the nodal mass is in dynamics, a scale, is this in statics, which alone asks for it.
-        """
-
-    def prescribed(self, time: float) -> FloatArray:
-        """Displacement of the `fixed` coordinates [m]."""
-
-    def reactions(self, residual: FloatArray) -> FloatArray:
-        """Resultant of a force [N] on the coordinates of each condition, this rank's part.
-
-        Args:
-            residual: Force on all owned coordinates, shape (num_owned,).
-
-        Returns:
-            Shape (conditions, 3).
-        """
-
-    def potential(self, u: FloatArray) -> float:
-        """Stored energy on this rank [J]."""
-
-    def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
-        """Smallest det F on this rank, inf without cells, and X of its cell [m], shape (3,).
-
-        A body may leave it out; else a step that ends with det F <= 0 is not accepted unless the
-        body's `allow_inversion` is True.
-        """
-
-    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
-        """This rank's part of sum x cross p about the origin [kg m^2/s], shape (3,)."""
-
-    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
-        """This rank's part of the linear momentum [kg m/s], shape (3,)."""
-
-    def accept(self, u: FloatArray, v: FloatArray) -> None:
-        """Make u and v the body's current state."""
 
 
 @known_options
@@ -201,9 +115,10 @@ class Continuum:
         traction: `Traction` loads.
         quadrature_degree: For energy, stress and mass alike; default 2 x 2 x 2 Gauss points on
             trilinear hexahedra.
-        extra_form: Further virtual work as UFL, a callable (u_m, v_m, w) -> form of the midpoint
-            displacement, velocity and test function (in statics the displacement at the end and
-            zero); it is added to the internal virtual work and its work counts as external.
+        extra_form: Further virtual work as UFL, a callable (u, v, w, t) -> form of displacement,
+            velocity and time where the integrator takes forces (the middle of the step; in statics
+            its end, at rest) and of the test function w; it is added to the internal virtual work
+            and its work counts as external.
         allow_inversion: Accept steps that turn a cell inside out, det F <= 0 at a corner or
             quadrature point, with a warning in the Solution; else such a step is cut, and the
             run stops where that does not help. W(C) cannot see it.
@@ -232,7 +147,7 @@ class Continuum:
         body_force: VectorInTime = (0.0, 0.0, 0.0),
         traction: Sequence[Traction] = (),
         quadrature_degree: int | None = None,
-        extra_form: Callable[[Any, Any, Any], Any] | None = None,
+        extra_form: Callable[[Any, Any, Any, Any], Any] | None = None,
         allow_inversion: bool = False,
     ) -> None:
         if not callable(material):
@@ -247,7 +162,7 @@ class Continuum:
                 raise ValueError(f"{option}={value!r}: must be a positive integer")
         require_name("name", name)
         if extra_form is not None and not callable(extra_form):
-            raise TypeError(f"extra_form={extra_form!r}: pass a callable (u, v, w) -> UFL form")
+            raise TypeError(f"extra_form={extra_form!r}: pass a callable (u, v, w, t) -> UFL form")
         require_bool("allow_inversion", allow_inversion)
         self.allow_inversion = allow_inversion
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
@@ -280,7 +195,7 @@ class Continuum:
         self._set_conditions(bcs)
         self._set_velocity(velocity)
         self._build_constant_forms()
-        self._compiled: dict[Any, tuple[Any, Any, Any]] = {}
+        self._compiled: dict[Integrator, tuple[Any, Any, Any]] = {}
         self._stiffness: FloatArray | None = None
         self._seen_at_rest = False
 
@@ -438,7 +353,7 @@ class Continuum:
         wanted = "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx"
         try:
             # Sums, as those that it will be given.
-            form = extra_form(self.u + self.v, self.u - self.v, w)
+            form = extra_form(self.u + self.v, self.u - self.v, w, fem.Constant(self.mesh, 0.0))
             arguments = set(form.arguments()) if isinstance(form, ufl.Form) else set()
         except Exception as error:  # any: as above
             problem, cause = f"raised {error!r}; {wanted}", error
@@ -455,50 +370,48 @@ class Continuum:
         text = f"extra_form={extra_form!r} of {self.name!r}: {problem}"
         raise_together(self.comm, text if problem else None, TypeError, cause)
 
-    def _compile(self, integrator: Any) -> tuple[Any, Any, Any]:
-        """Compiled internal virtual work, tangent and extra virtual work of an integrator."""
-        if integrator not in self._compiled:
+    def _compile(self, rule: Integrator) -> tuple[Any, Any, Any]:
+        """Compiled internal virtual work, tangent and extra virtual work by a rule."""
+        if rule not in self._compiled:
             if not self._compiled:
-                self._u0, self._u1, self._v0 = (fem.Function(self.space) for _ in range(3))
-                self._factor, self._rate = (fem.Constant(self.mesh, 1.0) for _ in range(2))
+                self._u0, self._u1, self._drift = (fem.Function(self.space) for _ in range(3))
+                # What multiplies mass and stiffness; change of the velocity with u_1; time.
+                self._a, self._b, self._rate, self._time = (
+                    fem.Constant(self.mesh, 0.0) for _ in range(4)
+                )
             du, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
             energy, h0, h1 = strain_energy(self.material), ufl.grad(self._u0), ufl.grad(self._u1)
-            work = ufl.inner(integrator.piola(energy, h0, h1), ufl.grad(w)) * self._dx
+            work = ufl.inner(rule.piola(energy, h0, h1), ufl.grad(w)) * self._dx
             virtual, extra = work, None
             if self._extra_form is not None:
-                moved, theta = self._u1 - self._u0, integrator.theta
-                extra = self._extra_form(self._u0 + theta * moved, self._rate * moved, w)
+                moved = self._u1 - self._u0
+                place, velocity = self._u0 + rule.theta * moved, self._rate * moved
+                if rule.accelerations:
+                    velocity += self._drift
+                extra = self._extra_form(place, velocity, w, self._time)
                 virtual = work + extra
-            tangent = self._factor * ufl.derivative(virtual, self._u1, du)
-            if integrator.inertia:
-                tangent += self._rho * ufl.inner(du, w) * self._dx
+            tangent = self._b * ufl.derivative(virtual, self._u1, du)
+            if rule.inertia:
+                tangent += self._a * self._rho * ufl.inner(du, w) * self._dx
             forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
-            self._compiled[integrator] = (
-                forms[0],
-                forms[1],
-                forms[2] if extra is not None else None,
-            )
+            self._compiled[rule] = forms[0], forms[1], forms[2] if extra is not None else None
             if not hasattr(self, "_matrix"):
                 self._matrix = compat.create_matrix(forms[1])
-        return self._compiled[integrator]
+        return self._compiled[rule]
 
     # ---- Body protocol
-    def begin_step(
-        self, integrator: Any, u0: FloatArray, v0: FloatArray, time: float, dt: float
-    ) -> None:
-        """Set the state at t_n, the step and its loads."""
-        scale = self.nodal_mass if integrator.inertia else self.nodal_stiffness()
-        total = self.comm.allreduce(np.array([scale.sum(), self.num_owned]))
-        self._diagonal = float(total[0] / total[1])
-        self._forms = self._compile(integrator)
+    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+        """Set the state at t_n and the loads of the step."""
+        self._rule, self._forms = rule, self._compile(rule)
         if not self._seen_at_rest:
-            self._warn_of_stress_at_rest(integrator.theta)
-        self._fill(self._u0, u0)
-        self._factor.value = integrator.factor(dt)
-        self._rate.value = 1.0 / dt if integrator.inertia else 0.0
-        when = time + integrator.theta * dt
-        for constant, (value, now) in zip(self._loads, self._loads_at(when), strict=True):
-            constant.value[:] = now if callable(value) else integrator.ramp(when) * now
+            self._warn_of_stress_at_rest(rule.theta)
+        self._fill(self._u0, moment.u0)
+        if self._extra_form is not None:
+            self._rate.value, self._time.value = moment.rate, moment.time
+            if moment.drift is not None:
+                self._fill(self._drift, moment.drift)
+        for constant, (value, now) in zip(self._loads, self._loads_at(moment.time), strict=True):
+            constant.value[:] = now if callable(value) else moment.ramp * now
         loads = np.concatenate([constant.value for constant in self._loads])
         if not np.array_equal(loads, self._assembled_loads):
             self._load, self._assembled_loads = self._assemble(self._load_form), loads
@@ -560,24 +473,36 @@ class Continuum:
             force -= self._assemble(self._forms[2])
         return force
 
-    def tangent(self, u1: FloatArray) -> Any:
-        """M + factor K, K alone in statics; contact may add to it before the next call."""
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+        """Return mass M + stiffness K; contact may add to it before the next call."""
+        diagonal = mass * self._mean(self.nodal_mass)
+        if not mass:
+            diagonal = stiffness * self._mean(self.nodal_stiffness(self._rule))
         self._fill(self._u1, u1)
-        compat.assemble_matrix(self._matrix, self._forms[1], self._bcs, self._diagonal)
+        self._a.value, self._b.value = mass, stiffness
+        compat.assemble_matrix(self._matrix, self._forms[1], self._bcs, diagonal)
         return self._matrix
 
-    def nodal_stiffness(self) -> FloatArray:
-        """Mean diagonal of the static tangent at each node of the undeformed body [N/m]."""
+    def _mean(self, values: FloatArray) -> float:
+        """Over all coordinates. Collective."""
+        total = self.comm.allreduce(np.array([values.sum(), self.num_owned]))
+        return float(total[0] / total[1])
+
+    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+        """Mean diagonal of a rule's tangent at each node of the undeformed body [N/m]."""
         if self._stiffness is None:
-            tangent = self._compile(Static())[1]
+            tangent = self._compile(rule)[1]
+            kept = [f.x.array.copy() for f in (self._u0, self._u1)]
             for u in (self._u0, self._u1):
                 self._fill(u, np.zeros(self.num_owned))
-            self._factor.value, self._rate.value = 1.0, 0.0
+            self._a.value, self._b.value, self._rate.value = 0.0, 1.0, 0.0
             compat.assemble_matrix(self._matrix, tangent, (), 0.0)
             diagonal = self._matrix.getDiagonal()
             # The mean of a node's three entries does not depend on the directions of the axes.
             self._stiffness = np.repeat(diagonal.array_r.reshape(-1, 3).mean(axis=1), 3)
             diagonal.destroy()
+            for u, values in zip((self._u0, self._u1), kept, strict=True):
+                u.x.array[:] = values
         return self._stiffness
 
     def reactions(self, residual: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts import balance
-from dolfinx_nts.continuum import Body
+from dolfinx_nts.body import Body
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.newton import Newton
 from dolfinx_nts.simulate import Solution, Stepper, run, writers

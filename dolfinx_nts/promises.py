@@ -98,7 +98,7 @@ class Promises:
                 f"nodes that start behind their facets bring {gain:.3g} J to "
                 f"{before['energy']:.3g} J, most {where}; after changes of facet {remedy}"
             )
-        elif total > _GAIN * self._largest:
+        elif gain > 0.0 and total > _GAIN * self._largest:
             gain, text = total, (
                 f"nodes that start steps behind their facets have brought {total:.3g} J in all, "
                 f"{total / self._largest:.2g} of the largest energy; {remedy}"

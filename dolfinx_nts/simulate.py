@@ -16,6 +16,7 @@ from mpi4py import MPI
 from dolfinx_nts import balance
 from dolfinx_nts.contact_step import ContactStep
 from dolfinx_nts.guards import check_momentum
+from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.inversion import describe, smallest_dets
 from dolfinx_nts.newton import ACCURACY, Newton, StepSolver
 from dolfinx_nts.overlap import OverlapWatch
@@ -45,6 +46,8 @@ _BESIDE = 1e-3
 _CUT = 0.4
 #: Searches for contact, each along the motion that came of the one before.
 _SEARCHES = 4
+#: Order of the integrators whose error `Adapt` knows.
+_ADAPTED = 2
 #: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
 _WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
 
@@ -154,7 +157,8 @@ class Stepper:
 
     Args:
         system: The scene.
-        integrator: `Midpoint()` or `EnergyMomentum()`.
+        integrator: `EnergyMomentum()`, `Midpoint()`, `Newmark()`, `GeneralizedAlpha()`, or one of
+            the user's own with the `Integrator` protocol.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
         start: Result of `equilibrium` to start from; see there.
@@ -181,9 +185,11 @@ class Stepper:
     ) -> None:
         if not isinstance(system, System):
             raise TypeError(f"system={system!r}: pass a System([body, ...])")
-        known = all(hasattr(integrator, name) for name in ("piola", "contact_gradient"))
-        if not known or isinstance(integrator, type):
-            raise TypeError(f"integrator={integrator!r}: pass Midpoint() or EnergyMomentum()")
+        if not isinstance(integrator, Integrator) or isinstance(integrator, type):
+            raise TypeError(
+                f"integrator={integrator!r}: pass EnergyMomentum(), Midpoint() or another one with "
+                "the Integrator protocol"
+            )
         if not isinstance(newton, Newton | None):
             raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")
         given = {} if petsc_options is None else petsc_options
@@ -322,7 +328,10 @@ class Stepper:
             p0, p1, p2 = (body.prescribed(self.state.time + s * dt) for s in (0.0, 0.5, 1.0))
             # So written, what does not move has the rate 0, not that of rounding.
             values[body.fixed] = (4.0 * (p1 - p0) - (p2 - p0)) / dt
-        self._accept(replace(self.state, v=tuple(v)))
+        state = replace(self.state, v=tuple(v))
+        if self.problem.integrator.accelerations and not state.a:
+            state = replace(state, a=self.problem.accelerations(state, dt))
+        self._accept(state)
         self._started = True
         self.solution.rows = Table([balance.first_row(self.system, self.state)])
 
@@ -440,10 +449,12 @@ class Stepper:
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
         """State at t_{n+1}."""
         old, scale = self.state, 1.0 / self.problem.factor
-        u, v = list(old.u), list(old.v)
+        u, v, a = list(old.u), list(old.v), list(old.a)
         for k in self.problem.awake:
-            u[k] = step.bodies[k].u1.copy()
-            v[k] = self.problem.integrator.velocity(step.bodies[k].du, old.v[k], dt)
+            u[k], a0 = step.bodies[k].u1.copy(), self.problem.acceleration(k)
+            v[k], a1 = self.problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
+            if a1 is not None:
+                a[k] = a1
         contact = [
             {
                 "facets": _at_nodes(c, c.candidates.facet, -1),
@@ -465,6 +476,7 @@ class Stepper:
             time=time,
             u=tuple(u),
             v=tuple(v),
+            a=tuple(a),
             followed=self.problem.followed,
             **{name: tuple(c[name] for c in contact) for name in names},
         )
@@ -536,7 +548,8 @@ def simulate(
 
     Args:
         system: The scene.
-        integrator: `Midpoint()` or `EnergyMomentum()`.
+        integrator: `EnergyMomentum()`, `Midpoint()`, `Newmark()`, `GeneralizedAlpha()`, or one of
+            the user's own with the `Integrator` protocol.
         dt: Largest step [s], > 0; t_end is reached in equal steps unless `adapt` is given.
         t_end: End of the run [s], > 0.
         newton: Tolerances and retries.
@@ -574,6 +587,11 @@ def simulate(
     output = writers(output)
     if not isinstance(adapt, Adapt | None):
         raise TypeError(f"adapt={adapt!r}: pass Adapt(tolerance=...)")
+    if adapt is not None and getattr(integrator, "order", _ADAPTED) != _ADAPTED:
+        raise ValueError(
+            f"adapt={adapt!r}: {integrator!r} is not of second order; leave adapt out, or choose "
+            "another integrator"
+        )
     newton = _newton(newton, accuracy)
     stepper = Stepper(
         system, integrator, newton=newton, petsc_options=petsc_options, start=start, sleep=sleep,

@@ -18,7 +18,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.assembly import ElementBlocks, Layout
+from dolfinx_nts.assembly import ElementBlocks, Layout, solve_mass
+from dolfinx_nts.body import Moment
 from dolfinx_nts.contact import Motion
 from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.obstacle_contact import ObstacleStep
@@ -97,7 +98,7 @@ class StepProblem:
 
     Args:
         system: The scene.
-        integrator: `Midpoint()`, `EnergyMomentum()` or `Static()`.
+        integrator: Rules of the step, or `Static()`.
         rtol: Residual of a block that counts as solved, relative to the forces or motions of the
             step.
         condense: Eliminate (d, f) and their multipliers pair by pair.
@@ -151,25 +152,28 @@ class StepProblem:
         """
         system = self.system
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
-        ramp = self.integrator.ramp(state.time + self.integrator.theta * dt)
-        self._gravity = ramp * system.gravity
-        for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
-            body.begin_step(self.integrator, u, v, state.time, dt)
+        for k, body in enumerate(system.bodies):
+            body.begin_step(self.integrator, self._moment(k))
+        self._gravity = self.integrator.ramp(self._when) * system.gravity
         self._paths = {k: self._path(c) for k, c in enumerate(system.contacts) if c.rigid}
-        self.first = [u + dt * v for u, v in zip(state.u, state.v, strict=True)]
+        flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
+        self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
         for body, u1 in zip(system.bodies, self.first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
         local = [
-            [np.abs(a).max(initial=0.0) for a in (u1 - u, b.reference + u1, v, u)]
+            [np.abs(x).max(initial=0.0) for x in (u1 - u, b.reference + u1, v, u)]
             for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
         ]
         top = _global_max(system.comm, np.array(local)).T
         self._motion, self._extent, speed, self._moved = top
+        if state.a:
+            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
+            speed = np.maximum(speed, _global_max(system.comm, np.array(local)))
         # In statics v only predicts the first guess.
-        momentum = dt if self.integrator.inertia else 0.0
+        moves = (speed > 0.0) & self.integrator.inertia
         self._inertia = [
-            self._inertial(b, momentum * v) if top > 0.0 else np.zeros_like(v)
-            for b, v, top in zip(system.bodies, state.v, speed, strict=True)
+            self._inertial(b, ahead) if top else np.zeros_like(ahead)
+            for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
         ]
         self._ahead = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
         if again is None:
@@ -193,6 +197,55 @@ class StepProblem:
             self._with_unknowns = [self._may_touch(k, c) for k, c in enumerate(self._found)]
         self._asleep = self._find_asleep(np.maximum(self._motion, speed) == 0.0)
         self._choose()
+
+    @property
+    def _when(self) -> float:
+        """When the step takes its loads [s]."""
+        return self.state.time + self.integrator.theta * self.dt
+
+    def acceleration(self, k: int) -> FloatArray | None:
+        """Of a body at t_n [m/s^2], if the integrator carries it."""
+        return self.state.a[k] if self.state.a else None
+
+    def _moment(self, k: int) -> Moment:
+        """What a body is told of the step."""
+        rule, state, drift = self.integrator, self.state, None
+        if rule.accelerations:
+            v0 = state.v[k]
+            end, _ = rule.advance(np.zeros_like(v0), v0, self.acceleration(k), self.dt)
+            drift = (1.0 - rule.theta) * v0 + rule.theta * end
+        # Load steps of equilibrium end with some of no length.
+        rate = rule.theta * rule.rate(self.dt) if rule.inertia else 0.0
+        return Moment(state.u[k], self._when, rule.ramp(self._when), rate, drift)
+
+    def accelerations(self, state: State, dt: float) -> tuple[FloatArray, ...]:
+        """Accelerations at a state [m/s^2], under the contact forces of its last step. Collective.
+
+        Args:
+            state: Its own accelerations play no part.
+            dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+        """
+        still = tuple(np.zeros_like(v) for v in state.v)
+        self.begin(replace(state, a=still), dt)
+        self.guess(flight=False, forces=True)
+        contact = [terms.contact / self.factor for terms in self.evaluate(self.x).bodies]
+        gravity = self.integrator.ramp(state.time) * self.system.gravity
+        out = []
+        for body, u, v, force in zip(
+            self.system.bodies, state.u, state.v, contact, strict=True
+        ):
+            moment = Moment(u, state.time, self.integrator.ramp(state.time), 0.0, v)
+            body.begin_step(self.integrator, moment)
+            right = body.external(u, gravity) - body.internal(u) - force
+            p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
+            a = np.zeros_like(u)
+            a[body.fixed] = 4.0 * (p0 - 2.0 * p1 + p2) / dt**2
+            right -= body.inertia(a)
+            right[body.fixed] = 0.0
+            solved = solve_mass(body.tangent(u, 1.0, 0.0), right)
+            solved[body.fixed] = a[body.fixed]
+            out.append(solved)
+        return tuple(out)
 
     def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
         """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
@@ -283,7 +336,7 @@ class StepProblem:
 
     def _stabilization(self, body: Any) -> FloatArray:
         """Stiffness that holds each free coordinate at t_n [N/m]."""
-        stiffness: FloatArray = self.stabilization * body.nodal_stiffness()
+        stiffness: FloatArray = self.stabilization * body.nodal_stiffness(self.integrator)
         stiffness[body.fixed] = 0.0
         return stiffness
 
@@ -350,7 +403,7 @@ class StepProblem:
         if self.integrator.inertia:
             mass: FloatArray = surface.mass
             return mass
-        stiffness: FloatArray = surface.nodal(surface.body.nodal_stiffness())
+        stiffness: FloatArray = surface.nodal(surface.body.nodal_stiffness(self.integrator))
         return stiffness
 
     def _drop_doubles(self) -> None:
@@ -440,13 +493,14 @@ class StepProblem:
         """Solve this step with nodes that slip rather than leave, see `ContactStep`."""
         self.contacts = [replace(c, lets_slip=True) for c in self.contacts]
 
-    def guess(self, *, flight: bool) -> None:
+    def guess(self, *, flight: bool, forces: bool | None = None) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 
         Args:
             flight: Free flight from t_n under the contact forces of the last step; else the
                 positions of t_n, which free flight of a fast turning or vibrating body may invert,
                 and no forces. Prescribed coordinates are at t_{n+1}.
+            forces: Whether to start with the contact forces of the last step; None: as `flight`.
         """
         with self.x as x:
             x[:] = 0.0
@@ -455,7 +509,8 @@ class StepProblem:
                 start = u1 if flight else self.state.u[k].copy()
                 start[fixed] = u1[fixed]
                 x[self.layout.owned(f)] = start
-        if self._fields and (flight or not self.integrator.inertia):
+        forces = flight if forces is None else forces
+        if self._fields and (forces or not self.integrator.inertia):
             guess = [
                 self._forces_as_before(k, p).ravel() for k, p in enumerate(self._positions(self.x))
             ]
@@ -577,7 +632,8 @@ class StepProblem:
 
     def body_tangent(self, k: int, u1: FloatArray) -> Any:
         """PETSc matrix of a body at a displacement, without contact."""
-        a = self.system.bodies[k].tangent(u1)
+        mass = 1.0 if self.integrator.inertia else 0.0
+        a = self.system.bodies[k].tangent(u1, mass, self.factor)
         if self.stabilization:
             held = a.createVecLeft()
             held.array_w[:] = self._stabilization(self.system.bodies[k])
@@ -639,7 +695,8 @@ class StepProblem:
     @property
     def momentum_rounding(self) -> float:
         """Change of momentum in the step that is rounding [kg m/s]."""
-        return float(self.rounding.sum() * np.sqrt(self.system.size) / (0.5 * self.dt))
+        rate = self.integrator.rate(self.dt)
+        return float(self.rounding.sum() * np.sqrt(self.system.size) * rate)
 
     @property
     def span(self) -> float:

@@ -1,8 +1,8 @@
 """Adaptive time steps: how far a step errs, how long the next may be, when the next gap closes.
 
-Both integrators are of second order with v_1 = 2 (q_1 - q_0)/h - v_0; what a step leaves out is
-h^3/12 times the third derivative of q (that of the trapezoidal rule), here from the change of the
-mean acceleration (v_1 - v_0)/h since the step before. It costs a product with the mass matrix.
+It takes integrators of second order. What a step leaves out is h^3/12 times the third derivative
+of q (that of the trapezoidal rule), here from the change of the mean acceleration (v_1 - v_0)/h
+since the step before. It costs a product with the mass matrix.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dolfinx_nts.validation import known_options
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Error of a step in powers of h.
+#: Error of a step in powers of h, one more than the order of the integrators that it takes.
 _ORDER = 3
 #: Part of what the error would allow that is taken.
 _CAUTION = 0.9
@@ -148,7 +148,8 @@ class Pace:
         """
         h = problem.dt
         acceleration = tuple(
-            2.0 / h * (b.du / h - v) for b, v in zip(step.bodies, problem.state.v, strict=True)
+            (problem.integrator.advance(b.du, v, problem.acceleration(k), h)[0] - v) / h
+            for k, (b, v) in enumerate(zip(step.bodies, problem.state.v, strict=True))
         )
         speed, error = self._measure(problem, acceleration)
         short = h <= self._shortest * (1 + 1e-9)

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from dolfinx_nts.body import Body
 from dolfinx_nts.contact import INITIAL_PENETRATION, ContactPair
-from dolfinx_nts.continuum import Body
 from dolfinx_nts.validation import items, known_options, raise_together, vector
 
 FloatArray = npt.NDArray[np.float64]
@@ -29,6 +29,7 @@ class State:
         time: t [s].
         u: Owned displacements of each body [m].
         v: Owned velocities of each body [m/s].
+        a: Owned accelerations of each body [m/s^2], where the integrator carries any; else empty.
         facets: Facet in the last step, or -1, of each slave node in this rank's `Surface.share`.
         force: Contact force p_N of the same nodes [N], >= 0.
         gap: Gap of the same nodes [m], infinite where a node was no candidate.
@@ -41,6 +42,7 @@ class State:
     time: float
     u: tuple[FloatArray, ...]
     v: tuple[FloatArray, ...]
+    a: tuple[FloatArray, ...]
     facets: tuple[IntArray, ...]
     force: tuple[FloatArray, ...]
     gap: tuple[FloatArray, ...]
@@ -118,6 +120,7 @@ class System:
             time=0.0,
             u=tuple(self._prescribed(b) for b in self.bodies),
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
+            a=(),
             facets=tuple(np.full(n, -1) for n in nodes),
             force=tuple(np.zeros(n) for n in nodes),
             gap=tuple(np.full(n, np.inf) for n in nodes),

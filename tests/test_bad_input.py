@@ -255,7 +255,7 @@ def test_coefficients_of_another_mesh(kind):
     mesh = box()
     dx = ufl.Measure("dx", mesh)
     pattern = r"^extra_form=<function .* of 'body': contains " + found
-    extra = {"extra_form": lambda u, v, w: other * ufl.inner(v, w) * dx}
+    extra = {"extra_form": lambda u, v, w, t: other * ufl.inner(v, w) * dx}
     raises(TypeError, pattern, lambda: continuum(mesh, **extra))
 
 
@@ -267,14 +267,14 @@ def test_a_number_in_a_material_that_is_none():
 @pytest.mark.parametrize(
     ("extra_form", "problem"),
     [
-        (lambda u, v, w: 3.0, r"returned an object of type float; return a UFL form like"),
-        (lambda u, v, w: ufl.inner(v, w), r"returned an object of type \w+; return a UFL form"),
-        (lambda u, v, w: None, r"returned an object of type NoneType; return a UFL form"),
-        (lambda u, v, w: ufl.inner(u, v) * ufl.dx, r"is not linear in the test function w alone"),
-        (lambda u, v, w: 0 * ufl.inner(v, w) * ufl.dx, r"raised|is not linear in the test"),
-        (lambda u, v, w: u.x, r"raised AttributeError.*; return a UFL form"),
+        (lambda u, v, w, t: 3.0, r"returned an object of type float; return a UFL form like"),
+        (lambda u, v, w, t: ufl.inner(v, w), r"returned an object of type \w+; return a UFL form"),
+        (lambda u, v, w, t: None, r"returned an object of type NoneType; return a UFL form"),
+        (lambda u, v, w, t: ufl.inner(u, v) * ufl.dx, r"is not linear in the test function w"),
+        (lambda u, v, w, t: 0 * ufl.inner(v, w) * ufl.dx, r"raised|is not linear in the test"),
+        (lambda u, v, w, t: u.x, r"raised AttributeError.*; return a UFL form"),
         (lambda u, w: ufl.inner(u, w) * ufl.dx, r"raised TypeError.*; return a UFL form"),
-        (lambda u, v, w: {}["drag"] if COMM.rank == COMM.size - 1 else None, "KeyError|NoneType"),
+        (lambda *_: {}["drag"] if COMM.rank == COMM.size - 1 else None, "KeyError|NoneType"),
     ],
 )
 def test_extra_form(extra_form, problem):
@@ -665,9 +665,9 @@ def test_newton():
 
 
 def test_integrator():
-    pattern = r"^integrator='midpoint': pass Midpoint\(\) or EnergyMomentum\(\)"
+    pattern = r"^integrator='midpoint': pass EnergyMomentum\(\), Midpoint\(\) or another"
     raises(TypeError, pattern, lambda: run(integrator="midpoint"))
-    raises(TypeError, r"^integrator=<class.*: pass Midp", lambda: run(integrator=nts.Midpoint))
+    raises(TypeError, r"^integrator=<class.*: pass EnergyM", lambda: run(integrator=nts.Midpoint))
     raises(TypeError, r"^system=.*: pass a System\(", lambda: run(continuum()))
 
 

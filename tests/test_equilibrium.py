@@ -179,7 +179,7 @@ def test_extra_form_is_at_the_end_and_at_rest():
     """An elastic foundation k u moves a free body by b/k everywhere; a dashpot does nothing."""
     stiffness, load = 2e5, np.array([3e3, 0.0, -1e4])
 
-    def foundation(u, v, w):
+    def foundation(u, v, w, t):
         return (stiffness * ufl.inner(u, w) + 1e9 * ufl.inner(v, w)) * ufl.dx
 
     body = nts.Continuum(

@@ -31,6 +31,7 @@ LEVELS = [
         "whole_files",
     },
     {
+        "body",
         "continuum",
         "rigid",
         "joints",

@@ -1,4 +1,4 @@
-"""Both integrators are of second order, in free flight and while contact persists."""
+"""All integrators are of second order, in free flight and while contact persists."""
 
 import numpy as np
 import pytest
@@ -13,6 +13,8 @@ INTEGRATORS = {
     "energy-momentum": nts.EnergyMomentum(),
     "mean-value stress": nts.EnergyMomentum(stress="mean-value"),
     "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
+    "newmark": nts.Newmark(),
+    "generalised alpha": nts.GeneralizedAlpha(rho_inf=0.8),
 }
 FREE = [name for name in INTEGRATORS if name != "gonzalez contact"]
 
@@ -64,7 +66,7 @@ def flying_block():
 
 
 @pytest.mark.parametrize("integrator", FREE)
-@pytest.mark.fast("energy-momentum")
+@pytest.mark.fast("energy-momentum", "newmark", "generalised alpha")
 def test_free_flight(integrator):
     results = [run(flying_block, integrator, 0.4, n)[:2] for n in (40, 80, 160, 320)]
     for values in zip(*results, strict=True):
@@ -116,7 +118,7 @@ def test_persistent_contact(integrator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum", "generalised alpha"])
 def test_sliding_with_friction(integrator):
     results = []
     for n in (40, 80, 160):

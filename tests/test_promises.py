@@ -68,15 +68,12 @@ class Sprung(PointMass):
         self.claim = claim
         self._first = None
 
-    def begin_step(self, integrator, u0, v0, time, dt):
-        self._u0, self._half = u0, 0.5 * dt**2
-
     def internal(self, u1):
-        return 0.5 * (self._u0 + u1) + self.reference
+        return 0.5 * (self.moment.u0 + u1) + self.reference
 
-    def tangent(self, u1):
-        matrix = super().tangent(u1)
-        matrix.shift(0.5 * self._half)
+    def tangent(self, u1, mass, stiffness):
+        matrix = super().tangent(u1, mass, stiffness)
+        matrix.shift(0.5 * stiffness)
         return matrix
 
     def potential(self, u):

@@ -193,7 +193,7 @@ def test_extra_form_is_external_work():
         [
             block(
                 velocity=(1, 0, 0),
-                extra_form=lambda u, v, w: drag * density * ufl.inner(v, w) * ufl.dx,
+                extra_form=lambda u, v, w, t: drag * density * ufl.inner(v, w) * ufl.dx,
             )
         ]
     )

@@ -39,8 +39,8 @@ class PointMass:
         first = self._matrix.getOwnershipRange()[0]
         self._rows = np.arange(first, first + n, dtype=PETSc.IntType)
 
-    def begin_step(self, integrator, u0, v0, time, dt):
-        pass
+    def begin_step(self, rule, moment):
+        self.rule, self.moment = rule, moment
 
     def inertia(self, v):
         return self.mass * v
@@ -51,9 +51,9 @@ class PointMass:
     def external(self, u1, gravity):
         return self.mass * gravity[: self.num_owned]
 
-    def tangent(self, u1):
+    def tangent(self, u1, mass, stiffness):
         self._matrix.zeroEntries()
-        self._matrix.setValues(self._rows, self._rows, self.mass * np.eye(self.num_owned))
+        self._matrix.setValues(self._rows, self._rows, mass * self.mass * np.eye(self.num_owned))
         self._matrix.assemble()
         return self._matrix
 

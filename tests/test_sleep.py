@@ -257,7 +257,9 @@ MOVERS = {
     "later support": {
         "bcs": [nts.Dirichlet(right, value=lambda t: (0, 0, max(t - BEGIN, 0.0) ** 2))]
     },
-    "extra form": {"extra_form": lambda u, v, w: ufl.inner(ufl.as_vector((5.0, 0, 0)), w) * ufl.dx},
+    "extra form": {
+        "extra_form": lambda u, v, w, t: ufl.inner(ufl.as_vector((5.0, 0, 0)), w) * ufl.dx
+    },
 }
 
 
@@ -276,7 +278,7 @@ def test_loads_wake_in_the_step_in_which_they_act(name):
     [
         ({"bcs": [nts.Dirichlet(right)]}, "a"),
         ({"bcs": [nts.Dirichlet(lambda x: x[0] > 0, value=(0.3, 0.1, 0.7))], "cells": 1}, "a"),
-        ({"extra_form": lambda u, v, w: 1e3 * ufl.inner(u + v, w) * ufl.dx}, "a"),
+        ({"extra_form": lambda u, v, w, t: 1e3 * ufl.inner(u + v, w) * ufl.dx}, "a"),
         ({"body_force": lambda t: (0, 0, 0)}, "a"),
     ],
     ids=["support", "held everywhere", "spring and damper", "force of zero"],

@@ -27,14 +27,11 @@ class SpringMass(PointMass):
     def __init__(self):
         super().__init__(COMM, MASS, (0.0, 0.0, 0.0), (RATE, 0.0, 0.0))
 
-    def begin_step(self, integrator, u0, v0, time, dt):
-        self.u0, self.dt = u0, dt
-
     def internal(self, u1):
-        return MASS * RATE**2 * (self.u0 + u1) / 2
+        return MASS * RATE**2 * (self.moment.u0 + u1) / 2
 
-    def tangent(self, u1):
-        slope = MASS * (1 + (RATE * self.dt / 2) ** 2)
+    def tangent(self, u1, mass, stiffness):
+        slope = MASS * (mass + stiffness * RATE**2 / 2)
         self._matrix.zeroEntries()
         self._matrix.setValues(self._rows, self._rows, slope * np.eye(self.num_owned))
         self._matrix.assemble()

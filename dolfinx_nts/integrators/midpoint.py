@@ -1,0 +1,24 @@
+"""The midpoint rule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from dolfinx_nts.integrators.rule import MiddleOfStep, stress_of
+from dolfinx_nts.strain_energy import StrainEnergy
+from dolfinx_nts.validation import known_options
+
+
+@known_options
+@dataclass(frozen=True)
+class Midpoint(MiddleOfStep):
+    """Midpoint rule (58)-(60): keeps linear and angular momentum, not the energy.
+
+    Contact is described directly: the projection is eliminated, the gap multiplier is the only
+    unknown.
+    """
+
+    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+        """First Piola-Kirchhoff stress P = F_m S(E(F_m)) in UFL [Pa] of F = 1 + H."""
+        return stress_of(energy, 0.5 * (h0 + h1))

@@ -1,0 +1,57 @@
+"""Newmark's family."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from dolfinx_nts.integrators.rule import WithAccelerations, stress_of
+from dolfinx_nts.strain_energy import StrainEnergy
+from dolfinx_nts.validation import is_finite, known_options
+
+
+@known_options
+@dataclass(frozen=True, kw_only=True)
+class Newmark(WithAccelerations):
+    """Newmark's method (1959), with forces and contact at t_{n+1}: keeps linear momentum alone.
+
+    u_1 = u_0 + h v_0 + h^2 ((1/2 - beta) a_0 + beta a_1),
+    v_1 = v_0 + h ((1 - gamma) a_0 + gamma a_1),
+    M a_1 + f(u_1) + G(u_1)^T lambda_1 = f_ext(t_1).
+
+    With gamma = 1/2 it is of second order, and the trapezoidal rule with beta = 1/4, which keeps
+    J + h^2/4 sum v x M a in place of the angular momentum J. Linear problems are stable for
+    2 beta >= gamma >= 1/2; a larger gamma damps, and is of first order. So is friction, whose force
+    at t_{n+1} opposes the slip of the whole step.
+
+    Attributes:
+        beta: > 0, up to 1/2.
+        gamma: From 1/2 to 1.
+
+    Raises:
+        ValueError: A parameter is out of range.
+    """
+
+    theta: ClassVar[float] = 1.0
+
+    beta: float = 0.25
+    gamma: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not (is_finite(self.beta) and 0.0 < self.beta <= 0.5):
+            raise ValueError(f"beta={self.beta!r}: must lie in (0, 0.5]")
+        if not (is_finite(self.gamma) and 0.5 <= self.gamma <= 1.0):
+            raise ValueError(f"gamma={self.gamma!r}: must lie in [0.5, 1]; less is unstable")
+
+    @property
+    def order(self) -> int:
+        """Of the global error."""
+        return 2 if self.gamma == 0.5 else 1
+
+    @property
+    def _parameters(self) -> tuple[float, float, float]:
+        return self.beta, self.gamma, 0.0
+
+    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+        """First Piola-Kirchhoff stress P = F_1 S(E_1) in UFL [Pa] of F = 1 + H."""
+        return stress_of(energy, h1)
