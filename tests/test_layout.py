@@ -17,6 +17,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 LEVELS = [
     {
+        "bounded_slope",
         "discrete_gradient",
         "strain_energy",
         "precise",
@@ -36,6 +37,7 @@ LEVELS = [
         "joints",
         "contact",
         "contact_step",
+        "intrusion",
         "obstacles",
         "obstacle_contact",
         "overlap",
