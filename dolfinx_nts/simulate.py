@@ -564,8 +564,9 @@ def simulate(
             caller changes in a material during the run wakes nothing.
         adapt: Choose the steps by their error and by closing gaps.
         watch_overlap: Look whether bodies of a contact end up inside each other, with all of their
-            boundaries, or an obstacle in the facets that it is the master of, and warn. It costs less than one part in fifty of the steps unless the
-            bodies move by a quarter of a facet in few of them.
+            boundaries, or an obstacle in the facets that it is the master of, and warn. It costs
+            less than one part in fifty of the steps unless the bodies move by a quarter of a facet
+            in few of them.
 
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then,
