@@ -406,13 +406,17 @@ def test_what_is_behind_an_open_surface_but_outside_is_no_overlap():
 class Ball(Obstacle):
     """A ball as a user may write it: by its gap alone."""
 
-    def __init__(self, centre, radius):
-        self.name, self.motion = "ball", None
+    def __init__(self, centre, radius, width=np.inf):
+        self.name, self.motion, self._width = "ball", None, width
         self.centre, self.radius = np.array(centre), radius
 
     @property
     def extent(self):
         return self.radius
+
+    @property
+    def width(self):
+        return self._width
 
     def gap(self, x):
         y = x - self.centre
@@ -481,6 +485,22 @@ def test_facets_in_obstacles_are_as_deep_as_their_distance_tells(nc, metre):
             assert np.allclose(-obstacle.gap(place[deep]).value, depth[deep], rtol=0.011)
             found_any += deep.sum()
     assert found_any > 100
+
+
+@pytest.mark.parametrize("far", [1.0, 30.0])
+def test_paths_through_an_obstacle_that_is_known_by_its_gap_alone(far):
+    """Also through one far smaller than the path, if it tells its width."""
+    rng = np.random.default_rng(5)
+    centre, radius = np.array([0.1, -0.2, 0.3]), 0.5
+    start = centre + far * rng.uniform(-1, 1, size=(200, 3))
+    aim = centre + rng.uniform(-0.4, 0.4, size=(200, 3))
+    end = start + rng.uniform(1.0, 2.0, size=(200, 1)) * (aim - start)
+    true = nts.Sphere(centre, radius).lowest_gap(start, end)
+    found = Ball(centre, radius, width=radius).lowest_gap(start, end)
+    least = 0.05 * np.minimum(radius, np.linalg.norm(end - start, axis=1))
+    deep = true < -least
+    assert deep.sum() > 50 and (found >= true - 1e-12).all()
+    assert np.allclose(found[deep], true[deep], rtol=0.011)
 
 
 def above(master, *, cells=(2, 2), height=0.5, cell_type=CellType.hexahedron, turn=None, **options):
