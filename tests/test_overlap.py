@@ -565,6 +565,16 @@ def test_a_run_in_which_a_ball_comes_through_a_facet_says_so(moving, integrator,
 
 
 @pytest.mark.mpi
+def test_load_steps_of_a_ball_through_a_facet_are_watched(caplog):
+    caplog.set_level(logging.CRITICAL)
+    ball = nts.Sphere((0.5, 0.5, -0.45), 0.4, motion=lambda t: (0.0, 0.0, 0.3 * t))
+    held = nts.Dirichlet(lambda x: x[2] > 0.49)
+    run = nts.equilibrium(above(ball, bcs=[held]), load_steps=3)
+    assert run.status.startswith("completed, but the facet of nodes")
+    assert abs(run.warnings["facet in an obstacle"].worst - 0.25) < 0.0028
+
+
+@pytest.mark.mpi
 def test_what_lies_on_an_obstacle_is_not_warned_of():
     """Flush on a floor and a little below; four nodes of each facet on a ball of two facets."""
     system = above(nts.Plane((0, 0, 0), (0, 0, 1)), cells=(6, 6))
