@@ -1,17 +1,15 @@
-"""Bodies that end up inside each other, which contact of nodes with facets may not see.
+"""Bodies that end up inside each other, or in obstacles, which contact of nodes may not see.
 
-Nodes of the slave are kept out of the master's facets; an edge of the one may still pass through
-the other between its nodes, and what is not declared as a surface is not held at all. The first
-part of this file is geometry, arrays in, arrays out: how deep the nodes and edges of a boundary lie
-in a body. `OverlapWatch` looks at the bodies of a run as often as their motion asks for it.
-
-The depth of a point inside a body is its distance from the boundary; it changes along an edge by at
-most the way, which bounds it between two points and leaves few edges to look at closely.
+Nodes of the slave are kept out of the master's facets and of obstacles; an edge of the one may
+still pass through the other between its nodes, a small obstacle into a large facet, and what is not
+declared as a surface is not held at all. `OverlapWatch` looks at the bodies of a run as often as
+their motion asks for it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -21,347 +19,28 @@ from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import facets as fc
-from dolfinx_nts import search
+from dolfinx_nts.intrusion import LEAST, Boundary, Found, Placed, box_gap, intrusions, sunk
 from dolfinx_nts.surfaces import Surface, winding
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Depth in facet sizes that is reported. What contact of nodes leaves by its nature is a few
-#: hundredths: a master that bulges between two slave nodes, a slave's edge over a convex master.
-LEAST = 0.2
 #: Bodies whose boxes meet are looked at again after a relative motion of this many facet sizes,
 #: but only after so many steps, which resolve a crossing at all, unless they have moved by a facet.
 _LOOK, _STEPS = 0.25, 4
-#: Closest points this near to the border of a facet (in convective coordinates) are on it.
-_ON_BORDER = 1e-9
-#: The deepest point of an edge is sought by so many divisions into so many parts, until its depth
-#: is known to this part of it.
-_ROUNDS, _PARTS, _PRECISE = 7, 4, 0.01
-#: A body is thin where its sides have normals with a cosine below this; an edge that sticks out on
-#: both sides counts from this part of `LEAST` on.
-_OPPOSITE, _THIN = -0.9, 0.01
-#: Part of a body's box that its nearest points are left out of, at most.
-_SHRINK = 0.25
-
-
-class Depth(NamedTuple):
-    """How deep points lie in a body.
-
-    Attributes:
-        value: Distance from the boundary [m], negative outside, shape (n,); -inf beyond reach.
-        facet: Closest facet, shape (n,); -1 beyond reach.
-        normal: Outward normal there, of any length, shape (n, 3).
-        over: Whether the closest point is inside the facet, not on its border, shape (n,).
-    """
-
-    value: FloatArray
-    facet: IntArray
-    normal: FloatArray
-    over: BoolArray
-
-
-class Found(NamedTuple):
-    """Points of one boundary inside the other body; axis 0 = node or edge.
-
-    Attributes:
-        nodes: Both ends of the edge, twice the same for a node; points of the boundary, (n, 2).
-        place: The deepest point of the edge, or the node [m], shape (n, 3).
-        depth: Its distance from the other body's boundary [m], shape (n,).
-        size: The same in facet sizes, the larger of both bodies there [-], shape (n,).
-        facet: Closest facet of the other body, shape (n,).
-    """
-
-    nodes: IntArray
-    place: FloatArray
-    depth: FloatArray
-    size: FloatArray
-    facet: IntArray
-
-    def part(self, chosen: IntArray | BoolArray) -> Found:
-        """Some of them, by number or by a mask."""
-        return Found._make(a[chosen] for a in self)
-
-    @property
-    def is_node(self) -> BoolArray:
-        """Whether each is a node, shape (n,)."""
-        same: BoolArray = self.nodes[:, 0] == self.nodes[:, 1]
-        return same
-
-
-_NOTHING = Found(
-    np.empty((0, 2), np.int64), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.int64)
-)
-
-
-class Boundary:
-    """Facets of a body's boundary and their edges.
-
-    Args:
-        facets: Points of the facets, cyclic, counter-clockwise seen from outside, shape (m, nc).
-
-    Attributes:
-        facets: These.
-        edges: Points of each edge, shape (e, 2).
-        sides: Edge of each side k of a facet (corner k to k + 1), shape (m, nc).
-        beside: The two facets of each edge, the same twice where only one has it, shape (e, 2).
-        closed: Whether every edge has two facets.
-    """
-
-    def __init__(self, facets: IntArray) -> None:
-        self.facets = facets
-        ends = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
-        self.edges, at, inverse = np.unique(
-            np.sort(ends, axis=1), axis=0, return_index=True, return_inverse=True
-        )
-        side = inverse.ravel()
-        nc, number = facets.shape[1], np.arange(len(side))
-        last = np.empty(len(self.edges), dtype=np.int64)
-        last[side] = number
-        self.sides = side.reshape(facets.shape)
-        self.beside = np.column_stack([at, last]) // nc
-        self.closed = bool((self.beside[:, 0] != self.beside[:, 1]).all())
-
-
-class Placed:
-    """A boundary at one instant.
-
-    Args:
-        boundary: Its facets and edges.
-        x: Positions of its points [m], shape (p, 3).
-    """
-
-    def __init__(self, boundary: Boundary, x: FloatArray) -> None:
-        self.boundary, self.x = boundary, x
-
-    @cached_property
-    def box(self) -> FloatArray:
-        """Smallest and largest coordinates [m], shape (2, 3)."""
-        return np.array([self.x.min(axis=0), self.x.max(axis=0)])
-
-    @cached_property
-    def corners(self) -> FloatArray:
-        """Corners of the facets [m], shape (m, nc, 3)."""
-        corners: FloatArray = self.x[self.boundary.facets]
-        return corners
-
-    @cached_property
-    def sizes(self) -> FloatArray:
-        """Mean edge length of each facet [m], shape (m,)."""
-        return fc.size(self.corners)
-
-    def edge_sizes(self, edge: IntArray) -> FloatArray:
-        """Size of the larger facet beside each of the edges [m], shape (n,)."""
-        largest: FloatArray = self.sizes[self.boundary.beside[edge]].max(axis=1)
-        return largest
-
-    def facets_near(self, box: FloatArray) -> IntArray:
-        """Facets whose boxes meet a box (2, 3)."""
-        c = self.corners
-        return np.flatnonzero(_meet(c.min(axis=1), c.max(axis=1), box))
-
-    def depth(
-        self, points: FloatArray, reach: FloatArray | float, chosen: IntArray | None = None
-    ) -> Depth:
-        """How deep points lie in the body, up to the reach.
-
-        The sign is that of the normal at the closest point; on an edge the sum of those of both
-        facets, at a corner weighted by the angles (Baerentzen and Aanaes 2005), without which
-        rounding would decide about points in the plane of a facet beside them. Nothing is known
-        of points over the rim of an open boundary, which count as outside.
-
-        Args:
-            points: Points [m], shape (n, 3).
-            reach: Largest distance of interest [m], one value or shape (n,).
-            chosen: Facets that alone can be so near; all without it.
-        """
-        b, n = self.boundary, len(points)
-        corners = self.corners if chosen is None else self.corners[chosen]
-        result = Depth(np.full(n, -np.inf), np.full(n, -1), np.zeros((n, 3)), np.zeros(n, bool))
-        closest = search.closest_facets(points, corners, reach=reach)
-        near = np.flatnonzero(closest.facet >= 0)
-        facet, xi = closest.facet[near], closest.xi[near]
-        foot, _, normal = fc.frame(corners[facet], xi)
-        facet = facet if chosen is None else chosen[facet]
-        on = fc.edge_excess(xi, b.facets.shape[1]) > -_ON_BORDER
-        count = on.sum(axis=1)
-        edge, corner = np.flatnonzero(count == 1), np.flatnonzero(count > 1)
-        beside = b.beside[b.sides[facet[edge], on[edge].argmax(axis=1)]]
-        normal[edge] = self._normals(beside.ravel()).reshape(-1, 2, 3).sum(axis=1)
-        rim = np.zeros(len(near), dtype=bool)
-        rim[edge] = beside[:, 0] == beside[:, 1]
-        first = (on & np.roll(on, 1, axis=1))[corner].argmax(axis=1)
-        normal[corner], rim[corner] = self._around(b.facets[facet[corner], first])
-        inward = foot - points[near]
-        inside = (np.einsum("ni,ni->n", normal, inward) > 0.0) & ~rim
-        result.value[near] = np.where(inside, 1.0, -1.0) * closest.distance[near]
-        result.facet[near], result.normal[near], result.over[near] = facet, normal, count == 0
-        return result
-
-    def _normals(self, facet: IntArray) -> FloatArray:
-        """Unit normals of facets, of a warped one its mean, shape (n, 3); 0 without an area."""
-        c = self.corners[facet]
-        if c.shape[1] == 4:
-            normal = np.cross(c[:, 2] - c[:, 0], c[:, 3] - c[:, 1])
-        else:
-            normal = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        unit: FloatArray = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
-        return unit
-
-    def _around(self, point: IntArray) -> tuple[FloatArray, BoolArray]:
-        """Normals at points, weighted by the facets' angles, (n, 3); which are on a rim, (n,)."""
-        b, (used, inverse) = self.boundary, np.unique(point, return_inverse=True)
-        facet, k = np.nonzero(np.isin(b.facets, used))
-        nc, at = b.facets.shape[1], np.searchsorted(used, b.facets[facet, k])
-        corner = self.corners[facet, k]
-        arms = [self.corners[facet, (k + s) % nc] - corner for s in (1, -1)]
-        area = np.linalg.norm(np.cross(*arms), axis=1)
-        angle = np.arctan2(area, np.einsum("ni,ni->n", *arms))
-        normal, rim = np.zeros((len(used), 3)), np.zeros(len(used), dtype=bool)
-        np.add.at(normal, at, angle[:, None] * self._normals(facet))
-        for side in (k, k - 1):
-            one, two = b.beside[b.sides[facet, side]].T
-            rim[at[one == two]] = True
-        return normal[inverse], rim[inverse]
-
-
-def _meet(low: FloatArray, high: FloatArray, box: FloatArray) -> BoolArray:
-    """Which of the boxes low (n, 3) to high (n, 3) meet a box (2, 3)."""
-    meet: BoolArray = ((low <= box[1]) & (high >= box[0])).all(axis=1)
-    return meet
-
-
-def box_gap(one: FloatArray, two: FloatArray) -> float:
-    """Distance between two boxes (2, 3) [m]."""
-    return float(np.linalg.norm(np.maximum(0.0, np.maximum(one[0] - two[1], two[0] - one[1]))))
-
-
-def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
-    """Nodes and edges of one boundary that lie deeper in another body than facets explain.
-
-    Edges are told where their ends are not as deep; also those that pass right through a body so
-    thin that nothing is deep in it. A body whose whole boundary is inside is found, too.
-
-    Args:
-        a: Boundary whose nodes and edges are looked at.
-        b: Boundary of the other body; of an open one, see `Placed.depth`.
-        least: Depth to report, in facet sizes, > 0.
-    """
-    near = _edges_near(a, b, least)
-    if not near.size:
-        return _NOTHING
-    ends, size = a.x[a.boundary.edges[near]], a.edge_sizes(near)
-    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    node, inverse = np.unique(a.boundary.edges[near], return_inverse=True)
-    end = inverse.reshape(-1, 2)
-    reach, around = np.zeros((2, len(node)))
-    for k in range(2):
-        np.maximum.at(reach, end[:, k], length)
-        np.maximum.at(around, end[:, k], size)
-    widest = float(reach.max())
-    part = b.facets_near(np.array([ends.min(axis=(0, 1)) - widest, ends.max(axis=(0, 1)) + widest]))
-    at = b.depth(a.x[node], reach, part)
-    deep = at.value > least * np.maximum(around, b.sizes[at.facet])
-    enclosed = b.boundary.closed and not (at.facet >= 0).any()
-    if enclosed and winding(a.x[node[0]], b.corners) > 0.5 or b.boundary.closed and deep.any():
-        part = np.arange(len(b.corners))
-        at = b.depth(a.x[node], np.inf)
-        deep = at.value > least * np.maximum(around, b.sizes[at.facet])
-    i = np.flatnonzero(deep)
-    depth, scale = at.value[i], np.maximum(around, b.sizes[at.facet])[i]
-    nodes = np.column_stack([node[i], node[i]])
-    inside = Found(nodes, a.x[node[i]], depth, depth / scale, at.facet[i])
-    start, limit = at.value[end], least * np.maximum(size, b.sizes.min())
-    through = _straddles(at, end) & (start < -limit[:, None]).all(axis=1)
-    limit[through] *= _THIN
-    kept = ~deep[end].any(axis=1) & (start.sum(axis=1) + length > 2.0 * limit)
-    ends, size, start, limit, near = (v[kept] for v in (ends, size, start, limit, near))
-    place, depth, facet = _deepest(ends, start, limit, b, part)
-    size = np.maximum(size, b.sizes[facet])
-    deep = depth > np.where(through[kept], limit, least * size)
-    crossing = Found(a.boundary.edges[near], place, depth, depth / size, facet).part(deep)
-    return Found._make(np.concatenate(pair) for pair in zip(inside, crossing, strict=True))
-
-
-def _edges_near(a: Placed, b: Placed, least: float) -> IntArray:
-    """Edges of `a` that may be as deep in `b`, by boxes."""
-    ends = a.x[a.boundary.edges]
-    if b.boundary.closed:
-        floor = least * max(float(a.sizes.min()), float(b.sizes.min()))
-        shrink = np.minimum(floor, _SHRINK * (b.box[1] - b.box[0]))
-    else:  # what is inside need not be in the box
-        shrink = np.full(3, -float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max()))
-    inner = np.array([b.box[0] + shrink, b.box[1] - shrink])
-    return np.flatnonzero(_meet(ends.min(axis=1), ends.max(axis=1), inner))
-
-
-def _straddles(at: Depth, end: IntArray) -> BoolArray:
-    """Whether the ends (n, 2) of edges are over facets that face opposite ways, shape (n,)."""
-    normal = at.normal[end]
-    cosine = np.einsum("ni,ni->n", normal[:, 0], normal[:, 1])
-    opposite = cosine < _OPPOSITE * np.linalg.norm(normal, axis=2).prod(axis=1)
-    both: BoolArray = opposite & at.over[end].all(axis=1)
-    return both
-
-
-def _deepest(
-    ends: FloatArray, start: FloatArray, limit: FloatArray, b: Placed, chosen: IntArray
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Deepest points of edges in a body, by dividing what may hold a deeper one.
-
-    Args:
-        ends: Ends of the edges [m], shape (n, 2, 3).
-        start: Their depth [m], shape (n, 2).
-        limit: Depth of interest of each edge [m], shape (n,).
-        b: The body.
-        chosen: Its facets that are near.
-
-    Returns:
-        Points [m] (n, 3), depths [m] (n,), and closest facets (n,); where nothing is as deep as
-        the limit, of some point of the edge or with a depth of -inf.
-    """
-    n = len(ends)
-    span = ends[:, 1] - ends[:, 0]
-    length = np.linalg.norm(span, axis=1)
-    place, best, facet = ends[:, 0].copy(), np.full(n, -np.inf), np.full(n, -1)
-    edge, s, d = np.arange(n), np.tile([0.0, 1.0], (n, 1)), start
-    for _ in range(_ROUNDS):
-        way = (s[:, 1] - s[:, 0]) * length[edge]
-        known = np.maximum(limit, (1.0 + _PRECISE) * best)[edge]
-        open_ = np.flatnonzero(d.sum(axis=1) + way > 2.0 * known)
-        if not open_.size:
-            break
-        edge, s, d, way = edge[open_], s[open_], d[open_], way[open_]
-        at = s[:, :1] + np.linspace(0.0, 1.0, _PARTS + 1) * (s[:, 1:] - s[:, :1])
-        points = ends[edge, None, 0] + at[:, 1:-1, None] * span[edge, None]
-        reach = np.maximum(d.max(axis=1), limit[edge]) + 0.5 * way
-        found = b.depth(points.reshape(-1, 3), np.repeat(reach, _PARTS - 1), chosen)
-        value = found.value.reshape(-1, _PARTS - 1)
-        order = np.lexsort((-found.value, np.repeat(edge, _PARTS - 1)))
-        of = np.repeat(edge, _PARTS - 1)[order]
-        first = order[np.unique(of, return_index=True)[1]]
-        better = first[found.value[first] > best[edge[first // (_PARTS - 1)]]]
-        k = edge[better // (_PARTS - 1)]
-        place[k], best[k] = points.reshape(-1, 3)[better], found.value[better]
-        facet[k] = found.facet[better]
-        known_at = np.column_stack([d[:, 0], value, d[:, 1]])
-        s, d = (np.stack([v[:, :-1], v[:, 1:]], axis=-1).reshape(-1, 2) for v in (at, known_at))
-        edge = np.repeat(edge, _PARTS)
-    return place, best, facet
 
 
 class Finding(NamedTuple):
     """The worst of what a look found of a kind.
 
     Attributes:
-        kind: "edge through a body" or "node inside a body".
+        kind: "edge through a body", "node inside a body" or "facet in an obstacle".
         depth: Of the deepest point [m].
         size: The same in facet sizes [-].
         place: Where it is [m], shape (3,).
-        bodies: Name of the body it belongs to, and of the one it is in.
-        nodes: Input numbers of the edge's ends, or of the node.
+        bodies: Name of the body it belongs to, and of the body or obstacle it is in.
+        nodes: Input numbers of the edge's ends, of the node, or of the facet's corners.
         text: Sentence with all this and a remedy.
     """
 
@@ -384,6 +63,21 @@ class Pause(NamedTuple):
 
     least: float
     most: float
+
+
+@dataclass
+class _Looked:
+    """The last look at a pair.
+
+    Attributes:
+        where: What was where, as of `where`.
+        pause: Until the next look.
+        steps: Since then.
+    """
+
+    where: list[FloatArray]
+    pause: Pause
+    steps: int = 0
 
 
 class _Watched:
@@ -489,13 +183,17 @@ class _Watched:
                 "contact holds nodes of the slave, but no edges, out of facets: use a finer mesh "
                 "of the slave there, round the edges, or exchange slave and master"
             )
-        place = ", ".join(f"{c:.4g}" for c in found.place[i])
         depth, size = float(found.depth[i]), float(found.size[i])
         text = (
             f"{what} lies up to {depth:.3g} m, or {size:.2g} of a facet, inside {two!r} at "
-            f"({place}); {remedy}"
+            f"({_point(found.place[i])}); {remedy}"
         )
         return Finding(kind, depth, size, found.place[i], (one, two), nodes, text)
+
+
+def _point(x: FloatArray) -> str:
+    """Coordinates (3,) for a message."""
+    return ", ".join(f"{c:.4g}" for c in x)
 
 
 def _belong(surface: Surface, declared: Sequence[Surface]) -> BoolArray:
@@ -507,12 +205,120 @@ def _belong(surface: Surface, declared: Sequence[Surface]) -> BoolArray:
     return result
 
 
+class _BodyPair:
+    """Two bodies, or twice the same, of which contacts are declared with each other.
+
+    Args:
+        bodies: Their numbers.
+        contacts: The contacts between them.
+        boundary: The whole boundary of a body by its number. Collective.
+    """
+
+    def __init__(
+        self,
+        bodies: tuple[int, ...],
+        contacts: Sequence[Any],
+        boundary: Callable[[int], Surface],
+    ) -> None:
+        self._bodies, self._contacts, self._boundary = bodies, contacts, boundary
+
+    def where(self, u: Sequence[FloatArray], time: float) -> list[FloatArray]:
+        """What moves, each a displacement of its points [m], shape (3 n,)."""
+        return [u[k] for k in self._bodies]
+
+    @cached_property
+    def _parts(self) -> list[_Watched]:
+        """What to look at, gathered at the first look. Collective."""
+        one, two = (self._boundary(k) for k in self._bodies)
+        if one is two:
+            return [_Watched((c.slave, c.master), [c], one) for c in self._contacts]
+        return [_Watched((one, two), self._contacts, None)]
+
+    def look(self, where: list[FloatArray], both: bool) -> tuple[list[Finding], Pause]:
+        """What is inside, and how long nothing else may be. Collective.
+
+        Args:
+            where: Of `where`.
+            both: Look at the nodes and edges of both bodies; else of one and the other in turn.
+        """
+        of = {id(self._boundary(k).body): u for k, u in zip(self._bodies, where, strict=True)}
+        needed = {id(s): s for part in self._parts for s in part.needed}
+        positions = {i: s.positions(of[id(s.body)]) for i, s in needed.items()}
+        looks = [part.look(positions, both) for part in self._parts]
+        return [f for found, _ in looks for f in found], min(pause for _, pause in looks)
+
+
+class _ObstacleContact:
+    """The slave of a contact and its obstacle, between whose nodes the obstacle may pass.
+
+    Args:
+        contact: The contact.
+        body: Number of its body.
+    """
+
+    def __init__(self, contact: Any, body: int) -> None:
+        self._contact, self._body = contact, body
+
+    def where(self, u: Sequence[FloatArray], time: float) -> list[FloatArray]:
+        """What moves, each a displacement of its points [m], shape (3 n,). Collective."""
+        slave, obstacle = self._contact.slave, self._contact.master
+        return [u[self._body], obstacle.displacement(time, slave.body.comm)]
+
+    def look(self, where: list[FloatArray], both: bool) -> tuple[list[Finding], Pause]:
+        """The deepest facet of the slave, and how long none may be as deep. Collective."""
+        slave, obstacle = self._contact.slave, self._contact.master
+        u, moved = where
+        x = slave.positions(u) - moved
+        corners = x[slave.facets]
+        size = fc.size(corners)
+        # Nothing is deeper in a thin obstacle than half its width.
+        scale = np.minimum(size, obstacle.width)
+        gap = obstacle.gap(x).value[slave.facets].min(axis=1)
+        # No point of a facet is farther from its next corner.
+        near = np.flatnonzero(gap < size)
+        smallest = float(scale[near if near.size else slice(None)].min())
+        if not near.size:
+            far = float((gap - size).min()) + _LOOK * smallest
+            return [], Pause(far, far)
+        pause = Pause(_LOOK * smallest, smallest)
+        limit = LEAST * scale[near]
+        place, depth = sunk(obstacle, corners[near], limit)
+        deep = depth > limit
+        if not deep.any():
+            return [], pause
+        i = int(np.where(deep, depth / size[near], 0.0).argmax())
+        facet, at_corner = near[i], bool(-gap[near[i]] > limit[i])
+        return [self._told(facet, at_corner, place[i] + moved, depth[i], size[facet])], pause
+
+    def _told(
+        self, facet: int, at_corner: bool, place: FloatArray, depth: float, size: float
+    ) -> Finding:
+        """A facet in words, and whether one of its nodes is inside, too."""
+        slave, other = self._contact.slave, self._contact.master.name
+        name = slave.body.name
+        nodes = tuple(sorted(int(n) for n in slave.original[slave.facets[facet]]))
+        if at_corner:
+            remedy = "contact did not hold its nodes: use a smaller dt"
+        else:
+            remedy = (
+                "contact holds nodes of the slave, but not what is between them, out of an "
+                "obstacle: use a finer mesh of the slave there"
+            )
+        text = (
+            f"the facet of nodes {list(nodes)} of {name!r} lies up to {depth:.3g} m, or "
+            f"{depth / size:.2g} of its size, inside {other!r} at ({_point(place)}); {remedy}"
+        )
+        kind = "facet in an obstacle"
+        return Finding(kind, float(depth), float(depth / size), place, (name, other), nodes, text)
+
+
 class OverlapWatch:
     """Looks whether bodies that are in a contact with each other end up inside each other.
 
-    Bodies of which no contact is declared may pass through each other, and obstacles are not
-    looked at. A look is due when the bodies have moved relative to each other so far that their
-    boxes can touch; then by a quarter of a facet since the last one, and four steps or a facet.
+    Also whether obstacles end up inside facets of a slave that they are the master of. Bodies of
+    which no contact is declared may pass through each other. A look is due when the two have moved
+    relative to each other so far that they can touch; then by a quarter of a facet since the last
+    one, and four steps or a facet. The radius of a small obstacle counts as a facet.
 
     Args:
         system: The scene.
@@ -520,75 +326,61 @@ class OverlapWatch:
 
     def __init__(self, system: Any) -> None:
         self._comm, self._bodies = system.comm, system.bodies
-        self._contacts: dict[tuple[int, ...], list[Any]] = {}
-        for contact, bodies in zip(system.contacts, system.contact_bodies, strict=True):
-            if len(bodies) == 2 and all(hasattr(b, "mesh") for b in contact.bodies):
-                self._contacts.setdefault(tuple(sorted(bodies)), []).append(contact)
-        self._pause: dict[tuple[int, ...], Pause] = {}
-        self._steps = dict.fromkeys(self._contacts, 0)
-        self._last: dict[tuple[int, ...], list[FloatArray]] = {}
-        self._watched: dict[tuple[int, ...], list[_Watched]] = {}
         self._surfaces: dict[int, Surface] = {}
+        between: dict[tuple[int, ...], list[Any]] = {}
+        self._pairs: list[_BodyPair | _ObstacleContact] = []
+        for contact, bodies in zip(system.contacts, system.contact_bodies, strict=True):
+            if contact.rigid and len(contact.slave.facets):
+                self._pairs.append(_ObstacleContact(contact, *bodies))
+            elif not contact.rigid and all(hasattr(b, "mesh") for b in contact.bodies):
+                between.setdefault(tuple(sorted(bodies)), []).append(contact)
+        self._pairs += [_BodyPair(k, c, self._boundary) for k, c in between.items()]
+        self._looked: dict[int, _Looked] = {}
 
-    def look(self, u: Sequence[FloatArray], *, last: bool = False) -> list[Finding]:
+    def look(
+        self, u: Sequence[FloatArray], time: float = 0.0, *, last: bool = False
+    ) -> list[Finding]:
         """The worst finding of each kind, if a look is due. Collective, the same on all ranks.
 
         Args:
             u: Owned displacements of all bodies [m]; kept until the next look, not to be changed.
+            time: At which they are so [s].
             last: Look again wherever anything has moved.
         """
+        now = [pair.where(u, time) for pair in self._pairs]
         findings: list[Finding] = []
-        for key in self._due(u, last):
-            both = last or key not in self._last
-            self._last[key], self._steps[key] = [u[k] for k in key], 0
-            watched = self._watched_of(key)
-            of = {id(self._bodies[k]): u[k] for k in key}
-            needed = {id(s): s for w in watched for s in w.needed}
-            positions = {i: s.positions(of[id(s.body)]) for i, s in needed.items()}
-            looks = [each.look(positions, both) for each in watched]
-            findings += [f for found, _ in looks for f in found]
-            self._pause[key] = min(pause for _, pause in looks)
+        for k in self._due(now, last):
+            found, pause = self._pairs[k].look(now[k], last or k not in self._looked)
+            findings += found
+            self._looked[k] = _Looked(now[k], pause)
         worst: dict[str, Finding] = {}
         for f in findings:
             if f.kind not in worst or f.size > worst[f.kind].size:
                 worst[f.kind] = f
         return list(worst.values())
 
-    def _due(self, u: Sequence[FloatArray], last: bool) -> list[tuple[int, ...]]:
+    def _due(self, now: list[list[FloatArray]], last: bool) -> list[int]:
         """Pairs that have moved enough. Collective."""
-        fresh = [key for key in self._contacts if key not in self._last]
-        known = list(self._last)
-        if not known:
+        fresh = [k for k in range(len(now)) if k not in self._looked]
+        if not self._looked:
             return fresh
         # Largest motion in each direction; the opposite ones are the least.
-        moved = np.full((len(known), 2, 2, 3), -np.inf)
-        for i, key in enumerate(known):
-            for j, (k, before) in enumerate(zip(key, self._last[key], strict=True)):
-                d = (u[k] - before).reshape(-1, 3)
+        moved = np.full((len(self._looked), 2, 2, 3), -np.inf)
+        for i, (k, looked) in enumerate(self._looked.items()):
+            for j, (after, before) in enumerate(zip(now[k], looked.where, strict=True)):
+                d = (after - before).reshape(-1, 3)
                 moved[i, j] = d.max(axis=0, initial=-np.inf), (-d).max(axis=0, initial=-np.inf)
         self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
         apart = np.maximum(moved[:, 0, 0] + moved[:, 1, 1], moved[:, 1, 0] + moved[:, 0, 1])
         ways = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
         due = []
-        for key, way in zip(known, ways.tolist(), strict=True):
-            self._steps[key] += 1
-            least, most = self._pause[key]
-            enough = way > (least if self._steps[key] >= _STEPS else most)
+        for (k, looked), way in zip(self._looked.items(), ways.tolist(), strict=True):
+            looked.steps += 1
+            least, most = looked.pause
+            enough = way > (least if looked.steps >= _STEPS else most)
             if enough or (last and way > 0.0):
-                due.append(key)
+                due.append(k)
         return fresh + due
-
-    def _watched_of(self, key: tuple[int, ...]) -> list[_Watched]:
-        """What to look at of a pair, gathered at its first look. Collective."""
-        if key not in self._watched:
-            whole = [self._boundary(k) for k in key]
-            contacts = self._contacts[key]
-            if key[0] == key[1]:
-                parts = [_Watched((c.slave, c.master), [c], whole[0]) for c in contacts]
-            else:
-                parts = [_Watched((whole[0], whole[1]), contacts, None)]
-            self._watched[key] = parts
-        return self._watched[key]
 
     def _boundary(self, k: int) -> Surface:
         """The whole boundary of a body. Collective."""

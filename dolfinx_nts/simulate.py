@@ -336,13 +336,13 @@ class Stepper:
         self.solution.rows = Table([balance.first_row(self.system, self.state)])
 
     def look(self, *, last: bool = False) -> None:
-        """Warn if bodies in contact are inside each other; only as often as they have moved.
+        """Warn if what is in contact is inside each other; only as often as it has moved.
 
         Args:
             last: Look wherever anything has moved since the last look.
         """
         if self._overlap is not None:
-            for found in self._overlap.look(self.state.u, last=last):
+            for found in self._overlap.look(self.state.u, self.state.time, last=last):
                 self.solution.warn(
                     found.kind, self.state.time, found.depth, found.text, grave=True
                 )
@@ -567,8 +567,9 @@ def simulate(
             caller changes in a material during the run wakes nothing.
         adapt: Choose the steps by their error and by closing gaps.
         watch_overlap: Look whether bodies of a contact end up inside each other, with all of their
-            boundaries, and warn. It costs less than one part in fifty of the steps unless the
-            bodies move by a quarter of a facet in few of them.
+            boundaries, or an obstacle in the facets that it is the master of, and warn. It costs
+            less than one part in fifty of the steps unless the bodies move by a quarter of a facet
+            in few of them.
 
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then,

@@ -17,6 +17,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 LEVELS = [
     {
+        "bounded_slope",
         "discrete_gradient",
         "strain_energy",
         "precise",
@@ -37,6 +38,7 @@ LEVELS = [
         "joints",
         "contact",
         "contact_step",
+        "intrusion",
         "obstacles",
         "obstacle_contact",
         "overlap",

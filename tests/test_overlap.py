@@ -1,5 +1,6 @@
 """Bodies inside each other: depths against brute force, edges that cross, scenes that are right."""
 
+import copy
 import itertools
 import logging
 
@@ -11,7 +12,8 @@ from scipy import ndimage
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts import overlap
+from dolfinx_nts import facets, intrusion, overlap
+from dolfinx_nts.obstacles import Obstacle
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
@@ -58,8 +60,8 @@ class Heap:
         used, inverse = np.unique(facets, return_inverse=True)
         grid = np.array(list(itertools.product(range(n + 1), repeat=3)))[used]
         self.x = self.place(grid)
-        self.boundary = overlap.Boundary(inverse.reshape(facets.shape))
-        self.placed = overlap.Placed(self.boundary, self.x)
+        self.boundary = intrusion.Boundary(inverse.reshape(facets.shape))
+        self.placed = intrusion.Placed(self.boundary, self.x)
         # Of a square, or of the triangle that is half of it.
         self.size = h if nc == 4 else h * (2 + np.sqrt(2)) / 3
 
@@ -118,7 +120,7 @@ def test_nodes_and_edges_inside_are_those_of_brute_force(seed, nc):
     least, found_any = 0.1, 0
     scale = max(h.size for h in heap)
     for a, b in (heap, heap[::-1]):
-        found = overlap.intrusions(a.placed, b.placed, least)
+        found = intrusion.intrusions(a.placed, b.placed, least)
         assert np.abs(found.depth - b.depth(found.place)).max(initial=0.0) < 1e-13
         assert np.allclose(found.size, found.depth / scale)
         node = found.part(found.is_node)
@@ -149,17 +151,17 @@ def box(low, high, cells):
     points = np.array(list(itertools.product(*(range(k + 1) for k in n)))) / n
     used, number = np.unique(facets[count[inverse.ravel()] == 1], return_inverse=True)
     x = np.array(low) + points[used] * np.subtract(high, low)
-    return overlap.Placed(overlap.Boundary(number.reshape(-1, 4)), x)
+    return intrusion.Placed(intrusion.Boundary(number.reshape(-1, 4)), x)
 
 
 def count(a, b):
-    return len(overlap.intrusions(a, b).depth)
+    return len(intrusion.intrusions(a, b).depth)
 
 
 def test_a_plate_too_thin_to_be_deep_in_it():
     """A plate of 1 cm with facets of 0.25 m: a post through it, one on it, posts beside it."""
     plate = box((-1, -1, -0.005), (1, 1, 0.005), (8, 8, 1))
-    found = overlap.intrusions(box((-0.1, -0.1, -0.3), (0.11, 0.12, 0.6), (1, 1, 1)), plate)
+    found = intrusion.intrusions(box((-0.1, -0.1, -0.3), (0.11, 0.12, 0.6), (1, 1, 1)), plate)
     assert len(found.depth) == 4 and not found.is_node.any()
     assert np.allclose(found.depth, 0.005, rtol=0.02)
     assert count(box((-0.1, -0.1, 0.0049), (0.1, 0.1, 0.6), (1, 1, 1)), plate) == 0
@@ -169,7 +171,7 @@ def test_a_plate_too_thin_to_be_deep_in_it():
 
 def test_a_body_wholly_inside_is_found():
     big, small = box((0, 0, 0), (1, 1, 1), (2, 2, 2)), box((0.4,) * 3, (0.55,) * 3, (1, 1, 1))
-    found = overlap.intrusions(small, big)
+    found = intrusion.intrusions(small, big)
     assert len(found.depth) == 8 and np.isclose(found.depth.max(), 0.45)
     assert count(big, small) == 0
 
@@ -182,7 +184,7 @@ def test_touching_faces_are_no_overlap(metre, distance):
 
     def placed(*arguments):
         body = box(*arguments)
-        return overlap.Placed(body.boundary, metre * (body.x @ turn.T + shift))
+        return intrusion.Placed(body.boundary, metre * (body.x @ turn.T + shift))
 
     lower = placed((0, 0, 0), (1, 1, 1), (4, 4, 4))
     upper = placed((0.1, 0.1, 1 + distance / 4), (0.9, 0.9, 1.8), (3, 3, 3))
@@ -344,7 +346,7 @@ def test_bodies_that_pass_or_touch_are_not_warned_of():
 def test_looks_are_as_rare_as_the_motion_allows(monkeypatch):
     """Not while nothing moves relatively or boxes are apart; else 4 a facet (of 1/3 m)."""
     system, looks = blocks(0.1), []
-    true = overlap.intrusions
+    true = intrusion.intrusions
     monkeypatch.setattr(overlap, "intrusions", lambda *a: looks.append(len(looks)) or true(*a))
     watch = overlap.OverlapWatch(system)
 
@@ -398,3 +400,222 @@ def test_what_is_behind_an_open_surface_but_outside_is_no_overlap():
     """The bottom of a cube lies behind the facets that face the other way, beyond the body."""
     system = two_in_one(low=2.2)
     assert overlap.OverlapWatch(system).look(moved(system, (0.0, 0.0, 0.0))) == []
+
+
+# ---- obstacles
+class Ball(Obstacle):
+    """A ball as a user may write it: by its gap alone."""
+
+    def __init__(self, centre, radius, width=np.inf):
+        self.name, self.motion, self._width = "ball", None, width
+        self.centre, self.radius = np.array(centre), radius
+
+    @property
+    def extent(self):
+        return self.radius
+
+    @property
+    def width(self):
+        return self._width
+
+    def gap(self, x):
+        y = x - self.centre
+        r = np.linalg.norm(y, axis=1)
+        unit = y / r[:, None]
+        bend = (np.eye(3) - unit[:, :, None] * unit[:, None]) / r[:, None, None]
+        return nts.nts.Gap(r - self.radius, unit[:, None], bend)
+
+
+def obstacles(rng):
+    """Obstacles among facets of size 1 about the origin, and distances of facets from them."""
+    centre, axis = 0.5 * rng.normal(size=3), rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    radius, far = rng.uniform(0.2, 2.0), 5.0
+
+    def from_centre(corners):
+        return facets.closest_point(np.tile(centre, (len(corners), 1)), corners)[1]
+
+    def sampled(corners, distance):
+        s, t = (a.ravel()[:, None] for a in np.meshgrid(*[np.linspace(-1, 1, 201)] * 2))
+        if corners.shape[1] == 3:
+            s, t = 0.5 * (1 + s), 0.25 * (1 + s) * (1 + t)
+            weights = np.hstack([1 - s, s - t, t])
+        else:
+            weights = 0.25 * np.hstack([(1 - s) * (1 - t), (1 + s) * (1 - t),
+                                        (1 + s) * (1 + t), (1 - s) * (1 + t)])  # fmt: skip
+        return np.array([distance(weights @ c).min() for c in corners])
+
+    yield nts.Sphere(centre, radius), lambda c: from_centre(c) - radius
+    yield Ball(centre, radius), lambda c: from_centre(c) - radius
+    yield nts.Cylinder(centre, axis, radius), lambda c: sampled(
+        c, lambda x: np.linalg.norm(np.cross(x - centre, axis), axis=1)
+    ) - radius
+    # What is farthest from a point or a line is a corner.
+    yield nts.Sphere(centre, far, inside=True), lambda c: (
+        far - np.linalg.norm(c - centre, axis=2).max(axis=1)
+    )
+    yield nts.Cylinder(centre, axis, far, inside=True), lambda c: (
+        far - np.linalg.norm(np.cross(c - centre, axis), axis=2).max(axis=1)
+    )
+    yield nts.Plane(centre, axis), lambda c: ((c - centre) @ axis).min(axis=1)
+
+
+@pytest.mark.parametrize("nc", [3, 4])
+@pytest.mark.parametrize("metre", [1.0, 1e-6])
+def test_facets_in_obstacles_are_as_deep_as_their_distance_tells(nc, metre):
+    """Warped facets of any shape; a twisted one may be seen edge on."""
+    rng, found_any = np.random.default_rng(nc), 0
+    shape = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float)[:nc]
+    for _ in range(4):
+        turned = np.array([shape @ rotation(rng).T for _ in range(30)])
+        c = turned + 0.2 * rng.normal(size=(30, nc, 3)) + 2 * rng.normal(size=(30, 1, 3))
+        for obstacle, lowest in obstacles(rng):
+            limit, true = np.full(len(c), 0.05), -lowest(c)
+            scaled = copy.copy(obstacle)
+            for name in ("centre", "point", "radius"):
+                if hasattr(scaled, name):
+                    object.__setattr__(scaled, name, metre * np.array(getattr(scaled, name)))
+            place, depth = (
+                v / metre for v in intrusion.sunk(scaled, metre * c, metre * limit)
+            )
+            deep = depth > limit
+            sure = np.abs(true / limit - 1) > 0.02
+            assert np.array_equal(deep[sure], (true > limit)[sure])
+            assert np.allclose(depth[deep], true[deep], rtol=0.011)
+            assert np.allclose(-obstacle.gap(place[deep]).value, depth[deep], rtol=0.011)
+            found_any += deep.sum()
+    assert found_any > 100
+
+
+@pytest.mark.parametrize("far", [1.0, 30.0])
+def test_paths_through_an_obstacle_that_is_known_by_its_gap_alone(far):
+    """Also through one far smaller than the path, if it tells its width."""
+    rng = np.random.default_rng(5)
+    centre, radius = np.array([0.1, -0.2, 0.3]), 0.5
+    start = centre + far * rng.uniform(-1, 1, size=(200, 3))
+    aim = centre + rng.uniform(-0.4, 0.4, size=(200, 3))
+    end = start + rng.uniform(1.0, 2.0, size=(200, 1)) * (aim - start)
+    true = nts.Sphere(centre, radius).lowest_gap(start, end)
+    found = Ball(centre, radius, width=radius).lowest_gap(start, end)
+    least = 0.05 * np.minimum(radius, np.linalg.norm(end - start, axis=1))
+    deep = true < -least
+    assert deep.sum() > 50 and (found >= true - 1e-12).all()
+    assert np.allclose(found[deep], true[deep], rtol=0.011)
+
+
+def above(master, *, cells=(2, 2), height=0.5, cell_type=CellType.hexahedron, turn=None, **options):
+    """A plate of 2 x 2 in the plane z = 0 with facets of 1, or others, held out of an obstacle."""
+    mesh = create_box(
+        COMM, [[-1, -1, 0], [1, 1, height]], [*cells, 1],
+        cell_type=cell_type, ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    body = nts.Continuum(mesh, rubber, density=1e3, name="plate", **options)
+    pair = nts.ContactPair(slave=body.surface(lambda x: x[2] < 1e-9), master=master)
+    return nts.System([body], contacts=[pair])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("cell_type", [CellType.hexahedron, CellType.tetrahedron])
+@pytest.mark.parametrize(
+    ("master", "up", "place"),
+    [
+        (nts.Sphere((0.4, 0.55, -1.0), 0.8), 0.6, (0.4, 0.55)),
+        (nts.Sphere((0.5, 0.0, -1.0), 0.4), 0.9, (0.5, 0.0)),
+        (nts.Cylinder((0.5, 0.5, -1.0), (0, 1, 0), 0.3), 1.0, (0.5, None)),
+        # Thinner than a fifth of a facet.
+        (nts.Cylinder((0.5, 0.3, -1.0), (1, 0.1, 0), 0.05), 0.97, (None, None)),
+    ],
+    ids=["under a facet", "under an edge", "roller", "wire"],
+)
+def test_an_obstacle_between_the_nodes_is_told_with_place_and_depth(master, up, place, cell_type):
+    """Its top comes from below to a height of `up` + radius - 1 above the plane of the facets."""
+    depth = up + master.radius - 1.0
+    system = above(master, cell_type=cell_type)
+    (found,) = overlap.OverlapWatch(system).look(moved(system, (0, 0, -up)))
+    assert found.kind == "facet in an obstacle" and found.bodies == ("plate", master.name)
+    assert abs(found.depth - depth) < 0.011 * depth
+    expected = np.array([np.nan if v is None else v for v in (*place, -up)], dtype=float)
+    off = np.abs(found.place - expected)
+    # A point whose depth is right to 1 % may lie beside the deepest.
+    assert np.nanmax(off) < np.sqrt(2 * 0.022 * depth * master.radius)
+    assert "finer mesh of the slave" in found.text and f"inside {master.name!r}" in found.text
+    body = system.bodies[0]
+    number = np.asarray(body.mesh.geometry.input_global_indices)
+    x = np.concatenate(COMM.allgather(body.mesh.geometry.x[np.isin(number, found.nodes)]))
+    assert (x[:, 2] == 0).all() and (x.min(axis=0)[:2] - 0.02 <= found.place[:2]).all()
+    assert (found.place[:2] <= x.max(axis=0)[:2] + 0.02).all()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.parametrize("moving", ["plate", "ball"])
+def test_a_run_in_which_a_ball_comes_through_a_facet_says_so(moving, integrator, caplog):
+    """A ball of radius 0.4 between four nodes of a facet of 1: nothing holds them apart."""
+    caplog.set_level(logging.CRITICAL)
+    path = (lambda t: (0.0, 0.0, 5.0 * t)) if moving == "ball" else None
+    ball = nts.Sphere((0.5, 0.5, -0.45), 0.4, motion=path)
+    down = (0, 0, -5.0) if moving == "plate" else (0, 0, 0)
+    run = nts.simulate(above(ball, velocity=down), integrator, dt=5e-3, t_end=0.06)
+    assert run.balance["active"].max() == 0
+    assert run.status.startswith("completed, but the facet of nodes")
+    (kind,) = run.warnings
+    assert kind == "facet in an obstacle" and run.warnings[kind].grave
+    assert abs(run.warnings[kind].worst - 0.25) < 0.0028
+
+
+@pytest.mark.mpi
+def test_load_steps_of_a_ball_through_a_facet_are_watched(caplog):
+    caplog.set_level(logging.CRITICAL)
+    ball = nts.Sphere((0.5, 0.5, -0.45), 0.4, motion=lambda t: (0.0, 0.0, 0.3 * t))
+    held = nts.Dirichlet(lambda x: x[2] > 0.49)
+    run = nts.equilibrium(above(ball, bcs=[held]), load_steps=3)
+    assert run.status.startswith("completed, but the facet of nodes")
+    assert abs(run.warnings["facet in an obstacle"].worst - 0.25) < 0.0028
+
+
+@pytest.mark.mpi
+def test_what_lies_on_an_obstacle_is_not_warned_of():
+    """Flush on a floor and a little below; four nodes of each facet on a ball of two facets."""
+    system = above(nts.Plane((0, 0, 0), (0, 0, 1)), cells=(6, 6))
+    watch = overlap.OverlapWatch(system)
+    for down in (0.0, 1e-12, 1e-3):
+        assert watch.look(moved(system, (0, 0, -down)), last=True) == []
+    ball = nts.Sphere((0.0, 0.0, -0.6 - 1e-9), 0.6)
+    system = above(ball, cells=(8, 8))
+    body = system.bodies[0]
+    x = body.reference.reshape(-1, 3)
+    r = np.hypot(x[:, 0], x[:, 1])
+    arc = np.minimum(r, 0.5) / 0.6
+    u = np.where(r > 0, 0.6 * np.sin(arc) / np.where(r > 0, r, 1.0), 1.0)[:, None] * x
+    u[:, 2] = x[:, 2] + 0.6 * (np.cos(arc) - 1)
+    assert overlap.OverlapWatch(system).look([(u - x).ravel()]) == []
+
+
+@pytest.mark.mpi
+def test_a_corner_in_an_obstacle_asks_for_a_smaller_step():
+    system = above(nts.Plane((0, 0, 0), (0, 0, 1)))
+    (found,) = overlap.OverlapWatch(system).look(moved(system, (0, 0, -0.3)))
+    assert abs(found.depth - 0.3) < 0.0031 and "use a smaller dt" in found.text
+
+
+@pytest.mark.mpi
+def test_obstacles_are_looked_at_as_rarely_as_the_motion_allows(monkeypatch):
+    """Not far away; else after a quarter of the radius and four steps, or the radius."""
+    ball, looks = nts.Sphere((0.5, 0.5, -0.45), 0.4), []
+    system = above(ball)
+    watch, true = overlap.OverlapWatch(system), overlap.sunk
+    monkeypatch.setattr(overlap, "sunk", lambda *a: looks.append(1) or true(*a))
+
+    def look(z, **options):
+        watch.look(moved(system, (0, 0, z)), **options)
+        done = len(looks)
+        looks.clear()
+        return done
+
+    # Some node is within a facet of the ball from a height of 0.6 on.
+    assert sum(look(z) for z in np.linspace(30.0, 1.0, 30)) == 0
+    assert look(0.0) == 1
+    assert [look(-z) for z in (0.05, 0.12, 0.12, 0.12, 0.13)] == [0, 0, 0, 1, 0]
+    assert [look(-z) for z in (0.5, 0.55)] == [0, 1]
+    assert [look(-0.56, last=True) for _ in range(2)] == [1, 0]

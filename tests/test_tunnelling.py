@@ -82,7 +82,96 @@ def test_hits_on_a_facet_that_turns():
     points = np.array([[0.3, 0.5, 0.3], [0.3, 0.5, -0.3]])
     found, when = search.first_hits(points, np.zeros((2, 3)), corners, end - corners)
     assert found.tolist() == [0, -1]
-    assert abs(when[0] - 0.5) < 0.05
+    assert abs(when[0] - 0.5) < 1e-15
+
+
+def sheet(corners, cells=8):
+    """Points of a square of 4 x 4 in the plane z = 0 and its facets, which look upwards."""
+    line = np.linspace(-2, 2, cells + 1)
+    x = np.stack([*np.meshgrid(line, line, indexing="ij"), np.zeros((cells + 1,) * 2)], axis=-1)
+    first = np.add.outer((cells + 1) * np.arange(cells), np.arange(cells)).ravel()
+    quads = first[:, None] + [0, cells + 1, cells + 2, 1]
+    halves = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return x.reshape(-1, 3), quads if corners == 4 else halves
+
+
+@pytest.mark.parametrize("corners", [3, 4])
+@pytest.mark.parametrize("angle", [0.0, 0.01, 0.1, 0.3, 1.0])
+def test_no_path_slips_between_facets_that_turn(corners, angle):
+    """Points go from above to below a plate that turns by an angle, and with it.
+
+    Of the rotation R about p x z, corners move to M(t) X = (1 - t) X + t R X and the normal is
+    (1 - t + t c) z - t s p, with c, s = cos, sin(angle). So the height of a point that goes from
+    X + a z to R (X - b z) is (1 - t) a (1 - t + t c) - t b (t + c (1 - t)).
+    """
+    random = np.random.default_rng(int(100 * angle))
+    x, facets = sheet(corners)
+    p, z = np.array([0.6, -0.8, 0.0]), np.array([0.0, 0.0, 1.0])
+    k, c, s = np.cross(z, p), np.cos(angle), np.sin(angle)
+    turn = np.outer(k, k) + c * (np.outer(p, p) + np.outer(z, z))
+    turn += s * (np.outer(z, p) - np.outer(p, z))
+    n = 30_000
+    foot = np.column_stack([random.uniform(-1.5, 1.5, (n, 2)), np.zeros(n)])
+    a, b = random.uniform(0.05, 0.3, (2, n))
+    start, end = foot + a[:, None] * z, (foot - b[:, None] * z) @ turn.T
+    corner = x[facets]
+    hit, when = search.first_hits(start, end - start, corner, corner @ turn.T - corner)
+    assert (hit >= 0).all()
+    height = (1 - when) * a * (1 - when + when * c) - when * b * (when + c * (1 - when))
+    assert np.abs(height).max() < 1e-14
+    # At that instant the path is at the facet.
+    there = (1 - when[:, None, None]) * corner[hit] + when[:, None, None] * (corner @ turn.T)[hit]
+    point = start + when[:, None] * (end - start)
+    beyond = np.maximum(there.min(axis=1) - point, point - there.max(axis=1))
+    assert beyond.max() < 1e-6
+
+
+@pytest.mark.parametrize("corners", [3, 4])
+def test_no_path_slips_through_a_sheet_that_crumples(corners):
+    """Each corner has a motion of its own, by a fifth of a facet; every path crosses the sheet."""
+    random = np.random.default_rng(corners)
+    x, facets = sheet(corners)
+    x, motion = x + random.uniform(-0.1, 0.1, x.shape), random.uniform(-0.1, 0.1, x.shape)
+    n = 30_000
+    start = np.column_stack([random.uniform(-1.6, 1.6, (n, 2)), np.full(n, 0.21)])
+    path = np.column_stack([random.uniform(-0.1, 0.1, (n, 2)), np.full(n, -0.42)])
+    hit, _ = search.first_hits(start, path, x[facets], motion[facets])
+    assert (hit >= 0).all()
+
+
+@pytest.mark.parametrize("corners", [3, 4])
+def test_first_hits_of_facets_that_turn_against_all_pairs(corners):
+    """Roots of numpy of the polynomial through four of its values."""
+    random = np.random.default_rng(corners)
+    facets = random.uniform(-1, 1, (60, 1, 3)) + 0.6 * random.normal(size=(60, corners, 3))
+    moved = 0.7 * random.normal(size=(60, corners, 3))
+    points, motion = random.uniform(-1, 1, (60, 3)), random.normal(size=(60, 3))
+    found, when = search.first_hits(points, motion, facets, moved)
+    parts, at = [[0, 1, 2], [0, 2, 3]][: corners - 2], np.array([0.0, 0.3, 0.7, 1.0])
+
+    def times(x, d, start, change):
+        def frame(t):
+            a, b, c = start + t * change
+            return x + t * d - a, b - a, c - a
+
+        values = [np.linalg.det(frame(t)) for t in at]
+        cubic = np.poly1d(np.polyfit(at, values, 3))
+        for root in cubic.roots:
+            t = root.real
+            if abs(root.imag) < 1e-9 and 0 <= t <= 1 and cubic.deriv()(t) < 0:
+                offset, *edges = frame(t)
+                w = np.linalg.lstsq(np.transpose(edges), offset, rcond=None)[0]
+                if w.min() >= 0 and w.sum() <= 1:
+                    yield t
+
+    for x, d, f, t in zip(points, motion, found, when, strict=True):
+        each = [
+            min((s for p in parts for s in times(x, d, c[p], m[p])), default=np.inf)
+            for c, m in zip(facets, moved, strict=True)
+        ]
+        assert np.isclose(t, min(each), rtol=1e-8) or t == min(each)
+        assert f == (-1 if np.isinf(t) else int(np.argmin(each)))
+    assert 10 < (found >= 0).sum() < 55
 
 
 # ---- masses
