@@ -37,7 +37,8 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import BalanceCSV, on_root
+from dolfinx_nts.output import BalanceCSV
+from dolfinx_nts.parallel import write_on_root
 from dolfinx_nts.pictures import picture
 
 MM = 1e-3
@@ -220,7 +221,7 @@ def main(
     if comm.rank == 0:
         report(result)
     if output:
-        on_root(comm, f"output={output!r}", lambda: write(result, Path(output)))
+        write_on_root(comm, f"output={output!r}", lambda: write(result, Path(output)))
     return result
 
 

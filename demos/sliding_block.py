@@ -36,7 +36,8 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import BalanceCSV, on_root
+from dolfinx_nts.output import BalanceCSV
+from dolfinx_nts.parallel import write_on_root
 
 GRAVITY = 9.81
 SIZE, HEIGHT, DENSITY = 0.2, 0.05, 1000.0
@@ -338,7 +339,8 @@ def main(
         report(results)
     if output:
         folder = Path(output)
-        on_root(comm, f"output={output!r}", lambda: plot(motions, folder / "sliding_block.png"))
+        file = folder / "sliding_block.png"
+        write_on_root(comm, f"output={output!r}", lambda: plot(motions, file))
     return results
 
 

@@ -16,6 +16,7 @@ from dolfinx_nts.integrators import (
 from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.newton import Newton
+from dolfinx_nts.nts_element import Gap
 from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
 from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.step_size import Adapt
@@ -34,6 +35,7 @@ __all__ = [
     "Dirichlet",
     "EnergyMomentum",
     "Equilibrium",
+    "Gap",
     "GeneralizedAlpha",
     "Integrator",
     "Isotropic",

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts import facets, nts, patches, search
+from dolfinx_nts import facets, nts_element, patches, search
 from dolfinx_nts.obstacles import Obstacle
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.validation import known_options
@@ -366,7 +366,8 @@ class ContactPair:
         carried = self.master.control_points(master_motion, c.facet)
         motion = motion - np.einsum("ni,nij->nj", shape, carried)
         metric = np.einsum("naj,nbj->nab", tangents, tangents)
-        slide = nts.solve(metric, np.einsum("naj,nj->na", tangents, motion)[:, :, None])[:, :, 0]
+        along = np.einsum("naj,nj->na", tangents, motion)
+        slide = nts_element.solve(metric, along[:, :, None])[:, :, 0]
         before, after = (facets.edge_excess(xi, nc) for xi in (c.xi, c.xi + slide))
         edge = after.argmax(axis=1)
         pairs = np.arange(len(edge))

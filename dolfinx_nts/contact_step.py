@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts import facets, nts
+from dolfinx_nts import facets, nts_element
 from dolfinx_nts.contact import Candidates, ContactPair
 from dolfinx_nts.friction import length, return_map
 
@@ -146,7 +146,7 @@ class ContactStep:
     @property
     def num_augmented(self) -> int:
         """Unknowns d and f per pair."""
-        return 0 if self._only_normal else nts.NUM_AUGMENTED
+        return 0 if self._only_normal else nts_element.NUM_AUGMENTED
 
     @property
     def num_tangential(self) -> int:
@@ -155,7 +155,7 @@ class ContactStep:
 
     @property
     def _num_constraints(self) -> int:
-        return 1 if self._only_normal else nts.NUM_CONSTRAINTS
+        return 1 if self._only_normal else nts_element.NUM_CONSTRAINTS
 
     @property
     def num_multipliers(self) -> int:
@@ -236,7 +236,7 @@ class ContactStep:
         """
         tangents = self._tangents()
         metric = np.matmul(tangents, tangents.transpose(0, 2, 1))
-        dual = nts.solve(metric, tangents)
+        dual = nts_element.solve(metric, tangents)
         projector: FloatArray = np.matmul(
             np.matmul(tangents, self._blocked), dual.transpose(0, 2, 1)
         )
@@ -284,7 +284,7 @@ class ContactStep:
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""
-        return nts.gap(x, self._projection(x)).value
+        return nts_element.gap(x, self._projection(x)).value
 
     def reference(self) -> FloatArray:
         """Reference positions of slaves and corners in the pair's frame [m], (n, nc + 1, 3)."""
@@ -419,7 +419,7 @@ class ContactStep:
         n, size, theta = self.num_pairs, self.num_coordinates, self.theta
         middle = self.x0 + theta * (x - self.x0)
         xi_middle, xi_end = self._projection(middle), self._projection(x)
-        force, end = nts.gap(middle, xi_middle), nts.gap(x, xi_end)
+        force, end = nts_element.gap(middle, xi_middle), nts_element.gap(x, xi_end)
         gradient = force.gradient.reshape(n, size)
         residual = np.zeros((n, size + self.num_multipliers))
         tangent = np.zeros((*residual.shape, residual.shape[1]))
@@ -432,8 +432,8 @@ class ContactStep:
             return residual, tangent, end.value, None
 
         length, t = self.candidates.length, multiplier[:, -2:]
-        middle_xi = nts.projection(middle, xi_middle, t)
-        end_xi = nts.projection(x, xi_end, np.zeros_like(t))
+        middle_xi = nts_element.projection(middle, xi_middle, t)
+        end_xi = nts_element.projection(x, xi_end, np.zeros_like(t))
         along = length[:, None, None] * middle_xi.gradient
         residual[:, :size] += np.einsum("na,naz->nz", t, along)
         tangent[:, :size, :size] += theta * length[:, None, None] * middle_xi.hessian
@@ -483,21 +483,25 @@ class ContactStep:
         # One length per pair makes every unknown a length or a force, so blocks compare across
         # units and scales.
         row, one = 1.0 / length, np.ones_like(length)
-        scale_z = np.concatenate([np.ones(positions), np.tile(row, nts.NUM_AUGMENTED)], axis=1)
+        rows = np.tile(row, nts_element.NUM_AUGMENTED)
+        scale_z = np.concatenate([np.ones(positions), rows], axis=1)
         scale_g = np.concatenate([one, one, one, length, row, row], axis=1)
         size = z1.shape[1]
-        stop, hidden = size + nts.NUM_CONSTRAINTS, slice(size - nts.NUM_AUGMENTED, size)
+        stop = size + nts_element.NUM_CONSTRAINTS
+        hidden = slice(size - nts_element.NUM_AUGMENTED, size)
 
         def hold(gradient: FloatArray) -> FloatArray:
             """All six multipliers from lambda_N and lambda_T."""
             rows = gradient[:, :, hidden] * scale_z[:, None, hidden]
             load = multiplier[:, :1] * rows[:, 0]
             load[:, -2:] += multiplier[:, 1:] if self.num_tangential else 0.0
-            others = nts.solve(rows[:, 1:].transpose(0, 2, 1), -load[:, :, None])[:, :, 0]
+            others = nts_element.solve(rows[:, 1:].transpose(0, 2, 1), -load[:, :, None])[:, :, 0]
             return np.concatenate([multiplier[:, :1], others], axis=1)
 
-        given = multiplier[:, : nts.NUM_CONSTRAINTS] * scale_g if not self.condense else None
-        e = nts.element(z0, z1, hold if given is None else given, self.rule)
+        given = hold
+        if not self.condense:
+            given = multiplier[:, : nts_element.NUM_CONSTRAINTS] * scale_g
+        e = nts_element.element(z0, z1, given, self.rule)
         residual = np.zeros((n, stop + self.num_tangential))
         residual[:, :size], residual[:, size:stop] = e.force * scale_z, e.constraint * scale_g
         tangent = np.zeros((*residual.shape, residual.shape[1]))
@@ -513,7 +517,7 @@ class ContactStep:
         tangent[:, f, -2:] = np.eye(2)
         gradient = np.zeros((n, 2, residual.shape[1]))
         gradient[:, :, f] = np.eye(2)
-        metric, by_pi = nts.metric(e.invariants, self.num_corners)
+        metric, by_pi = nts_element.metric(e.invariants, self.num_corners)
         metric_gradient = np.zeros((n, 2, 2, residual.shape[1]))
         by_z = np.matmul(by_pi.reshape(n, 4, by_pi.shape[-1]), e.invariant_gradient)
         metric_gradient[..., :size] = by_z.reshape(n, 2, 2, size) * scale_z[:, None, None]
@@ -529,11 +533,12 @@ class ContactStep:
         is the exact tangent.
         """
         residual, tangent, gap, slip = self._invariants(x, self._augmented(x), multiplier)
-        stop = self.num_coordinates + nts.NUM_AUGMENTED
-        middle = stop + nts.NUM_CONSTRAINTS
+        stop = self.num_coordinates + nts_element.NUM_AUGMENTED
+        middle = stop + nts_element.NUM_CONSTRAINTS
         inner = np.r_[self.num_coordinates : stop, stop + 1 : middle]
         outer = np.r_[: self.num_coordinates, stop, middle : tangent.shape[1]]
-        inside = nts.solve(tangent[:, inner[:, None], inner], tangent[:, inner[:, None], outer])
+        among, by_outer = (tangent[:, inner[:, None], columns] for columns in (inner, outer))
+        inside = nts_element.solve(among, by_outer)
 
         def reduce(a: FloatArray) -> FloatArray:
             """Derivatives by the outer unknowns from those by all."""

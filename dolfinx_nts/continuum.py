@@ -23,6 +23,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.inversion import Determinants
 from dolfinx_nts.materials import misfit
 from dolfinx_nts.mesh_check import check_mesh
+from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.surfaces import Surface, locate_facets
 from dolfinx_nts.validation import (
@@ -31,7 +32,6 @@ from dolfinx_nts.validation import (
     is_whole,
     items,
     known_options,
-    raise_together,
     require_bool,
     require_name,
     require_positive,

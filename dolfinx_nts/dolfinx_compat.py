@@ -150,6 +150,14 @@ def interpolation_points(space: Any) -> FloatArray:
     return points
 
 
+def node_blocks(mesh: Any, space: Any) -> IntArray:
+    """Block of coordinates of each geometry node of this rank, ghosts included, shape (nodes,)."""
+    geometry = geometry_dofmap(mesh)
+    blocks = np.full(len(mesh.geometry.x), -1, dtype=np.int64)
+    blocks[geometry] = cell_dofs(space)[: len(geometry), : geometry.shape[1]]
+    return blocks
+
+
 def subspace_component_bc(space: Any, component: int, blocked_dofs: IntArray) -> Any:
     """Homogeneous DirichletBC on one component of blocked dofs; it only masks rows and columns."""
     dofs = np.sort(np.asarray(blocked_dofs, np.int32) * 3 + component)

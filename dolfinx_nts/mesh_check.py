@@ -10,8 +10,8 @@ from dolfinx import mesh as dolfinx_mesh
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.surfaces import flux, oriented_nodes
-from dolfinx_nts.validation import raise_together
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -27,6 +27,7 @@ from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.continuum import Continuum
+from dolfinx_nts.parallel import on_root
 from dolfinx_nts.validation import is_whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -155,7 +156,7 @@ def bodies_from_gmsh(file_or_model: Any, comm: Any) -> Parts:
     """
     if not isinstance(comm, MPI.Comm):
         raise TypeError(f"comm={comm!r}: pass an MPI communicator, e.g. MPI.COMM_WORLD")
-    return _parts(comm, _on_root(comm, lambda: _read_gmsh(file_or_model)))
+    return _parts(comm, on_root(comm, lambda: _read_gmsh(file_or_model)))
 
 
 def bodies_from_tags(
@@ -202,22 +203,7 @@ def bodies_from_tags(
     local = (*_tagged_cells(mesh, cell_tags), *_tagged_facets(mesh, facet_tags))
     gathered = mesh.comm.gather(local)
     bodies, named = dict(names or {}), dict(surfaces or {})
-    return _parts(mesh.comm, _on_root(mesh.comm, lambda: _merge(kind, gathered, bodies, named)))
-
-
-# ---- ranks
-def _on_root(comm: Any, work: Callable[[], T]) -> T | None:
-    """What `work` returns, on rank 0; what it raises, on every rank."""
-    result, error = None, None
-    if comm.rank == 0:
-        try:
-            result = work()
-        except Exception as caught:  # Gmsh raises nothing more special; the other ranks wait
-            error = caught
-    error = comm.bcast(error)
-    if error is not None:
-        raise error
-    return result
+    return _parts(mesh.comm, on_root(mesh.comm, lambda: _merge(kind, gathered, bodies, named)))
 
 
 def _parts(comm: Any, data: _Input | None) -> Parts:

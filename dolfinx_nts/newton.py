@@ -27,13 +27,7 @@ from dolfinx_nts.linear_solver import (
 )
 from dolfinx_nts.step import EQUAL, BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.system import System
-from dolfinx_nts.validation import (
-    StepFailedError,
-    is_finite,
-    is_whole,
-    known_options,
-    require_bool,
-)
+from dolfinx_nts.validation import StepFailedError, is_finite, is_whole, known_options, require_bool
 
 logger = logging.getLogger(__name__)
 

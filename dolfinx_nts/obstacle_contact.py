@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.contact_step import ContactStep, Contribution, Slip
-from dolfinx_nts.nts import Gap
+from dolfinx_nts.nts_element import Gap
 from dolfinx_nts.obstacles import inverse
 
 FloatArray = npt.NDArray[np.float64]

@@ -16,14 +16,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts.bounded_slope import highest
-from dolfinx_nts.nts import Gap
-from dolfinx_nts.validation import (
-    at_time,
-    known_options,
-    require_name,
-    require_positive,
-    vector,
-)
+from dolfinx_nts.nts_element import Gap
+from dolfinx_nts.validation import at_time, known_options, require_name, require_positive, vector
 
 FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float] | FloatArray

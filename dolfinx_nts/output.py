@@ -22,66 +22,14 @@ import numpy.typing as npt
 from dolfinx_nts import balance as ledger
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact import ContactPair
+from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.simulate import Stepper
 from dolfinx_nts.system import State
-from dolfinx_nts.validation import is_whole, require_positive
+from dolfinx_nts.validation import StrPath, as_path, is_whole, require_positive
 from dolfinx_nts.whole_files import Draft, amend_file, extend_file, replace_file
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
-StrPath = str | os.PathLike[str]
-
-
-# ---- what files and pictures share
-def on_root(comm: Any, what: str, action: Callable[[], Any]) -> Any:
-    """Result of an action of rank 0, on rank 0; if it fails, every rank raises."""
-    result, cause, problem = None, None, None
-    if comm.rank == 0:
-        try:
-            result = action()
-        except Exception as error:  # any: a rank left alone in a collective call would hang
-            cause, problem = error, (isinstance(error, OSError), f"{error or repr(error)}")
-    problem = comm.bcast(problem)
-    if problem is None:
-        return result
-    if not problem[0]:
-        raise RuntimeError(f"{what}: rank 0 failed: {problem[1]}") from cause
-    raise OSError(
-        f"{what}: cannot be written ({problem[1]}); pass a place that exists or can be made, with "
-        "space and write permission"
-    ) from cause
-
-
-def gather(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Rows of all ranks in rank order on rank 0, none elsewhere."""
-    parts = comm.gather(rows)
-    return rows[:0] if parts is None else np.concatenate([p for p in parts if len(p)] or parts)
-
-
-def node_blocks(body: Any) -> IntArray:
-    """Block of coordinates of each geometry node of this rank, ghosts included, shape (nodes,)."""
-    geometry = compat.geometry_dofmap(body.mesh)
-    blocks = np.full(len(body.mesh.geometry.x), -1, dtype=np.int64)
-    blocks[geometry] = compat.cell_dofs(body.space)[: len(geometry), : geometry.shape[1]]
-    return blocks
-
-
-def as_path(name: str, value: Any) -> Path:
-    """The path that an argument is.
-
-    Raises:
-        TypeError: It is none.
-    """
-    if not isinstance(value, str | os.PathLike):
-        raise TypeError(f"{name}={value!r}: pass a path, e.g. {name}='out/run'")
-    return Path(value)
-
-
-def save_figure(figure: Any, path: Path, **options: Any) -> None:
-    """Save a figure of matplotlib, and make its folder; if that fails, an old picture remains."""
-    kind, image = path.suffix[1:] or figure.canvas.get_default_filetype(), io.BytesIO()
-    figure.savefig(image, format=kind, **options)
-    replace_file(path if path.suffix else path.with_name(f"{path.name}.{kind}"), image.getvalue())
 
 
 def _file_name(name: str) -> str:
@@ -106,22 +54,23 @@ class _Series:
         self.body, self.index, self.contacts = body, index, contacts
         self.path = folder / _file_name(body.name)
         self._times = 0
-        blocks = node_blocks(body)
+        blocks = compat.node_blocks(body.mesh, body.space)
         nodes = np.flatnonzero((blocks >= 0) & (blocks < body.num_owned // 3))
         self._blocks = blocks[nodes]
         original = np.asarray(body.mesh.geometry.input_global_indices)
-        numbers, self._order = np.unique(gather(body.comm, original[nodes]), return_index=True)
+        everywhere = gather_on_root(body.comm, original[nodes])
+        numbers, self._order = np.unique(everywhere, return_index=True)
         self._points = self._nodal(body.reference.reshape(-1, 3))
         owned = body.mesh.topology.index_map(3).size_local
-        cells = gather(body.comm, original[compat.geometry_dofmap(body.mesh)[:owned]])
-        order = gather(
+        cells = gather_on_root(body.comm, original[compat.geometry_dofmap(body.mesh)[:owned]])
+        order = gather_on_root(
             body.comm, np.asarray(body.mesh.topology.original_cell_index[:owned], dtype=np.int64)
         )
         self._cells = np.searchsorted(numbers, cells[np.argsort(order)])
 
     def _nodal(self, values: FloatArray) -> FloatArray:
         """Values of owned blocks in the order of the file, on rank 0."""
-        gathered: FloatArray = gather(self.body.comm, values[self._blocks])[self._order]
+        gathered: FloatArray = gather_on_root(self.body.comm, values[self._blocks])[self._order]
         return gathered
 
     def create(self) -> None:
@@ -299,7 +248,7 @@ class Fields:
             self._root(stepper, partial(series.append, time, series.fields(stepper)))
 
     def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
-        on_root(stepper.system.comm, f"folder={str(self.folder)!r}", action)
+        write_on_root(stepper.system.comm, f"folder={str(self.folder)!r}", action)
 
 
 # ---- balance table
@@ -360,4 +309,4 @@ class BalanceCSV:
         self._open = True
 
     def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
-        on_root(stepper.system.comm, f"path={str(self.path)!r}", action)
+        write_on_root(stepper.system.comm, f"path={str(self.path)!r}", action)

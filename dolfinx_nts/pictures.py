@@ -12,10 +12,11 @@ import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.output import StrPath, as_path, gather, node_blocks, on_root, save_figure
+from dolfinx_nts.parallel import gather_on_root, write_on_root
+from dolfinx_nts.plots import save_figure
 from dolfinx_nts.strain_energy import green_strain, strain_energy
 from dolfinx_nts.surfaces import oriented_nodes
-from dolfinx_nts.validation import floats, items, require_bool, require_positive
+from dolfinx_nts.validation import StrPath, as_path, floats, items, require_bool, require_positive
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -86,7 +87,7 @@ def picture(
     for body in bodies:
         corners, values = _coloured_facets(body, colour)
         corners = corners @ _axes_of(*view).T
-        drawn.append(_Drawn(body.name, gather(comm, corners), gather(comm, values)))
+        drawn.append(_Drawn(body.name, gather_on_root(comm, corners), gather_on_root(comm, values)))
 
     def draw() -> None:
         figure, axes = _figure(drawn, width, title)
@@ -95,7 +96,7 @@ def picture(
         _furnish(figure, axes, scale, _COLOURS[colour][1], view, drawn if labels else ())
         save_figure(figure, file, dpi=200, bbox_inches="tight", pad_inches=0.05)
 
-    on_root(comm, f"path={str(path)!r}", draw)
+    write_on_root(comm, f"path={str(path)!r}", draw)
 
 
 def _check_picture(
@@ -139,7 +140,7 @@ def _coloured_facets(body: Any, colour: str) -> tuple[FloatArray, FloatArray]:
     """
     mesh, local = body.mesh, compat.exterior_facets(body.mesh)
     nodes = oriented_nodes(mesh, local)[:, [0, 1, 2, -1]]
-    blocks = node_blocks(body)[nodes]
+    blocks = compat.node_blocks(body.mesh, body.space)[nodes]
     corners = mesh.geometry.x[nodes] + body.u.x.array.reshape(-1, 3)[blocks]
     if colour == "speed":
         return corners, np.linalg.norm(body.v.x.array.reshape(-1, 3)[blocks], axis=-1)

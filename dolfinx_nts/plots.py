@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import balance as ledger
-from dolfinx_nts.output import StrPath, save_figure
+from dolfinx_nts.validation import StrPath
+from dolfinx_nts.whole_files import replace_file
 
 FloatArray = npt.NDArray[np.float64]
 Balance = Mapping[str, FloatArray]
@@ -139,3 +141,10 @@ def _style(axes: Any, panel: _Panel) -> None:
     axes.set_axisbelow(True)
     if panel.floor is not None:
         axes.set_yscale("log")
+
+
+def save_figure(figure: Any, path: Path, **options: Any) -> None:
+    """Save a figure of matplotlib, and make its folder; if that fails, an old picture remains."""
+    kind, image = path.suffix[1:] or figure.canvas.get_default_filetype(), io.BytesIO()
+    figure.savefig(image, format=kind, **options)
+    replace_file(path if path.suffix else path.with_name(f"{path.name}.{kind}"), image.getvalue())

@@ -20,6 +20,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.inversion import describe, smallest_dets
 from dolfinx_nts.newton import ACCURACY, Newton, StepSolver
 from dolfinx_nts.overlap import OverlapWatch
+from dolfinx_nts.parallel import first_problem, write_on_root
 from dolfinx_nts.promises import MaterialWatch, Promises
 from dolfinx_nts.run_warnings import RunWarnings
 from dolfinx_nts.step import Evaluation, StepProblem
@@ -29,7 +30,7 @@ from dolfinx_nts.table import Table
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
-    first_problem,
+    as_path,
     items,
     known_options,
     require_bool,
@@ -128,11 +129,10 @@ class Solution:
         Args:
             path: Picture file; its ending chooses the format.
         """
-        from dolfinx_nts.output import as_path, on_root
         from dolfinx_nts.plots import plot_balance
 
         as_path("path", path)
-        on_root(self.system.comm, f"path={path!r}", lambda: plot_balance(self.balance, path))
+        write_on_root(self.system.comm, f"path={path!r}", lambda: plot_balance(self.balance, path))
 
 
 class Trial(NamedTuple):

@@ -23,6 +23,7 @@ from dolfinx_nts.body import Moment
 from dolfinx_nts.contact import Motion
 from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.obstacle_contact import ObstacleStep
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.sleep import Sleepers
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError
@@ -164,11 +165,11 @@ class StepProblem:
             [np.abs(x).max(initial=0.0) for x in (u1 - u, b.reference + u1, v, u)]
             for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
         ]
-        top = _global_max(system.comm, np.array(local)).T
+        top = global_max(system.comm, np.array(local)).T
         self._motion, self._extent, speed, self._moved = top
         if state.a:
             local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
-            speed = np.maximum(speed, _global_max(system.comm, np.array(local)))
+            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
         # In statics v only predicts the first guess.
         moves = (speed > 0.0) & self.integrator.inertia
         self._inertia = [
@@ -263,7 +264,7 @@ class StepProblem:
     def _touched(self) -> set[int]:
         """Bodies of contacts that have unknowns, the same on all ranks."""
         local = np.array([float(awake.any()) for awake in self._with_unknowns])
-        on = _global_max(self.system.comm, local) > 0.0
+        on = global_max(self.system.comm, local) > 0.0
         return set().union(*itertools.compress(self.system.contact_bodies, on))
 
     def _force_rounding(self, k: int) -> float:
@@ -690,7 +691,7 @@ class StepProblem:
         An iterate that runs off excuses no more than the positions would.
         """
         local = np.array([np.abs(terms.u1).max(initial=0.0) for terms in e.bodies])
-        return np.minimum(_global_max(self.system.comm, local), self._extent + self._moved)
+        return np.minimum(global_max(self.system.comm, local), self._extent + self._moved)
 
     @property
     def momentum_rounding(self) -> float:
@@ -719,7 +720,7 @@ class StepProblem:
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
         local = [np.abs(b.du).max(initial=0.0) for b in e.bodies]
-        return _global_max(self.system.comm, np.array(local))
+        return global_max(self.system.comm, np.array(local))
 
     @property
     def followed(self) -> tuple[BoolArray, ...]:
@@ -809,7 +810,7 @@ class StepProblem:
             gaps = c.rows(k, "multipliers") / c.scale[:, None]
             arrays = (c.rows(k, "augmented"), gaps, m, c.scale)
             local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
-        top = _global_max(self.system.comm, np.array(local))
+        top = global_max(self.system.comm, np.array(local))
         motion = max(top[0], float(self._motion.max()))
         length = self.rtol * motion + 8 * _EPS * (motion + float(self._moved.max()))
         ratio: dict[str, float] = {}
@@ -837,19 +838,13 @@ def _free(body: Any, residual: FloatArray) -> FloatArray:
     return free
 
 
-def _global_max(comm: Any, values: FloatArray) -> FloatArray:
-    out = np.array(values, dtype=np.float64)
-    comm.Allreduce(MPI.IN_PLACE, out, op=MPI.MAX)
-    return out
-
-
 def _box(system: System) -> tuple[FloatArray, float]:
     """Middle of the box around all bodies' reference and half its diagonal [m]. Collective."""
     ends = np.full((2, 3), -np.inf)
     for body in system.bodies:
         x = body.reference.reshape(-1, 3)
         np.maximum(ends, [x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)], ends)
-    high, low = _global_max(system.comm, ends) * [[1.0], [-1.0]]
+    high, low = global_max(system.comm, ends) * [[1.0], [-1.0]]
     return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
 
 

@@ -19,6 +19,7 @@ from mpi4py import MPI
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import facets as facet_math
 from dolfinx_nts import patches, search
+from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.validation import at_points, is_whole
 
 logger = logging.getLogger(__name__)
@@ -28,11 +29,6 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 Marker = Callable[[FloatArray], npt.NDArray[np.bool_]]
 
 _CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
-
-
-def gather_rows(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Rows of all ranks in rank order, on every rank."""
-    return np.concatenate(comm.allgather(rows))
 
 
 def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArray:
@@ -118,11 +114,7 @@ class Surface:
         mesh, space = body.mesh, body.space
         self.body = body
         nodes = oriented_nodes(mesh, local_facets)
-        node_to_dof = np.full(len(mesh.geometry.x), -1, dtype=np.int64)
-        geometry = compat.geometry_dofmap(mesh)
-        cells = len(geometry)
-        node_to_dof[geometry] = compat.cell_dofs(space)[:cells, : geometry.shape[1]]
-        local = node_to_dof[nodes]
+        local = compat.node_blocks(mesh, space)[nodes]
         index_map = space.dofmap.index_map
         corners = index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
         # An empty rank's list would become an array of floats.

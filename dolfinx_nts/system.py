@@ -12,7 +12,8 @@ from mpi4py import MPI
 
 from dolfinx_nts.body import Body
 from dolfinx_nts.contact import INITIAL_PENETRATION, ContactPair
-from dolfinx_nts.validation import items, known_options, raise_together, vector
+from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.validation import items, known_options, vector
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

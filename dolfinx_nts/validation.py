@@ -6,14 +6,19 @@ import functools
 import inspect
 import math
 import numbers
+import os
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.parallel import raise_together
+
 FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
+StrPath = str | os.PathLike[str]
 
 
 class StepFailedError(RuntimeError):
@@ -113,23 +118,6 @@ def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tu
     return found
 
 
-def first_problem(comm: Any, problem: str | None) -> str | None:
-    """The first rank's problem, on every rank."""
-    return next((p for p in comm.allgather(problem) if p is not None), None)
-
-
-def raise_together(
-    comm: Any,
-    problem: str | None,
-    kind: type[Exception] = ValueError,
-    cause: Exception | None = None,
-) -> None:
-    """Raise with the first rank's problem on every rank, if any rank has one."""
-    found = first_problem(comm, problem)
-    if found is not None:
-        raise kind(found) from cause
-
-
 def at_time(
     comm: Any, name: str, function: Callable[[float], Any], time: float, unit: str
 ) -> FloatArray:
@@ -198,3 +186,14 @@ def at_points(
             problem = f"{name}={function!r}: not finite at x={bad.tolist()}; check it for NaN"
     raise_together(comm, problem, cause=cause)
     return values
+
+
+def as_path(name: str, value: Any) -> Path:
+    """The path that an argument is.
+
+    Raises:
+        TypeError: It is none.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError(f"{name}={value!r}: pass a path, e.g. {name}='out/run'")
+    return Path(value)

@@ -11,7 +11,7 @@ from mpi4py import MPI
 import dolfinx_nts as nts
 from dolfinx_nts import contact_step, facets
 from dolfinx_nts.friction import return_map
-from dolfinx_nts.nts import invariants, metric, projection
+from dolfinx_nts.nts_element import invariants, metric, projection
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dolfinx_nts import discrete_gradient, nts
+from dolfinx_nts import discrete_gradient, nts_element
 from dolfinx_nts import facets as fc
 
 #: Triangle, quadrilateral, patch over a quadrilateral.
@@ -152,7 +152,7 @@ def relative(found, expected):
 @pytest.mark.parametrize("nc", KINDS)
 def test_invariants_are_the_products(nc):
     z = random_pairs(np.random.default_rng(1), 50, nc)
-    pi = nts.invariants(z, nc)
+    pi = nts_element.invariants(z, nc)
     assert pi.shape == (50, NUM_INVARIANTS[nc])
     assert np.allclose(pi, [products(row, nc) for row in z], rtol=0, atol=4e-15)
 
@@ -161,21 +161,21 @@ def test_invariants_are_the_products(nc):
 def test_invariant_gradient(nc):
     z = random_pairs(np.random.default_rng(2), 10, nc)
     expected = [complex_step(lambda x: products(x, nc), row) for row in z]
-    assert np.allclose(nts.invariant_gradient(z, nc), expected, rtol=0, atol=4e-15)
+    assert np.allclose(nts_element.invariant_gradient(z, nc), expected, rtol=0, atol=4e-15)
 
 
 @pytest.mark.parametrize("nc", KINDS)
 def test_midpoint_gradient_gives_exact_differences_of_the_invariants(nc):
     z0, z1, _ = random_step(np.random.default_rng(3), 50, nc)
-    increment = nts.invariants(z1, nc) - nts.invariants(z0, nc)
-    gradient = nts.invariant_gradient(0.5 * (z0 + z1), nc)
+    increment = nts_element.invariants(z1, nc) - nts_element.invariants(z0, nc)
+    gradient = nts_element.invariant_gradient(0.5 * (z0 + z1), nc)
     assert np.allclose(np.einsum("npz,nz->np", gradient, z1 - z0), increment, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("nc", KINDS)
 def test_constraints_state_the_geometry(nc):
     z = random_pairs(np.random.default_rng(4), 50, nc)
-    found = nts.constraints(nts.invariants(z, nc), nc)
+    found = nts_element.constraints(nts_element.invariants(z, nc), nc)
     expected = [geometric_constraints(row, nc) for row in z]
     assert np.allclose(found, expected, rtol=0, atol=4e-15)
 
@@ -188,11 +188,11 @@ def test_projection_and_normal_satisfy_the_augmented_constraints(nc):
     assert converged.all()
     foot, _, normal = fc.frame(corners, xi)
     z[:, -5:-2], z[:, -2:] = normal, xi
-    g = nts.constraints(nts.invariants(z, nc), nc)
+    g = nts_element.constraints(nts_element.invariants(z, nc), nc)
     distance = np.linalg.norm(slave - foot, axis=1)
     assert np.allclose(np.abs(g[:, 0]), distance, rtol=0, atol=1e-14)
     assert np.allclose(g[:, 1:], 0.0, atol=1e-14)
-    value = nts.gap(z[:, :-5].reshape(50, nc + 1, 3), xi).value
+    value = nts_element.gap(z[:, :-5].reshape(50, nc + 1, 3), xi).value
     assert np.allclose(value, g[:, 0], rtol=0, atol=1e-14)
 
 
@@ -200,7 +200,7 @@ def test_projection_and_normal_satisfy_the_augmented_constraints(nc):
 def test_constraint_gradient(nc):
     pi = np.random.default_rng(6).normal(size=(10, NUM_INVARIANTS[nc]))
     expected = [complex_step(lambda p: constraints_of_invariants(p, nc), row) for row in pi]
-    assert np.allclose(nts.constraint_gradient(pi, nc), expected, rtol=0, atol=1e-14)
+    assert np.allclose(nts_element.constraint_gradient(pi, nc), expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("nc", KINDS)
@@ -217,9 +217,9 @@ def test_constraint_curvature(nc):
     # Over a facet of degree 3, so the stencil is exact.
     step, error = (0.5, 2e-14) if nc < 16 else (1e-3, 1e-11)
     expected = differences(gradient, pi, step)
-    found = nts.constraint_curvature(pi, multiplier, nc)
+    found = nts_element.constraint_curvature(pi, multiplier, nc)
     assert np.allclose(found, expected[:, :, -2:], rtol=0, atol=error)
-    assert np.allclose(nts._full_curvature(found), expected, rtol=0, atol=error)
+    assert np.allclose(nts_element._full_curvature(found), expected, rtol=0, atol=error)
 
 
 # ---- the direct description
@@ -251,7 +251,7 @@ def random_gaps(rng, n, nc):
 def test_gap_and_its_derivatives(nc):
     rows = 8 if nc < 16 else 1
     x, xi = random_gaps(np.random.default_rng(8), rows, nc)
-    found = nts.gap(x, xi)
+    found = nts_element.gap(x, xi)
     size = 3 * (nc + 1)
 
     def values(flat):
@@ -285,7 +285,7 @@ def test_gap_over_a_flat_facet_is_the_height(nc):
     x[:, 1:] = 0.5 * FLAT[nc]
     x[:, 0] = n @ (0.5 * FLAT[nc])
     x[:, 0, 2] += height
-    g = nts.gap(x @ turn.T + shift, xi)
+    g = nts_element.gap(x @ turn.T + shift, xi)
     assert np.allclose(g.value, height, rtol=0, atol=2e-15)
     weight = np.concatenate([np.ones((20, 1)), -n], axis=1)
     assert np.allclose(g.gradient, weight[:, :, None] * turn[:, 2], rtol=0, atol=1e-14)
@@ -299,12 +299,12 @@ def renumbered_corners(nc, shift):
 @pytest.mark.parametrize("nc", KINDS)
 def test_gap_does_not_depend_on_the_numbering_of_the_corners(nc):
     x, xi = random_gaps(np.random.default_rng(10), 20, nc)
-    first = nts.gap(x, xi)
+    first = nts_element.gap(x, xi)
     for shift in range(1, min(nc, 4)):
         order = np.concatenate([[0], 1 + renumbered_corners(nc, shift)])
         other = x[:, order]
         xi, converged = fc.project(other[:, 0], other[:, 1:], np.tile(CENTRE[nc], (20, 1)))
-        g = nts.gap(other, xi)
+        g = nts_element.gap(other, xi)
         assert converged.all()
         assert np.allclose(g.value, first.value, rtol=0, atol=1e-14)
         assert np.allclose(g.gradient, first.gradient[:, order], rtol=0, atol=1e-13)
@@ -320,7 +320,7 @@ def test_gap_does_not_depend_on_the_numbering_of_the_corners(nc):
 def test_directionality(nc, rule, motion):
     z0, z1, multiplier = random_step(np.random.default_rng(11), 100, nc, motion)
     # gradbar g . D pi(z_m) . (z_1 - z_0) = gradbar g . (pi_1 - pi_0) = g(pi_1) - g(pi_0)
-    e = nts.element(z0, z1, multiplier, rule)
+    e = nts_element.element(z0, z1, multiplier, rule)
     found = np.einsum("nmz,nz->nm", e.force_gradient, z1 - z0)
     g0, g1 = (np.array([geometric_constraints(row, nc) for row in z]) for z in (z0, z1))
     assert np.abs(found - (g1 - g0)).max() < 1e-14 * max(1.0, np.abs(g1).max())
@@ -333,25 +333,25 @@ def test_directionality(nc, rule, motion):
 @pytest.mark.parametrize("nc", KINDS)
 def test_mean_value_is_the_integral_of_the_gradient(nc):
     z0, z1, multiplier = random_step(np.random.default_rng(12), 20, nc)
-    pi0, pi1 = nts.invariants(z0, nc), nts.invariants(z1, nc)
-    number = nts._GAUSS_POINTS[nc]
+    pi0, pi1 = nts_element.invariants(z0, nc), nts_element.invariants(z1, nc)
+    number = nts_element._GAUSS_POINTS[nc]
     found = discrete_gradient.mean_value(
-        pi0, pi1, lambda pi: nts.constraint_gradient(pi, nc), number
+        pi0, pi1, lambda pi: nts_element.constraint_gradient(pi, nc), number
     )
     copies = np.tile(multiplier, (number, 1))
     tangent = discrete_gradient.mean_value_tangent(
         pi0,
         pi1,
-        lambda pi: nts._full_curvature(nts.constraint_curvature(pi, copies, nc)),
+        lambda pi: nts_element._full_curvature(nts_element.constraint_curvature(pi, copies, nc)),
         number,
     )
     points, weights = np.polynomial.legendre.leggauss(9)
     gradient, slope = 0.0, 0.0
     for x, w in zip(0.5 + 0.5 * points, 0.5 * weights, strict=True):
         pi = pi0 + x * (pi1 - pi0)
-        gradient = gradient + w * nts.constraint_gradient(pi, nc)
-        curvature = nts.constraint_curvature(pi, multiplier, nc)
-        slope = slope + w * x * nts._full_curvature(curvature)
+        gradient = gradient + w * nts_element.constraint_gradient(pi, nc)
+        curvature = nts_element.constraint_curvature(pi, multiplier, nc)
+        slope = slope + w * x * nts_element._full_curvature(curvature)
     assert np.allclose(found, gradient, rtol=0, atol=4e-15)
     assert np.allclose(tangent, slope, rtol=0, atol=1e-14)
 
@@ -359,8 +359,8 @@ def test_mean_value_is_the_integral_of_the_gradient(nc):
 def test_gonzalez_is_the_corrected_formula_row_by_row():
     nc = 4
     z0, z1, multiplier = random_step(np.random.default_rng(13), 5, nc)
-    pi0, pi1 = nts.invariants(z0, nc), nts.invariants(z1, nc)
-    e = nts.element(z0, z1, multiplier, "gonzalez")
+    pi0, pi1 = nts_element.invariants(z0, nc), nts_element.invariants(z1, nc)
+    e = nts_element.element(z0, z1, multiplier, "gonzalez")
     for k in range(5):
         middle, change = 0.5 * (pi0[k] + pi1[k]), pi1[k] - pi0[k]
         gradient = complex_step(lambda p: constraints_of_invariants(p, nc), middle)
@@ -378,10 +378,12 @@ def test_gonzalez_is_the_corrected_formula_row_by_row():
 @pytest.mark.fast("3-mean-value", "4-gonzalez", "16-mean-value")
 def test_tangents(nc, rule):
     z0, z1, multiplier = random_step(np.random.default_rng(14), 10, nc)
-    e = nts.element(z0, z1, multiplier, rule)
-    stiffness = differences(lambda z: nts.element(z0, z, multiplier, rule).force, z1, 1e-3)
+    e = nts_element.element(z0, z1, multiplier, rule)
+    stiffness = differences(lambda z: nts_element.element(z0, z, multiplier, rule).force, z1, 1e-3)
     assert relative(e.stiffness, stiffness) < 1e-9
-    by_multiplier = differences(lambda m: nts.element(z0, z1, m, rule).force, multiplier, 1.0)
+    by_multiplier = differences(
+        lambda m: nts_element.element(z0, z1, m, rule).force, multiplier, 1.0
+    )
     assert relative(e.force_gradient, by_multiplier.transpose(0, 2, 1)) < 1e-13
     geometry = [complex_step(lambda x: geometric_constraints(x, nc), row) for row in z1]
     assert np.allclose(e.constraint_gradient, geometry, rtol=0, atol=2e-14)
@@ -391,7 +393,7 @@ def test_tangents(nc, rule):
 @pytest.mark.parametrize("nc", KINDS)
 def test_momentum(nc, rule):
     z0, z1, multiplier = random_step(np.random.default_rng(15), 100, nc)
-    force = nts.element(z0, z1, multiplier, rule).force
+    force = nts_element.element(z0, z1, multiplier, rule).force
     middle = (0.5 * (z0 + z1))[:, :-2].reshape(100, nc + 2, 3)
     vectors = force[:, :-2].reshape(100, nc + 2, 3)
     scale = np.abs(force).max()
@@ -411,8 +413,8 @@ def test_units(nc):
     scale_force = np.concatenate([np.ones(3 * (nc + 1)), np.full(5, mm)])
     difference = {}
     for rule in RULES:
-        here = nts.element(z0, z1, multiplier, rule).force
-        there = nts.element(lengths * z0, lengths * z1, conjugate * multiplier, rule).force
+        here = nts_element.element(z0, z1, multiplier, rule).force
+        there = nts_element.element(lengths * z0, lengths * z1, conjugate * multiplier, rule).force
         difference[rule] = relative((there / scale_force)[:, :-5], here[:, :-5])
     assert difference["mean-value"] < 2e-15
     # Over a triangle the constraints are quadratic in pi: nothing is left to correct.
@@ -421,11 +423,11 @@ def test_units(nc):
 
 def test_over_triangles_both_rules_are_the_midpoint_gradient():
     z0, z1, multiplier = random_step(np.random.default_rng(20), 50, 3)
-    middle = 0.5 * (nts.invariants(z0, 3) + nts.invariants(z1, 3))
-    gradient = nts.invariant_gradient(0.5 * (z0 + z1), 3)
-    expected = nts.constraint_gradient(middle, 3) @ gradient
+    middle = 0.5 * (nts_element.invariants(z0, 3) + nts_element.invariants(z1, 3))
+    gradient = nts_element.invariant_gradient(0.5 * (z0 + z1), 3)
+    expected = nts_element.constraint_gradient(middle, 3) @ gradient
     for rule in RULES:
-        found = nts.element(z0, z1, multiplier, rule).force_gradient
+        found = nts_element.element(z0, z1, multiplier, rule).force_gradient
         assert np.allclose(found, expected, rtol=0, atol=1e-14)
 
 
@@ -435,7 +437,7 @@ def test_over_triangles_both_rules_are_the_midpoint_gradient():
 def test_at_rest(nc, rule):
     z, _, multiplier = random_step(np.random.default_rng(17), 10 if nc < 16 else 2, nc)
     with np.errstate(all="raise"):
-        e = nts.element(z, z, multiplier, rule)
+        e = nts_element.element(z, z, multiplier, rule)
     gradient = [complex_step(lambda x: geometric_constraints(x, nc), row) for row in z]
     assert np.allclose(e.force_gradient, gradient, rtol=0, atol=1e-14)
     assert np.allclose(e.force, np.einsum("nm,nmz->nz", multiplier, gradient), rtol=0, atol=2e-14)
@@ -455,8 +457,8 @@ def test_rotation_equivariance(nc, rule):
     rng = np.random.default_rng(18)
     z0, z1, multiplier = random_step(rng, 20, nc)
     turn = random_rotation(rng)
-    here = nts.element(z0, z1, multiplier, rule)
-    there = nts.element(rotated(z0, turn), rotated(z1, turn), multiplier, rule)
+    here = nts_element.element(z0, z1, multiplier, rule)
+    there = nts_element.element(rotated(z0, turn), rotated(z1, turn), multiplier, rule)
     assert np.allclose(there.constraint, here.constraint, rtol=0, atol=1e-14)
     assert relative(there.force, rotated(here.force, turn)) < 1e-14
     blocks = np.eye(z0.shape[1])
@@ -481,8 +483,8 @@ def test_forces_do_not_depend_on_the_numbering_of_the_corners(nc):
 
     other = multiplier.copy()
     other[:, 1:3], other[:, 4:] = multiplier[:, 1:3] @ a.T, multiplier[:, 4:] @ a.T
-    here = nts.element(z0, z1, multiplier, "mean-value").force
-    there = nts.element(renumbered(z0), renumbered(z1), other, "mean-value").force
+    here = nts_element.element(z0, z1, multiplier, "mean-value").force
+    there = nts_element.element(renumbered(z0), renumbered(z1), other, "mean-value").force
     expected = here[:, :-2].reshape(20, nc + 2, 3)[:, order].reshape(20, -1)
     assert relative(there[:, :-2], expected) < 1e-14
     assert relative(there[:, -2:], here[:, -2:] @ np.linalg.inv(a)) < 1e-14
@@ -493,6 +495,6 @@ def test_forces_do_not_depend_on_the_numbering_of_the_corners(nc):
 def test_gonzalez_near_rest_has_no_noise(nc, motion):
     """Both rules differ by O(D pi) in the tangent and O(D pi^2) in the force."""
     z0, z1, multiplier = random_step(np.random.default_rng(21), 50, nc, motion)
-    expected, found = (nts.element(z0, z1, multiplier, rule) for rule in RULES)
+    expected, found = (nts_element.element(z0, z1, multiplier, rule) for rule in RULES)
     assert relative(found.force, expected.force) < 1e-11
     assert relative(found.stiffness, expected.stiffness) < 1e-5

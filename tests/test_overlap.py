@@ -423,7 +423,7 @@ class Ball(Obstacle):
         r = np.linalg.norm(y, axis=1)
         unit = y / r[:, None]
         bend = (np.eye(3) - unit[:, :, None] * unit[:, None]) / r[:, None, None]
-        return nts.nts.Gap(r - self.radius, unit[:, None], bend)
+        return nts.Gap(r - self.radius, unit[:, None], bend)
 
 
 def obstacles(rng):

@@ -1,0 +1,91 @@
+"""What all ranks do together: gather, agree on a maximum or a problem, leave work to one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+FloatArray = npt.NDArray[np.float64]
+T = TypeVar("T")
+
+
+def gather_rows(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Rows of all ranks in rank order, on every rank."""
+    return np.concatenate(comm.allgather(rows))
+
+
+def gather_on_root(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Rows of all ranks in rank order on rank 0, none elsewhere."""
+    parts = comm.gather(rows)
+    return rows[:0] if parts is None else np.concatenate([p for p in parts if len(p)] or parts)
+
+
+def global_max(comm: Any, values: FloatArray) -> FloatArray:
+    """Largest of each value over all ranks, on every rank."""
+    out = np.array(values, dtype=np.float64)
+    comm.Allreduce(MPI.IN_PLACE, out, op=MPI.MAX)
+    return out
+
+
+def first_problem(comm: Any, problem: str | None) -> str | None:
+    """The first rank's problem, on every rank."""
+    return next((p for p in comm.allgather(problem) if p is not None), None)
+
+
+def raise_together(
+    comm: Any,
+    problem: str | None,
+    kind: type[Exception] = ValueError,
+    cause: Exception | None = None,
+) -> None:
+    """Raise with the first rank's problem on every rank, if any rank has one."""
+    found = first_problem(comm, problem)
+    if found is not None:
+        raise kind(found) from cause
+
+
+def on_root(comm: Any, work: Callable[[], T]) -> T | None:
+    """What `work` returns, on rank 0; what it raises, on every rank."""
+    result, error = None, None
+    if comm.rank == 0:
+        try:
+            result = work()
+        except Exception as caught:  # Gmsh raises nothing more special; the other ranks wait
+            error = caught
+    error = comm.bcast(error)
+    if error is not None:
+        raise error
+    return result
+
+
+def write_on_root(comm: Any, what: str, action: Callable[[], Any]) -> Any:
+    """Let rank 0 write; its result there. If it fails, every rank raises.
+
+    Args:
+        comm: MPI communicator.
+        what: Argument that names the file, and its value.
+        action: What rank 0 does.
+
+    Raises:
+        OSError: The file cannot be written; the message says what to do.
+        RuntimeError: Rank 0 failed otherwise.
+    """
+    result, cause, problem = None, None, None
+    if comm.rank == 0:
+        try:
+            result = action()
+        except Exception as error:  # any: a rank left alone in a collective call would hang
+            cause, problem = error, (isinstance(error, OSError), f"{error or repr(error)}")
+    problem = comm.bcast(problem)
+    if problem is None:
+        return result
+    if not problem[0]:
+        raise RuntimeError(f"{what}: rank 0 failed: {problem[1]}") from cause
+    raise OSError(
+        f"{what}: cannot be written ({problem[1]}); pass a place that exists or can be made, with "
+        "space and write permission"
+    ) from cause
