@@ -118,6 +118,22 @@ class ContactStep:
         )
 
     @property
+    def strong(self) -> bool:
+        """Whether friction may hold a node that free motion lets go (Painleve's paradox)."""
+        return self.pair.friction > _STRONG
+
+    @staticmethod
+    def no_pull(friction: FloatArray) -> FloatArray:
+        """Contact force that counts as none beside these friction forces (n, 3), in their unit."""
+        none: FloatArray = _NO_PULL * np.linalg.norm(friction, axis=1)
+        return none
+
+    @property
+    def _endless(self) -> bool:
+        """Whether friction has no bound; where no step comes of that, it has the largest one."""
+        return bool(np.isinf(self.pair.friction)) and not self.lets_slip
+
+    @property
     def immovable(self) -> BoolArray:
         """Whether all coordinates of the pairs' masters are prescribed, shape (n,)."""
         fixed: BoolArray = (np.concatenate([*self.dofs()[1:]], axis=1) < 0).all(axis=1)
@@ -260,7 +276,7 @@ class ContactStep:
     def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
         """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
         c = TANGENTIAL_SCALE * self._yielding
-        if np.isinf(self.pair.friction):
+        if self._endless:
             return c
         moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2))
         s = slip.value[moved]
@@ -595,7 +611,7 @@ class ContactStep:
         adds no solution.
         """
         none: FloatArray = self.scale * self.rounding
-        endless = np.isinf(self.pair.friction)
+        endless = self._endless
         if slip is None or not (self.lets_slip or endless):
             return none
         t, s = multiplier[:, -2:], TANGENTIAL_SCALE * self._yielding[:, None] * slip.value
@@ -627,7 +643,7 @@ class ContactStep:
         depth asks for, as in the active set: with none it would have to slip at first, by the slope
         of the bound, which is mu for all active pairs.
         """
-        endless = np.isinf(self.pair.friction)
+        endless = self._endless
         mu, t = min(self.pair.friction, _LARGEST), multiplier[:, -2:]
         force, scale = multiplier[:, 0], self.scale[:, None, None]
         normal = residual.shape[1] - self.num_multipliers

@@ -231,9 +231,12 @@ class StepProblem:
         if not self.integrator.inertia:
             return np.ones(c.num_pairs, dtype=bool)
         node, reach = c.candidates.node, self._reach(index, self._motion)
+        force = self.state.force[index][node]
+        if c.strong:
+            return force > c.no_pull(self.state.tangential[index][node])
         # What goes to and fro at the limit would change the layout in every step.
         had = np.isin(node, self.contacts[index].candidates.node) if self.contacts else False
-        awake: BoolArray = had | (c.candidates.gap < reach) | (self.state.force[index][node] > 0.0)
+        awake: BoolArray = had | (c.candidates.gap < reach) | (force > 0.0)
         return awake
 
     def wake(self, e: Evaluation) -> Evaluation | None:
@@ -248,7 +251,7 @@ class StepProblem:
             return replace(e, idle_gaps=tuple(np.empty(0) for _ in self.idle))
         u = [b.u1 for b in e.bodies]
         gaps = tuple(self._gaps(self.idle, u))
-        closed = [~(gap >= 0.0) for gap in gaps]
+        closed = [~(gap >= -c.rounding) for c, gap in zip(self.idle, gaps, strict=True)]
         if not self.system.comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
             return replace(e, idle_gaps=gaps)
         for awake, late in zip(self._with_unknowns, closed, strict=True):
@@ -433,8 +436,8 @@ class StepProblem:
 
     @property
     def may_slip(self) -> bool:
-        """Whether any contact has friction with a bound."""
-        return any(0.0 < pair.friction < np.inf for pair in self.system.contacts)
+        """Whether any contact has friction."""
+        return any(pair.friction > 0.0 for pair in self.system.contacts)
 
     def let_slip(self) -> None:
         """Solve this step with nodes that slip rather than leave, see `ContactStep`."""
