@@ -83,10 +83,11 @@ class ContactStep:
         condense: Whether (d, f) and their multipliers are eliminated pair by pair.
         x0: Slave and corners, or control points of the patch, at t_n [m], shape (n, nc + 1, 3).
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
-            nodal mass [kg] in dynamics; scales multipliers and the active set.
+            nodal mass [kg] in dynamics; scales multipliers.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
         master_scale: `scale` of the points of the masters, shape (n, np); empty without.
-        rounding: Gap [m], and contact force over `scale`, that counts as none.
+        rounding: Gap [m] that counts as none.
+        force_rounding: Contact force [kg m] that counts as none.
         lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
     """
 
@@ -99,6 +100,7 @@ class ContactStep:
     theta: float
     master_scale: FloatArray = field(kw_only=True)
     rounding: float = field(default=0.0, kw_only=True)
+    force_rounding: float = field(default=0.0, kw_only=True)
     lets_slip: bool = field(default=False, kw_only=True)
 
     @property
@@ -116,6 +118,12 @@ class ContactStep:
             scale=self.scale[chosen],
             master_scale=self.master_scale[chosen],
         )
+
+    @property
+    def gap_rounding(self) -> FloatArray:
+        """Gap [m] that counts as none, or that a force which does would open, shape (n,)."""
+        gap: FloatArray = np.maximum(self.rounding, self.force_rounding / self._yielding)
+        return gap
 
     @property
     def strong(self) -> bool:
@@ -578,7 +586,7 @@ class ContactStep:
         g_N = 0 where active, else lambda_N = 0; there Coulomb's law, else lambda_T = 0.
         """
         gap, force, scale = gap.copy(), multiplier[:, 0], self.scale
-        active = -force - scale * gap > self._none(slip, multiplier)
+        active = -force - self._yielding * gap > self._none(slip, multiplier)
         off = ~active
         row = residual.shape[1] - self.num_multipliers
         residual[off, row] = force[off] / scale[off]
@@ -610,7 +618,7 @@ class ContactStep:
         again. As the law drives such a node along its slip where solved, which is excluded, this
         adds no solution.
         """
-        none: FloatArray = self.scale * self.rounding
+        none = self._yielding * self.gap_rounding
         endless = self._endless
         if slip is None or not (self.lets_slip or endless):
             return none
@@ -649,7 +657,7 @@ class ContactStep:
         normal = residual.shape[1] - self.num_multipliers
         new = active & (force >= 0.0) & (mu > _STRONG)
         bound = mu * np.where(active, -force if mu > _STRONG else np.maximum(-force, 0.0), 0.0)
-        bound[new] -= mu * self.scale[new] * residual[new, normal]
+        bound[new] -= mu * self._yielding[new] * residual[new, normal]
         bound[active & endless] = np.inf
         held = self._held(x)
         loose = np.eye(2) - held
@@ -661,7 +669,7 @@ class ContactStep:
         rows[:, :, -2:] += np.matmul(law.d_multiplier, loose)
         rows[:, :, normal] -= mu * law.d_bound
         by_gap = law.d_bound[new, :, None] * tangent[new, normal][:, None]
-        rows[new] -= mu * scale[new] * by_gap
+        rows[new] -= mu * self._yielding[new, None, None] * by_gap
         value, slipping = law.residual, ~stick
         value[slipping] /= scale[slipping, 0]
         rows[slipping] /= scale[slipping]

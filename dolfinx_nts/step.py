@@ -43,6 +43,8 @@ EQUAL = 1e-6
 _PASSING = 0.1
 #: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
 _ANOTHER_STEP = 4.0
+#: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
+_SURELY = 1e-3
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
 _ONE = 1e-6
 
@@ -115,6 +117,8 @@ class StepProblem:
         rtol: As given.
         centre: Middle of all bodies in the reference [m], shape (3,).
         stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
+        bounded: Whether infinite friction may be given its largest bound where nothing else solves
+            a step.
     """
 
     def __init__(
@@ -131,6 +135,7 @@ class StepProblem:
         self._petsc: list[Any] = []
         self.version = 0
         self.stabilization = 0.0
+        self.bounded = False
         self._cover = [0.0] * len(system.contacts)
         self._beside = [(0.0, -1)] * len(system.contacts)
         self.centre, self._span = _box(system)
@@ -226,14 +231,17 @@ class StepProblem:
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
 
-        In statics, where no motion bounds the next one, all do.
+        In statics, where no motion bounds the next one, all do. Strong friction may hold nodes that
+        free motion lets go (Painleve's paradox), and an iterate's errors would choose which: there
+        only what carries, or what flight presses in, begins with unknowns.
         """
         if not self.integrator.inertia:
             return np.ones(c.num_pairs, dtype=bool)
         node, reach = c.candidates.node, self._reach(index, self._motion)
         force = self.state.force[index][node]
         if c.strong:
-            return force > c.no_pull(self.state.tangential[index][node])
+            closes = self._gap(index, c, self.first) < -_SURELY * reach
+            return closes | (force > c.no_pull(self.state.tangential[index][node]))
         # What goes to and fro at the limit would change the layout in every step.
         had = np.isin(node, self.contacts[index].candidates.node) if self.contacts else False
         awake: BoolArray = had | (c.candidates.gap < reach) | (force > 0.0)
@@ -251,7 +259,7 @@ class StepProblem:
             return replace(e, idle_gaps=tuple(np.empty(0) for _ in self.idle))
         u = [b.u1 for b in e.bodies]
         gaps = tuple(self._gaps(self.idle, u))
-        closed = [~(gap >= -c.rounding) for c, gap in zip(self.idle, gaps, strict=True)]
+        closed = [~(gap >= -c.gap_rounding) for c, gap in zip(self.idle, gaps, strict=True)]
         if not self.system.comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
             return replace(e, idle_gaps=gaps)
         for awake, late in zip(self._with_unknowns, closed, strict=True):
@@ -338,15 +346,14 @@ class StepProblem:
             master = self._scale(pair.master)[pair.master.patches[found.facet]]
             step = ContactStep(pair, found, rule, condense, x0, scale, theta, master_scale=master)
         bodies = self.system.contact_bodies[index]
-        rounding = _EPS * (step.extent + float(max(self._length[b] for b in bodies)))
+        gap, force = _EPS * (step.extent + float(max(self._length[b] for b in bodies))), 0.0
         if pair.friction:
             # A force that is rounding of the bodies' own would stick or slip by its sign.
             for b in bodies:
                 if not self._diagonal[b]:
                     self._measure_rounding(b)
-            forces = float(self.rounding[list(bodies)].sum())
-            rounding = max(rounding, forces / float(self._scale(slave).min()))
-        return replace(step, rounding=_TOUCH * rounding)
+            force = float(self.rounding[list(bodies)].sum())
+        return replace(step, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
 
     def _scale(self, surface: Any) -> FloatArray:
         """Force per motion of a surface's points, shape (p,), see `ContactStep`. Collective."""
@@ -436,12 +443,16 @@ class StepProblem:
 
     @property
     def may_slip(self) -> bool:
-        """Whether any contact has friction."""
-        return any(pair.friction > 0.0 for pair in self.system.contacts)
+        """Whether any contact has friction with a bound."""
+        coefficients = [pair.friction for pair in self.system.contacts]
+        return any(mu > 0.0 and (self.bounded or np.isfinite(mu)) for mu in coefficients)
 
     def let_slip(self) -> None:
         """Solve this step with nodes that slip rather than leave, see `ContactStep`."""
-        self.contacts = [replace(c, lets_slip=True) for c in self.contacts]
+        self.contacts = [
+            replace(c, lets_slip=self.bounded or np.isfinite(c.pair.friction))
+            for c in self.contacts
+        ]
 
     def guess(self, *, flight: bool) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
@@ -496,9 +507,12 @@ class StepProblem:
 
     def _gaps(self, contacts: list[ContactStep], u: Sequence[FloatArray]) -> list[FloatArray]:
         """Gaps of some candidates of all contacts at displacements of all bodies [m]."""
-        bodies = self.system.contact_bodies
-        moved = [c.pair.positions([u[k] for k in b]) for c, b in zip(contacts, bodies, strict=True)]
-        return [c.gap(c.pair.points(x, c.candidates)) for c, x in zip(contacts, moved, strict=True)]
+        return [self._gap(k, c, u) for k, c in enumerate(contacts)]
+
+    def _gap(self, index: int, c: ContactStep, u: Sequence[FloatArray]) -> FloatArray:
+        """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
+        moved = c.pair.positions([u[k] for k in self.system.contact_bodies[index]])
+        return c.gap(c.pair.points(moved, c.candidates))
 
     # ---- iterates
     def _positions(self, x: Any) -> list[FloatArray]:
