@@ -27,6 +27,8 @@ BoolArray = npt.NDArray[np.bool_]
 TANGENTIAL_SCALE = 0.05
 #: Largest coefficient of friction in numbers: larger ones are this one, but for infinite friction.
 _LARGEST = 1e8
+#: Coefficient of infinite friction where it has a bound: sticking by more would be rounding's.
+_BOUND = 1e4
 #: Pull over friction that counts as none.
 _NO_PULL = 1e-8
 #: Coefficient from which on friction counts as strong.
@@ -88,6 +90,7 @@ class ContactStep:
         master_scale: `scale` of the points of the masters, shape (n, np); empty without.
         rounding: Gap [m] that counts as none.
         force_rounding: Contact force [kg m] that counts as none.
+        bounded: Whether infinite friction has a bound.
         lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
     """
 
@@ -101,6 +104,7 @@ class ContactStep:
     master_scale: FloatArray = field(kw_only=True)
     rounding: float = field(default=0.0, kw_only=True)
     force_rounding: float = field(default=0.0, kw_only=True)
+    bounded: bool = field(default=False, kw_only=True)
     lets_slip: bool = field(default=False, kw_only=True)
 
     @property
@@ -138,8 +142,8 @@ class ContactStep:
 
     @property
     def _endless(self) -> bool:
-        """Whether friction has no bound; where no step comes of that, it has the largest one."""
-        return bool(np.isinf(self.pair.friction)) and not self.lets_slip
+        """Whether friction has no bound."""
+        return bool(np.isinf(self.pair.friction)) and not self.bounded
 
     @property
     def immovable(self) -> BoolArray:
@@ -652,7 +656,8 @@ class ContactStep:
         of the bound, which is mu for all active pairs.
         """
         endless = self._endless
-        mu, t = min(self.pair.friction, _LARGEST), multiplier[:, -2:]
+        largest = _BOUND if np.isinf(self.pair.friction) else _LARGEST
+        mu, t = min(self.pair.friction, largest), multiplier[:, -2:]
         force, scale = multiplier[:, 0], self.scale[:, None, None]
         normal = residual.shape[1] - self.num_multipliers
         new = active & (force >= 0.0) & (mu > _STRONG)

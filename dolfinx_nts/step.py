@@ -117,8 +117,7 @@ class StepProblem:
         rtol: As given.
         centre: Middle of all bodies in the reference [m], shape (3,).
         stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
-        bounded: Whether infinite friction may be given its largest bound where nothing else solves
-            a step.
+        bounded: Whether infinite friction has a bound, where nothing else solves a step.
     """
 
     def __init__(
@@ -273,6 +272,8 @@ class StepProblem:
         """Give unknowns to the candidates that are awake."""
         both = list(zip(self._found, self._with_unknowns, strict=True))
         self.contacts, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
+        if self.bounded:
+            self.contacts = [replace(c, bounded=True) for c in self.contacts]
         system, watching = self.system, any(c.num_pairs for c in self.idle)
         self._watching = system.comm.allreduce(watching, op=MPI.LOR)
         if len(self._asleep) == len(system.bodies):
@@ -449,10 +450,7 @@ class StepProblem:
 
     def let_slip(self) -> None:
         """Solve this step with nodes that slip rather than leave, see `ContactStep`."""
-        self.contacts = [
-            replace(c, lets_slip=self.bounded or np.isfinite(c.pair.friction))
-            for c in self.contacts
-        ]
+        self.contacts = [replace(c, lets_slip=True) for c in self.contacts]
 
     def guess(self, *, flight: bool) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
