@@ -724,8 +724,8 @@ class StepProblem:
         u0 = self.state.u[body]
         x0, x1 = (pair.positions([u])[0] for u in (u0, u0 + e.bodies[body].du))
         x0, x1 = x0 - start, x1 - end
-        ends = np.minimum(pair.master.gap(x0).value, pair.master.gap(x1).value)
-        passed = pair.master.lowest_gap(x0, x1) < ends - _PASSING * pair.master.width
+        ends = np.minimum(pair.obstacle.gap(x0).value, pair.obstacle.gap(x1).value)
+        passed = pair.obstacle.lowest_gap(x0, x1) < ends - _PASSING * pair.obstacle.width
         if passed.any():
             node = int(pair.slave.original[np.flatnonzero(passed)[0]])
             raise StepFailedError(
