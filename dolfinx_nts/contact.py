@@ -107,7 +107,8 @@ class ContactPair:
     Args:
         slave: Surface whose nodes are kept outside.
         master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
-        friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact never slip.
+        friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact stick, but for
+            those that no step holds or lets go, which a warning tells.
 
     Attributes:
         origin: Point of space that positions are relative to [m], shape (3,).
