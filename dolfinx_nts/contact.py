@@ -114,6 +114,7 @@ class ContactPair:
         origin: Point of space that positions are relative to [m], shape (3,).
         obstacle: The master relative to it, if it is an obstacle.
         extent: Largest of the reference positions' components, relative to it [m].
+        given: Largest of the slave's as they were given, whose rounding they have [m].
 
     Raises:
         TypeError: `slave` is no Surface, or `master` neither that nor an obstacle.
@@ -131,7 +132,7 @@ class ContactPair:
         self.master: Any = master
         self.obstacle: Any = None
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
-        self.origin = slave.reference[0]
+        self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         if isinstance(master, Obstacle):
             self.obstacle = master.about(self.origin)
             self.extent = float(np.abs(slave.reference - self.origin).max())

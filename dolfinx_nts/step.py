@@ -348,6 +348,9 @@ class StepProblem:
             step = ContactStep(pair, found, rule, condense, x0, scale, theta, master_scale=master)
         bodies = self.system.contact_bodies[index]
         gap, force = _EPS * (step.extent + float(max(self._length[b] for b in bodies))), 0.0
+        if step.strong:
+            # What touches as far as its coordinates tell would stick by their rounding.
+            gap += _EPS * pair.given
         if pair.friction:
             # A force that is rounding of the bodies' own would stick or slip by its sign.
             for b in bodies:

@@ -5,7 +5,7 @@ import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from test_obstacle_friction import sliding
-from test_single_mass import INTEGRATORS, MASS
+from test_single_mass import INTEGRATORS, MASS, turn
 
 import dolfinx_nts as nts
 
@@ -71,6 +71,40 @@ def test_a_stiff_or_fine_cube_flush_with_a_wall_falls_freely(young, cells, frict
     assert run.status == "completed" and run.retries == 0
     momentum = run.balance["linear_momentum"][-1]
     assert np.allclose(momentum, [0, 0, -1e3 * GRAVITY * 0.06], rtol=0, atol=1e-9 * 1e3)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("friction", [50.0, np.inf])
+@pytest.mark.parametrize("meshed", [False, True])
+def test_a_cube_that_touches_as_far_as_coordinates_tell_falls_freely(meshed, friction):
+    """100 m off the origin a turned cube's nodes are off its wall by a hundred times rounding."""
+    q, at = turn(0.9), np.full(3, 100.0)
+
+    def placed(low, high, parts, name, bcs=()):
+        mesh = create_box(
+            COMM, [np.array(low, float), np.array(high, float)], parts, CellType.hexahedron,
+            ghost_mode=GhostMode.shared_facet,
+        )  # fmt: skip
+        mesh.geometry.x[:] = mesh.geometry.x @ q.T + at
+        rubber = nts.StVenantKirchhoff(young=1e6, poisson=0.3)
+        return nts.Continuum(mesh, rubber, density=1e3, name=name, bcs=bcs)
+
+    def on_wall(x):
+        return np.abs((x.T - at) @ q[:, 0]) < 1e-9
+
+    cube = placed((0, 0, 0), (1, 1, 1), (2, 2, 2), "cube")
+    master, bodies = nts.Plane(at, q[:, 0]), [cube]
+    if meshed:
+        still = nts.Dirichlet(lambda x: np.full(x.shape[1], True))
+        wall = placed((-0.5, -1, -1.1), (0, 2, 2.1), (1, 3, 3), "wall", bcs=[still])
+        master, bodies = wall.surface(on_wall), [cube, wall]
+    pair = nts.ContactPair(cube.surface(on_wall), master, friction=friction)
+    gravity = -GRAVITY * q[:, 2]
+    system = nts.System(bodies, contacts=[pair], gravity=gravity)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.02)
+    assert run.status == "completed" and run.retries == 0
+    momentum = run.balance["linear_momentum"][-1]
+    assert np.linalg.norm(momentum - 1e3 * 0.02 * gravity) < 1e-9 * 1e3 * 0.02 * GRAVITY
 
 
 # ---- no normal force that friction could be in proportion to
