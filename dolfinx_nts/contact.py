@@ -107,11 +107,14 @@ class ContactPair:
     Args:
         slave: Surface whose nodes are kept outside.
         master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
-        friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact never slip.
+        friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact stick, but for
+            those that no step holds or lets go, which a warning tells.
 
     Attributes:
-        origin: Point of space that positions of a pair of surfaces are relative to [m], shape (3,).
+        origin: Point of space that positions are relative to [m], shape (3,).
+        obstacle: The master relative to it, if it is an obstacle.
         extent: Largest of the reference positions' components, relative to it [m].
+        given: Largest of the slave's as they were given, whose rounding they have [m].
 
     Raises:
         TypeError: `slave` is no Surface, or `master` neither that nor an obstacle.
@@ -127,8 +130,12 @@ class ContactPair:
             raise TypeError(f"slave={slave!r}: pass a Surface, e.g. body.surface(marker){hint}")
         self.slave, self.friction = slave, float(friction)
         self.master: Any = master
-        self.origin, self.extent = np.zeros(3), float(np.abs(slave.reference).max())
+        self.obstacle: Any = None
+        # What is near is small: gaps keep their digits wherever in space the bodies meet.
+        self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         if isinstance(master, Obstacle):
+            self.obstacle = master.about(self.origin)
+            self.extent = float(np.abs(slave.reference - self.origin).max())
             return
         if not isinstance(master, Surface):
             raise TypeError(
@@ -140,8 +147,6 @@ class ContactPair:
                 f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
                 "choose disjoint markers"
             )
-        # What is near is small: gaps keep their digits wherever in space the bodies meet.
-        self.origin = slave.reference[0]
         self.extent = max(float(np.abs(s.reference - self.origin).max()) for s in (slave, master))
         self._free_edges = master.boundary_edges
         self._joined = patches.neighbours(master.facets, master.reference[master.facets])
@@ -344,7 +349,7 @@ class ContactPair:
         """Candidates of an obstacle. Nothing limits the depth: what is behind it is inside."""
         slave = self.slave
         x = slaves[slave.share] - moved
-        gap, length = self.master.gap(x), np.sqrt(slave.area[slave.share])
+        gap, length = self.obstacle.gap(x), np.sqrt(slave.area[slave.share])
         movable = ~slave.fixed[slave.share].all(axis=1)
         node = np.flatnonzero(movable & (gap.value < reach + _MARGIN * length))
         only, xi = np.zeros(len(node), dtype=np.int64), np.zeros((len(node), 2))

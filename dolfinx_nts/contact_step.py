@@ -27,6 +27,8 @@ BoolArray = npt.NDArray[np.bool_]
 TANGENTIAL_SCALE = 0.05
 #: Largest coefficient of friction in numbers: larger ones are this one, but for infinite friction.
 _LARGEST = 1e8
+#: Coefficient of infinite friction where it has a bound: sticking by more would be rounding's.
+_BOUND = 1e4
 #: Pull over friction that counts as none.
 _NO_PULL = 1e-8
 #: Coefficient from which on friction counts as strong.
@@ -83,10 +85,12 @@ class ContactStep:
         condense: Whether (d, f) and their multipliers are eliminated pair by pair.
         x0: Slave and corners, or control points of the patch, at t_n [m], shape (n, nc + 1, 3).
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
-            nodal mass [kg] in dynamics; scales multipliers and the active set.
+            nodal mass [kg] in dynamics; scales multipliers.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
         master_scale: `scale` of the points of the masters, shape (n, np); empty without.
-        rounding: Gap [m], and contact force over `scale`, that counts as none.
+        rounding: Gap [m] that counts as none.
+        force_rounding: Contact force [kg m] that counts as none.
+        bounded: Whether infinite friction has a bound.
         lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
     """
 
@@ -99,6 +103,8 @@ class ContactStep:
     theta: float
     master_scale: FloatArray = field(kw_only=True)
     rounding: float = field(default=0.0, kw_only=True)
+    force_rounding: float = field(default=0.0, kw_only=True)
+    bounded: bool = field(default=False, kw_only=True)
     lets_slip: bool = field(default=False, kw_only=True)
 
     @property
@@ -116,6 +122,28 @@ class ContactStep:
             scale=self.scale[chosen],
             master_scale=self.master_scale[chosen],
         )
+
+    @property
+    def gap_rounding(self) -> FloatArray:
+        """Gap [m] that counts as none, or that a force which does would open, shape (n,)."""
+        gap: FloatArray = np.maximum(self.rounding, self.force_rounding / self._yielding)
+        return gap
+
+    @property
+    def strong(self) -> bool:
+        """Whether friction may hold a node that free motion lets go (Painleve's paradox)."""
+        return self.pair.friction > _STRONG
+
+    @staticmethod
+    def no_pull(friction: FloatArray) -> FloatArray:
+        """Contact force that counts as none beside these friction forces (n, 3), in their unit."""
+        none: FloatArray = _NO_PULL * np.linalg.norm(friction, axis=1)
+        return none
+
+    @property
+    def _endless(self) -> bool:
+        """Whether friction has no bound."""
+        return bool(np.isinf(self.pair.friction)) and not self.bounded
 
     @property
     def immovable(self) -> BoolArray:
@@ -260,7 +288,7 @@ class ContactStep:
     def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
         """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
         c = TANGENTIAL_SCALE * self._yielding
-        if np.isinf(self.pair.friction):
+        if self._endless:
             return c
         moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2))
         s = slip.value[moved]
@@ -567,7 +595,7 @@ class ContactStep:
         g_N = 0 where active, else lambda_N = 0; there Coulomb's law, else lambda_T = 0.
         """
         gap, force, scale = gap.copy(), multiplier[:, 0], self.scale
-        active = -force - scale * gap > self._none(slip, multiplier)
+        active = -force - self._yielding * gap > self._none(slip, multiplier)
         off = ~active
         row = residual.shape[1] - self.num_multipliers
         residual[off, row] = force[off] / scale[off]
@@ -599,8 +627,8 @@ class ContactStep:
         again. As the law drives such a node along its slip where solved, which is excluded, this
         adds no solution.
         """
-        none: FloatArray = self.scale * self.rounding
-        endless = np.isinf(self.pair.friction)
+        none = self._yielding * self.gap_rounding
+        endless = self._endless
         if slip is None or not (self.lets_slip or endless):
             return none
         t, s = multiplier[:, -2:], TANGENTIAL_SCALE * self._yielding[:, None] * slip.value
@@ -632,13 +660,14 @@ class ContactStep:
         depth asks for, as in the active set: with none it would have to slip at first, by the slope
         of the bound, which is mu for all active pairs.
         """
-        endless = np.isinf(self.pair.friction)
-        mu, t = min(self.pair.friction, _LARGEST), multiplier[:, -2:]
+        endless = self._endless
+        largest = _BOUND if np.isinf(self.pair.friction) else _LARGEST
+        mu, t = min(self.pair.friction, largest), multiplier[:, -2:]
         force, scale = multiplier[:, 0], self.scale[:, None, None]
         normal = residual.shape[1] - self.num_multipliers
         new = active & (force >= 0.0) & (mu > _STRONG)
         bound = mu * np.where(active, -force if mu > _STRONG else np.maximum(-force, 0.0), 0.0)
-        bound[new] -= mu * self.scale[new] * residual[new, normal]
+        bound[new] -= mu * self._yielding[new] * residual[new, normal]
         bound[active & endless] = np.inf
         held = self._held(x)
         loose = np.eye(2) - held
@@ -650,7 +679,7 @@ class ContactStep:
         rows[:, :, -2:] += np.matmul(law.d_multiplier, loose)
         rows[:, :, normal] -= mu * law.d_bound
         by_gap = law.d_bound[new, :, None] * tangent[new, normal][:, None]
-        rows[new] -= mu * scale[new] * by_gap
+        rows[new] -= mu * self._yielding[new, None, None] * by_gap
         value, slipping = law.residual, ~stick
         value[slipping] /= scale[slipping, 0]
         rows[slipping] /= scale[slipping]

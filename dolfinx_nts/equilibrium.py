@@ -106,6 +106,7 @@ class _LoadStepper(Stepper):
         """Nothing moves at the start."""
 
     def _step(self, dt: float, time: float) -> None:
+        self._note_materials()
         old = self.state
         step, state, iterations, lost = self._relax(dt, time)
         self._rates = [(a - b) / dt for a, b in zip(state.u, old.u, strict=True)]
@@ -126,7 +127,8 @@ class _LoadStepper(Stepper):
                 start, end = (pair.master.displacement(t, comm) for t in times)
                 terms["external_work"] += float(mean @ (end - start))
         terms |= {"time": time, "newton_iterations": iterations}
-        terms |= {"contact_defect": 0.0, "material_change": 0.0}
+        terms |= {"contact_defect": 0.0, "material_change": self._material_change}
+        self._material_change = 0.0
         rows, measured = self.solution.rows, balance.measure(self.system, state)
         row = balance.next_row(rows[0], rows[-1], measured, terms)
         rows.append(row | resultants)

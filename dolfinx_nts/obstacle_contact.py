@@ -1,7 +1,7 @@
 """Contact of a surface with a rigid obstacle: the element of `contact` without a facet.
 
-Everything is relative to the obstacle's motion c(t), so that a moving obstacle is one at rest to
-the element; only the balance learns of its work.
+Everything is in the pair's frame and relative to the obstacle's motion c(t), so that a moving
+obstacle is one at rest to the element; only the balance learns of its work.
 """
 
 from __future__ import annotations
@@ -62,13 +62,14 @@ class ObstacleStep(ContactStep):
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves at t_{n+1}, shape (n, 1, 3)."""
-        value: FloatArray = self.pair.master.gap(self._control(x)[:, 0]).value
+        value: FloatArray = self.pair.obstacle.gap(self._control(x)[:, 0]).value
         return value
 
     def reference(self) -> FloatArray:
-        """Reference positions of slaves [m], shape (n, 1, 3)."""
+        """Reference positions of slaves in the pair's frame [m], shape (n, 1, 3)."""
         slave = self.pair.slave
-        x: FloatArray = slave.reference[slave.share[self.candidates.node]][:, None]
+        nodes = slave.reference[slave.share[self.candidates.node]][:, None]
+        x: FloatArray = nodes - self.pair.origin
         return x
 
     def _control(self, x: FloatArray) -> FloatArray:
@@ -82,7 +83,7 @@ class ObstacleStep(ContactStep):
     @property
     def extent(self) -> float:
         """Of the slave, the obstacle and its path [m]."""
-        extent: float = self.pair.extent + self.pair.master.extent
+        extent: float = self.pair.extent + self.pair.obstacle.extent
         return extent + float(np.abs(self.displacement).max())
 
     def external_work(self, part: Contribution) -> float:
@@ -108,7 +109,7 @@ class ObstacleStep(ContactStep):
 
     def _middle(self, x: FloatArray) -> Gap:
         """Gap and normal where the contact force acts."""
-        gap: Gap = self.pair.master.gap((self.x0 + self.theta * (x - self.x0))[:, 0])
+        gap: Gap = self.pair.obstacle.gap((self.x0 + self.theta * (x - self.x0))[:, 0])
         return gap
 
     def _tangential(self, x: FloatArray, force: FloatArray) -> FloatArray:
@@ -120,7 +121,7 @@ class ObstacleStep(ContactStep):
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
         """Residual and tangent of (x, lambda_N, lambda_T) in [kg m] and [m], gap and slip."""
-        master, normal = self.pair.master, multiplier[:, :1]
+        master, normal = self.pair.obstacle, multiplier[:, :1]
         end = master.gap(x[:, 0])
         if self.rule == "direct":
             middle = self._middle(x)

@@ -8,6 +8,7 @@ side. Axis 0 of every array is the point. Points are relative to the obstacle's 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
@@ -51,6 +52,10 @@ class Obstacle:
     @property
     def extent(self) -> float:
         """Largest length that enters the gap [m]; its rounding is the gap's."""
+        raise NotImplementedError
+
+    def about(self, origin: FloatArray) -> Obstacle:
+        """The same obstacle in coordinates relative to a point of space [m], shape (3,)."""
         raise NotImplementedError
 
     def gap(self, x: FloatArray) -> Gap:
@@ -164,6 +169,10 @@ class Plane(Obstacle):
         """Height above the origin [m]."""
         return abs(self._height)
 
+    def about(self, origin: FloatArray) -> Plane:
+        """The same plane in coordinates relative to a point of space [m], shape (3,)."""
+        return _placed(self, "point", np.subtract(self.point, origin))
+
     def gap(self, x: FloatArray) -> Gap:
         """Distance of points (n, 3) above the plane."""
         normal, n = np.asarray(self.normal), len(x)
@@ -179,6 +188,13 @@ class Plane(Obstacle):
         """The normal: the gap is linear."""
         n = len(x0)
         return np.tile(np.asarray(self.normal), (n, 1)), np.zeros((n, 3, 3))
+
+
+def _placed(obstacle: Any, name: str, place: FloatArray) -> Any:
+    """A copy of a checked obstacle at another place [m], shape (3,)."""
+    other = copy(obstacle)
+    object.__setattr__(other, name, tuple(place.tolist()))
+    return other
 
 
 class _Round(Obstacle):
@@ -281,6 +297,10 @@ class Sphere(_Round):
         object.__setattr__(self, "centre", _place("centre", self.centre))
         self._check()
 
+    def about(self, origin: FloatArray) -> Sphere:
+        """The same sphere in coordinates relative to a point of space [m], shape (3,)."""
+        return _placed(self, "centre", np.subtract(self.centre, origin))
+
     def _frame(self) -> tuple[FloatArray, FloatArray]:
         return np.asarray(self.centre), np.eye(3)
 
@@ -316,6 +336,11 @@ class Cylinder(_Round):
         object.__setattr__(self, "point", _place("point", self.point))
         object.__setattr__(self, "axis", _direction("axis", self.axis))
         self._check()
+
+    def about(self, origin: FloatArray) -> Cylinder:
+        """The same cylinder in coordinates relative to a point of space [m], shape (3,)."""
+        # The point of the axis next to the origin: one far along it would cost digits.
+        return _placed(self, "point", self._frame()[1] @ np.subtract(self.point, origin))
 
     def _frame(self) -> tuple[FloatArray, FloatArray]:
         axis = np.asarray(self.axis)

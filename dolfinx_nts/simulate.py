@@ -45,6 +45,8 @@ FloatArray = npt.NDArray[np.float64]
 _BESIDE = 1e-3
 #: What a step chosen by its error is cut to: halves would soon end where it has failed.
 _CUT = 0.4
+#: Cuts of a step before nodes that infinite friction holds may slip.
+_CUTS = 3
 #: Searches for contact, each along the motion that came of the one before.
 _SEARCHES = 4
 #: Order of the integrators whose error `Adapt` knows.
@@ -264,12 +266,20 @@ class Stepper:
                 retries += 1
                 self.solution.retries += 1
                 # An odd number: halves of halves would end where one of them has failed.
-                parts = 2 * parts + 1
+                parts = 1 if self._bind(retries) else 2 * parts + 1
                 smaller = (end - self.state.time) / parts
                 logger.info("%s; retrying with dt=%.3g", failure, smaller)
             else:
                 parts -= 1
         return self.state
+
+    def _bind(self, retries: int) -> bool:
+        """Let infinite friction have a bound once cuts are of no use; tells whether that is new."""
+        endless = any(np.isinf(pair.friction) for pair in self.system.contacts)
+        if not endless or self.problem.bounded or retries < _CUTS:
+            return False
+        self.problem.bounded = True
+        return True
 
     def paced(self, pace: Pace, end: float) -> Iterator[None]:
         """Advance in steps of a pace, stopping after each.
@@ -301,7 +311,7 @@ class Stepper:
                     raise
                 retries += 1
                 self.solution.retries += 1
-                pace.dt = _CUT * dt
+                pace.dt = dt if self._bind(retries) else _CUT * dt
                 logger.info("%s; retrying with dt=%.3g", failure, pace.dt)
                 continue
             if not pace.accepts(self.problem, trial.step):
@@ -420,7 +430,25 @@ class Stepper:
         self._accept(state)
         self._tell_inversion(step)
         self._tell_beside()
+        self._tell_slip(step)
         self.look()
+
+    def _tell_slip(self, step: Evaluation) -> None:
+        """Say where nodes slip in spite of infinite friction, which they may in the next step."""
+        both = zip(self.problem.contacts, step.contacts, strict=True)
+        endless = [(c, k) for c, k in both if np.isinf(c.pair.friction)]
+        if not (endless and self.problem.bounded):
+            return
+        slips = [k.distance[k.active & ~k.stick].max(initial=0.0) for _, k in endless]
+        farthest = float(self.system.comm.allreduce(max(slips), op=MPI.MAX))
+        self.problem.bounded = farthest > 0.0
+        if farthest > 0.0:
+            self.solution.warn(
+                "slip", self.state.time, farthest,
+                "nodes would pull if they stuck and would enter the master if they left: in spite "
+                f"of infinite friction they slip, by up to {farthest:.3g} m in a step; a finite "
+                "coefficient may be meant",
+            )  # fmt: skip
 
     def _tell_beside(self) -> None:
         """Warn of nodes that have passed by a surface's edge and lie behind it."""

@@ -45,6 +45,8 @@ EQUAL = 1e-6
 _PASSING = 0.1
 #: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
 _ANOTHER_STEP = 4.0
+#: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
+_SURELY = 1e-3
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
 _ONE = 1e-6
 
@@ -117,6 +119,7 @@ class StepProblem:
         rtol: As given.
         centre: Middle of all bodies in the reference [m], shape (3,).
         stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
+        bounded: Whether infinite friction has a bound, where nothing else solves a step.
     """
 
     def __init__(
@@ -133,6 +136,7 @@ class StepProblem:
         self._petsc: list[Any] = []
         self.version = 0
         self.stabilization = 0.0
+        self.bounded = False
         self._cover = [0.0] * len(system.contacts)
         self._beside = [(0.0, -1)] * len(system.contacts)
         self.centre, self._span = _box(system)
@@ -280,14 +284,20 @@ class StepProblem:
     def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
 
-        In statics, where no motion bounds the next one, all do.
+        In statics, where no motion bounds the next one, all do. Strong friction may hold nodes that
+        free motion lets go (Painleve's paradox), and an iterate's errors would choose which: there
+        only what carries, or what flight presses in, begins with unknowns.
         """
         if not self.integrator.inertia:
             return np.ones(c.num_pairs, dtype=bool)
         node, reach = c.candidates.node, self._reach(index, self._motion)
+        force = self.state.force[index][node]
+        if c.strong:
+            closes = self._gap(index, c, self.first) < -_SURELY * reach
+            return closes | (force > c.no_pull(self.state.tangential[index][node]))
         # What goes to and fro at the limit would change the layout in every step.
         had = np.isin(node, self.contacts[index].candidates.node) if self.contacts else False
-        awake: BoolArray = had | (c.candidates.gap < reach) | (self.state.force[index][node] > 0.0)
+        awake: BoolArray = had | (c.candidates.gap < reach) | (force > 0.0)
         return awake
 
     def wake(self, e: Evaluation) -> Evaluation | None:
@@ -302,7 +312,7 @@ class StepProblem:
             return replace(e, idle_gaps=tuple(np.empty(0) for _ in self.idle))
         u = [b.u1 for b in e.bodies]
         gaps = tuple(self._gaps(self.idle, u))
-        closed = [~(gap >= 0.0) for gap in gaps]
+        closed = [~(gap >= -c.gap_rounding) for c, gap in zip(self.idle, gaps, strict=True)]
         if not self.system.comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
             return replace(e, idle_gaps=gaps)
         for awake, late in zip(self._with_unknowns, closed, strict=True):
@@ -316,6 +326,8 @@ class StepProblem:
         """Give unknowns to the candidates that are awake."""
         both = list(zip(self._found, self._with_unknowns, strict=True))
         self.contacts, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
+        if self.bounded:
+            self.contacts = [replace(c, bounded=True) for c in self.contacts]
         system, watching = self.system, any(c.num_pairs for c in self.idle)
         self._watching = system.comm.allreduce(watching, op=MPI.LOR)
         if len(self._asleep) == len(system.bodies):
@@ -389,15 +401,17 @@ class StepProblem:
             master = self._scale(pair.master)[pair.master.patches[found.facet]]
             step = ContactStep(pair, found, rule, condense, x0, scale, theta, master_scale=master)
         bodies = self.system.contact_bodies[index]
-        rounding = _EPS * (step.extent + float(max(self._length[b] for b in bodies)))
+        gap, force = _EPS * (step.extent + float(max(self._length[b] for b in bodies))), 0.0
+        if step.strong:
+            # What touches as far as its coordinates tell would stick by their rounding.
+            gap += _EPS * pair.given
         if pair.friction:
             # A force that is rounding of the bodies' own would stick or slip by its sign.
             for b in bodies:
                 if not self._diagonal[b]:
                     self._measure_rounding(b)
-            forces = float(self.rounding[list(bodies)].sum())
-            rounding = max(rounding, forces / float(self._scale(slave).min()))
-        return replace(step, rounding=_TOUCH * rounding)
+            force = float(self.rounding[list(bodies)].sum())
+        return replace(step, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
 
     def _scale(self, surface: Any) -> FloatArray:
         """Force per motion of a surface's points, shape (p,), see `ContactStep`. Collective."""
@@ -488,7 +502,8 @@ class StepProblem:
     @property
     def may_slip(self) -> bool:
         """Whether any contact has friction with a bound."""
-        return any(0.0 < pair.friction < np.inf for pair in self.system.contacts)
+        coefficients = [pair.friction for pair in self.system.contacts]
+        return any(mu > 0.0 and (self.bounded or np.isfinite(mu)) for mu in coefficients)
 
     def let_slip(self) -> None:
         """Solve this step with nodes that slip rather than leave, see `ContactStep`."""
@@ -549,9 +564,12 @@ class StepProblem:
 
     def _gaps(self, contacts: list[ContactStep], u: Sequence[FloatArray]) -> list[FloatArray]:
         """Gaps of some candidates of all contacts at displacements of all bodies [m]."""
-        bodies = self.system.contact_bodies
-        moved = [c.pair.positions([u[k] for k in b]) for c, b in zip(contacts, bodies, strict=True)]
-        return [c.gap(c.pair.points(x, c.candidates)) for c, x in zip(contacts, moved, strict=True)]
+        return [self._gap(k, c, u) for k, c in enumerate(contacts)]
+
+    def _gap(self, index: int, c: ContactStep, u: Sequence[FloatArray]) -> FloatArray:
+        """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
+        moved = c.pair.positions([u[k] for k in self.system.contact_bodies[index]])
+        return c.gap(c.pair.points(moved, c.candidates))
 
     # ---- iterates
     def _positions(self, x: Any) -> list[FloatArray]:
@@ -767,8 +785,8 @@ class StepProblem:
         u0 = self.state.u[body]
         x0, x1 = (pair.positions([u])[0] for u in (u0, u0 + e.bodies[body].du))
         x0, x1 = x0 - start, x1 - end
-        ends = np.minimum(pair.master.gap(x0).value, pair.master.gap(x1).value)
-        passed = pair.master.lowest_gap(x0, x1) < ends - _PASSING * pair.master.width
+        ends = np.minimum(pair.obstacle.gap(x0).value, pair.obstacle.gap(x1).value)
+        passed = pair.obstacle.lowest_gap(x0, x1) < ends - _PASSING * pair.obstacle.width
         if passed.any():
             node = int(pair.slave.original[np.flatnonzero(passed)[0]])
             raise StepFailedError(

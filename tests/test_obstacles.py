@@ -148,7 +148,7 @@ class Pair:
 
     def at(self, unknowns):
         x, multiplier = unknowns[None, None, :3], unknowns[None, 3:]
-        return self.step.evaluate(x, np.empty((1, 0)), multiplier)
+        return self.step.evaluate(x - self.step.pair.origin, np.empty((1, 0)), multiplier)
 
 
 @pytest.mark.parametrize("active", [True, False])
@@ -479,6 +479,30 @@ def test_facets_and_obstacles_in_one_scene(mpi_tmp_path):
 def test_bad_obstacles(make, message):
     with pytest.raises((ValueError, TypeError), match=message):
         make()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("place", [(1e6, 0.0, 1e6), (3e6, -2e6, 1e6)])
+@pytest.mark.parametrize("name", ["plane", "sphere", "cylinder"])
+def test_an_obstacle_may_be_anywhere(name, place):
+    """At 1e-6 g a cube settles by 1e-8 m, a hundred roundings of coordinates 1e6 m away."""
+    works = []
+    for at in (np.zeros(3), np.array(place)):
+        obstacle = {
+            "plane": nts.Plane(at + [30.0, 20.0, 0.0], (0, 0, 1)),
+            "sphere": nts.Sphere(at + [0.5, 0.5, -2.0], 2.0),
+            "cylinder": nts.Cylinder(at + [0.5, 0.0, -2.0], (0, 1, 0), 2.0),
+        }[name]
+        body, face = block(low=at, size=1.0, velocity=(0, 0, 0))
+        pair = nts.ContactPair(face, obstacle)
+        system = nts.System([body], contacts=[pair], gravity=(0, 0, -1e-6 * ACCELERATION))
+        run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.04)
+        work = np.abs(run.balance["external_work"]).max()
+        assert run.status == "completed" and run.balance["active"][-1] > 0
+        # Of a round one, positions over its radius have the digits that doubles have.
+        assert np.abs(run.balance["ledger_residual"]).max() < 1e-6 * work
+        works.append(work)
+    assert works[1] == pytest.approx(works[0], rel=1e-5)
 
 
 @pytest.mark.mpi

@@ -140,3 +140,40 @@ def test_a_stiffness_that_changes_in_time_is_named_in_the_ledger(sleep):
     warning = stepper.solution.warnings["material changed"]
     assert warning.count == 1 and not warning.grave and "'body'" in warning.text
     assert "ledger" not in stepper.solution.warnings
+
+
+class Changes:
+    """A writer after whose first call a material's stiffness is another."""
+
+    def __init__(self, factor, value):
+        self.factor, self.value = factor, value
+
+    def start(self, stepper):
+        pass
+
+    def write(self, stepper, last=False):
+        self.factor.value = self.value
+
+    def close(self, stepper):
+        pass
+
+
+@pytest.mark.mpi
+def test_a_stiffness_that_changes_between_load_steps_is_named():
+    """What stands under its weight stores 1.75 times as much until it moves."""
+    mesh = create_box(
+        COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    factor, base = fem.Constant(mesh, 1.0), nts.StVenantKirchhoff(young=1e6, poisson=0.3)
+    held = nts.Dirichlet(lambda x: x[2] < 1e-9)
+    body = nts.Continuum(mesh, lambda c: factor * base(c), density=1e3, bcs=[held])
+    system = nts.System([body], gravity=(0, 0, -9.81))
+    run = nts.equilibrium(system, load_steps=2, output=[Changes(factor, 1.75)])
+    table = run.balance
+    assert run.status == "completed"
+    assert table["material_change"] == pytest.approx(
+        [0, 0, 0.75 * table["potential"][1]], rel=1e-12
+    )
+    warning = run.warnings["material changed"]
+    assert warning.count == 1 and warning.first == 0.5 and not warning.grave
