@@ -18,15 +18,15 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.assembly import StepMatrix
-from dolfinx_nts.contact import ContactPair
-from dolfinx_nts.contact_step import ContactStep
+from dolfinx_nts.contact_elements import ContactElements
 from dolfinx_nts.continuum import Continuum
+from dolfinx_nts.facet_pair import FacetPair
 from dolfinx_nts.newton import ACCURACY, StepSolver
 
 #: What a step is made of: label -> class and method that are timed.
 PARTS = {
-    "search": (ContactPair, "find"),
-    "contact elements": (ContactStep, "evaluate"),
+    "search": (FacetPair, "find"),
+    "contact elements": (ContactElements, "evaluate"),
     "bulk forces": (Continuum, "internal"),
     "bulk matrices": (Continuum, "tangent"),
     "contact into the matrix": (StepMatrix, "assemble"),

@@ -243,7 +243,8 @@ def nodes_in_contact(problem, run):
     """
     state, slave = run.state, run.system.contacts[0].slave
     x, area = slave.reference[slave.share], slave.area[slave.share]
-    rows = np.column_stack([x[:, :2], area, state.force[0], -state.tangential[0][:, 0]])
+    contact = state.contacts[0]
+    rows = np.column_stack([x[:, :2], area, contact.force, -contact.tangential[:, 0]])
     rows = np.concatenate(run.system.comm.allgather(rows))
     if not problem.spheres:
         rows = rows[np.abs(rows[:, 1]) < 1e-9 * problem.radius]

@@ -5,7 +5,17 @@ from importlib.metadata import version
 from dolfinx_nts.body import Body, Moment
 from dolfinx_nts.contact import ContactPair
 from dolfinx_nts.continuum import Continuum, Dirichlet, Traction
+from dolfinx_nts.elements import (
+    Coupling,
+    Elements,
+    EveryStep,
+    Joint,
+    PointElements,
+    PointPart,
+    Step,
+)
 from dolfinx_nts.equilibrium import Equilibrium, equilibrium
+from dolfinx_nts.facet_pair import FacetPair
 from dolfinx_nts.integrators import (
     EnergyMomentum,
     GeneralizedAlpha,
@@ -17,7 +27,9 @@ from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.newton import Newton
 from dolfinx_nts.nts_element import Gap
+from dolfinx_nts.obstacle_pair import ObstaclePair
 from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
+from dolfinx_nts.points import Points
 from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.step_size import Adapt
 from dolfinx_nts.strain_energy import Isotropic
@@ -31,25 +43,35 @@ __all__ = [
     "Body",
     "ContactPair",
     "Continuum",
+    "Coupling",
     "Cylinder",
     "Dirichlet",
+    "Elements",
     "EnergyMomentum",
     "Equilibrium",
+    "EveryStep",
+    "FacetPair",
     "Gap",
     "GeneralizedAlpha",
     "Integrator",
     "Isotropic",
+    "Joint",
     "Midpoint",
     "Moment",
     "MooneyRivlin",
     "NeoHookean",
     "Newmark",
     "Newton",
+    "ObstaclePair",
     "Plane",
+    "PointElements",
+    "PointPart",
+    "Points",
     "Solution",
     "Sphere",
     "StVenantKirchhoff",
     "State",
+    "Step",
     "StepFailedError",
     "Stepper",
     "Surface",

@@ -40,6 +40,17 @@ COLUMNS = (
 )
 
 
+
+def columns(system: System) -> tuple[str, ...]:
+    """Columns of a system's balance table: `COLUMNS`, and what its joints add."""
+    return COLUMNS + tuple(dict.fromkeys(name for j in system.joints for name in j.losses))
+
+
+#: Columns that add up over the steps, and those that count in a step.
+WORKS = ("external_work", "friction_dissipation", "contact_defect")
+COUNTS = ("active", "stick", "slip")
+
+
 class Switch(NamedTuple):
     """An active node that went over to another facet at the start of a step.
 
@@ -122,6 +133,8 @@ def measure(
         if last is None or last[0] is not u or last[1] is not v:
             known[body.name] = last = u, v, _of_body(body, u, v)
         local += last[2]
+    for joint, bodies in zip(system.joints, system.joint_bodies, strict=True):
+        local[1] += joint.potential([state.u[b] for b in bodies])
     total = np.empty_like(local)
     system.comm.Allreduce(local, total, op=MPI.SUM)
     return {
@@ -141,39 +154,31 @@ def _of_body(body: Any, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
-    """Works and counts of an accepted step, the same on all ranks.
+    """Works and counts of an accepted step, the same on all ranks. Collective.
 
-    The contact defect is -sum lambda_N g_0: what activation loses and what a change of facet gains
-    or loses. Friction dissipates sum lambda_T . (f_1 - f_0).
+    Loads and supports do external work; what elements add, they name, see `Elements.ledger`.
 
     Returns:
-        external_work, friction_dissipation, contact_defect [J], active, stick, slip, min_gap [m]
-        (infinite without candidates), min_det (infinite without flexible bodies).
+        By columns of the balance table: works [J] and counts of the step, min_gap [m] (infinite
+        without candidates), min_det (infinite without flexible bodies).
     """
     scale = 1.0 / problem.factor
-    work = dissipation = defect = 0.0
-    counts = np.zeros(3)
+    sums, smallest = dict.fromkeys((*WORKS, *COUNTS), 0.0), {"min_gap": np.inf}
     for body, terms in zip(problem.system.bodies, step.bodies, strict=True):
-        work += scale * float(terms.external @ terms.du)
-        work += scale * float(terms.residual[body.fixed] @ terms.du[body.fixed])
-    smallest = np.inf
-    for contact, part, multiplier in zip(
-        problem.contacts, step.contacts, step.multipliers, strict=True
-    ):
-        work += scale * contact.external_work(part)
-        defect -= scale * float(multiplier[:, 0] @ contact.candidates.gap)
-        if contact.num_tangential:
-            slipping = part.active & ~part.stick
-            dissipation += scale * float((multiplier[:, -2:] * part.slip)[slipping].sum())
-            counts[1:] += part.stick.sum(), slipping.sum()
-        counts[0] += part.active.sum()
-        smallest = min(smallest, float(part.gap.min(initial=np.inf)))
-    smallest = min([smallest, *(float(gap.min(initial=np.inf)) for gap in step.idle_gaps)])
+        work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed]
+        sums["external_work"] += scale * float(work)
+    for elements, part in zip(problem.elements, step.parts, strict=True):
+        for name, value in elements.ledger(part, problem.factor).items():
+            sums[name] = sums.get(name, 0.0) + value
+    for coupling, parts in problem.each(step):
+        smallest |= coupling.smallest(parts)
     comm = problem.system.comm
-    local = np.array([work, dissipation, defect, *counts])
-    names = ("external_work", "friction_dissipation", "contact_defect", "active", "stick", "slip")
-    return dict(zip(names, comm.allreduce(local).tolist(), strict=True)) | {
-        "min_gap": float(comm.allreduce(smallest, op=MPI.MIN)),
+    total = comm.allreduce(np.array(list(sums.values())))
+    least = np.array(list(smallest.values()))
+    comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+    return {
+        **dict(zip(sums, total.tolist(), strict=True)),
+        **dict(zip(smallest, least.tolist(), strict=True)),
         "min_det": step.min_det,
     }
 
@@ -186,17 +191,19 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
         step: Its solution.
         time: End of the step [s].
     """
-    if not problem.contacts:
+    if not problem.contacts.elements:
         return []
-    found, state = [], problem.state
-    for k, (contact, part) in enumerate(zip(problem.contacts, step.contacts, strict=True)):
+    found = []
+    for contact, part, old in zip(
+        problem.contacts.elements, problem.contact_parts(step), problem.state.contacts, strict=True
+    ):
         c = contact.candidates
-        old, defect = state.facets[k][c.node], -step.multipliers[k][:, 0] * c.gap / problem.factor
-        stayed = (state.force[k][c.node] > 0.0) & part.active
-        for i in np.flatnonzero(stayed & (old >= 0) & (old != c.facet)):
-            facets = (int(old[i]), int(c.facet[i]))
-            node, name = contact.input_node(i), contact.pair.name
-            found.append(Switch(time, name, node, facets, float(defect[i])))
+        before, gain = old.facet[c.node], contact.gains(part, problem.factor)
+        stayed = (old.force[c.node] > 0.0) & part.active
+        for i in np.flatnonzero(stayed & (before >= 0) & (before != c.facet)):
+            facets = (int(before[i]), int(c.facet[i]))
+            node = contact.input_node(i)
+            found.append(Switch(time, contact.name, node, facets, -float(gain[i])))
     gathered = problem.system.comm.allgather(found)
     return sorted((s for part in gathered for s in part), key=lambda s: s[:3])
 
@@ -204,11 +211,11 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
 def expelled(problem: StepProblem, step: Evaluation) -> str:
     """The node that brings most energy in by starting behind its facet. Every rank must call it."""
     best = (0.0, "")
-    for contact, multiplier in zip(problem.contacts, step.multipliers, strict=True):
-        gain = multiplier[:, 0] * contact.candidates.gap / problem.factor
+    for contact, part in zip(problem.contacts.elements, problem.contact_parts(step), strict=True):
+        gain = contact.gains(part, problem.factor)
         if len(gain) and gain.max() > best[0]:
             i = int(gain.argmax())
-            where = f"node {contact.input_node(i)} of {contact.pair.name!r}"
+            where = f"node {contact.input_node(i)} of {contact.name!r}"
             text = f"{gain[i]:.3g} J by {where}, {-contact.candidates.gap[i]:.3g} m deep"
             best = float(gain[i]), text
     return max(problem.system.comm.allgather(best))[1]
@@ -216,20 +223,16 @@ def expelled(problem: StepProblem, step: Evaluation) -> str:
 
 def first_row(system: System, state: State) -> dict[str, Any]:
     """Balance table row of the state a run starts from."""
-    row: dict[str, Any] = dict.fromkeys(COLUMNS, 0.0)
+    row: dict[str, Any] = dict.fromkeys(columns(system), 0.0)
     row |= measure(system, state)
     row |= {"time": state.time, "energy": row["kinetic"] + row["potential"]}
-    carrying = [force > 0.0 for force in state.force]
-    active = sum(int(on.sum()) for on in carrying)
-    stick = sum(int((on & held).sum()) for on, held in zip(carrying, state.stick, strict=True))
-    slip = sum(
-        int((on & ~held).sum())
-        for on, held, pair in zip(carrying, state.stick, system.contacts, strict=True)
-        if pair.friction
-    )
-    counts = system.comm.allreduce(np.array([active, stick, slip], dtype=float))
-    row |= dict(zip(("active", "stick", "slip"), counts.tolist(), strict=True))
-    smallest = min((float(gap.min(initial=np.inf)) for gap in state.gap), default=np.inf)
+    local = np.zeros(len(COUNTS))
+    for pair, old in zip(system.contacts, state.contacts, strict=True):
+        on = old.force > 0.0
+        slips = (on & ~old.stick).sum() if pair.friction else 0
+        local += on.sum(), (on & old.stick).sum(), slips
+    row |= dict(zip(COUNTS, system.comm.allreduce(local).tolist(), strict=True))
+    smallest = min((float(c.gap.min(initial=np.inf)) for c in state.contacts), default=np.inf)
     row["min_gap"] = float(system.comm.allreduce(smallest, op=MPI.MIN))
     return row | {"min_det": float(smallest_dets(system, state.u).min())}
 
@@ -246,7 +249,8 @@ def next_row(
         terms: `step_terms` of the step.
     """
     row = {**last, **measured, **terms}
-    for name in ("external_work", "friction_dissipation", "contact_defect", "material_change"):
+    losses = [name for name in terms if name not in COLUMNS]
+    for name in (*WORKS, "material_change", *losses):
         row[name] = last[name] + terms[name]
     row["energy"] = row["kinetic"] + row["potential"]
     row["ledger_residual"] = (
@@ -256,5 +260,6 @@ def next_row(
         - row["material_change"]
         + row["friction_dissipation"]
         + row["contact_defect"]
+        + sum(row[name] for name in losses)
     )
     return row

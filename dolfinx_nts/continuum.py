@@ -24,11 +24,13 @@ from dolfinx_nts.inversion import Determinants
 from dolfinx_nts.materials import misfit
 from dolfinx_nts.mesh_check import check_mesh
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.points import Points, in_mesh
 from dolfinx_nts.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.surfaces import Surface, locate_facets
 from dolfinx_nts.validation import (
     at_points,
     at_time,
+    floats,
     is_whole,
     items,
     known_options,
@@ -235,6 +237,20 @@ class Continuum:
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
         return Surface(self, found, smoothing)
+
+    def points(self, x: Any) -> Points:
+        """Material points, for joints and springs. Collective.
+
+        Args:
+            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
+
+        Raises:
+            ValueError: x is no array of points, or one of them lies in no cell.
+        """
+        given = np.atleast_2d(floats(x))
+        if given.ndim != 2 or given.shape[1] != 3 or not np.isfinite(given).all():
+            raise ValueError(f"x={x!r}: pass points of shape (3,) or (n, 3) [m]")
+        return in_mesh(self, given, "x")
 
     # ---- set-up
     def _size(self) -> float:

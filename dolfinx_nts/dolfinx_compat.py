@@ -14,7 +14,7 @@ import dolfinx.fem.petsc as fem_petsc
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import cpp, fem, mesh
+from dolfinx import cpp, fem, geometry, mesh
 from petsc4py import PETSc
 
 VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
@@ -152,10 +152,32 @@ def interpolation_points(space: Any) -> FloatArray:
 
 def node_blocks(mesh: Any, space: Any) -> IntArray:
     """Block of coordinates of each geometry node of this rank, ghosts included, shape (nodes,)."""
-    geometry = geometry_dofmap(mesh)
+    nodes = geometry_dofmap(mesh)
     blocks = np.full(len(mesh.geometry.x), -1, dtype=np.int64)
-    blocks[geometry] = cell_dofs(space)[: len(geometry), : geometry.shape[1]]
+    blocks[nodes] = cell_dofs(space)[: len(nodes), : nodes.shape[1]]
     return blocks
+
+
+def cells_at(msh: Any, x: FloatArray) -> IntArray:
+    """One of this rank's own cells that holds each point (n, 3), or -1, shape (n,)."""
+    tree = geometry.BoundingBoxTree(msh, 3) if _OLD else geometry.bb_tree(msh, 3)
+    collide = geometry.compute_collisions if _OLD else geometry.compute_collisions_points
+    x = np.ascontiguousarray(x, dtype=np.float64)
+    found = geometry.compute_colliding_cells(msh, collide(tree, x), x)
+    owned, cells = msh.topology.index_map(3).size_local, np.full(len(x), -1)
+    for i in range(len(x)):
+        own = [c for c in found.links(i) if c < owned]
+        cells[i] = own[0] if own else -1
+    return cells
+
+
+def with_ghosts(space: Any, chosen: IntArray) -> npt.NDArray[np.bool_]:
+    """Which coordinates of this rank's nodes and ghosts are among chosen owned ones, (b, 3)."""
+    mark = fem.Function(space)
+    mark.x.array[chosen] = 1.0
+    mark.x.scatter_forward()
+    marked: npt.NDArray[np.bool_] = mark.x.array.reshape(-1, 3) > 0.5
+    return marked
 
 
 def subspace_component_bc(space: Any, component: int, blocked_dofs: IntArray) -> Any:

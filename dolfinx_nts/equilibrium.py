@@ -121,11 +121,9 @@ class _LoadStepper(Stepper):
         terms["external_work"] = self.system.comm.allreduce(work)
         terms["friction_dissipation"] += lost
         for k, pair in enumerate(self.system.contacts):
-            if pair.rigid:
-                mean = 0.5 * (before["contact_forces"][k] + resultants["contact_forces"][k])
-                times, comm = (old.time, time), self.system.comm
-                start, end = (pair.master.displacement(t, comm) for t in times)
-                terms["external_work"] += float(mean @ (end - start))
+            mean = 0.5 * (before["contact_forces"][k] + resultants["contact_forces"][k])
+            start, end = pair.path(old.time, time)
+            terms["external_work"] += float(mean @ (end - start))
         terms |= {"time": time, "newton_iterations": iterations}
         terms |= {"contact_defect": 0.0, "material_change": self._material_change}
         self._material_change = 0.0
@@ -144,7 +142,8 @@ class _LoadStepper(Stepper):
         stabilization: a proximal-point iteration, whose limit knows nothing of it.
         """
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
-        search, lost, since, slipped = True, 0.0, 0.0, self.state.slip
+        search, lost, since = True, 0.0, 0.0
+        slipped = [contact.slip for contact in kept.contacts]
         problem.stabilization = self._stabilization
         state = replace(kept, v=tuple(self._rates))
         try:
@@ -153,10 +152,14 @@ class _LoadStepper(Stepper):
                     step = self._solve(state, dt, search)
                     reached = self._accepted(step, dt, time)
                     if search:  # else slip still counts from the last search
-                        lost, slipped = lost + since, state.slip
-                    moved = (b - a for a, b in zip(kept.slip, reached.slip, strict=True))
-                    total = tuple(a + b for a, b in zip(slipped, moved, strict=True))
-                    reached = replace(reached, slip=total)
+                        lost, slipped = lost + since, [contact.slip for contact in state.contacts]
+                    contacts = tuple(
+                        new._replace(slip=start + new.slip - old.slip)
+                        for start, old, new in zip(
+                            slipped, state.contacts, reached.contacts, strict=True
+                        )
+                    )
+                    reached = replace(reached, histories=(contacts, *reached.histories[1:]))
                     self._check_missed(reached)
                 except UserFunctionError:
                     raise
@@ -205,7 +208,7 @@ class _LoadStepper(Stepper):
         """Forces [N] of supports and contacts, the same on all ranks."""
         bodies, contacts = self.system.bodies, len(self.system.contacts)
         reactions = [b.reactions(t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
-        forces = [-k.residual[:, :3].sum(axis=0) for k in step.contacts]
+        forces = [-part.residual[:, :3].sum(axis=0) for part in self.problem.contact_parts(step)]
         local = np.concatenate([*reactions, *np.reshape(forces, (contacts, 1, 3))])
         total = np.empty_like(local)
         self.system.comm.Allreduce(local, total, op=MPI.SUM)

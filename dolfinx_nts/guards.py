@@ -51,11 +51,11 @@ def check_momentum(
     for k, (body, terms, u0, v0, v1) in enumerate(zip(
         problem.system.bodies, step.bodies, problem.state.u, problem.state.v, state.v, strict=True
     )):
-        force = terms.external - terms.internal - terms.contact
+        force = terms.external - terms.internal - terms.coupling
         force[body.fixed] += terms.residual[body.fixed]
         local[:3] += body.linear_momentum(force)
         local[3:6] += body.angular_momentum(u0 + 0.5 * terms.du, force)
-        parts = (terms.internal, terms.external, terms.contact)
+        parts = (terms.internal, terms.external, terms.coupling)
         local[6] += sum(float(np.abs(p).sum()) for p in parts)
         speed = np.abs(v0) + np.abs(v1)
         if rule.accelerations:

@@ -14,7 +14,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.assembly import StepMatrix
-from dolfinx_nts.contact_step import ContactStep, Contribution
 from dolfinx_nts.inversion import describe, forbidden, smallest_dets
 from dolfinx_nts.linear_solver import (
     SOLVERS,
@@ -27,6 +26,7 @@ from dolfinx_nts.linear_solver import (
 )
 from dolfinx_nts.step import EQUAL, BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.system import System
+from dolfinx_nts.unknowns import Unknowns
 from dolfinx_nts.validation import StepFailedError, is_finite, is_whole, known_options, require_bool
 
 logger = logging.getLogger(__name__)
@@ -128,8 +128,6 @@ _INSIDE_OUT = 8
 _LAST = 1e5
 #: Where residuals add up over steps, one above this part of its tolerance gets one more iteration.
 _SURE = 0.05
-#: Changes of one node's state in a step that are no search any more.
-_CYCLE = 8
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 
@@ -200,9 +198,8 @@ class StepSolver:
         while True:
             last = self._attempt()
             iterations += last.iterations
-            solved = self.problem.wake(last)
-            if solved is not None:
-                return replace(solved, iterations=iterations)
+            if not self.problem.wake(last):
+                return replace(last, iterations=iterations)
 
     def _attempt(self) -> Evaluation:
         """Solve the step with the candidates that have unknowns."""
@@ -271,7 +268,7 @@ class StepSolver:
         """Make SNES and matrices ready for the current step."""
         self._last = self._passed = None
         self._measured = False
-        self._flips = [np.zeros((2, c.num_pairs), dtype=int) for c in self.problem.contacts]
+        self._flips: list[IntArray] = []
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
         self._matrices_due |= not self.newton.reuse or changed > EQUAL
@@ -297,16 +294,16 @@ class StepSolver:
                 self._bodies[k] = self.problem.body_tangent(k, e.bodies[k].u1)
         if self.matrix is None:
             self.matrix = StepMatrix(
-                self.problem.layout,
+                self._laid.layout,
                 [self._bodies[k] for k in awake],
-                self.problem.elements,
+                self._laid.blocks,
                 split=self._options.split,
                 blocked=self._options.blocked,
             )
-        elif self._solved and self.newton.reuse and self.problem.elements:
+        elif self._solved and self.newton.reuse and self._laid.own:
             keep_bodies(self.snes, not fresh)
-        if fresh or new or self.problem.elements:
-            tangents = [c.tangent for c in e.contacts] if self.problem.elements else []
+        if fresh or new or self._laid.blocks:
+            tangents = [part.tangent for part in e.parts] if self._laid.blocks else []
             self.matrix.assemble(tangents, fresh=fresh)
         if self.snes is not None:
             self._refresh_schur()
@@ -322,7 +319,7 @@ class StepSolver:
         self.snes.setConvergenceTest(self._converged)
         self.snes.setLineSearchPreCheck(self._shorten)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
-        contact = self.matrix if self.problem.elements else None
+        contact = self.matrix if self._laid.own else None
         self._solved = False
         ours = self._options.blocked and self.problem.system.comm.size > 1
         bodies = self.matrix.whole_bodies() if ours else None
@@ -334,11 +331,16 @@ class StepSolver:
 
     def _refresh_schur(self) -> None:
         """Give the preset's field split the Schur complement of the matrix as it is now."""
-        if self.problem.elements and self._options.schur:
+        if self._laid.own and self._options.schur:
             assert self.matrix is not None
             set_schur(self.snes, self.matrix.schur())
 
     # ---- SNES callbacks
+    @property
+    def _laid(self) -> Unknowns:
+        assert self.problem.unknowns is not None
+        return self.problem.unknowns
+
     def _at(self, x: Any) -> Evaluation:
         """Evaluation at an iterate, reused while SNES asks for the same one."""
         same = self._last is not None and np.array_equal(self._last.x, x.array_r)
@@ -348,10 +350,12 @@ class StepSolver:
                 new = self.problem.evaluate(x)
             self._rests = True
             if self._last is not None:
-                for count, a, b in zip(self._flips, self._last.contacts, new.contacts, strict=True):
-                    changes = np.stack([a.active != b.active, a.stick != b.stick])
-                    count += changes
+                for k, (a, b) in enumerate(zip(self._last.parts, new.parts, strict=True)):
+                    changes = a.status != b.status
+                    self._flips[k] += changes
                     self._rests &= not changes.any()
+            else:
+                self._flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
             self._last = new
         assert self._last is not None
         return self._last
@@ -406,8 +410,8 @@ class StepSolver:
     def _displacements(self, x: FloatArray) -> list[FloatArray]:
         """Of each body at an iterate [m]."""
         u = list(self.problem.state.u)
-        for f, k in enumerate(self.problem.awake):
-            u[k] = x[self.problem.layout.owned(f)]
+        for k in self.problem.awake:
+            u[k] = x[self._laid.of_body(k)]
         return u
 
     def _smallest_dets(self, u: list[FloatArray]) -> FloatArray:
@@ -448,7 +452,7 @@ class StepSolver:
         where contact acts, the parts differ.
         """
         assert self._last is not None
-        acts = any(bool(k.active.any()) for k in self._last.contacts)
+        acts = any(bool(part.status.any()) for part in self._last.parts)
         return self.newton.reuse and not self.problem.system.comm.allreduce(acts, op=MPI.LOR)
 
     def _aim(self, worst: float) -> None:
@@ -487,9 +491,9 @@ class StepSolver:
         ratio = {k: r if np.isfinite(r) else np.inf for k, r in found.items()}
         worst = max(ratio, key=lambda name: ratio[name])
         notes = [
-            _contact_note(c, k, flips)
-            for c, k, flips in zip(problem.contacts, e.contacts, self._flips, strict=True)
-            if c.num_pairs
+            (c.name, *c.describe(part, flips))
+            for c, part, flips in zip(problem.elements, e.parts, self._flips, strict=True)
+            if c.num_elements
         ]
         notes += [
             _body_note(body, terms)
@@ -541,26 +545,6 @@ class StepSolver:
             self._f.destroy()
             self.snes = None
         self._version = -1
-
-
-def _contact_note(c: ContactStep, k: Contribution, flips: IntArray) -> tuple[str, float, str]:
-    """Name, weight and text of the pair that flipped most or is worst solved."""
-    rows = np.abs(k.residual[:, c.num_coordinates :]).max(axis=1)
-    weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips.sum(axis=0))
-    i = int(np.argmax(weight))
-    touch, slide = (int(n) for n in flips[:, i])
-    facet = "" if c.pair.rigid else f" on facet {int(c.candidates.facet[i])}"
-    where = f"contact {c.pair.name!r}: node {c.input_node(i)}{facet}"
-    text = f"{where}, {touch} active-set flips"
-    if slide:
-        text += f" and {slide} between stick and slip"
-    if max(touch, slide) >= _CYCLE:
-        states = "stick and slip" if slide > touch else "contact and none"
-        text += (
-            f": it flips between {states} and settles in neither; try another dt"
-            f"{', a smaller coefficient of friction' if c.pair.friction else ''} or a finer surface"
-        )
-    return c.pair.name, float(weight[i]), text
 
 
 def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:

@@ -147,7 +147,8 @@ def _contact_fields(
     pair: ContactPair, state: State, k: int, mean: FloatArray
 ) -> dict[str, tuple[float, FloatArray]]:
     """Name -> value elsewhere and values at this rank's slave nodes."""
-    slave, force, gap = pair.slave, state.force[k], state.gap[k]
+    slave, own = pair.slave, state.contacts[k]
+    force, gap = own.force, own.gap
     near = np.isfinite(gap)
     fields = {
         "contact_force": (0.0, force),
@@ -155,11 +156,11 @@ def _contact_fields(
         "contact_force_mean": (0.0, mean),
         "contact_pressure_mean": (0.0, mean / slave.area[slave.share]),
         "contact_gap": (np.nan, np.where(near, gap, np.nan)),
-        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + state.stick[k]),
+        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + own.stick),
     }
     if pair.friction:
-        fields["contact_friction"] = (0.0, state.tangential[k])
-        fields["contact_slip"] = (0.0, state.slip[k])
+        fields["contact_friction"] = (0.0, own.tangential)
+        fields["contact_slip"] = (0.0, own.slip)
     return fields
 
 
@@ -276,7 +277,7 @@ class BalanceCSV:
     def start(self, stepper: Stepper) -> None:
         """Write the header and the row of the initial state."""
         header, self._rows = [], 0
-        for name in ledger.COLUMNS:
+        for name in ledger.columns(stepper.system):
             unit = _UNITS.get(name, "J")
             vector = np.ndim(stepper.solution.rows[0][name]) > 0
             header += [f"{name}{s} [{unit}]" for s in (("_x", "_y", "_z") if vector else ("",))]
@@ -302,7 +303,7 @@ class BalanceCSV:
         self._open = False
         lines = []
         for row in stepper.solution.rows[self._rows :]:
-            cells = np.concatenate([np.ravel(row[name]) for name in ledger.COLUMNS])
+            cells = np.concatenate([np.ravel(row[name]) for name in ledger.columns(stepper.system)])
             lines.append(",".join(f"{x:.17g}" for x in cells.tolist()))
         extend_file(self.path, "".join(f"{line}\n" for line in (*lines, *footer)).encode())
         self._rows += len(lines)

@@ -330,9 +330,9 @@ class OverlapWatch:
         between: dict[tuple[int, ...], list[Any]] = {}
         self._pairs: list[_BodyPair | _ObstacleContact] = []
         for contact, bodies in zip(system.contacts, system.contact_bodies, strict=True):
-            if contact.rigid and len(contact.slave.facets):
+            if len(contact.bodies) == 1 and len(contact.slave.facets):
                 self._pairs.append(_ObstacleContact(contact, *bodies))
-            elif not contact.rigid and all(hasattr(b, "mesh") for b in contact.bodies):
+            elif len(contact.bodies) == 2 and all(hasattr(b, "mesh") for b in contact.bodies):
                 between.setdefault(tuple(sorted(bodies)), []).append(contact)
         self._pairs += [_BodyPair(k, c, self._boundary) for k, c in between.items()]
         self._looked: dict[int, _Looked] = {}

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts import balance
-from dolfinx_nts.contact_step import ContactStep
 from dolfinx_nts.guards import check_momentum
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.inversion import describe, smallest_dets
@@ -87,7 +86,7 @@ class Solution:
 
         They are read-only and hold the rows up to now.
         """
-        return {name: self.rows.column(name) for name in balance.COLUMNS}
+        return {name: self.rows.column(name) for name in balance.columns(self.system)}
 
     @property
     def summary(self) -> str:
@@ -276,9 +275,9 @@ class Stepper:
     def _bind(self, retries: int) -> bool:
         """Let infinite friction have a bound once cuts are of no use; tells whether that is new."""
         endless = any(np.isinf(pair.friction) for pair in self.system.contacts)
-        if not endless or self.problem.bounded or retries < _CUTS:
+        if not endless or self.problem.contacts.bounded or retries < _CUTS:
             return False
-        self.problem.bounded = True
+        self.problem.contacts.bounded = True
         return True
 
     def paced(self, pace: Pace, end: float) -> Iterator[None]:
@@ -426,7 +425,8 @@ class Stepper:
         rows.append(balance.next_row(rows[0], rows[-1], trial.measured, terms))
         self._promises.hold(self.problem, step, trial.impulses)
         self.solution.switches.extend(balance.switches(self.problem, step, time))
-        self._recent.append((time - self.state.time, state.force))
+        forces = tuple(contact.force for contact in state.contacts)
+        self._recent.append((time - self.state.time, forces))
         self._accept(state)
         self._tell_inversion(step)
         self._tell_beside()
@@ -435,13 +435,14 @@ class Stepper:
 
     def _tell_slip(self, step: Evaluation) -> None:
         """Say where nodes slip in spite of infinite friction, which they may in the next step."""
-        both = zip(self.problem.contacts, step.contacts, strict=True)
+        contacts = self.problem.contacts
+        both = zip(contacts.elements, self.problem.contact_parts(step), strict=True)
         endless = [(c, k) for c, k in both if np.isinf(c.pair.friction)]
-        if not (endless and self.problem.bounded):
+        if not (endless and self.problem.contacts.bounded):
             return
         slips = [k.distance[k.active & ~k.stick].max(initial=0.0) for _, k in endless]
         farthest = float(self.system.comm.allreduce(max(slips), op=MPI.MAX))
-        self.problem.bounded = farthest > 0.0
+        self.problem.contacts.bounded = farthest > 0.0
         if farthest > 0.0:
             self.solution.warn(
                 "slip", self.state.time, farthest,
@@ -452,7 +453,7 @@ class Stepper:
 
     def _tell_beside(self) -> None:
         """Warn of nodes that have passed by a surface's edge and lie behind it."""
-        found = self.problem.beside
+        found = self.problem.contacts.beside
         deepest = np.array([depth for depth, _ in found])
         self.system.comm.Allreduce(MPI.IN_PLACE, deepest, op=MPI.MAX)
         if deepest.max(initial=0.0) <= _BESIDE:
@@ -476,38 +477,15 @@ class Stepper:
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
         """State at t_{n+1}."""
-        old, scale = self.state, 1.0 / self.problem.factor
+        old = self.state
         u, v, a = list(old.u), list(old.v), list(old.a)
         for k in self.problem.awake:
             u[k], a0 = step.bodies[k].u1.copy(), self.problem.acceleration(k)
             v[k], a1 = self.problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
             if a1 is not None:
                 a[k] = a1
-        contact = [
-            {
-                "facets": _at_nodes(c, c.candidates.facet, -1),
-                "force": _at_nodes(c, -scale * np.where(k.active, m[:, 0], 0.0), 0.0),
-                "gap": _at_nodes(c, k.gap, np.inf),
-                "tangential": _at_nodes(c, scale * k.tangential, 0.0),
-                "stick": _at_nodes(c, k.stick, False),
-                "slip": slip + _at_nodes(c, k.distance, 0.0),
-            }
-            for c, k, m, slip in zip(
-                self.problem.contacts, step.contacts, step.multipliers, old.slip, strict=True
-            )
-        ]
-        for values, c, gap in zip(contact, self.problem.idle, step.idle_gaps, strict=True):
-            values["facets"][c.candidates.node] = c.candidates.facet
-            values["gap"][c.candidates.node] = gap
-        names = ("facets", "force", "gap", "tangential", "stick", "slip")
-        return State(
-            time=time,
-            u=tuple(u),
-            v=tuple(v),
-            a=tuple(a),
-            followed=self.problem.followed,
-            **{name: tuple(c[name] for c in contact) for name in names},
-        )
+        histories = [coupling.history(parts) for coupling, parts in self.problem.each(step)]
+        return State(time, tuple(u), tuple(v), tuple(a), tuple(histories))
 
     def mean_force(self, k: int) -> FloatArray:
         """Contact force p_N of the last two steps in the mean over their time [N].
@@ -519,10 +497,10 @@ class Stepper:
             k: Number of the contact.
 
         Returns:
-            At this rank's slave nodes, as in `state.force`.
+            At this rank's slave nodes, as in `state.contacts`.
         """
         if not self._recent:
-            return self.state.force[k]
+            return self.state.contacts[k].force
         steps, forces = zip(*self._recent, strict=True)
         mean: FloatArray = np.average([force[k] for force in forces], axis=0, weights=steps)
         return mean
@@ -531,14 +509,6 @@ class Stepper:
         """Free the PETSc objects of the last step."""
         self.solver.destroy()
         self.problem.destroy()
-
-
-def _at_nodes(contact: ContactStep, values: npt.NDArray[Any], elsewhere: Any) -> npt.NDArray[Any]:
-    """Values of the pairs at this rank's slave nodes, which are candidates or not."""
-    shape = (len(contact.pair.slave.share), *values.shape[1:])
-    out = np.full(shape, elsewhere, dtype=values.dtype)
-    out[contact.candidates.node] = values
-    return out
 
 
 def _first_state(system: System, start: Any) -> State:

@@ -1,4 +1,6 @@
-"""The equations of one step: unknowns, residual, contact tangents, convergence of each block.
+"""The equations of one step: residual, tangents of bodies, convergence of each block.
+
+What couples bodies comes as `Elements`, of whatever kind they are.
 
 The momentum equation is multiplied by h/2 and the multipliers are h^2/2 lambda (theory section 8),
 which makes the condition number independent of h. Equilibrium has a factor 1 for h^2/2 and no
@@ -8,8 +10,7 @@ pure: nothing here changes a State, and history changes only when a step is acce
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,37 +19,25 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.assembly import ElementBlocks, Layout, solve_mass
+from dolfinx_nts.assembly import solve_mass
 from dolfinx_nts.body import Moment
-from dolfinx_nts.contact import Motion
-from dolfinx_nts.contact_step import ContactStep, Contribution
-from dolfinx_nts.obstacle_contact import ObstacleStep
+from dolfinx_nts.contact_elements import over
+from dolfinx_nts.contact_search import ContactSearch
+from dolfinx_nts.elements import Coupling, Step
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.sleep import Sleepers
 from dolfinx_nts.system import State, System
-from dolfinx_nts.validation import StepFailedError
+from dolfinx_nts.unknowns import Unknowns
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 _EPS = float(np.finfo(float).eps)
-#: In statics a node nearer to its facet than this part of the facet's size starts as active.
-_TOUCHING = 1e-6
-#: A gap of this many roundings of positions, or of forces, that is closed without force is no
-#: contact.
-_TOUCH = 4.0
 #: Relative difference of the factors of two equal steps, which differ by rounding.
 EQUAL = 1e-6
-#: A node passes through an obstacle if its path is longer than this part of the radius, and lies
-#: this part of it deeper than both ends.
-_PASSING = 0.1
 #: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
 _ANOTHER_STEP = 4.0
-#: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
-_SURELY = 1e-3
-#: Difference of two normals, or of two gaps over the facet's size, that counts as none.
-_ONE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +49,7 @@ class BodyTerms:
         du: u_1 - u_0.
         internal: h^2/2 internal forces.
         external: h^2/2 external forces.
-        contact: h^2/2 contact forces G^T lambda.
+        coupling: h^2/2 forces of elements, such as contact forces G^T lambda.
         residual: Complete equation, also at prescribed coordinates, where it is h^2/2 times the
             reaction.
     """
@@ -69,7 +58,7 @@ class BodyTerms:
     du: FloatArray
     internal: FloatArray
     external: FloatArray
-    contact: FloatArray
+    coupling: FloatArray
     residual: FloatArray
 
 
@@ -80,19 +69,15 @@ class Evaluation:
     Attributes:
         x: Iterate it belongs to, this rank's part.
         bodies: Terms of each body.
-        contacts: Contribution of each contact.
-        multipliers: Multipliers of each contact [kg m], shape (n, multipliers).
+        parts: Contribution of each batch of elements.
         iterations: Newton iterations it took.
-        idle_gaps: Gaps [m] of the idle candidates of each contact, once solved.
         min_det: Smallest det F of all bodies, once solved.
     """
 
     x: FloatArray
     bodies: tuple[BodyTerms, ...]
-    contacts: tuple[Contribution, ...]
-    multipliers: tuple[FloatArray, ...]
+    parts: tuple[Any, ...]
     iterations: int = 0
-    idle_gaps: tuple[FloatArray, ...] = ()
     min_det: float = np.inf
 
 
@@ -109,17 +94,14 @@ class StepProblem:
 
     Attributes:
         awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
-        contacts: Candidates of each contact that have unknowns in this step.
-        idle: The others, which the step's motion does not bring to their facets.
-        layout: Fields of the unknowns.
-        elements: Unknowns of the contact elements; empty without candidates.
-        x: PETSc vector of the unknowns, holding the first guess after `begin`.
-        version: Changes whenever layout and elements do.
+        contacts: What makes the elements of contacts.
+        couplings: All that makes elements.
+        unknowns: Their layout; made anew whenever the elements' coordinates change.
+        version: Changes whenever `unknowns` does.
         factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
         rtol: As given.
         centre: Middle of all bodies in the reference [m], shape (3,).
         stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
-        bounded: Whether infinite friction has a bound, where nothing else solves a step.
     """
 
     def __init__(
@@ -130,15 +112,14 @@ class StepProblem:
         self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
         self._asleep: dict[int, BodyTerms] = {}
         self.awake: tuple[int, ...] = ()
-        self._searched: dict[int, tuple[list[FloatArray], ContactStep]] = {}
         self._numbers: tuple[Any, ...] | None = None
-        self.contacts: list[ContactStep] = []
-        self._petsc: list[Any] = []
+        self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
+        self.couplings: list[Coupling] = [self.contacts]
+        for joint, bodies in zip(system.joints, system.joint_bodies, strict=True):
+            self.couplings.append(joint.coupling(bodies))
+        self.unknowns: Unknowns | None = None
         self.version = 0
         self.stabilization = 0.0
-        self.bounded = False
-        self._cover = [0.0] * len(system.contacts)
-        self._beside = [(0.0, -1)] * len(system.contacts)
         self.centre, self._span = _box(system)
         self._diagonal, self._diagonal_factor = np.zeros((2, len(system.bodies)))
 
@@ -151,16 +132,15 @@ class StepProblem:
         Args:
             state: State at t_n.
             dt: Step [s].
-            again: Solution of this step whose motion the candidates did not cover, see `misses`:
+            again: Solution of this step whose motion the elements did not cover, see `misses`:
                 contact is sought along that motion in place of the one that velocities predict.
-            search: Seek candidates; False keeps those of the last step, for statics only.
+            search: Seek contacts; False keeps the candidates of the last step, for statics only.
         """
         system = self.system
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
         for k, body in enumerate(system.bodies):
             body.begin_step(self.integrator, self._moment(k))
         self._gravity = self.integrator.ramp(self._when) * system.gravity
-        self._paths = {k: self._path(c) for k, c in enumerate(system.contacts) if c.rigid}
         flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
         self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
         for body, u1 in zip(system.bodies, self.first, strict=True):
@@ -180,12 +160,10 @@ class StepProblem:
             self._inertial(b, ahead) if top else np.zeros_like(ahead)
             for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
         ]
-        self._ahead = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
-        if again is None:
-            self._aimed = [np.full(len(c.slave.share), -1) for c in system.contacts]
-        else:
+        way = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
+        if again is not None:
             self._motion = np.maximum(self._motion, self.motion(again))
-            self._ahead = [terms.du for terms in again.bodies]
+            way = [terms.du for terms in again.bodies]
         # Bodies at rest may fall.
         self._length = self._moved + self._motion + dt**2 * float(np.linalg.norm(self._gravity))
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
@@ -195,13 +173,105 @@ class StepProblem:
         old = self._diagonal_factor
         other = (self.factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * self.factor)
         self._diagonal[other] = 0.0
-        if search:
-            self._followed = list(state.followed)
-            self._found = [self._search(k) for k in range(len(system.contacts))]
-            self._drop_doubles()
-            self._with_unknowns = [self._may_touch(k, c) for k, c in enumerate(self._found)]
+        step = Step(
+            state, dt, self.factor, self.integrator, self.condense, self.first, way,
+            self._motion, self._length, self._force_rounding_of,
+        )  # fmt: skip
+        for coupling in self.couplings:
+            coupling.begin(step, again, search)
         self._asleep = self._find_asleep(np.maximum(self._motion, speed) == 0.0)
-        self._choose()
+        self._lay_out()
+
+    @property
+    def elements(self) -> list[Any]:
+        """Batches of elements in the step."""
+        return [batch for coupling in self.couplings for batch in coupling.elements]
+
+    def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
+        """Couplings with their parts of an evaluation."""
+        start = 0
+        for coupling in self.couplings:
+            stop = start + len(coupling.elements)
+            yield coupling, e.parts[start:stop]
+            start = stop
+
+    def contact_parts(self, e: Evaluation) -> tuple[Any, ...]:
+        """Parts of an evaluation that contacts contribute, one of each."""
+        return next(parts for coupling, parts in self.each(e) if coupling is self.contacts)
+
+    def wake(self, e: Evaluation) -> bool:
+        """Whether a solved step asks for more elements, and is to be solved again. Collective.
+
+        Args:
+            e: Solution of the step without them.
+        """
+        u1 = [terms.u1 for terms in e.bodies]
+        if not any([coupling.wake(u1) for coupling in self.couplings]):
+            return False
+        for k in self._asleep.keys() & self._touched():
+            del self._asleep[k]
+        self._lay_out()
+        return True
+
+    def misses(self, e: Evaluation) -> bool:
+        """Whether a solved step may have passed by something. Collective.
+
+        If so, `begin` is to be called again with it.
+
+        Raises:
+            StepFailedError: Only a shorter step helps.
+        """
+        motion = self.motion(e)
+        return any([coupling.misses(e, parts, motion) for coupling, parts in self.each(e)])
+
+    @property
+    def may_slip(self) -> bool:
+        """Whether `let_slip` changes anything."""
+        return any(coupling.may_slip for coupling in self.couplings)
+
+    def let_slip(self) -> None:
+        """Solve this step by a rule that adds no solution but may find one."""
+        for coupling in self.couplings:
+            coupling.let_slip()
+
+    def _touched(self) -> set[int]:
+        """Bodies that elements move, the same on all ranks. Collective."""
+        return set().union(*(coupling.touched() for coupling in self.couplings))
+
+    def _force_rounding_of(self, bodies: Sequence[int]) -> float:
+        """Norm of the forces on some bodies that is rounding [kg m]. Collective."""
+        for k in bodies:
+            if not self._diagonal[k]:
+                self._measure_rounding(k)
+        return float(self.rounding[list(bodies)].sum())
+
+    def _lay_out(self) -> None:
+        """Layout of the unknowns, kept while no rank's elements change, and a first guess."""
+        system = self.system
+        if len(self._asleep) == len(system.bodies):
+            # SNES needs an unknown; at rest it takes no iteration.
+            del self._asleep[0]
+        self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
+        elements = self.elements
+        numbers = (np.array(self.awake), *(a for c in elements for a in c.points()))
+        if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
+            self.destroy()
+            sizes = {k: system.bodies[k].num_owned for k in self.awake}
+            bodies = [of for coupling in self.couplings for of in coupling.bodies]
+            self.unknowns = Unknowns(system.comm, sizes, elements, bodies)
+            self.version += 1
+            self._numbers = numbers
+        self.guess(flight=True)
+
+    @property
+    def x(self) -> Any:
+        """PETSc vector of the unknowns, holding the first guess after `begin`."""
+        return self._laid.x
+
+    @property
+    def _laid(self) -> Unknowns:
+        assert self.unknowns is not None, "begin comes first"
+        return self.unknowns
 
     @property
     def _when(self) -> float:
@@ -233,7 +303,7 @@ class StepProblem:
         still = tuple(np.zeros_like(v) for v in state.v)
         self.begin(replace(state, a=still), dt)
         self.guess(flight=False, forces=True)
-        contact = [terms.contact / self.factor for terms in self.evaluate(self.x).bodies]
+        contact = [terms.coupling / self.factor for terms in self.evaluate(self.x).bodies]
         gravity = self.integrator.ramp(state.time) * self.system.gravity
         out = []
         for body, u, v, force in zip(
@@ -265,12 +335,6 @@ class StepProblem:
             for k, (a, b) in found.items()
         }
 
-    def _touched(self) -> set[int]:
-        """Bodies of contacts that have unknowns, the same on all ranks."""
-        local = np.array([float(awake.any()) for awake in self._with_unknowns])
-        on = global_max(self.system.comm, local) > 0.0
-        return set().union(*itertools.compress(self.system.contact_bodies, on))
-
     def _force_rounding(self, k: int) -> float:
         """Norm of the forces on a body at rest [N] that is rounding, as in `ratios`.
 
@@ -280,65 +344,6 @@ class StepProblem:
             self._measure_rounding(k)
         rounding = self._rounding_of(self._moved)[k]
         return float(rounding / max(self.factor, self._diagonal_factor[k]))
-
-    def _may_touch(self, index: int, c: ContactStep) -> BoolArray:
-        """Which candidates need unknowns: all within reach, and who had them in the last step.
-
-        In statics, where no motion bounds the next one, all do. Strong friction may hold nodes that
-        free motion lets go (Painleve's paradox), and an iterate's errors would choose which: there
-        only what carries, or what flight presses in, begins with unknowns.
-        """
-        if not self.integrator.inertia:
-            return np.ones(c.num_pairs, dtype=bool)
-        node, reach = c.candidates.node, self._reach(index, self._motion)
-        force = self.state.force[index][node]
-        if c.strong:
-            closes = self._gap(index, c, self.first) < -_SURELY * reach
-            return closes | (force > c.no_pull(self.state.tangential[index][node]))
-        # What goes to and fro at the limit would change the layout in every step.
-        had = np.isin(node, self.contacts[index].candidates.node) if self.contacts else False
-        awake: BoolArray = had | (c.candidates.gap < reach) | (force > 0.0)
-        return awake
-
-    def wake(self, e: Evaluation) -> Evaluation | None:
-        """A solved step with the gaps of the idle candidates, if none of them is closed.
-
-        Else these get unknowns, and the step is to be solved again. Every rank must call it.
-
-        Args:
-            e: Solution of the step without them.
-        """
-        if not self._watching:
-            return replace(e, idle_gaps=tuple(np.empty(0) for _ in self.idle))
-        u = [b.u1 for b in e.bodies]
-        gaps = tuple(self._gaps(self.idle, u))
-        closed = [~(gap >= -c.gap_rounding) for c, gap in zip(self.idle, gaps, strict=True)]
-        if not self.system.comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
-            return replace(e, idle_gaps=gaps)
-        for awake, late in zip(self._with_unknowns, closed, strict=True):
-            awake[np.flatnonzero(~awake)[late]] = True
-        for k in self._asleep.keys() & self._touched():
-            del self._asleep[k]
-        self._choose()
-        return None
-
-    def _choose(self) -> None:
-        """Give unknowns to the candidates that are awake."""
-        both = list(zip(self._found, self._with_unknowns, strict=True))
-        self.contacts, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
-        if self.bounded:
-            self.contacts = [replace(c, bounded=True) for c in self.contacts]
-        system, watching = self.system, any(c.num_pairs for c in self.idle)
-        self._watching = system.comm.allreduce(watching, op=MPI.LOR)
-        if len(self._asleep) == len(system.bodies):
-            # SNES needs an unknown; at rest it takes no iteration.
-            del self._asleep[0]
-        self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
-        numbers = (np.array(self.awake), *(a for c in self.contacts for a in c.points()))
-        if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
-            self._lay_out()
-            self._numbers = numbers
-        self.guess(flight=True)
 
     def _inertial(self, body: Any, du: FloatArray) -> FloatArray:
         """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
@@ -353,162 +358,6 @@ class StepProblem:
         stiffness[body.fixed] = 0.0
         return stiffness
 
-    def _path(self, pair: Any) -> FloatArray:
-        """Displacements of the obstacle of a contact at t_n and t_{n+1} [m], shape (2, 3)."""
-        times = (self.state.time, self.state.time + self.dt)
-        return np.stack([pair.master.displacement(t, self.system.comm) for t in times])
-
-    def _reach(self, index: int, motion: FloatArray) -> float:
-        reach = np.sqrt(3.0) * float(sum(motion[b] for b in self.system.contact_bodies[index]))
-        if self.system.contacts[index].rigid:
-            reach += float(np.linalg.norm(np.diff(self._paths[index], axis=0)))
-        return reach
-
-    def _search(self, index: int) -> ContactStep:
-        """Candidates of a contact, found anew unless all its bodies slept and nothing moves."""
-        u = [self.state.u[b] for b in self.system.contact_bodies[index]]
-        known, reach = self._searched.pop(index, None), self._reach(index, self._motion)
-        if reach > 0.0:
-            return self._contact_step(index, u, reach)
-        if known is None or any(a is not b for a, b in zip(known[0], u, strict=True)):
-            known = u, self._contact_step(index, u, reach)
-        self._searched[index] = known
-        return known[1]
-
-    def _contact_step(self, index: int, u: list[FloatArray], reach: float) -> ContactStep:
-        pair, state = self.system.contacts[index], self.state
-        paths = [self._ahead[b] for b in self.system.contact_bodies[index]]
-        moved = self._paths[index][0] if pair.rigid else None
-        positions = pair.positions(u)
-        found, self._followed[index], self._cover[index], self._beside[index] = pair.find(
-            positions,
-            state.facets[index],
-            moved,
-            Motion(reach, paths, self._aimed[index]),
-            # In statics steps may be of any length, and what they carry inside is looked for.
-            state.followed[index] if self.integrator.inertia else None,
-        )
-        slave, x0, theta = pair.slave, pair.points(positions, found), self.integrator.theta
-        scale = self._scale(slave)[slave.share[found.node]]
-        rule, condense = self.integrator.contact_gradient, self.condense
-        step: ContactStep
-        if pair.rigid:
-            path, none = self._paths[index], np.empty((len(scale), 0))
-            step = ObstacleStep(
-                pair, found, rule, condense, x0 - path[0], scale, theta, path, master_scale=none
-            )
-        else:
-            master = self._scale(pair.master)[pair.master.patches[found.facet]]
-            step = ContactStep(pair, found, rule, condense, x0, scale, theta, master_scale=master)
-        bodies = self.system.contact_bodies[index]
-        gap, force = _EPS * (step.extent + float(max(self._length[b] for b in bodies))), 0.0
-        if step.strong:
-            # What touches as far as its coordinates tell would stick by their rounding.
-            gap += _EPS * pair.given
-        if pair.friction:
-            # A force that is rounding of the bodies' own would stick or slip by its sign.
-            for b in bodies:
-                if not self._diagonal[b]:
-                    self._measure_rounding(b)
-            force = float(self.rounding[list(bodies)].sum())
-        return replace(step, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
-
-    def _scale(self, surface: Any) -> FloatArray:
-        """Force per motion of a surface's points, shape (p,), see `ContactStep`. Collective."""
-        if self.integrator.inertia:
-            mass: FloatArray = surface.mass
-            return mass
-        stiffness: FloatArray = surface.nodal(surface.body.nodal_stiffness(self.integrator))
-        return stiffness
-
-    def _drop_doubles(self) -> None:
-        """Of two pairs that keep a node out of the same fixed surface, leave one.
-
-        Two constraints on one gap are one too many where no master can yield, as over the seam of
-        two plates. A node stays with the one that carried it.
-        """
-        for i, j in itertools.combinations(range(len(self._found)), 2):
-            a, b = self._found[i], self._found[j]
-            if a.pair.slave.body is not b.pair.slave.body:
-                continue
-            one, two = (c.pair.slave.points[c.pair.slave.share[c.candidates.node]] for c in (a, b))
-            _, ia, ib = np.intersect1d(one, two, return_indices=True)
-            ca, cb = a.candidates.part(ia), b.candidates.part(ib)
-            double = np.einsum("ni,ni->n", ca.normal, cb.normal) > 1.0 - _ONE
-            double &= np.abs(ca.gap - cb.gap) < _ONE * np.minimum(ca.length, cb.length)
-            double &= a.immovable[ia] & b.immovable[ib]
-            stay = self.state.force[i][ca.node] >= self.state.force[j][cb.node]
-            for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
-                if len(there):
-                    self._found[k] = c.part(~np.isin(np.arange(c.num_pairs), there))
-
-    def _lay_out(self) -> None:
-        """Layout, vectors and scatter; kept from step to step while no rank's candidates change."""
-        self.destroy()
-        system, contacts, num_bodies = self.system, self.contacts, len(self.awake)
-        self._body_field = {k: f for f, k in enumerate(self.awake)}
-        sizes = [system.bodies[k].num_owned for k in self.awake]
-        multipliers = sum(c.num_pairs * c.num_multipliers for c in contacts)
-        self._fields: dict[str, int] = {}
-        if system.comm.allreduce(multipliers) > 0:
-            if any(c.num_augmented for c in contacts):
-                self._fields["augmented"] = num_bodies
-                sizes.append(sum(c.num_pairs * c.num_augmented for c in contacts))
-            self._fields["multipliers"] = len(sizes)
-            sizes.append(multipliers)
-        self.layout = Layout(system.comm, sizes)
-        self.elements = self._element_blocks() if self._fields else []
-        index = [np.empty(0, np.int64)]
-        for c, bodies in zip(contacts, system.contact_bodies, strict=True):
-            if c.num_pairs:
-                fields = [self._body_field[b] for b in bodies]
-                points = zip(fields, c.points(), strict=True)
-                parts = [self.layout.to_system(f, p) for f, p in points]
-                index.append(np.concatenate(parts, axis=1).ravel())
-        needed = np.concatenate(index).astype(PETSc.IntType)
-        self.x = PETSc.Vec().createMPI((self.layout.num_owned, None), comm=system.comm)
-        self._forces = self.x.duplicate()
-        self._local = PETSc.Vec().createSeq(len(needed), comm=PETSc.COMM_SELF)
-        source = PETSc.IS().createGeneral(needed, comm=PETSc.COMM_SELF)
-        self._scatter = PETSc.Scatter().create(self.x, source, self._local, None)
-        source.destroy()
-        self._petsc = [self.x, self._forces, self._local, self._scatter]
-        self.version += 1
-
-    def _element_blocks(self) -> list[ElementBlocks]:
-        """Numbers of the contact elements' unknowns in their fields."""
-        blocks = []
-        offset = {name: self.layout.start(f) for name, f in self._fields.items()}
-        for c, bodies in zip(self.contacts, self.system.contact_bodies, strict=True):
-            if not all(b in self._body_field for b in bodies):
-                blocks.append(ElementBlocks((), (), (), np.empty((0, 0), dtype=bool)))
-                continue
-            own = {"augmented": c.num_augmented, "multipliers": c.num_multipliers}
-            numbers = list(c.dofs())
-            widths = [n.shape[1] for n in numbers] + [own[name] for name in self._fields]
-            for name in self._fields:
-                count = c.num_pairs * own[name]
-                new = offset[name] + np.arange(count)
-                numbers.append(new.reshape(c.num_pairs, own[name]))
-                offset[name] += count
-            stops = np.cumsum(widths)
-            pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
-            pattern[stops[-2] :, stops[-2] :] = c.multiplier_pattern
-            columns = tuple(slice(int(b - w), int(b)) for w, b in zip(widths, stops, strict=True))
-            fields = (*(self._body_field[b] for b in bodies), *self._fields.values())
-            blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
-        return blocks
-
-    @property
-    def may_slip(self) -> bool:
-        """Whether any contact has friction with a bound."""
-        coefficients = [pair.friction for pair in self.system.contacts]
-        return any(mu > 0.0 and (self.bounded or np.isfinite(mu)) for mu in coefficients)
-
-    def let_slip(self) -> None:
-        """Solve this step with nodes that slip rather than leave, see `ContactStep`."""
-        self.contacts = [replace(c, lets_slip=True) for c in self.contacts]
-
     def guess(self, *, flight: bool, forces: bool | None = None) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 
@@ -518,131 +367,66 @@ class StepProblem:
                 and no forces. Prescribed coordinates are at t_{n+1}.
             forces: Whether to start with the contact forces of the last step; None: as `flight`.
         """
+        laid, elements = self._laid, self.elements
         with self.x as x:
             x[:] = 0.0
-            for f, k in enumerate(self.awake):
+            for k in self.awake:
                 fixed, u1 = self.system.bodies[k].fixed, self.first[k]
                 start = u1 if flight else self.state.u[k].copy()
                 start[fixed] = u1[fixed]
-                x[self.layout.owned(f)] = start
+                x[laid.of_body(k)] = start
         forces = flight if forces is None else forces
-        if self._fields and (forces or not self.integrator.inertia):
+        if "constraints" in laid.own and (forces or not self.integrator.inertia):
+            places = iter(laid.positions(self.x, elements))
             guess = [
-                self._forces_as_before(k, p).ravel() for k, p in enumerate(self._positions(self.x))
+                coupling.guess(k, next(places)).ravel()
+                for coupling in self.couplings
+                for k in range(len(coupling.elements))
             ]
             with self.x as x:
-                x[self.layout.owned(self._fields["multipliers"])] = np.concatenate(guess)
-        if "augmented" in self._fields:
-            positions = self._positions(self.x)
-            guess = [
-                c.initial_guess(p).ravel() for c, p in zip(self.contacts, positions, strict=True)
-            ]
+                x[laid.of_elements("constraints")] = np.concatenate(guess)
+        if "augmented" in laid.own:
+            positions = laid.positions(self.x, elements)
+            guess = [c.initial_guess(p).ravel() for c, p in zip(elements, positions, strict=True)]
             with self.x as x:
-                x[self.layout.owned(self._fields["augmented"])] = np.concatenate(guess)
-
-    def _forces_as_before(self, index: int, x: FloatArray) -> FloatArray:
-        """Multipliers of the contact forces of the last step, shape (n, multipliers).
-
-        In statics nodes that touch at t_n start as active: without inertia a body may have nothing
-        but its contacts to hold it.
-        """
-        c, state = self.contacts[index], self.state
-        node = c.candidates.node
-        force, tangential = state.force[index][node], state.tangential[index][node]
-        multipliers = self.factor * c.multipliers(force, tangential) / c.scale[:, None]
-        if not self.integrator.inertia:
-            near = _TOUCHING * c.candidates.length
-            touching = (force > 0.0) | (c.candidates.gap <= near)
-            nothing = np.zeros_like(multipliers)
-            gap = c.evaluate(x, np.empty((c.num_pairs, 0)), nothing).gap
-            multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
-        return multipliers
-
-    def flight_gaps(self) -> list[FloatArray]:
-        """Gaps of each contact's candidates after free flight over the step [m]."""
-        return self._gaps(self.contacts, self.first)
-
-    def _gaps(self, contacts: list[ContactStep], u: Sequence[FloatArray]) -> list[FloatArray]:
-        """Gaps of some candidates of all contacts at displacements of all bodies [m]."""
-        return [self._gap(k, c, u) for k, c in enumerate(contacts)]
-
-    def _gap(self, index: int, c: ContactStep, u: Sequence[FloatArray]) -> FloatArray:
-        """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
-        moved = c.pair.positions([u[k] for k in self.system.contact_bodies[index]])
-        return c.gap(c.pair.points(moved, c.candidates))
+                x[laid.of_elements("augmented")] = np.concatenate(guess)
 
     # ---- iterates
-    def _positions(self, x: Any) -> list[FloatArray]:
-        """Slave and corners of each contact's pairs at an iterate [m], shape (n, nc + 1, 3)."""
-        self._scatter.scatter(x, self._local, mode=PETSc.ScatterMode.FORWARD)
-        u, start, out = self._local.array_r, 0, []
-        for c in self.contacts:
-            reference = c.reference()
-            out.append(reference + u[start : start + reference.size].reshape(reference.shape))
-            start += reference.size
-        return out
-
-    def _unknowns(self, x: FloatArray, name: str) -> list[FloatArray]:
-        """This rank's "augmented" unknowns or "multipliers" of each contact, shape (n, width)."""
-        widths = [getattr(c, f"num_{name}") for c in self.contacts]
-        shapes = [(c.num_pairs, w) for c, w in zip(self.contacts, widths, strict=True)]
-        if name not in self._fields:
-            return [np.zeros(s) for s in shapes]
-        stops = np.cumsum([n * w for n, w in shapes])
-        parts = np.split(x[self.layout.owned(self._fields[name])], stops[:-1])
-        return [p.reshape(s) for p, s in zip(parts, shapes, strict=True)]
-
     def evaluate(self, x: Any) -> Evaluation:
         """The step equations at an iterate; pure. Every rank must call it.
 
         Args:
             x: PETSc vector of the unknowns.
         """
-        values = x.array_r.copy()
-        multipliers = self._unknowns(values, "multipliers")
-        augmented = self._unknowns(values, "augmented")
-        positions = self._positions(x) if self._fields else [np.empty(0)] * len(self.contacts)
-        contacts = tuple(
-            c.evaluate(*arguments)
-            for c, *arguments in zip(self.contacts, positions, augmented, multipliers, strict=True)
+        values, laid, elements = x.array_r.copy(), self._laid, self.elements
+        positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
+        parts = tuple(
+            c.evaluate(y, own)
+            for c, y, own in zip(
+                elements, positions, laid.own_values(values, elements), strict=True
+            )
         )
-        none = np.zeros(len(values))
-        force = self._contact_forces(contacts) if self._fields else none
+        force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
         bodies = dict(self._asleep)
-        for f, k in enumerate(self.awake):
-            body, u0, here = self.system.bodies[k], self.state.u[k], self.layout.owned(f)
+        for k in self.awake:
+            body, u0, here = self.system.bodies[k], self.state.u[k], laid.of_body(k)
             u1 = values[here]
             internal = self.factor * body.internal(u1)
             external = self.factor * body.external(u1, self._gravity)
-            du, contact = u1 - u0, force[here]
-            residual = self._inertial(body, du) - self._inertia[k] + internal - external + contact
-            bodies[k] = BodyTerms(u1, du, internal, external, contact, residual)
-        forces = tuple(
-            c.scale[:, None] * m for c, m in zip(self.contacts, multipliers, strict=True)
-        )
-        return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), contacts, forces)
-
-    def _contact_forces(self, contacts: tuple[Contribution, ...]) -> FloatArray:
-        """G^T lambda of all contacts in this rank's coordinates [kg m]."""
-        parts = [
-            k.residual[:, : c.num_coordinates].ravel()
-            for c, k in zip(self.contacts, contacts, strict=True)
-        ]
-        self._local.array_w[:] = np.concatenate([np.empty(0), *parts])
-        self._forces.set(0.0)
-        add, reverse = PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE
-        self._scatter.scatter(self._local, self._forces, addv=add, mode=reverse)
-        force: FloatArray = self._forces.array_r.copy()
-        return force
+            du, coupling = u1 - u0, force[here]
+            residual = self._inertial(body, du) - self._inertia[k] + internal - external + coupling
+            bodies[k] = BodyTerms(u1, du, internal, external, coupling, residual)
+        return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
 
     def residual(self, e: Evaluation) -> FloatArray:
         """This rank's part of the residual, zero at prescribed coordinates."""
-        out = np.zeros(self.layout.num_owned)
-        for f, k in enumerate(self.awake):
-            out[self.layout.owned(f)] = _free(self.system.bodies[k], e.bodies[k].residual)
-        for name, f in self._fields.items():
-            rows = [c.rows(k, name).ravel() for c, k in zip(self.contacts, e.contacts, strict=True)]
-            out[self.layout.owned(f)] = np.concatenate(rows)
+        laid = self._laid
+        out = np.zeros(len(e.x))
+        for k in self.awake:
+            out[laid.of_body(k)] = _free(self.system.bodies[k], e.bodies[k].residual)
+        for name in laid.own:
+            rows = [c.rows(p, name).ravel() for c, p in zip(self.elements, e.parts, strict=True)]
+            out[laid.of_elements(name)] = np.concatenate(rows)
         return out
 
     def body_tangents(self, e: Evaluation) -> list[Any]:
@@ -725,128 +509,62 @@ class StepProblem:
     @property
     def rounded_length(self) -> float:
         """Largest length whose rounding enters forces and gaps [m]."""
-        return max(self.span, *(c.extent for c in self.contacts), 0.0)
-
-    @property
-    def beside(self) -> list[tuple[float, int]]:
-        """How deep in facet sizes nodes that passed a surface's edge lie behind it, and the node.
-
-        Of each contact this rank's deepest at t_n, in input numbers; see `ContactPair.find`.
-        """
-        return self._beside
+        return max(self.span, *(c.extent for c in self.elements), 0.0)
 
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
         local = [np.abs(b.du).max(initial=0.0) for b in e.bodies]
         return global_max(self.system.comm, np.array(local))
 
-    @property
-    def followed(self) -> tuple[BoolArray, ...]:
-        """Of each contact, which of the rank's slave nodes have not passed by the surface."""
-        return tuple(self._followed)
-
-    def misses(self, e: Evaluation) -> bool:
-        """Whether a solved step may have passed by a contact that was no candidate. Collective.
-
-        If so, `begin` is to be called again with it.
-
-        Raises:
-            StepFailedError: A node went through an obstacle and out of it again.
-        """
-        motion, missed = self.motion(e), False
-        for k, pair in enumerate(self.system.contacts):
-            reach = self._reach(k, motion)
-            missed |= reach > self._cover[k]
-            if pair.rigid and reach > _PASSING * pair.master.width:
-                self._check_passed(k, e)
-            elif not pair.rigid and pair.is_long(reach):
-                missed |= self._met(k, e)
-        return missed
-
-    def _met(self, index: int, e: Evaluation) -> bool:
-        """Whether nodes have come through facets unseen, which are noted. Collective."""
-        pair, bodies = self.system.contacts[index], self.system.contact_bodies[index]
-        positions = pair.positions([self.state.u[b] for b in bodies])
-        held = np.full(len(pair.slave.share), -1)
-        c, active = self.contacts[index].candidates, e.contacts[index].active
-        held[c.node[active]] = c.facet[active]
-        hit = pair.missed(positions, [e.bodies[b].du for b in bodies], held)
-        new = hit >= 0
-        self._aimed[index] = np.where(new, hit, self._aimed[index])
-        # What is held at a facet that its path led to is to be so again.
-        at = np.where(self._aimed[index] >= 0, held, -1)
-        self._aimed[index] = np.where(new | (at < 0), self._aimed[index], at)
-        return bool(self.system.comm.allreduce(bool(new.any()), op=MPI.LOR))
-
-    def _check_passed(self, index: int, e: Evaluation) -> None:
-        """Raise on every rank if a node has gone through an obstacle and out of it again."""
-        pair, (body,) = self.system.contacts[index], self.system.contact_bodies[index]
-        start, end = self._paths[index]
-        u0 = self.state.u[body]
-        x0, x1 = (pair.positions([u])[0] for u in (u0, u0 + e.bodies[body].du))
-        x0, x1 = x0 - start, x1 - end
-        ends = np.minimum(pair.obstacle.gap(x0).value, pair.obstacle.gap(x1).value)
-        passed = pair.obstacle.lowest_gap(x0, x1) < ends - _PASSING * pair.obstacle.width
-        if passed.any():
-            node = int(pair.slave.original[np.flatnonzero(passed)[0]])
-            raise StepFailedError(
-                f"step from t={self.state.time:.6g} with dt={self.dt:.3g}: contact {pair.name!r}: "
-                f"node {node} passes through the obstacle within the step; use a smaller dt"
-            )
-
     def unrest(self, e: Evaluation) -> float:
         """Force of the stabilization over what counts as converged, the largest of the bodies."""
         squares = []
         for body, t in zip(self.system.bodies, e.bodies, strict=True):
-            parts = (self._stabilization(body) * t.du, t.internal, t.external, t.contact)
+            parts = (self._stabilization(body) * t.du, t.internal, t.external, t.coupling)
             squares.append([float(p @ p) for p in parts])
         norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
         limits = self.rtol * norms[:, 1:].max(axis=1) + self._rounding_of(self._lengths(e))
-        return max(_over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
+        return max(over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
         """Residual of each block over what counts as converged there; solved when all are <= 1."""
         squares = np.zeros((len(e.bodies), 5))
         for k in self.awake:
             t, free = e.bodies[k], _free(self.system.bodies[k], e.bodies[k].residual)
-            parts = (free, self._inertia[k], t.internal, t.external, t.contact)
+            parts = (free, self._inertia[k], t.internal, t.external, t.coupling)
             squares[k] = [float(p @ p) for p in parts]
         norms = np.sqrt(self.system.comm.allreduce(squares))
         ratio, rounding = {}, self.rounding
         for k, body in enumerate(self.system.bodies):
             limit = self.rtol * norms[k, 1:].max() + rounding[k]
-            ratio[body.name] = _over(norms[k, 0], limit)
-        if self._fields:
-            ratio |= self._contact_ratios(e)
+            ratio[body.name] = over(norms[k, 0], limit)
+        if self._laid.own:
+            ratio |= self._element_ratios(e)
         return ratio
 
-    def _contact_ratios(self, e: Evaluation) -> dict[str, float]:
+    def _element_ratios(self, e: Evaluation) -> dict[str, float]:
+        """`ratios` of the elements' own unknowns."""
         moved = max(float(np.abs(b.du).max(initial=0.0)) for b in e.bodies)
         # MPI's maximum may swallow a NaN, so it travels as a flag.
-        local = [moved, float(any(np.isnan(k.residual).any() for k in e.contacts))]
-        for c, k, m in zip(self.contacts, e.contacts, e.multipliers, strict=True):
-            gaps = c.rows(k, "multipliers") / c.scale[:, None]
-            arrays = (c.rows(k, "augmented"), gaps, m, c.scale)
-            local += [float(np.abs(a).max(initial=0.0)) for a in arrays]
+        local = [moved, float(any(np.isnan(p.residual).any() for p in e.parts))]
+        for c, part in zip(self.elements, e.parts, strict=True):
+            local += c.largest(part)
         top = global_max(self.system.comm, np.array(local))
         motion = max(top[0], float(self._motion.max()))
-        length = self.rtol * motion + 8 * _EPS * (motion + float(self._moved.max()))
+        rounded = motion + float(self._moved.max())
         ratio: dict[str, float] = {}
-        for c, (a, g, force, scale) in zip(self.contacts, top[2:].reshape(-1, 4), strict=True):
+        for c, largest in zip(self.elements, top[2:].reshape(-1, 4), strict=True):
             broken = np.inf if top[1] else 0.0
-            parts = {"constraints": _over(g, length + 8 * _EPS * c.extent)}
-            if c.num_augmented:
-                parts["(d, f)"] = _over(a, self.rtol * max(force, scale * motion))
-            for part, value in parts.items():  # several contacts of two bodies have one name
-                name = f"{c.pair.name} {part}"
+            # Several contacts of two bodies have one name.
+            for name, value in c.ratios(largest, motion, rounded, self.rtol).items():
                 ratio[name] = max(value, broken, ratio.get(name, 0.0))
         return ratio
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
-        for a in self._petsc:
-            a.destroy()
-        self._petsc, self._numbers = [], None
+        if self.unknowns is not None:
+            self.unknowns.destroy()
+        self.unknowns, self._numbers = None, None
 
 
 def _free(body: Any, residual: FloatArray) -> FloatArray:
@@ -864,12 +582,6 @@ def _box(system: System) -> tuple[FloatArray, float]:
         np.maximum(ends, [x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)], ends)
     high, low = global_max(system.comm, ends) * [[1.0], [-1.0]]
     return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-
-
-def _over(value: float, limit: float) -> float:
-    if value == 0.0:
-        return 0.0
-    return float(value / limit) if limit > 0 else np.inf
 
 
 def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:

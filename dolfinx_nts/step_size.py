@@ -124,11 +124,11 @@ class Pace:
         out: a consistent mass makes their nodes bounce in turn, and to meet each bounce costs many
         steps and saves no energy (measured). Every rank must call it.
         """
-        comm, state = problem.system.comm, problem.state
-        carrying = np.array([bool((force > 0.0).any()) for force in state.force], dtype=bool)
+        comm, state, contacts = problem.system.comm, problem.state, problem.contacts
+        carrying = np.array([bool((c.force > 0.0).any()) for c in state.contacts], dtype=bool)
         comm.Allreduce(MPI.IN_PLACE, carrying, op=MPI.LOR)
         lost, first = 0.0, 1.0
-        for c, end, late in zip(problem.contacts, problem.flight_gaps(), carrying, strict=True):
+        for c, end, late in zip(contacts.elements, contacts.flight_gaps(), carrying, strict=True):
             gap = c.candidates.gap
             closing = (end < 0.0) & (gap > 0.0) & ~late
             part = gap[closing] / (gap[closing] - end[closing])
@@ -190,9 +190,8 @@ class Pace:
 
     def _expels(self, problem: StepProblem, step: Evaluation) -> bool:
         gain = 0.0
-        for c, m in zip(problem.contacts, step.multipliers, strict=True):
-            behind = np.minimum(c.candidates.gap, 0.0)
-            gain += float(np.maximum(m[:, 0] * behind, 0.0).sum()) / problem.factor
+        for c, part in zip(problem.contacts.elements, problem.contact_parts(step), strict=True):
+            gain += float(np.maximum(c.gains(part, problem.factor), 0.0).sum())
         total = float(problem.system.comm.allreduce(gain))
         return total > self._tolerance * 0.5 * self._top**2
 

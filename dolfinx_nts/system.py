@@ -12,11 +12,12 @@ from mpi4py import MPI
 
 from dolfinx_nts.body import Body
 from dolfinx_nts.contact import INITIAL_PENETRATION, ContactPair
+from dolfinx_nts.contact_elements import ContactHistory
+from dolfinx_nts.elements import Joint
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import items, known_options, vector
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Part of a body's coordinates by which a start may differ from prescribed displacements.
 _ON_SUPPORT = 1e-9
@@ -31,26 +32,20 @@ class State:
         u: Owned displacements of each body [m].
         v: Owned velocities of each body [m/s].
         a: Owned accelerations of each body [m/s^2], where the integrator carries any; else empty.
-        facets: Facet in the last step, or -1, of each slave node in this rank's `Surface.share`.
-        force: Contact force p_N of the same nodes [N], >= 0.
-        gap: Gap of the same nodes [m], infinite where a node was no candidate.
-        tangential: Friction force on the same nodes [N], shape (n, 3).
-        stick: Which of the same nodes stick.
-        slip: Distance that the same nodes have slipped since the start [m].
-        followed: Which of the same nodes are not known to have passed by the surface's edge.
+        histories: What each `Coupling` of the system remembers; that of the contacts comes first.
     """
 
     time: float
     u: tuple[FloatArray, ...]
     v: tuple[FloatArray, ...]
     a: tuple[FloatArray, ...]
-    facets: tuple[IntArray, ...]
-    force: tuple[FloatArray, ...]
-    gap: tuple[FloatArray, ...]
-    tangential: tuple[FloatArray, ...]
-    stick: tuple[npt.NDArray[np.bool_], ...]
-    slip: tuple[FloatArray, ...]
-    followed: tuple[npt.NDArray[np.bool_], ...]
+    histories: tuple[Any, ...]
+
+    @property
+    def contacts(self) -> tuple[ContactHistory, ...]:
+        """What each contact remembers of its slave nodes."""
+        history: tuple[ContactHistory, ...] = self.histories[0]
+        return history
 
 
 @known_options
@@ -60,6 +55,7 @@ class System:
     Args:
         bodies: Objects with the `Body` protocol, on one communicator, with different names.
         contacts: Pairs of surfaces of these bodies.
+        joints: What else couples them, objects with the `Joint` protocol.
         gravity: Acceleration [m/s^2]; its work counts as external work.
 
     Attributes:
@@ -77,12 +73,14 @@ class System:
         bodies: Sequence[Body],
         *,
         contacts: Sequence[ContactPair] = (),
+        joints: Sequence[Joint] = (),
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         self.bodies = items("bodies", bodies, lambda b: hasattr(b, "begin_step"), "bodies")
         self.contacts = items(
             "contacts", contacts, lambda c: isinstance(c, ContactPair), "ContactPair"
         )
+        self.joints = items("joints", joints, lambda j: hasattr(j, "coupling"), "joints")
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
         names = [b.name for b in self.bodies]
@@ -104,31 +102,33 @@ class System:
                         f"contacts: the {role} body {body.name!r} is not among "
                         f"bodies={names}; add it"
                     )
+        for joint in self.joints:
+            for body in joint.bodies:
+                if not any(body is b for b in self.bodies):
+                    raise ValueError(
+                        f"joints: {joint.name!r} holds body {body.name!r}, which is not among "
+                        f"bodies={names}; add it"
+                    )
         index = {id(b): i for i, b in enumerate(self.bodies)}
+        self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
         self._check_overlap()
         start = self.initial_state()
         depths = self.penetration(start)
-        for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
-            if len(set(where)) == 2:  # the search looks half a facet deep; this, the whole body
-                depths[k] = np.maximum(depths[k], pair.master.depth(pair.slave.reference))
+        for k, pair in enumerate(self.contacts):
+            # The search looks half a facet deep; this, the whole body.
+            depths[k] = np.maximum(depths[k], pair.depth())
         self._check_penetration(depths)
 
     def initial_state(self) -> State:
         """Undeformed bodies with their initial velocities at t = 0."""
-        nodes = [len(c.slave.share) for c in self.contacts]
+        contacts = tuple(ContactHistory.of_start(len(c.slave.share)) for c in self.contacts)
         return State(
             time=0.0,
             u=tuple(self._prescribed(b) for b in self.bodies),
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
             a=(),
-            facets=tuple(np.full(n, -1) for n in nodes),
-            force=tuple(np.zeros(n) for n in nodes),
-            gap=tuple(np.full(n, np.inf) for n in nodes),
-            tangential=tuple(np.zeros((n, 3)) for n in nodes),
-            stick=tuple(np.zeros(n, dtype=bool) for n in nodes),
-            slip=tuple(np.zeros(n) for n in nodes),
-            followed=tuple(np.ones(n, dtype=bool) for n in nodes),
+            histories=(contacts, *(joint.start() for joint in self.joints)),
         )
 
     def state_from(self, other: System, state: State) -> State:
@@ -155,13 +155,13 @@ class System:
             old = other.bodies[index[body.name]]
             self._check_start(body, old, now, state.time)
         found = self.initial_state()
-        start = replace(found, time=state.time, u=u)
+        contacts = list(found.contacts)
         for k, pair in enumerate(self.contacts):
             for j, known in enumerate(other.contacts):
                 if pair.is_like(known):
-                    names = ("facets", "force", "gap", "tangential", "stick", "slip", "followed")
-                    for name in names:
-                        getattr(start, name)[k][:] = getattr(state, name)[j]
+                    contacts[k] = state.contacts[j]
+        histories = (tuple(contacts), *found.histories[1:])
+        start = replace(found, time=state.time, u=u, histories=histories)
         self._check_penetration(self.penetration(start))
         return start
 
@@ -190,17 +190,10 @@ class System:
         """Raise if two contacts hold the same nodes out of the same facets or obstacle."""
         for i, a in enumerate(self.contacts):
             for b in self.contacts[:i]:
-                same = a.slave.body is b.slave.body and a.rigid == b.rigid
-                if not same or not np.intersect1d(a.slave.points, b.slave.points).size:
+                if a.slave.body is not b.slave.body:
                     continue
-                if a.rigid:
-                    overlap, what = a.master == b.master, f"the same {a.master.name}"
-                else:
-                    facets = [{tuple(sorted(f)) for f in c.master.points[c.master.facets].tolist()}
-                              for c in (a, b)]  # fmt: skip
-                    overlap = a.master.body is b.master.body and bool(facets[0] & facets[1])
-                    what = f"the same facets of {a.master.body.name!r}"
-                if overlap:
+                what = a.shares_master(b)
+                if what and np.intersect1d(a.slave.points, b.slave.points).size:
                     raise ValueError(
                         f"contacts: two of them hold the same nodes of {a.slave.body.name!r} "
                         f"out of {what}; drop one"
@@ -214,12 +207,12 @@ class System:
             obstacles, deep inside.
         """
         depths = []
-        for pair, bodies, facets in zip(
-            self.contacts, self.contact_bodies, state.facets, strict=True
+        for pair, bodies, history in zip(
+            self.contacts, self.contact_bodies, state.contacts, strict=True
         ):
-            moved = pair.master.displacement(state.time, self.comm) if pair.rigid else None
             positions = pair.positions([state.u[b] for b in bodies])
-            found = pair.find(positions, facets, moved).candidates
+            path = pair.path(state.time, state.time)
+            found = pair.find(positions, history.facet, path).candidates
             depth = np.zeros(len(pair.slave.points))
             depth[pair.slave.share[found.node]] = np.maximum(-found.gap, 0.0) / found.length
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)

@@ -100,7 +100,7 @@ class Motion:
             body.inertia(u) @ test
             for body, u, test in zip(stepper.system.bodies, state.u, self._tests, strict=True)
         ]
-        force = sum(float(f.sum()) for f in state.force)
+        force = sum(float(contact.force.sum()) for contact in state.contacts)
         total = comm.allreduce(np.append(np.concatenate(local), force))
         self.impulse += float(total[-1]) * (state.time - self.times[-1] if self.times else 0.0)
         self.times.append(state.time)

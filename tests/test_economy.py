@@ -15,7 +15,7 @@ from test_layout import in_fresh_python
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import economy, search, tradeoff
-from dolfinx_nts.step import StepProblem
+from dolfinx_nts.contact_search import ContactSearch
 
 COMM = MPI.COMM_WORLD
 FEATURE = {f.name: f for f in economy.FEATURES}
@@ -30,8 +30,8 @@ def stepper(scene, name="energy-momentum", **newton):
 
 def all_awake(monkeypatch):
     """Give every candidate unknowns, as if each could touch in every step."""
-    everyone = lambda self, index, c: np.ones(c.num_pairs, dtype=bool)  # noqa: E731
-    monkeypatch.setattr(StepProblem, "_may_touch", everyone)
+    everyone = lambda self, index, c: np.ones(c.num_elements, dtype=bool)  # noqa: E731
+    monkeypatch.setattr(ContactSearch, "_may_touch", everyone)
 
 
 def displacements(s):
@@ -118,7 +118,7 @@ def test_far_bodies_have_neither_search_nor_contact_unknowns(monkeypatch, integr
     for _ in range(3):
         far.advance(scenes.dt)
     assert far.problem.version == version
-    assert far.problem.layout.counts.shape[1] == 2 and not far.problem.elements
+    assert far.problem.unknowns.layout.counts.shape[1] == 2 and not far.problem.unknowns.blocks
     row, u = far.solution.rows[-1], displacements(far)
     far.close()
     alone = stepper(scenes.system(FEATURE["contact not declared"]), integrator)
@@ -154,8 +154,8 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
     near.advance(scenes.dt)
     version = near.problem.version
     near.advance(scenes.dt)
-    assert COMM.allreduce(sum(c.num_pairs for c in near.problem.idle)) == 9
-    assert near.problem.version == version and near.problem.layout.counts.shape[1] == 2
+    assert COMM.allreduce(sum(c.num_elements for c in near.problem.contacts.idle)) == 9
+    assert near.problem.version == version and near.problem.unknowns.layout.counts.shape[1] == 2
     fill, near_row = factor_entries(near), near.solution.rows[-1]
     near.close()
 
@@ -168,8 +168,9 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
         awake.advance(scenes.dt)
     assert fill == factor_entries(none) < factor_entries(awake)
     assert same(displacements(near), displacements(none))
-    assert np.array_equal(near.state.facets[0], awake.state.facets[0])
-    assert near.state.gap[0] == pytest.approx(awake.state.gap[0], rel=1e-12, abs=1e-13)
+    assert np.array_equal(near.state.contacts[0].facet, awake.state.contacts[0].facet)
+    gap = awake.state.contacts[0].gap
+    assert near.state.contacts[0].gap == pytest.approx(gap, rel=1e-12, abs=1e-13)
     assert near_row["min_gap"] == pytest.approx(awake.solution.rows[-1]["min_gap"], rel=1e-12)
     assert near_row["newton_iterations"] == none.solution.rows[-1]["newton_iterations"]
     none.close()
@@ -192,7 +193,7 @@ def test_an_impact_is_the_same_as_with_all_candidates_awake(monkeypatch, integra
         s = stepper(system, integrator)
         for _ in range(steps):
             s.advance(dt)
-            idle.append(COMM.allreduce(sum(c.num_pairs for c in s.problem.idle)))
+            idle.append(COMM.allreduce(sum(c.num_elements for c in s.problem.contacts.idle)))
         s.close()
         tables.append(s.solution.balance)
         all_awake(monkeypatch)
@@ -230,7 +231,7 @@ def test_idle_candidates_wake_in_the_step_that_closes_their_gap(
         system = nts.System([cube, plate], contacts=[pair])
         s = stepper(system, integrator)
         s.problem.begin(s.state, dt)
-        states.append(COMM.allreduce(sum(c.num_pairs for c in s.problem.idle)))
+        states.append(COMM.allreduce(sum(c.num_elements for c in s.problem.contacts.idle)))
         s.advance(dt)
         assert s.solution.rows[-1]["active"] > 0
         assert s.solution.rows[-1]["min_gap"] > -1e-10
@@ -247,7 +248,7 @@ def test_frictionless_contact_has_no_tangential_unknowns():
     for name in ("active", "friction, active"):
         s = stepper(scenes.system(FEATURE[name]))
         s.advance(scenes.dt)
-        counts.append(int(s.problem.layout.counts[:, 2:].sum()))
+        counts.append(int(s.problem.unknowns.layout.counts[:, 2:].sum()))
         s.close()
     assert counts == [9, 9 * 3]
 

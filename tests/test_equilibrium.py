@@ -154,7 +154,7 @@ def test_block_on_block_carries_its_weight(load_steps):
     # Nothing is lost sideways either: supports of both blocks together carry the weight only.
     total = lower.sum(axis=0) + upper.sum(axis=0)
     assert np.abs(total - [0, 0, 2 * weight]).max() < 1e-11 * weight
-    nodal = COMM.allreduce(run.state.force[0].sum())
+    nodal = COMM.allreduce(run.state.contacts[0].force.sum())
     # Nodal forces are normal to the bent facets: their sum is a little more than the resultant.
     assert 0 <= nodal / weight - 1 < 1e-3
     assert run.balance["active"][-1] == 16
@@ -225,7 +225,7 @@ def patch(slave, master, *, metre=1.0, strain=1e-4, comm=COMM):
     )
     assert run.status == "completed"
     area = faces[0].area[faces[0].share]
-    pressure = np.concatenate(comm.allgather(run.state.force[0] / area)) * metre / strain
+    pressure = np.concatenate(comm.allgather(run.state.contacts[0].force / area)) * metre / strain
     errors = np.concatenate([np.abs(mean_strain(b, n) / -strain - 1) for b, n in
                              zip(bodies, (slave, master), strict=True)])  # fmt: skip
     force = run.contact_forces[-1, 0] / (strain * metre)

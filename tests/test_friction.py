@@ -9,7 +9,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import contact_step, facets
+from dolfinx_nts import contact_elements, facets
 from dolfinx_nts.friction import return_map
 from dolfinx_nts.nts_element import invariants, metric, projection
 
@@ -209,7 +209,8 @@ def test_stick_and_slip_occur_together_and_h_may_change():
 @pytest.mark.fast("energy-momentum-0.01")
 def test_result_does_not_depend_on_the_algorithmic_scale(integrator, factor, monkeypatch):
     expected = to_rounding(integrator)
-    monkeypatch.setattr(contact_step, "TANGENTIAL_SCALE", factor * contact_step.TANGENTIAL_SCALE)
+    nominal = contact_elements.TANGENTIAL_SCALE
+    monkeypatch.setattr(contact_elements, "TANGENTIAL_SCALE", factor * nominal)
     table = run(rubbing_blocks(0.3), integrator, newton=TO_ROUNDING).balance
     assert difference(expected, table) < 1e-9
     assert np.array_equal(expected["stick"], table["stick"])
@@ -222,19 +223,19 @@ def test_a_solution_is_one_for_any_algorithmic_scale(integrator, monkeypatch):
     stepper = nts.Stepper(
         rubbing_blocks(0.3), INTEGRATORS[integrator], newton=nts.Newton(rtol=1e-14)
     )
-    problem, nominal = stepper.problem, contact_step.TANGENTIAL_SCALE
+    problem, nominal = stepper.problem, contact_elements.TANGENTIAL_SCALE
     problem_rtol, both = problem.rtol, 0
     for _ in range(40):
         stepper.advance(2e-3)
-        own = problem.evaluate(problem.x).contacts[0]
+        own = problem.evaluate(problem.x).parts[0]
         both += bool(own.stick.any() and (own.active & ~own.stick).any())
         problem.rtol = 1e-10
         for factor in 10.0 ** np.arange(-4, 5):
-            monkeypatch.setattr(contact_step, "TANGENTIAL_SCALE", factor * nominal)
+            monkeypatch.setattr(contact_elements, "TANGENTIAL_SCALE", factor * nominal)
             other = problem.evaluate(problem.x)
-            assert np.array_equal(other.contacts[0].stick, own.stick)
+            assert np.array_equal(other.parts[0].stick, own.stick)
             assert max(problem.ratios(other).values()) <= 1.0
-        monkeypatch.setattr(contact_step, "TANGENTIAL_SCALE", nominal)
+        monkeypatch.setattr(contact_elements, "TANGENTIAL_SCALE", nominal)
         problem.rtol = problem_rtol
     stepper.close()
     assert both >= 3
@@ -348,17 +349,17 @@ def plane_strain_slider(friction, integrator, speed=0.0):
 def test_prescribed_tangential_direction_carries_no_force(friction, speed, integrator):
     stepper = plane_strain_slider(friction, integrator, speed)
     state = stepper.state
-    force, tangential = state.force[0], state.tangential[0]
+    force, tangential = state.contacts[0].force, state.contacts[0].tangential
     top = COMM.allreduce(force.max(initial=0.0), op=MPI.MAX)
     assert top > 0
     assert np.abs(tangential[:, 1:]).max(initial=0.0) < 1e-9 * top
     if speed:
         assert np.allclose(tangential[force > 0, 0], -friction * force[force > 0], rtol=1e-9)
-        assert not state.stick[0].any()
-        assert np.abs(state.slip[0] - 0.02 * speed).max(initial=0.0) < 2e-3
+        assert not state.contacts[0].stick.any()
+        assert np.abs(state.contacts[0].slip - 0.02 * speed).max(initial=0.0) < 2e-3
     elif math.isinf(friction):
-        assert np.array_equal(state.stick[0], force > 0)
-        assert state.slip[0].max(initial=0.0) < 1e-12
+        assert np.array_equal(state.contacts[0].stick, force > 0)
+        assert state.contacts[0].slip.max(initial=0.0) < 1e-12
     else:
         bound = friction * force * (1 + 1e-9)
         assert (np.linalg.norm(tangential, axis=1) <= bound).all()
@@ -374,6 +375,6 @@ def test_bad_coefficient(friction):
 def test_without_friction_nothing_tangential_is_allocated():
     stepper = nts.Stepper(rubbing_blocks(0.0), nts.Midpoint())
     stepper.advance(0.04)
-    counts = [c.num_multipliers for c in stepper.problem.contacts]
-    assert counts == [1] and stepper.problem.contacts[0].num_tangential == 0
+    counts = [c.num_constraints for c in stepper.problem.elements]
+    assert counts == [1] and stepper.problem.elements[0].num_tangential == 0
     stepper.close()

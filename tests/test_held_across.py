@@ -61,8 +61,8 @@ def dragged(friction, shape, drag, steps):
 
 def forces(run):
     """p_N, and the length of the friction and its part across of this rank's slaves."""
-    tangential = run.state.tangential[0]
-    return run.state.force[0], np.linalg.norm(tangential, axis=1), np.abs(tangential[:, 2])
+    tangential = run.state.contacts[0].tangential
+    return run.state.contacts[0].force, np.linalg.norm(tangential, axis=1), np.abs(tangential[:, 2])
 
 
 @pytest.mark.mpi
@@ -115,24 +115,26 @@ def at_rest(shape):
     run = dragged(0.6, shape, 0.002, 1)
     problem = StepProblem(run.system, Static(), rtol=1e-12, condense=False)
     problem.begin(run.state, 0.0)
-    (contact,) = problem.contacts
-    (x,) = problem._positions(problem.x)
+    (contact,) = problem.elements
+    (x,) = problem.unknowns.positions(problem.x, problem.elements)
     node = contact.candidates.node
-    force, tangential = run.state.force[0][node], run.state.tangential[0][node]
+    force, tangential = run.state.contacts[0].force[node], run.state.contacts[0].tangential[node]
     multiplier = contact.multipliers(force, tangential) / contact.scale[:, None]
     problem.destroy()
     return contact, x, multiplier
 
 
 def evaluate(contact, x, multiplier):
-    return contact.evaluate(x, np.empty((contact.num_pairs, 0)), multiplier)
+    return contact.evaluate(
+        x, {"augmented": np.empty((contact.num_elements, 0)), "constraints": multiplier}
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_rows_are_regular_at_the_edge_of_sticking(shape):
     """Nodes that have not slipped yet but are at Coulomb's bound, as at the start of a step."""
     contact, x, multiplier = at_rest(shape)
-    tangents = contact._tangents()
+    tangents = contact._tangents
     dual = np.linalg.solve(tangents @ tangents.transpose(0, 2, 1), tangents)
     length = np.linalg.norm(np.einsum("na,nai->ni", multiplier[:, -2:], dual), axis=1)
     edge = (1 + 1e-5) * 0.6 * -multiplier[:, 0] / length

@@ -102,7 +102,7 @@ class Linearised:
         problem.begin(state, dt)
         self.solver = self.stepper.solver
         rng = np.random.default_rng(COMM.rank)
-        layout = problem.layout
+        layout = problem.unknowns.layout
         fields = range(len(system.bodies), layout.counts.shape[1])
         with problem.x as x:
             for k, body in enumerate(system.bodies):
@@ -113,22 +113,22 @@ class Linearised:
             if len(fields) == 2:
                 here = layout.owned(fields[0])
                 x[here] += 0.03 * rng.uniform(-1, 1, here.stop - here.start)
-        contact = problem.contacts[0]
-        gap = problem.evaluate(problem.x).contacts[0].gap
+        contact = problem.elements[0]
+        gap = problem.evaluate(problem.x).parts[0].gap
         on = {
             "none": np.zeros(len(gap), bool),
             "all": np.ones(len(gap), bool),
             "mixed": rng.uniform(size=len(gap)) < 0.5,
         }[active]
         margin = np.where(on, -1, 1) * rng.uniform(0.2, 0.4, len(gap))
-        force = 0.05 * rng.uniform(-1, 1, (len(gap), contact.num_multipliers))
+        force = 0.05 * rng.uniform(-1, 1, (len(gap), contact.num_constraints))
         force[:, 0] = margin - gap
         with problem.x as x:
             x[layout.owned(fields[-1])] = force.ravel()
         evaluation = problem.evaluate(problem.x)
-        assert np.array_equal(evaluation.contacts[0].active, on)
+        assert np.array_equal(evaluation.parts[0].active, on)
         self.candidates, self.active = len(gap), on
-        self.stick = evaluation.contacts[0].stick
+        self.stick = evaluation.parts[0].stick
         self.solver.assemble(evaluation)
 
     def residual(self, x):
@@ -142,8 +142,8 @@ class Linearised:
         self.stepper.close()
 
     def blocks(self):
-        fields = range(self.problem.layout.counts.shape[1])
-        return [self.problem.layout.owned(f) for f in fields]
+        fields = range(self.problem.unknowns.layout.counts.shape[1])
+        return [self.problem.unknowns.layout.owned(f) for f in fields]
 
 
 def dense(a):
@@ -196,7 +196,7 @@ def test_prescribed_coordinates_hold_only_a_diagonal(rule):
     bcs = [nts.Dirichlet(lambda x: x[0] > 1 - 1e-9, components=(0, 2))]
     system = two_blocks("hex", bcs=bcs)
     at = Linearised(system, rule, "mixed", rotated_state(system, 0.1, fixed=True))
-    offset = at.problem.layout.owned(1).start
+    offset = at.problem.unknowns.layout.owned(1).start
     fixed = offset + system.bodies[1].fixed
     assert len(fixed) == 18
     matrix, x, step = dense(at.solver.matrix.operator), at.problem.x.array_r.copy(), 1e-4
@@ -260,7 +260,7 @@ def test_contact_changes_beside_matrices_that_are_kept(rule, solver):
     solver.assemble(other)
     matrix.operator.mult(vectors[0], vectors[1])
     problem.body_tangents(first)
-    matrix.assemble([c.tangent for c in other.contacts])
+    matrix.assemble([part.tangent for part in other.parts])
     matrix.operator.mult(vectors[0], vectors[2])
     kept, fresh = vectors[1].array_r, vectors[2].array_r
     top = COMM.allreduce(np.abs(fresh).max(initial=0.0), op=MPI.MAX)
@@ -315,10 +315,10 @@ def convergence(system, rule, state, dt):
     def record(snes, iteration, norm):
         norms.append(norm)
         iterates.append(snes.getSolution().array_r.copy())
-        sets.append([c.active.astype(int) + c.stick for c in solver._last.contacts])
+        sets.append([c.active.astype(int) + c.stick for c in solver._last.parts])
 
     solver.snes.setMonitor(record)
-    (last,) = solver.solve().contacts
+    (last,) = solver.solve().parts
     slips = last.distance[last.active & ~last.stick]
     stepper.close()
     return np.array(norms), iterates, sets, slips.min(initial=np.inf)
@@ -395,7 +395,11 @@ def test_condensing_changes_no_solution(cell):
         stepper.close()
     full, condensed = results
     for name in ("u", "v", "force", "gap"):
-        for a, b in zip(getattr(full, name), getattr(condensed, name), strict=True):
+        sides = (
+            getattr(s, name) if name in "uv" else [getattr(c, name) for c in s.contacts]
+            for s in (full, condensed)
+        )
+        for a, b in zip(*sides, strict=True):
             finite = np.isfinite(a)
             assert np.array_equal(finite, np.isfinite(b))
             top = COMM.allreduce(np.abs(a[finite]).max(initial=0.0), op=MPI.MAX)

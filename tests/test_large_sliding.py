@@ -91,9 +91,10 @@ def follow(system, integrator, steps, dt=STEP):
             stepper.advance(dt)
         s, count = stepper.state, len(system.contacts)
         row = [system.bodies[0].reference + s.u[0], s.v[0]]
-        row.append(sum(np.concatenate([s.force[c], s.tangential[c].ravel()]) for c in range(count)))
-        row.append(sum(s.stick[c] for c in range(count)))
-        row.append(np.max([s.facets[c] for c in range(count)], axis=0))
+        found = s.contacts[:count]
+        row.append(sum(np.concatenate([c.force, c.tangential.ravel()]) for c in found))
+        row.append(sum(c.stick for c in found))
+        row.append(np.max([c.facet for c in found], axis=0))
         rows.append(COMM.bcast(np.concatenate(row)))
     stepper.close()
     assert stepper.solution.retries == 0
@@ -276,7 +277,7 @@ def test_a_block_over_fifty_facets_has_no_switch_defect(integrator, facets, fric
     passed = []
     for _ in range(100):
         stepper.advance(dt)
-        passed.append(stepper.state.facets[0].copy())
+        passed.append(stepper.state.contacts[0].facet.copy())
     table = stepper.solution.balance
     stepper.close()
     changes = (np.diff(passed, axis=0) != 0).sum(axis=0)

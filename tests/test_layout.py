@@ -22,11 +22,12 @@ LEVELS = [
     | {"patches", "bounded_slope"},
     {"integrators"},
     {"body", "continuum", "materials", "inversion", "mesh_check", "mesh_input"}
-    | {"contact", "contact_step", "obstacles", "obstacle_contact", "search", "surfaces"}
-    | {"overlap", "intrusion"},
+    | {"contact", "contact_elements", "contact_search", "facet_pair", "facet_elements"}
+    | {"obstacles", "obstacle_pair", "obstacle_elements", "search", "surfaces"}
+    | {"overlap", "intrusion", "elements", "points"},
     {"system", "balance"},
     {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"}
-    | {"promises"},
+    | {"promises", "unknowns"},
     {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]

@@ -112,8 +112,8 @@ def test_schur_complements_are_those_of_the_operator(blocked, condense):
     stepper = touching(COMM, options, condense=condense)
     problem, matrix = stepper.problem, stepper.solver.matrix
     e = problem.evaluate(problem.x)
-    tangents = [c.tangent for c in e.contacts]
-    points = np.unique(np.concatenate([c.dofs()[0] for c in problem.contacts]))
+    tangents = [part.tangent for part in e.parts]
+    points = np.unique(np.concatenate([c.dofs()[0] for c in problem.elements]))
     rows = points[points >= 0]
 
     def parts():
@@ -279,8 +279,10 @@ def test_matrix_in_blocks_of_nodes(cells, masters):
     assert bodies.getType().endswith("baij") and bodies.getInfo()["mallocs"] == 0
     problem = stepper.problem
     e = problem.evaluate(problem.x)
-    other = StepMatrix(problem.layout, problem.body_tangents(e), problem.elements, split=True)
-    tangents = [c.tangent for c in e.contacts] if problem.elements else []
+    other = StepMatrix(
+        problem.unknowns.layout, problem.body_tangents(e), problem.unknowns.blocks, split=True
+    )
+    tangents = [part.tangent for part in e.parts] if problem.unknowns.blocks else []
     matrix.assemble(tangents, fresh=True)
     other.assemble(tangents)
     x, y, z = (problem.x.duplicate() for _ in range(3))

@@ -132,7 +132,7 @@ class Pair:
         stepper = nts.Stepper(nts.System([body], contacts=[pair]), INTEGRATORS[integrator])
         stepper.problem.begin(stepper.state, STEP)
         problem = stepper.problem
-        (self.step,) = (c for c in (*problem.contacts, *problem.idle) if c.num_pairs)
+        (self.step,) = (c for c in (*problem.elements, *problem.contacts.idle) if c.num_elements)
         stepper.close()
         self.x = start + np.array([0.11, -0.07, 0.05])
 
@@ -148,7 +148,8 @@ class Pair:
 
     def at(self, unknowns):
         x, multiplier = unknowns[None, None, :3], unknowns[None, 3:]
-        return self.step.evaluate(x - self.step.pair.origin, np.empty((1, 0)), multiplier)
+        own = {"augmented": np.empty((1, 0)), "constraints": multiplier}
+        return self.step.evaluate(x - self.step.pair.origin, own)
 
 
 @pytest.mark.parametrize("active", [True, False])

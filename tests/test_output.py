@@ -133,7 +133,8 @@ def test_contact_fields(mpi_tmp_path):
         {n: fields[f"contact_{n}_left-the_right_one"] for n in names}
         for fields in (file.fields[0], file.fields[-1])
     )
-    slave, force, gap = run.system.contacts[0].slave, run.state.force[0], run.state.gap[0]
+    slave, contact = run.system.contacts[0].slave, run.state.contacts[0]
+    force, gap = contact.force, contact.gap
     row = rows_at(file.points, slave.reference[slave.share])
     assert COMM.allreduce(force.sum()) > 0
     assert np.array_equal(last["force"][row], force)
@@ -172,7 +173,7 @@ def test_mean_force_of_two_steps():
     for _ in range(36):
         # Two steps of other lengths than the rest: the mean is that over time.
         run.advance(0.5 * dt if len(force) in (20, 21) else dt)
-        force.append((run.state.force[0], run.mean_force(0)))
+        force.append((run.state.contacts[0].force, run.mean_force(0)))
     run.close()
     single, mean = COMM.allreduce(np.array(force).sum(axis=2)).T
     right = density * wave * speed / n**2

@@ -166,7 +166,7 @@ def test_a_failed_step_leaves_no_trace(monkeypatch):
 
     def broken(x):
         e = evaluate(x)
-        for c in e.contacts:
+        for c in e.parts:
             c.tangent[:] = np.nan
             c.residual[:] = np.nan
         return e

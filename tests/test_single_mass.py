@@ -177,7 +177,7 @@ def test_contact_force_and_momentum(integrator):
     v, stepper = run(system, integrator, 1)
     # m (v_1 - v_0) = h p with v_1 = (1 - 2 theta) v: the tangential velocity is untouched.
     force = 2 * MASS * SPEED * (1 - theta) / STEP
-    assert np.isclose(COMM.allreduce(stepper.state.force[0].sum()), force, rtol=1e-12)
+    assert np.isclose(COMM.allreduce(stepper.state.contacts[0].force.sum()), force, rtol=1e-12)
     assert np.allclose(v[1], [0.4, -0.7, (1 - 2 * theta) * SPEED], rtol=0, atol=1e-12 * SPEED)
     momentum = stepper.solution.balance["linear_momentum"]
     assert np.allclose(momentum[1] - momentum[0], [0, 0, STEP * force], rtol=0, atol=1e-11)

@@ -164,10 +164,10 @@ def test_a_sleeper_is_neither_evaluated_nor_assembled_nor_searched(monkeypatch):
     system, calls = row(), []
     s = nts.Stepper(system, nts.EnergyMomentum(), sleep=True)
     s.start(DT)
-    sleeper, searched, find = system.bodies[3], [], nts.ContactPair.find
+    sleeper, searched, find = system.bodies[3], [], nts.FacetPair.find
     count(sleeper, ("internal", "tangent", "inertia", "potential"), calls)
     monkeypatch.setattr(
-        nts.ContactPair, "find", lambda pair, *args: searched.append(pair) or find(pair, *args)
+        nts.FacetPair, "find", lambda pair, *args: searched.append(pair) or find(pair, *args)
     )
     for _ in range(12):
         s.advance(DT)
@@ -176,7 +176,7 @@ def test_a_sleeper_is_neither_evaluated_nor_assembled_nor_searched(monkeypatch):
         assert s.state.u[3] is s.problem.state.u[3] and 3 not in s.problem.awake
         assert searched.count(system.contacts[2]) == 1 or 2 in s.problem.awake
     assert s.problem.awake == (0, 1, 2) and searched.count(system.contacts[2]) > 1
-    fields = s.problem.layout.counts.sum(axis=0)
+    fields = s.problem.unknowns.layout.counts.sum(axis=0)
     assert list(fields[:3]) == [COMM.allreduce(b.num_owned) for b in system.bodies[:3]]
     s.close()
 

@@ -90,7 +90,7 @@ def slide(shape, variant, part, integrator=None, facets=FACETS, uneven=0.0):
     facet, changes, others, before = [], [], [], 0.0
     for step in range(int(2 * WAY / (SPEED * dt)) - 1):
         state = stepper.advance(dt)
-        facet.append(COMM.bcast(state.facets[0].copy())[0])
+        facet.append(COMM.bcast(state.contacts[0].facet.copy())[0])
         loss = stepper.solution.rows[-1]["contact_defect"]
         if step > 3:
             (others if facet[-1] == facet[-2] else changes).append(loss - before)

@@ -1,4 +1,4 @@
-"""Contact of a surface with a rigid obstacle: the element of `contact` without a facet.
+"""Contact of nodes with a rigid obstacle in one step: the element without a facet.
 
 Everything is in the pair's frame and relative to the obstacle's motion c(t), so that a moving
 obstacle is one at rest to the element; only the balance learns of its work.
@@ -8,25 +8,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact_step import ContactStep, Contribution, Slip
+from dolfinx_nts.contact_elements import ContactElements, Contribution, Slip
 from dolfinx_nts.nts_element import Gap
 from dolfinx_nts.obstacles import inverse
+
+if TYPE_CHECKING:
+    from dolfinx_nts.obstacle_pair import ObstaclePair
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class ObstacleStep(ContactStep):
-    """The candidates of a surface and an obstacle in one step.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ObstacleElements(ContactElements):
+    """Candidates of a surface and an obstacle.
 
-    lambda_N, and with friction lambda_T, are all its unknowns for both integrators: the discrete
+    lambda_N, and with friction lambda_T, are all its unknowns for any integrator: the discrete
     gradient is in closed form.
 
     Attributes:
@@ -34,31 +37,31 @@ class ObstacleStep(ContactStep):
         displacement: c(t_n) and c(t_{n+1}) [m], shape (2, 3).
     """
 
+    pair: ObstaclePair
     displacement: FloatArray
 
     @property
-    def num_corners(self) -> int:
+    def num_points(self) -> int:
         """None."""
         return 0
+
+    def master_numbers(self) -> tuple[tuple[IntArray, BoolArray], ...]:
+        """None."""
+        return ()
 
     @property
     def immovable(self) -> BoolArray:
         """All are."""
-        return np.ones(self.num_pairs, dtype=bool)
+        return np.ones(self.num_elements, dtype=bool)
 
     @property
-    def _only_normal(self) -> bool:
-        return True
+    def _ease(self) -> FloatArray:
+        return np.zeros(self.num_elements)
 
-    def dofs(self) -> tuple[IntArray, ...]:
-        """Global coordinates of slaves (n, 3); -1 where prescribed."""
-        slave = self.pair.slave
-        return (np.where(slave.fixed, -1, slave.dofs)[slave.share[self.candidates.node]],)
-
-    def points(self) -> tuple[IntArray, ...]:
-        """Global coordinates as in `dofs`, prescribed ones included."""
-        slave = self.pair.slave
-        return (slave.dofs[slave.share[self.candidates.node]],)
+    @property
+    def foot(self) -> FloatArray:
+        """No weights."""
+        return np.empty((self.num_elements, 0))
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves at t_{n+1}, shape (n, 1, 3)."""
@@ -77,10 +80,6 @@ class ObstacleStep(ContactStep):
         return x - self.displacement[1]
 
     @property
-    def _weights(self) -> None:
-        return None
-
-    @property
     def extent(self) -> float:
         """Of the slave, the obstacle and its path [m]."""
         extent: float = self.pair.extent + self.pair.obstacle.extent
@@ -91,31 +90,22 @@ class ObstacleStep(ContactStep):
         path = self.displacement[1] - self.displacement[0]
         return -float((part.residual[:, :3] @ path).sum())
 
-    def _tangents(self) -> FloatArray:
-        tangents: FloatArray = self._basis
-        return tangents
-
     @cached_property
-    def _basis(self) -> FloatArray:
+    def _tangents(self) -> FloatArray:
         """Orthonormal directions along the surface at t_n, shape (n, 2, 3)."""
         normal = self.candidates.normal
         first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
         first *= inverse(np.linalg.norm(first, axis=1))[:, None]
         return np.stack([first, np.cross(normal, first)], axis=1)
 
-    @cached_property
-    def _shape(self) -> FloatArray:
-        return np.empty((self.num_pairs, 0))
-
     def _middle(self, x: FloatArray) -> Gap:
         """Gap and normal where the contact force acts."""
         gap: Gap = self.pair.obstacle.gap((self.x0 + self.theta * (x - self.x0))[:, 0])
         return gap
 
-    def _tangential(self, x: FloatArray, force: FloatArray) -> FloatArray:
-        normal = self._middle(x).gradient[:, 0]
-        along: FloatArray = np.einsum("ni,ni->n", force, normal)
-        return force - along[:, None] * normal
+    def _normal(self, x: FloatArray) -> FloatArray:
+        normal: FloatArray = self._middle(x).gradient[:, 0]
+        return normal
 
     def _element(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
@@ -128,7 +118,7 @@ class ObstacleStep(ContactStep):
             gradient, slope = middle.gradient[:, 0], self.theta * middle.hessian
         else:
             gradient, slope = master.discrete_gradient(self.x0[:, 0], x[:, 0])
-        residual = np.zeros((self.num_pairs, 3 + self.num_multipliers))
+        residual = np.zeros((self.num_elements, 3 + self.num_constraints))
         tangent = np.zeros((*residual.shape, residual.shape[1]))
         residual[:, :3], residual[:, 3] = normal * gradient, end.value
         tangent[:, :3, :3] = normal[:, :, None] * slope
@@ -142,11 +132,11 @@ class ObstacleStep(ContactStep):
     ) -> Slip:
         """Add lambda_T t^a to the rows of x; returns the slip Df^a = t^a . (x_1 - x_0).
 
-        t_a are the directions e_a of `_basis` less their part along the normal n where the force
+        t_a are the directions e_a of `_tangents` less their part along the normal n where the force
         acts. Dual to them are t^a = e_a - n_0 (n . e_a) / (n . n_0), which lie along the surface,
         too, and t^a . t_b = t^a . e_b = 1 or 0, because n_0 . e_b = 0.
         """
-        middle, motion, e = self._middle(x), (x - self.x0)[:, 0], self._basis
+        middle, motion, e = self._middle(x), (x - self.x0)[:, 0], self._tangents
         normal, n0, t = middle.gradient[:, 0], self.candidates.normal, multiplier[:, -2:]
         part, turn = np.einsum("nai,ni->na", e, normal), self.theta * np.matmul(e, middle.hessian)
         per_height = inverse(np.einsum("ni,ni->n", normal, n0))[:, None]
@@ -158,10 +148,10 @@ class ObstacleStep(ContactStep):
         residual[:, :3] += np.einsum("na,nai->ni", t, dual)
         tangent[:, :3, :3] -= n0[:, :, None] * np.einsum("na,naj->nj", t, tilt_gradient)[:, None]
         tangent[:, :3, -2:] = dual.transpose(0, 2, 1)
-        gradient = np.zeros((self.num_pairs, 2, residual.shape[1]))
+        gradient = np.zeros((self.num_elements, 2, residual.shape[1]))
         rise = np.einsum("ni,ni->n", n0, motion)[:, None, None]
         gradient[..., :3] = dual - rise * tilt_gradient
-        metric_gradient = np.zeros((self.num_pairs, 2, 2, residual.shape[1]))
+        metric_gradient = np.zeros((self.num_elements, 2, 2, residual.shape[1]))
         half = -part[:, :, None, None] * turn[:, None]
         metric_gradient[..., :3] = half + half.transpose(0, 2, 1, 3)
         metric = np.eye(2) - part[:, :, None] * part[:, None]

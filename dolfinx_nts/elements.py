@@ -1,0 +1,405 @@
+"""What a step asks of whatever couples coordinates: contacts now, joints and springs to come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.points import Points
+
+if TYPE_CHECKING:
+    from dolfinx_nts.step import Evaluation
+    from dolfinx_nts.surfaces import Surface
+    from dolfinx_nts.system import State
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A step as those know it who make its elements.
+
+    Attributes:
+        state: At t_n.
+        dt: Length [s]; 0 in the relaxations of equilibrium.
+        factor: What the step equations multiply forces by [s^2].
+        integrator: Its rules.
+        condense: Whether unknowns that stand in one element alone are eliminated there.
+        first: Displacement of each body after flight without forces [m].
+        ahead: Motion of each body along which contact is sought [m].
+        motion: Largest component of each body's motion [m], shape (bodies,).
+        length: Of each body, the displacement whose rounding its forces have [m], shape (bodies,).
+        force_rounding: Of some bodies, the norm of forces that is rounding [kg m]. Collective.
+    """
+
+    state: State
+    dt: float
+    factor: float
+    integrator: Integrator
+    condense: bool
+    first: Sequence[FloatArray]
+    ahead: Sequence[FloatArray]
+    motion: FloatArray
+    length: FloatArray
+    force_rounding: Callable[[Sequence[int]], float]
+
+    def scale(self, surface: Surface) -> FloatArray:
+        """Force per motion of a surface's points in the units of the step, (p,). Collective."""
+        if self.integrator.inertia:
+            return surface.mass
+        return surface.nodal(surface.body.nodal_stiffness(self.integrator))
+
+
+class Part(Protocol):
+    """What elements contribute at an iterate; axis 0 = element.
+
+    Attributes:
+        residual: Rows of coordinates [kg m] (forces times `Step.factor`), then of own unknowns.
+        tangent: Its derivative, shape (n, r, r).
+        status: What Newton's method may flip from iterate to iterate, shape (states, n).
+    """
+
+    residual: FloatArray
+    tangent: FloatArray
+
+    @property
+    def status(self) -> BoolArray:
+        """What Newton's method may flip from iterate to iterate, shape (states, n)."""
+
+
+class Elements(Protocol):
+    """A batch of elements in a step; axis 0 = element. They are never changed."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def num_elements(self) -> int:
+        """On this rank."""
+
+    @property
+    def num_coordinates(self) -> int:
+        """Coordinates of bodies per element."""
+
+    @property
+    def widths(self) -> Mapping[str, int]:
+        """Own unknowns per element by field, "augmented" and "constraints"."""
+
+    @property
+    def pattern(self) -> BoolArray:
+        """Which constraints stand in the rows of which, shape (m, m)."""
+
+    def points(self) -> tuple[IntArray, ...]:
+        """Global coordinates of each body, shape (n, k) each."""
+
+    def dofs(self) -> tuple[IntArray, ...]:
+        """The same with -1 where they are prescribed."""
+
+    def reference(self) -> FloatArray:
+        """What is added to the displacements of these coordinates [m], shape (n, k / 3, 3)."""
+
+    def initial_guess(self, x: FloatArray) -> FloatArray:
+        """Augmented unknowns that fit predicted positions, shape (n, augmented)."""
+
+    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Part:
+        """Residual and tangent; pure.
+
+        Args:
+            x: Reference plus displacement at t_{n+1} [m], shape (n, k / 3, 3).
+            own: Own unknowns by field, shape (n, width).
+        """
+
+    def rows(self, part: Any, name: str) -> FloatArray:
+        """The residual's rows of a field of own unknowns, shape (n, width)."""
+
+    def largest(self, part: Any) -> list[float]:
+        """Four sizes on this rank whose maxima over all ranks `ratios` needs."""
+
+    def ratios(
+        self, largest: FloatArray, motion: float, rounded: float, rtol: float
+    ) -> dict[str, float]:
+        """Own rows over what counts as converged, by names for messages.
+
+        Args:
+            largest: `largest` over all ranks.
+            motion: Largest motion of the step [m].
+            rounded: Length whose rounding is in all positions [m].
+            rtol: Tolerance of Newton's method.
+        """
+
+    def ledger(self, part: Any, factor: float) -> dict[str, float]:
+        """Sums of an accepted step on this rank, by columns of the balance table.
+
+        Of the same columns on all ranks; those that only a joint has are energies [J] that leave.
+        """
+
+    def describe(self, part: Any, flips: IntArray) -> tuple[float, str]:
+        """Weight and text of the worst element, for messages.
+
+        Args:
+            part: Last iterate.
+            flips: How often `Part.status` changed, shape (states, n).
+        """
+
+
+class Joint(Protocol):
+    """What a System accepts beside contacts: joints, springs, ties; part of the scene.
+
+    Attributes:
+        name: For messages.
+        bodies: Bodies of the system that it couples.
+        losses: Columns of the balance table for energy that leaves through it, of its own names;
+            its elements' `ledger` says how much.
+    """
+
+    name: str
+    bodies: tuple[Any, ...]
+    losses: tuple[str, ...]
+
+    def start(self) -> Any:
+        """What it remembers at the start."""
+
+    def potential(self, u: Sequence[FloatArray]) -> float:
+        """Stored energy on this rank [J].
+
+        Args:
+            u: Owned displacements of each of its bodies [m].
+        """
+
+    def coupling(self, bodies: tuple[int, ...]) -> Coupling:
+        """What makes its elements in a run.
+
+        Args:
+            bodies: Numbers of its bodies in the system.
+        """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PointElements:
+    """What elements between points of bodies have in common, see `Elements`.
+
+    A kind of its own adds `evaluate`, and what else it has to say.
+
+    Attributes:
+        name: For messages.
+        sides: Of each body, the nodes of the elements' points, see `Points`.
+    """
+
+    name: str
+    sides: tuple[Points, ...]
+
+    @property
+    def num_elements(self) -> int:
+        """On this rank."""
+        return len(self.sides[0].nodes)
+
+    @property
+    def num_coordinates(self) -> int:
+        """Coordinates of all nodes of an element."""
+        return sum(3 * side.nodes.shape[1] for side in self.sides)
+
+    @property
+    def widths(self) -> Mapping[str, int]:
+        """No unknowns of its own."""
+        return {"augmented": 0, "constraints": 0}
+
+    @property
+    def pattern(self) -> BoolArray:
+        """Which constraints stand in the rows of which: all."""
+        return np.ones((self.widths["constraints"],) * 2, dtype=bool)
+
+    def points(self) -> tuple[IntArray, ...]:
+        """Global coordinates of each body's nodes."""
+        return tuple(self._flat(side.dofs) for side in self.sides)
+
+    @staticmethod
+    def _flat(numbers: IntArray) -> IntArray:
+        n, k, _ = numbers.shape
+        flat: IntArray = numbers.reshape(n, 3 * k)
+        return flat
+
+    def dofs(self) -> tuple[IntArray, ...]:
+        """The same with -1 where they are prescribed."""
+        return tuple(self._flat(np.where(side.fixed, -1, side.dofs)) for side in self.sides)
+
+    def reference(self) -> FloatArray:
+        """Reference positions of the nodes [m], shape (n, nodes, 3)."""
+        return np.concatenate([side.reference for side in self.sides], axis=1)
+
+    @property
+    def weights(self) -> FloatArray:
+        """Of the nodes in each side's point, shape (n, sides, nodes)."""
+        zeros = [np.zeros_like(side.weights) for side in self.sides]
+        rows = [
+            np.concatenate([*zeros[:k], side.weights, *zeros[k + 1 :]], axis=1)
+            for k, side in enumerate(self.sides)
+        ]
+        return np.stack(rows, axis=1)
+
+    @property
+    def extent(self) -> float:
+        """Length beside the displacements whose rounding enters [m]."""
+        return float(np.abs(self.reference()).max(initial=0.0))
+
+    def initial_guess(self, x: FloatArray) -> FloatArray:
+        """No augmented unknowns."""
+        return np.empty((self.num_elements, 0))
+
+    def rows(self, part: Any, name: str) -> FloatArray:
+        """The residual's rows of a field of own unknowns."""
+        start = self.num_coordinates if name == "constraints" else part.residual.shape[1]
+        own: FloatArray = part.residual[:, start:]
+        return own
+
+    def largest(self, part: Any) -> list[float]:
+        """Nothing to compare."""
+        return [0.0] * 4
+
+    def ratios(
+        self, largest: FloatArray, motion: float, rounded: float, rtol: float
+    ) -> dict[str, float]:
+        """No rows of its own."""
+        return {}
+
+    def ledger(self, part: Any, factor: float) -> dict[str, float]:
+        """Nothing lost."""
+        return {}
+
+    def describe(self, part: Any, flips: IntArray) -> tuple[float, str]:
+        """The element with the largest rows."""
+        size = np.nan_to_num(np.abs(part.residual).max(axis=1), nan=np.inf)
+        return float(size.max()), f"{self.name!r}: element {int(size.argmax())}"
+
+
+class PointPart(NamedTuple):
+    """What elements without states contribute, see `Part`."""
+
+    residual: FloatArray
+    tangent: FloatArray
+
+    @property
+    def status(self) -> BoolArray:
+        """Nothing flips."""
+        return np.empty((0, len(self.residual)), dtype=bool)
+
+
+class EveryStep:
+    """A `Coupling` with the same kind of elements in every step, and nothing to look for.
+
+    Args:
+        bodies: Numbers of their bodies in the system.
+        make: Makes the elements of a step.
+        remember: What is remembered of an accepted one, from its part; nothing without.
+    """
+
+    may_slip = False
+
+    def __init__(
+        self,
+        bodies: tuple[int, ...],
+        make: Callable[[Step], Any],
+        remember: Callable[[Any], Any] | None = None,
+    ) -> None:
+        self.bodies, self._make, self._remember = [bodies], make, remember
+        self.elements: list[Any] = []
+
+    def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
+        """Make the elements of a step."""
+        self.elements = [self._make(step)]
+
+    def touched(self) -> set[int]:
+        """All bodies."""
+        return set(self.bodies[0])
+
+    def wake(self, u1: Sequence[FloatArray]) -> bool:
+        """Nothing sleeps."""
+        return False
+
+    def misses(self, e: Evaluation, parts: Sequence[Any], motion: FloatArray) -> bool:
+        """Nothing is missed."""
+        return False
+
+    def guess(self, k: int, x: FloatArray) -> FloatArray:
+        """Zero."""
+        batch = self.elements[k]
+        return np.zeros((batch.num_elements, batch.widths["constraints"]))
+
+    def let_slip(self) -> None:
+        """Nothing slips."""
+
+    def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
+        """Nothing to tell."""
+        return {}
+
+    def history(self, parts: Sequence[Any]) -> Any:
+        """What is remembered of an accepted step."""
+        return self._remember(parts[0]) if self._remember else None
+
+
+class Coupling(Protocol):
+    """Makes elements of one kind, step after step; one for a run.
+
+    Attributes:
+        elements: Those of the current step that have unknowns, the same number on all ranks.
+        bodies: Numbers of the bodies of each of `elements`, in the order of their coordinates.
+    """
+
+    elements: list[Any]
+    bodies: list[tuple[int, ...]]
+
+    def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
+        """Make the elements of a step. Collective.
+
+        Args:
+            step: The step.
+            again: Solution of this step that was not covered, see `misses`.
+            search: Whether what may couple is sought anew.
+        """
+
+    def touched(self) -> set[int]:
+        """Numbers of the bodies that elements move, the same on all ranks. Collective."""
+
+    def wake(self, u1: Sequence[FloatArray]) -> bool:
+        """Whether a solved step asks for more elements, which are made. Collective."""
+
+    def misses(self, e: Evaluation, parts: Sequence[Any], motion: FloatArray) -> bool:
+        """Whether a solved step may have passed by something, so that it begins again. Collective.
+
+        Args:
+            e: Its solution.
+            parts: Of it, those of `elements`.
+            motion: Largest component of each body's motion [m], shape (bodies,).
+        """
+
+    def guess(self, k: int, x: FloatArray) -> FloatArray:
+        """Constraints' unknowns of elements k as in the last step, shape (n, constraints).
+
+        Args:
+            k: Number among `elements`.
+            x: Positions of the first guess, as of `Elements.evaluate`.
+        """
+
+    @property
+    def may_slip(self) -> bool:
+        """Whether `let_slip` changes anything."""
+
+    def let_slip(self) -> None:
+        """Let the step be solved by a rule that adds no solution but may find one."""
+
+    def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
+        """Minima of an accepted step on this rank, by columns of the balance table."""
+
+    def history(self, parts: Sequence[Any]) -> Any:
+        """What is remembered of an accepted step.
+
+        Args:
+            parts: Solution, of each of `elements`.
+        """
