@@ -405,4 +405,4 @@ def test_condensing_changes_no_solution(cell):
             top = COMM.allreduce(np.abs(a[finite]).max(initial=0.0), op=MPI.MAX)
             tolerance = 1e-10 * top if name != "gap" else 1e-12
             assert np.abs(a[finite] - b[finite]).max(initial=0.0) <= tolerance
-    assert COMM.allreduce(int((full.force[0] > 0).sum())) >= 3
+    assert COMM.allreduce(int((full.contacts[0].force > 0).sum())) >= 3
