@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -31,6 +31,7 @@ from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
     as_path,
+    call_together,
     items,
     known_options,
     require_bool,
@@ -166,6 +167,7 @@ class Stepper:
         start: Result of `equilibrium` to start from; see there.
         sleep: Leave bodies that nothing moves out of the steps; see `simulate`.
         watch_overlap: Look whether bodies end up inside each other; see `simulate`.
+        before_step: Called before every attempt at a step; see `simulate`.
 
     Attributes:
         state: Last accepted state.
@@ -184,6 +186,7 @@ class Stepper:
         start: Solution | None = None,
         sleep: bool = False,
         watch_overlap: bool = True,
+        before_step: Callable[[float, float], Any] | None = None,
     ) -> None:
         if not isinstance(system, System):
             raise TypeError(f"system={system!r}: pass a System([body, ...])")
@@ -207,6 +210,9 @@ class Stepper:
             )
         require_bool("sleep", sleep)
         require_bool("watch_overlap", watch_overlap)
+        if not callable(before_step) and before_step is not None:
+            raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
+        self._before_step = before_step
         self.newton = newton or Newton()
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
@@ -247,8 +253,8 @@ class Stepper:
             ValueError: dt is not positive.
             StepFailedError: Not solved even with the smallest step; everything accepted so far is
                 kept.
-            UserFunctionError: A function of time raised or returned no vector on some rank; not
-                tried again, everything is kept.
+            UserFunctionError: A function of time raised or returned no vector on some rank, or
+                `before_step` raised; not tried again, everything is kept.
         """
         require_positive("dt", dt, "s")
         dt = float(dt)
@@ -298,12 +304,11 @@ class Stepper:
             now = self.state.time
             left = end - now
             dt = pace.propose(left)
-            self._note_materials()
-            self.problem.begin(self.state, dt)
+            self._begin(dt)
             part = pace.first_touch(self.problem)
             if part < 1.0:
                 dt *= part
-                self.problem.begin(self.state, dt)
+                self._begin(dt)
             try:
                 trial = self._attempt(dt, end if dt == left else now + dt)
             except StepFailedError as failure:
@@ -333,6 +338,9 @@ class Stepper:
         """
         if self._started:
             return
+        self._call_before(dt)
+        # What the first call sets is what the run begins with.
+        self._materials.changed()
         v = [v.copy() for v in self.state.v]
         for body, values in zip(self.system.bodies, v, strict=True):
             p0, p1, p2 = (body.prescribed(self.state.time + s * dt) for s in (0.0, 0.5, 1.0))
@@ -363,9 +371,24 @@ class Stepper:
         self.state = state
 
     def _step(self, dt: float, time: float) -> None:
-        self._note_materials()
-        self.problem.begin(self.state, dt)
+        self._begin(dt)
         self._take(self._attempt(dt, time))
+
+    def _begin(self, dt: float) -> None:
+        """Fix the equations of a step from the last accepted state."""
+        self._prepare(dt)
+        self.problem.begin(self.state, dt)
+
+    def _prepare(self, dt: float) -> None:
+        """Let the user change what the forms of the step hold, and account for it."""
+        self._call_before(dt)
+        self._note_materials()
+
+    def _call_before(self, dt: float) -> None:
+        if self._before_step is not None:
+            time = self.state.time
+            name = f"before_step at t={time!r} with dt={dt!r}"
+            call_together(self.system.comm, name, self._before_step, time, dt)
 
     def _note_materials(self) -> None:
         """Name in the ledger what changed parameters of materials do to the stored energy."""
@@ -571,6 +594,7 @@ def simulate(
     sleep: bool = False,
     adapt: Adapt | None = None,
     watch_overlap: bool = True,
+    before_step: Callable[[float, float], Any] | None = None,
 ) -> Solution:
     """Run a system from t = 0, or from where an equilibrium ended, to t_end.
 
@@ -598,12 +622,31 @@ def simulate(
             boundaries, or an obstacle in the facets that it is the master of, and warn. It costs
             less than one part in fifty of the steps unless the bodies move by a quarter of a facet
             in few of them.
+        before_step: Callable (time, dt) that all ranks call before every attempt at a step, also
+            when it is cut or its length chosen anew, with the time at its start [s] and its length
+            [s]; the last call before a step is with the step's own. It may change the Constants and
+            Functions in a material and in an `extra_form`, here from an old load to a new one in
+            0.1 s:
+
+                load = fem.Constant(mesh, 0.0)
+                body = nts.Continuum(
+                    mesh, rubber, density=1e3, extra_form=lambda u, v, w, t: -load * w[2] * ufl.ds
+                )
+
+                def ramp(time, dt):
+                    load.value = 2e3 * min((time + dt / 2) / 0.1, 1.0)
+
+                run = nts.simulate(system, nts.EnergyMomentum(), ..., before_step=ramp)
+
+            It should depend on its arguments alone, as steps may be tried again. The first call
+            comes before the row of the start. What changes a material's energy later is
+            "material_change" in the balance.
 
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then,
-        also where a function of time or a writer raises, or returns what it must not, on any rank:
-        the run ends there, and all writers are closed. Only a writer that raises between collective
-        calls of its own on some ranks alone makes the others wait for ever.
+        also where a function of time, `before_step` or a writer raises, or returns what it must
+        not, on any rank: the run ends there, and all writers are closed. Only one that raises
+        between collective calls of its own on some ranks alone makes the others wait for ever.
 
     Raises:
         TypeError: An argument is of another type.
@@ -624,7 +667,7 @@ def simulate(
     newton = _newton(newton, accuracy)
     stepper = Stepper(
         system, integrator, newton=newton, petsc_options=petsc_options, start=start, sleep=sleep,
-        watch_overlap=watch_overlap,
+        watch_overlap=watch_overlap, before_step=before_step,
     )  # fmt: skip
     begin = stepper.state.time
     if not t_end > begin:
