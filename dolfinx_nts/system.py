@@ -111,15 +111,17 @@ class System:
         depths = self.penetration(start)
         for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
             if len(set(where)) == 2:  # the search looks half a facet deep; this, the whole body
-                depths[k] = np.maximum(depths[k], pair.master.depth(pair.slave.reference))
+                slave, master = (start.u[b] for b in where)
+                inside = pair.master.depth(pair.slave.positions(slave), master)
+                depths[k] = np.maximum(depths[k], inside)
         self._check_penetration(depths)
 
     def initial_state(self) -> State:
-        """Undeformed bodies with their initial velocities at t = 0."""
+        """Bodies with their initial displacements and velocities at t = 0."""
         nodes = [len(c.slave.share) for c in self.contacts]
         return State(
             time=0.0,
-            u=tuple(self._prescribed(b) for b in self.bodies),
+            u=tuple(self._at_start(b) for b in self.bodies),
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
             a=(),
             facets=tuple(np.full(n, -1) for n in nodes),
@@ -181,8 +183,9 @@ class System:
         raise_together(body.comm, problem)
 
     @staticmethod
-    def _prescribed(body: Body) -> FloatArray:
-        u = np.zeros(body.num_owned)
+    def _at_start(body: Body) -> FloatArray:
+        given = getattr(body, "initial_displacement", None)
+        u = np.zeros(body.num_owned) if given is None else given.copy()
         u[body.fixed] = body.prescribed(0.0)
         return u
 
