@@ -276,9 +276,9 @@ def equilibrium(
 
     The ledger closes as the square of the load steps: work is that of the mean of their forces.
 
-    A dynamic run starts from the result, at its pseudo time and with the initial velocities of the
-    bodies: `t_end=1.2` is 0.2 s later, and a motion that begins with the run is a function of
-    `max(t - 1, 0)`. Bodies correspond by name, so that what holds them may differ:
+    A dynamic run starts from the result with the initial velocities of the bodies, at its pseudo
+    time, or at the `start_time` of `simulate`, from which its functions of time count. Bodies
+    correspond by name, so that what holds them may differ:
 
         def block(bcs=()):
             return nts.Continuum(mesh, rubber, density=1e3, bcs=bcs, name="block")
@@ -289,7 +289,9 @@ def equilibrium(
 
         pulled = nts.Dirichlet(top, value=lambda t: (0, 0, -0.02 * t))
         settled = nts.equilibrium(scene(block([pulled])), load_steps=10)
-        run = nts.simulate(scene(block()), nts.EnergyMomentum(), dt=1e-3, t_end=1.2, start=settled)
+        run = nts.simulate(
+            scene(block()), nts.EnergyMomentum(), dt=1e-3, t_end=0.2, start=settled, start_time=0.0
+        )
 
     Args:
         system: The scene.

@@ -32,6 +32,7 @@ from dolfinx_nts.validation import (
     UserFunctionError,
     as_path,
     call_together,
+    is_finite,
     items,
     known_options,
     require_bool,
@@ -165,6 +166,7 @@ class Stepper:
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
         start: Result of `equilibrium` to start from; see there.
+        start_time: Time at the start [s]; see `simulate`.
         sleep: Leave bodies that nothing moves out of the steps; see `simulate`.
         watch_overlap: Look whether bodies end up inside each other; see `simulate`.
         before_step: Called before every attempt at a step; see `simulate`.
@@ -184,6 +186,7 @@ class Stepper:
         newton: Newton | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         start: Solution | None = None,
+        start_time: float | None = None,
         sleep: bool = False,
         watch_overlap: bool = True,
         before_step: Callable[[float, float], Any] | None = None,
@@ -228,7 +231,7 @@ class Stepper:
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._measured: dict[str, balance.Measured] = {}
         self._recent: deque[tuple[float, tuple[FloatArray, ...]]] = deque(maxlen=2)
-        self._accept(_first_state(system, start))
+        self._accept(_first_state(system, start, start_time))
         self.solution = Solution(system, rows=Table([balance.first_row(system, self.state)]))
         self._promises = Promises(
             self.solution,
@@ -564,14 +567,19 @@ def _at_nodes(contact: ContactStep, values: npt.NDArray[Any], elsewhere: Any) ->
     return out
 
 
-def _first_state(system: System, start: Any) -> State:
+def _first_state(system: System, start: Any, time: Any) -> State:
+    if time is not None and not is_finite(time):
+        raise ValueError(f"start_time={time!r}: must be finite [s]")
     if start is None:
+        if time is not None:
+            raise ValueError(f"start_time={time!r}: pass start=, too, or leave it out")
         return system.initial_state()
     if not (isinstance(start, Solution) and hasattr(start, "state")):
         raise TypeError(
             f"start of type {type(start).__name__}: pass the result of equilibrium(...)"
         )
-    return system.state_from(start.system, start.state)
+    state = start.state if time is None else replace(start.state, time=float(time))
+    return system.state_from(start.system, state)
 
 
 def _is_writer(item: Any) -> bool:
@@ -590,13 +598,14 @@ def simulate(
     output: Sequence[Any] = (),
     progress: bool = False,
     start: Solution | None = None,
+    start_time: float | None = None,
     accuracy: str | None = None,
     sleep: bool = False,
     adapt: Adapt | None = None,
     watch_overlap: bool = True,
     before_step: Callable[[float, float], Any] | None = None,
 ) -> Solution:
-    """Run a system from t = 0, or from where an equilibrium ended, to t_end.
+    """Run a system from t = 0, or from an equilibrium, to t_end.
 
     Args:
         system: The scene.
@@ -611,6 +620,8 @@ def simulate(
             cadence asks for.
         progress: Show a progress line on rank 0.
         start: Result of `equilibrium` to start from; see there.
+        start_time: Time at which a run from `start` begins [s], from which functions of time, `dt`
+            and `t_end` count; default: the pseudo time of `start`.
         accuracy: In place of `newton`: "exact" closes the ledger to rounding; "balanced" to about
             1e-8 and "fast" to about 1e-5 of the energy, with matrices kept over many steps.
         sleep: Leave a body out of a step while its velocity is exactly zero, its forces balance to
@@ -666,8 +677,8 @@ def simulate(
         )
     newton = _newton(newton, accuracy)
     stepper = Stepper(
-        system, integrator, newton=newton, petsc_options=petsc_options, start=start, sleep=sleep,
-        watch_overlap=watch_overlap, before_step=before_step,
+        system, integrator, newton=newton, petsc_options=petsc_options, start=start,
+        start_time=start_time, sleep=sleep, watch_overlap=watch_overlap, before_step=before_step,
     )  # fmt: skip
     begin = stepper.state.time
     if not t_end > begin:
