@@ -128,31 +128,16 @@ class Recorder:
 
     def start(self, stepper):
         """Begin anew with the state the run starts from."""
-        body = stepper.system.bodies[0]
-        self.mass = self._sum(body, np.tile([1.0, 0.0, 0.0], body.num_owned // 3))[0][0]
-        middle = self._sum(body, body.reference)[0] / self.mass
-        arm = body.reference.reshape(-1, 3) - middle
-        spin = np.cross([0.0, 1.0, 0.0], arm).ravel()
-        momentum = body.inertia(spin)
-        inertia = (np.cross(arm, momentum.reshape(-1, 3)).sum(axis=0))[1]
-        self.inertia = body.comm.allreduce(float(inertia))
+        wheel = nts.motion_of(stepper.system.bodies[0])
+        self.mass, self.inertia = wheel.mass, wheel.inertia[1, 1]
         self.rows = []
         self.write(stepper)
 
-    def _sum(self, body, field):
-        """Integrals of density times a field and times its moment about the origin."""
-        momentum = body.inertia(field)
-        return body.comm.allreduce(body.linear_momentum(momentum)), momentum
-
     def write(self, stepper, *, last=False):
         """Add the accepted state."""
-        body, state = stepper.system.bodies[0], stepper.state
-        u, v = state.u[0], state.v[0]
-        centre = self._sum(body, body.reference + u)[0] / self.mass
-        total, momentum = self._sum(body, v)
-        moment = body.comm.allreduce(body.angular_momentum(u, momentum))
-        moment = moment - np.cross(centre, total)
-        self.rows.append((state.time, *centre, total[0] / self.mass, moment[1] / self.inertia))
+        wheel = nts.motion_of(stepper.system.bodies[0])
+        row = (stepper.state.time, *wheel.centre, wheel.velocity[0], wheel.spin[1])
+        self.rows.append(row)
 
     def close(self, stepper):
         """Make columns of the rows."""

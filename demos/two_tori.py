@@ -123,18 +123,10 @@ def figures(run):
         "contact": (touching[0], touching[-1]) if len(touching) else None,
         "active_max": int(b["active"].max()),
         "min_gap": float(b["min_gap"].min()),
-        "velocities": {body.name: mean_velocity(body) for body in run.system.bodies},
+        "velocities": {body.name: nts.motion_of(body).velocity for body in run.system.bodies},
         "newton_iterations": float(b["newton_iterations"][1:].mean()) if len(p) > 1 else np.nan,
         "retries": run.retries,
     }
-
-
-def mean_velocity(body):
-    """Velocity of a body's centre of mass; every rank must call it."""
-    momentum = body.inertia(body.v.x.array[: body.num_owned])
-    local = [*body.linear_momentum(momentum), body.nodal_mass.sum() / 3]
-    *total, mass = body.comm.allreduce(np.array(local))
-    return np.array(total) / mass
 
 
 def report(result, integrator, refinement, dt):

@@ -15,6 +15,7 @@ from dolfinx_nts.integrators import (
 )
 from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.motion import BodyMotion, motion_of
 from dolfinx_nts.newton import Newton
 from dolfinx_nts.nts_element import Gap
 from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
@@ -29,6 +30,7 @@ __version__ = version("dolfinx_nts")
 __all__ = [
     "Adapt",
     "Body",
+    "BodyMotion",
     "ContactPair",
     "Continuum",
     "Cylinder",
@@ -59,5 +61,6 @@ __all__ = [
     "bodies_from_gmsh",
     "bodies_from_tags",
     "equilibrium",
+    "motion_of",
     "simulate",
 ]
