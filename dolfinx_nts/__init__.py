@@ -22,6 +22,7 @@ from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
 from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.step_size import Adapt
 from dolfinx_nts.strain_energy import Isotropic
+from dolfinx_nts.stress import cauchy_stress, von_mises
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
@@ -60,7 +61,9 @@ __all__ = [
     "UserFunctionError",
     "bodies_from_gmsh",
     "bodies_from_tags",
+    "cauchy_stress",
     "equilibrium",
     "motion_of",
     "simulate",
+    "von_mises",
 ]

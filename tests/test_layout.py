@@ -22,7 +22,7 @@ LEVELS = [
     | {"patches", "bounded_slope"},
     {"integrators"},
     {"body", "continuum", "materials", "inversion", "mesh_check", "mesh_input"}
-    | {"motion"}
+    | {"motion", "stress"}
     | {"contact", "contact_step", "obstacles", "obstacle_contact", "search", "surfaces"}
     | {"overlap", "intrusion"},
     {"system", "balance"},
