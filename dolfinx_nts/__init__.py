@@ -26,6 +26,7 @@ from dolfinx_nts.stress import cauchy_stress, von_mises
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
+from dolfinx_nts.writer import Writer
 
 __version__ = version("dolfinx_nts")
 __all__ = [
@@ -59,6 +60,7 @@ __all__ = [
     "System",
     "Traction",
     "UserFunctionError",
+    "Writer",
     "bodies_from_gmsh",
     "bodies_from_tags",
     "cauchy_stress",

@@ -27,6 +27,7 @@ from dolfinx_nts.validation import (
     require_bool,
     require_positive,
 )
+from dolfinx_nts.writer import Writer
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -257,7 +258,7 @@ def equilibrium(
     stabilization: float | None = None,
     newton: Newton | None = None,
     petsc_options: Mapping[str, Any] | None = None,
-    output: Sequence[Any] = (),
+    output: Sequence[Writer] = (),
     progress: bool = False,
     watch_overlap: bool = True,
     before_step: Callable[[float, float], Any] | None = None,
@@ -302,8 +303,7 @@ def equilibrium(
             forces. 0.1 is a good value.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
-        output: Writers of `dolfinx_nts.output`; each is called after every load step that its
-            cadence asks for.
+        output: Writers, as in `simulate`; all ranks call them after every load step.
         progress: Show a progress line on rank 0.
         watch_overlap: Look whether bodies of a contact end up inside each other, as in `simulate`.
         before_step: Callable (time, dt) before every attempt at a load step, with the pseudo time

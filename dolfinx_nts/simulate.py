@@ -38,6 +38,7 @@ from dolfinx_nts.validation import (
     require_bool,
     require_positive,
 )
+from dolfinx_nts.writer import Writer
 
 logger = logging.getLogger(__name__)
 
@@ -595,7 +596,7 @@ def simulate(
     t_end: float,
     newton: Newton | None = None,
     petsc_options: Mapping[str, Any] | None = None,
-    output: Sequence[Any] = (),
+    output: Sequence[Writer] = (),
     progress: bool = False,
     start: Solution | None = None,
     start_time: float | None = None,
@@ -616,8 +617,21 @@ def simulate(
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix, e.g. {"pc_type":
             "fieldsplit"}.
-        output: Writers of `dolfinx_nts.output`; each is called after every accepted step that its
-            cadence asks for.
+        output: Writers of `dolfinx_nts.output`, or of one's own with the `Writer` protocol, which
+            all ranks call before the first step, after every accepted step and at the end:
+
+                class Heights:
+                    def start(self, stepper):
+                        self.rows = []
+                    def write(self, stepper, *, last=False):
+                        centre = nts.motion_of(stepper.system.bodies[0]).centre
+                        self.rows.append((stepper.state.time, centre[2]))
+                    def close(self, stepper):
+                        print(len(self.rows), "steps;", stepper.solution.status)
+
+                heights = Heights()
+                run = nts.simulate(system, integrator, dt=1e-3, t_end=0.2, output=[heights])
+
         progress: Show a progress line on rank 0.
         start: Result of `equilibrium` to start from; see there.
         start_time: Time at which a run from `start` begins [s], from which functions of time, `dt`
@@ -709,7 +723,7 @@ def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
 def run(
     stepper: Stepper,
     times: Sequence[float],
-    output: Sequence[Any],
+    output: Sequence[Writer],
     *,
     dt: float,
     progress: bool,
@@ -729,7 +743,7 @@ def run(
     """
     solution, root = stepper.solution, stepper.system.comm.rank == 0
     bar = _progress_bar(None if adapt else len(times), progress and root)
-    started: list[Any] = []
+    started: list[Writer] = []
     try:
         try:
             _march(stepper, times, output, started, dt, adapt, bar)
@@ -756,8 +770,8 @@ def run(
 def _march(
     stepper: Stepper,
     times: Sequence[float],
-    output: Sequence[Any],
-    started: list[Any],
+    output: Sequence[Writer],
+    started: list[Writer],
     dt: float,
     adapt: Adapt | None,
     bar: Any,
@@ -795,7 +809,7 @@ def _stop(stepper: Stepper, reason: str, cause: BaseException | None = None) -> 
 
 
 def _call(
-    stepper: Stepper, output: Sequence[Any], name: str, **options: Any
+    stepper: Stepper, output: Sequence[Writer], name: str, **options: Any
 ) -> tuple[str | None, Exception | None]:
     """Call a method of all writers, also when one raises: what the first raised here, and it."""
     problem, cause = None, None
@@ -811,7 +825,7 @@ def _call(
 
 
 def _call_together(
-    stepper: Stepper, output: Sequence[Any], name: str, **options: Any
+    stepper: Stepper, output: Sequence[Writer], name: str, **options: Any
 ) -> tuple[str | None, Exception | None]:
     """`_call` with the first problem of any rank, on all ranks alike. Every rank must call it."""
     problem, cause = _call(stepper, output, name, **options)
@@ -830,9 +844,10 @@ def _moves(stepper: Stepper, times: Sequence[float], pace: Pace | None) -> Itera
                 yield final and stepper.state.time == time
 
 
-def writers(output: Any) -> tuple[Any, ...]:
+def writers(output: Any) -> tuple[Writer, ...]:
     """The argument `output`, checked."""
-    return items("output", output, _is_writer, "writers of dolfinx_nts.output")
+    wanted = "writers of dolfinx_nts.output, or others with the Writer protocol"
+    return items("output", output, _is_writer, wanted)
 
 
 def _progress_bar(steps: int | None, wanted: bool) -> Any:

@@ -28,7 +28,7 @@ LEVELS = [
     {"system", "balance"},
     {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"}
     | {"promises"},
-    {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff", "economy"},
+    {"simulate", "equilibrium", "output", "writer", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]
 LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}
