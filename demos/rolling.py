@@ -21,7 +21,7 @@ What to see. Sliding follows the straight lines, all nodes in contact slip until
 afterwards, and friction takes the third of the energy that it must. With the energy-momentum scheme
 what the ledger misses is round-off.
 
-    mpirun -n 2 python demos/rolling.py --output out/rolling
+    mpirun -n 2 python demos/rolling.py
 """
 
 import argparse
@@ -34,6 +34,8 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
+from dolfinx_nts.output import Fields
+from dolfinx_nts.pictures import picture
 
 RADIUS, WIDTH, DENSITY, GRAVITY = 1.0, 0.5, 1e3, 9.81
 SPEED, FRICTION = 3.0, 0.3
@@ -151,9 +153,9 @@ def rigid(t, kappa):
     return SPEED - FRICTION * GRAVITY * t, FRICTION * GRAVITY * t / kappa
 
 
-def figures(run, wheel, start):
+def figures(run, wheel):
     """The wheel against the rigid one; speeds over v0, energies over m v0^2 / 2."""
-    t, b = wheel.time - start, run.balance
+    t, b = wheel.time, run.balance
     kappa = wheel.inertia / wheel.mass / RADIUS**2
     energy = wheel.mass * SPEED**2 / 2
     speed, spin = rigid(t, kappa)
@@ -229,34 +231,40 @@ def main(
     dt=4e-3,
     duration=0.7,
     integrators=tuple(INTEGRATORS),
+    progress=False,
 ):
     """Throw the wheel with each integrator.
 
     Args:
         comm: MPI communicator.
-        output: Folder for pictures, or None.
+        output: Folder for pictures and fields, or None.
         facets: Facets around the rim, a multiple of 8.
         dt: Step [s].
         duration: From the throw to the end of the run [s].
         integrators: Which of "energy-momentum", "midpoint".
+        progress: Show a progress line.
 
     Returns:
         {integrator: figures}; see `figures`.
     """
-    settled = nts.equilibrium(scene(comm, facets, settle=True), load_steps=4)
-    start = settled.state.time
+    settled = nts.equilibrium(scene(comm, facets, settle=True), load_steps=4, progress=progress)
     results, balances = {}, {}
     for name in integrators:
-        wheel, clock = Recorder(), time.perf_counter()
+        wheel, clock, system = Recorder(), time.perf_counter(), scene(comm, facets, settle=False)
+        folder = output and Path(output) / name
         run = nts.simulate(
-            scene(comm, facets, settle=False),
+            system,
             INTEGRATORS[name],
             dt=dt,
-            t_end=start + duration,
-            output=[wheel],
+            t_end=duration,
+            output=[wheel, *([Fields(folder, every=5)] if folder else [])],
+            progress=progress,
             start=settled,
+            start_time=0.0,
         )
-        results[name] = figures(run, wheel, start)
+        if folder:
+            picture(system.bodies, folder / "wheel.png", view=(10.0, -75.0))
+        results[name] = figures(run, wheel)
         results[name]["seconds"] = time.perf_counter() - clock
         balances[name] = run.balance
     if comm.rank == 0:
@@ -268,7 +276,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", help="folder for pictures")
+    parser.add_argument("--output", default="out/rolling", help="pictures and fields")
     parser.add_argument("--facets", type=int, default=48)
     parser.add_argument("--dt", type=float, default=4e-3)
-    main(**vars(parser.parse_args()))
+    main(progress=True, **vars(parser.parse_args()))

@@ -634,8 +634,8 @@ def simulate(
 
         progress: Show a progress line on rank 0.
         start: Result of `equilibrium` to start from; see there.
-        start_time: Time at which a run from `start` begins [s], from which functions of time, `dt`
-            and `t_end` count; default: the pseudo time of `start`.
+        start_time: Time at which a run from `start` begins [s], from which functions of time and
+            `t_end` count; default: the pseudo time of `start`.
         accuracy: In place of `newton`: "exact" closes the ledger to rounding; "balanced" to about
             1e-8 and "fast" to about 1e-5 of the energy, with matrices kept over many steps.
         sleep: Leave a body out of a step while its velocity is exactly zero, its forces balance to
