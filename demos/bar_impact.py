@@ -22,7 +22,7 @@ end of a step, but at the release, where the end touches the wall once more. It 
 mesh: E/E0 = 0.9978, 0.9987, 0.9992 and rebound 0.9841, 0.9892, 0.9927 of v0 with 50, 100, 200
 elements. In the linear range the midpoint rule and the energy-momentum scheme coincide.
 
-    mpirun -n 2 python demos/bar_impact.py --elements 100 --output out/bar_impact
+    mpirun -n 2 python demos/bar_impact.py --elements 100
 """
 
 import argparse
@@ -34,6 +34,8 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
+from dolfinx_nts.output import Fields
+from dolfinx_nts.pictures import picture
 
 LENGTH, AREA, YOUNG, DENSITY = 10.0, 1.0, 900.0, 1.0
 GAP, SPEED, GRAVITY = 5e-3, 1e-2, 1e-2
@@ -218,17 +220,19 @@ def main(
     courant=1.0,
     t_end=None,
     integrators=tuple(INTEGRATORS),
+    progress=False,
 ):
     """Run the impact with each integrator.
 
     Args:
         comm: MPI communicator.
-        output: Folder for pictures, or None.
+        output: Folder for pictures and fields, or None.
         elements: Hexahedra along the bar.
         gravity: Drop the bar instead of throwing it.
         courant: Step over the time a wave needs for one element.
         t_end: End of the run [s]; default just after the last contact.
         integrators: Which of "energy-momentum", "midpoint".
+        progress: Show a progress line.
 
     Returns:
         {integrator: figures}; see `figures`.
@@ -239,7 +243,13 @@ def main(
     for name in integrators:
         recorder, clock = Recorder(), time.perf_counter()
         system = scene(comm, elements, gravity)
-        run = nts.simulate(system, INTEGRATORS[name], dt=dt, t_end=end, output=[recorder])
+        folder = output and Path(output) / name
+        writers = [recorder, *([Fields(folder, every=5)] if folder else [])]
+        run = nts.simulate(
+            system, INTEGRATORS[name], dt=dt, t_end=end, output=writers, progress=progress
+        )
+        if folder:
+            picture(system.bodies, folder / "bar.png", colour="stress")
         results[name] = figures(run, recorder, dt, gravity)
         results[name]["seconds"] = time.perf_counter() - clock
         balances[name] = run.balance
@@ -252,7 +262,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", help="folder for pictures")
+    parser.add_argument("--output", default="out/bar_impact", help="pictures and fields")
     parser.add_argument("--elements", type=int, default=100)
     parser.add_argument("--gravity", action="store_true", help="drop the bar")
-    main(**vars(parser.parse_args()))
+    main(progress=True, **vars(parser.parse_args()))

@@ -13,7 +13,7 @@ a radian, both are constant to round-off over the whole run. The midpoint rule k
 not the energy: it grows until, before t = 30, Newton's method fails. Newton's steps are shortened
 where they overshoot (`bt`): full ones diverge in one step of the energy-momentum run too.
 
-    mpirun -n 2 python demos/flying_l_block.py --t-end 200 --output out/flying_l_block
+    mpirun -n 2 python demos/flying_l_block.py --t-end 200
 """
 
 import argparse
@@ -25,6 +25,8 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
+from dolfinx_nts.output import Fields
+from dolfinx_nts.pictures import picture
 
 LOAD = np.array([256.0, 512.0, 768.0]) / 9
 PEAK, END = 2.5, 5.0
@@ -104,15 +106,17 @@ def main(
     dt=1.0,
     t_end=50.0,
     integrators=tuple(INTEGRATORS),
+    progress=False,
 ):
     """Run the block with each integrator.
 
     Args:
         comm: MPI communicator.
-        output: Folder for pictures, or None.
+        output: Folder for pictures and fields, or None.
         dt: Step [s]; the paper's is 1.
         t_end: End of the run [s]; the paper's is 200.
         integrators: Which of "energy-momentum", "midpoint".
+        progress: Show a progress line.
 
     Returns:
         {integrator: figures}; see `figures`.
@@ -121,14 +125,12 @@ def main(
     for name in integrators:
         clock, system = time.perf_counter(), scene(comm)
         run = nts.simulate(
-            system, INTEGRATORS[name], dt=dt, t_end=t_end, newton=NEWTON, petsc_options=LINE_SEARCH
-        )
+            system, INTEGRATORS[name], dt=dt, t_end=t_end, newton=NEWTON, progress=progress,
+            petsc_options=LINE_SEARCH, output=[Fields(Path(output) / name)] if output else [],
+        )  # fmt: skip
         results[name], balances[name] = figures(run), run.balance
         results[name]["seconds"] = time.perf_counter() - clock
         if output is not None:
-            from dolfinx_nts.pictures import picture
-
-            Path(output).mkdir(parents=True, exist_ok=True)
             picture(system.bodies, str(Path(output) / f"block_{name}.png"), colour="speed")
     if comm.rank == 0:
         report(results, dt)
@@ -141,7 +143,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", help="folder for pictures")
+    parser.add_argument("--output", default="out/flying_l_block", help="pictures and fields")
     parser.add_argument("--dt", type=float, default=1.0)
     parser.add_argument("--t-end", type=float, default=50.0)
-    main(**vars(parser.parse_args()))
+    main(progress=True, **vars(parser.parse_args()))

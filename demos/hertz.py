@@ -37,7 +37,7 @@ Pressing takes several load steps where there is friction. A node that closes it
 step counts its whole way along the facet in that step as slip, although it touches only at the
 end; the traction that this leaves behind, seen at scale 1, shrinks with the step.
 
-    mpirun -n 2 python demos/hertz.py --output out/hertz
+    mpirun -n 2 python demos/hertz.py
 """
 
 import argparse
@@ -51,6 +51,8 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
+from dolfinx_nts.output import Fields
+from dolfinx_nts.pictures import picture
 
 MESHES = runpy.run_path(str(Path(__file__).resolve().parents[1] / "meshes" / "half_round.py"))
 #: Size of the finely meshed block over the half-width of contact.
@@ -195,39 +197,42 @@ def scene(comm, problem, *, held=(), loads=(), whole=False, friction=0.0):
     return nts.System([upper, lower], contacts=[pair])
 
 
-def press(comm, problem):
-    """Equilibrium under an even pressure on the flat face."""
+def press(comm, problem, **options):
+    """Equilibrium under an even pressure on the flat face; `options` are of `equilibrium`."""
     r, n = problem.radius, problem.cells
     rim = np.sin(np.diff(np.arctan(np.arange(n + 1) / n)))  # the face of a sphere is a polygon
     area = 4 * r**2 * rim.sum() if problem.spheres else 2 * r
     load = nts.Traction(plane(problem, 2, r), (0.0, 0.0, -problem.force / area))
-    return nts.equilibrium(scene(comm, problem, loads=[load]), load_steps=2)
+    return nts.equilibrium(scene(comm, problem, loads=[load]), load_steps=2, **options)
 
 
-def depth(comm, problem):
+def depth(comm, problem, *, progress=False):
     """How far a plate on the flat face goes down under the force [m], without friction."""
     top = plane(problem, 2, problem.radius)
     a, per_modulus = problem.half_width, problem.force / np.pi / problem.modulus
     most = 1.2 * per_modulus * (2 * np.log(4 * problem.radius / a) - 1)
     down = nts.Dirichlet(top, value=lambda t: (0, 0, -most * t), components=(2,))
     parts = np.array([0.7, 0.8, 0.9, 1.0])
-    run = nts.equilibrium(scene(comm, problem, held=[down]), load_steps=parts)
+    run = nts.equilibrium(
+        scene(comm, problem, held=[down]), load_steps=parts, progress=progress
+    )
     force = pressing_force(problem, run, parts=2)[1:]
     return most * np.polyval(np.polyfit(force / problem.force, parts, 3), 1.0)
 
 
-def press_and_shear(comm, problem):
+def press_and_shear(comm, problem, *, progress=False, **options):
     """Equilibrium after pressing, until t = 1, and shearing, until t = 2.
 
-    The plate keeps the face level, which a dead load would not: it would roll off.
+    The plate keeps the face level, which a dead load would not: it would roll off. `options` are of
+    `equilibrium`.
     """
-    top, deepest = plane(problem, 2, problem.radius), depth(comm, problem)
+    top, deepest = plane(problem, 2, problem.radius), depth(comm, problem, progress=progress)
     down = nts.Dirichlet(top, value=lambda t: (0, 0, -deepest * min(t, 1.0)), components=(2,))
     most = problem.shear / (2 * problem.radius)
     shear = nts.Traction(top, lambda t: (most * max(t - 1.0, 0.0), 0, 0))
     steps = [*np.linspace(0, 1, PRESSING + 1)[1:], *np.linspace(1, 2, SHEARING + 1)[1:]]
     system = scene(comm, problem, held=[down], loads=[shear], whole=True, friction=problem.friction)
-    return nts.equilibrium(system, load_steps=steps)
+    return nts.equilibrium(system, load_steps=steps, progress=progress, **options)
 
 
 def pressing_force(problem, run, *, parts):
@@ -360,15 +365,17 @@ def main(
     problems=tuple(PROBLEMS),
     scales=(1.0, 0.01),
     refinement=1.0,
+    progress=False,
 ):
     """Solve the problems.
 
     Args:
         comm: MPI communicator.
-        output: Folder for profiles (CSV) and a picture, or None.
+        output: Folder for profiles (CSV), pictures and fields, or None.
         problems: Which of "cylinders", "friction", "spheres".
         scales: Sizes of contact and strains over those of the problem as prescribed.
         refinement: Cells across the contact over those of the demo's mesh.
+        progress: Show a progress line.
 
     Returns:
         {problem: {scale: figures}}; see `figures`.
@@ -381,7 +388,13 @@ def main(
             problem = PROBLEMS[name].scaled(scale)
             problem = replace(problem, cells=round(refinement * problem.cells))
             solve = press_and_shear if problem.shear > 0 else press
-            result = figures(problem, solve(comm, problem))
+            folder = output and Path(output) / f"{name}_{scale:g}"
+            writers = [Fields(folder)] if folder else []
+            run = solve(comm, problem, output=writers, progress=progress)
+            if folder:
+                bodies = run.system.bodies
+                picture(bodies, folder / "stress.png", colour="stress", view=(10.0, -75.0))
+            result = figures(problem, run)
             result["seconds"] = time.perf_counter() - clock
             results[name][scale] = result
             if comm.rank == 0:
@@ -393,8 +406,8 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", help="folder for profiles and a picture")
+    parser.add_argument("--output", default="out/hertz", help="profiles, pictures and fields")
     parser.add_argument("--problems", nargs="+", choices=PROBLEMS, default=tuple(PROBLEMS))
     parser.add_argument("--scales", nargs="+", type=float, default=(1.0, 0.01))
     parser.add_argument("--refinement", type=float, default=1.0)
-    main(**vars(parser.parse_args()))
+    main(progress=True, **vars(parser.parse_args()))

@@ -22,7 +22,7 @@ together than the nodes of the block; and the block's surface is smooth. Without
 sinks into the corners between facets and jumps from one to the next: no equilibrium follows from
 the one before, however small the step, and the run stops (`--faceted`).
 
-    mpirun -n 2 python demos/ironing.py --output out/ironing
+    mpirun -n 2 python demos/ironing.py
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import BalanceCSV
+from dolfinx_nts.output import BalanceCSV, Fields
 from dolfinx_nts.parallel import write_on_root
 from dolfinx_nts.pictures import picture
 
@@ -199,7 +199,7 @@ def main(
         smoothing: Whether the block's surface is smooth or of facets.
         steps: Load steps of the whole ways down and along; the published runs took 100 and 500.
         end: Time of the last load step.
-        output: Folder for tables and pictures.
+        output: Folder for tables, pictures and fields.
         progress: Show a progress line.
 
     Returns:
@@ -209,7 +209,12 @@ def main(
     times = np.concatenate([down, 1 + along])
     writers: list[Any] = []
     if output:
-        writers = [BalanceCSV(Path(output) / "balance.csv"), Pictures(Path(output), (*BAND, end))]
+        folder = Path(output)
+        writers = [
+            BalanceCSV(folder / "balance.csv"),
+            Fields(folder, interval=0.05),
+            Pictures(folder, (*BAND, end)),
+        ]
     clock = time.perf_counter()
     run = nts.equilibrium(
         scene(comm, block=block, die=die, smoothing=smoothing),
@@ -266,7 +271,7 @@ def write(result: dict[str, Any], folder: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", help="folder for tables and pictures")
+    parser.add_argument("--output", default="out/ironing", help="tables, pictures and fields")
     parser.add_argument("--block", type=int, nargs=2, default=(48, 6), help="hexahedra")
     parser.add_argument("--die", type=int, nargs=2, default=(12, 4), help="hexahedra")
     parser.add_argument("--steps", type=int, nargs=2, default=(25, 250), help="down and along")

@@ -21,7 +21,7 @@ What to see. Sliding follows the straight lines, all nodes in contact slip until
 afterwards, and friction takes the third of the energy that it must. With the energy-momentum scheme
 what the ledger misses is round-off.
 
-    mpirun -n 2 python demos/rolling.py --output out/rolling
+    mpirun -n 2 python demos/rolling.py
 """
 
 import argparse
@@ -34,6 +34,8 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
+from dolfinx_nts.output import Fields
+from dolfinx_nts.pictures import picture
 
 RADIUS, WIDTH, DENSITY, GRAVITY = 1.0, 0.5, 1e3, 9.81
 SPEED, FRICTION = 3.0, 0.3
@@ -128,31 +130,16 @@ class Recorder:
 
     def start(self, stepper):
         """Begin anew with the state the run starts from."""
-        body = stepper.system.bodies[0]
-        self.mass = self._sum(body, np.tile([1.0, 0.0, 0.0], body.num_owned // 3))[0][0]
-        middle = self._sum(body, body.reference)[0] / self.mass
-        arm = body.reference.reshape(-1, 3) - middle
-        spin = np.cross([0.0, 1.0, 0.0], arm).ravel()
-        momentum = body.inertia(spin)
-        inertia = (np.cross(arm, momentum.reshape(-1, 3)).sum(axis=0))[1]
-        self.inertia = body.comm.allreduce(float(inertia))
+        wheel = nts.motion_of(stepper.system.bodies[0])
+        self.mass, self.inertia = wheel.mass, wheel.inertia[1, 1]
         self.rows = []
         self.write(stepper)
 
-    def _sum(self, body, field):
-        """Integrals of density times a field and times its moment about the origin."""
-        momentum = body.inertia(field)
-        return body.comm.allreduce(body.linear_momentum(momentum)), momentum
-
     def write(self, stepper, *, last=False):
         """Add the accepted state."""
-        body, state = stepper.system.bodies[0], stepper.state
-        u, v = state.u[0], state.v[0]
-        centre = self._sum(body, body.reference + u)[0] / self.mass
-        total, momentum = self._sum(body, v)
-        moment = body.comm.allreduce(body.angular_momentum(u, momentum))
-        moment = moment - np.cross(centre, total)
-        self.rows.append((state.time, *centre, total[0] / self.mass, moment[1] / self.inertia))
+        wheel = nts.motion_of(stepper.system.bodies[0])
+        row = (stepper.state.time, *wheel.centre, wheel.velocity[0], wheel.spin[1])
+        self.rows.append(row)
 
     def close(self, stepper):
         """Make columns of the rows."""
@@ -166,9 +153,9 @@ def rigid(t, kappa):
     return SPEED - FRICTION * GRAVITY * t, FRICTION * GRAVITY * t / kappa
 
 
-def figures(run, wheel, start):
+def figures(run, wheel):
     """The wheel against the rigid one; speeds over v0, energies over m v0^2 / 2."""
-    t, b = wheel.time - start, run.balance
+    t, b = wheel.time, run.balance
     kappa = wheel.inertia / wheel.mass / RADIUS**2
     energy = wheel.mass * SPEED**2 / 2
     speed, spin = rigid(t, kappa)
@@ -244,34 +231,40 @@ def main(
     dt=4e-3,
     duration=0.7,
     integrators=tuple(INTEGRATORS),
+    progress=False,
 ):
     """Throw the wheel with each integrator.
 
     Args:
         comm: MPI communicator.
-        output: Folder for pictures, or None.
+        output: Folder for pictures and fields, or None.
         facets: Facets around the rim, a multiple of 8.
         dt: Step [s].
         duration: From the throw to the end of the run [s].
         integrators: Which of "energy-momentum", "midpoint".
+        progress: Show a progress line.
 
     Returns:
         {integrator: figures}; see `figures`.
     """
-    settled = nts.equilibrium(scene(comm, facets, settle=True), load_steps=4)
-    start = settled.state.time
+    settled = nts.equilibrium(scene(comm, facets, settle=True), load_steps=4, progress=progress)
     results, balances = {}, {}
     for name in integrators:
-        wheel, clock = Recorder(), time.perf_counter()
+        wheel, clock, system = Recorder(), time.perf_counter(), scene(comm, facets, settle=False)
+        folder = output and Path(output) / name
         run = nts.simulate(
-            scene(comm, facets, settle=False),
+            system,
             INTEGRATORS[name],
             dt=dt,
-            t_end=start + duration,
-            output=[wheel],
+            t_end=duration,
+            output=[wheel, *([Fields(folder, every=5)] if folder else [])],
+            progress=progress,
             start=settled,
+            start_time=0.0,
         )
-        results[name] = figures(run, wheel, start)
+        if folder:
+            picture(system.bodies, folder / "wheel.png", view=(10.0, -75.0))
+        results[name] = figures(run, wheel)
         results[name]["seconds"] = time.perf_counter() - clock
         balances[name] = run.balance
     if comm.rank == 0:
@@ -283,7 +276,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", help="folder for pictures")
+    parser.add_argument("--output", default="out/rolling", help="pictures and fields")
     parser.add_argument("--facets", type=int, default=48)
     parser.add_argument("--dt", type=float, default=4e-3)
-    main(**vars(parser.parse_args()))
+    main(progress=True, **vars(parser.parse_args()))

@@ -13,7 +13,7 @@ round-off with each of them. The midpoint rule, stable with every step for linea
 by an amount that grows with the square of the step (4e-4 with h = 0.01, 1.3e-2 with 0.05); with
 h = 0.1 it multiplies the energy until Newton's method fails. Both keep the momenta.
 
-    mpirun -n 2 python demos/rotating_cross.py --output out/rotating_cross
+    mpirun -n 2 python demos/rotating_cross.py
 """
 
 import argparse
@@ -25,6 +25,8 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
+from dolfinx_nts.output import Fields
+from dolfinx_nts.pictures import picture
 
 DENSITY, OMEGA, ARM = 1000.0, 4.0, 3
 INTEGRATORS = {"energy-momentum": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}
@@ -94,16 +96,18 @@ def main(
     t_end=5.0,
     refine=1,
     integrators=tuple(INTEGRATORS),
+    progress=False,
 ):
     """Run the cross with each integrator and step.
 
     Args:
         comm: MPI communicator.
-        output: Folder for pictures, or None.
+        output: Folder for pictures and fields, or None.
         steps: Step sizes [s].
         t_end: End of each run [s].
         refine: Elements across an arm.
         integrators: Which of "energy-momentum", "midpoint".
+        progress: Show a progress line.
 
     Returns:
         {(integrator, step): figures}; see `figures`.
@@ -111,11 +115,15 @@ def main(
     results, balances = {}, {}
     for name in integrators:
         for dt in steps:
-            clock = time.perf_counter()
+            clock, system = time.perf_counter(), scene(comm, refine)
+            folder = output and Path(output) / f"{name}_{dt:g}"
             run = nts.simulate(
-                scene(comm, refine), INTEGRATORS[name], dt=dt, t_end=t_end, newton=NEWTON,
-                petsc_options=LINE_SEARCH,
+                system, INTEGRATORS[name], dt=dt, t_end=t_end, newton=NEWTON,
+                petsc_options=LINE_SEARCH, progress=progress,
+                output=[Fields(folder, interval=0.1)] if folder else [],
             )  # fmt: skip
+            if folder:
+                picture(system.bodies, folder / "cross.png", colour="stress")
             results[name, dt], balances[f"{name}, h = {dt:g}"] = figures(run), run.balance
             results[name, dt]["seconds"] = time.perf_counter() - clock
     if comm.rank == 0:
@@ -130,7 +138,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", help="folder for pictures")
+    parser.add_argument("--output", default="out/rotating_cross", help="pictures and fields")
     parser.add_argument("--t-end", type=float, default=5.0)
     parser.add_argument("--refine", type=int, default=1, help="elements across an arm")
-    main(**vars(parser.parse_args()))
+    main(progress=True, **vars(parser.parse_args()))

@@ -13,7 +13,7 @@ What to see:
 - no node penetrates with either of them.
 
 Run it with `python demos/two_blocks.py`, or unchanged on two ranks with
-`mpirun -n 2 python demos/two_blocks.py --output out/two_blocks`.
+`mpirun -n 2 python demos/two_blocks.py`.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _print(results: dict[str, dict[str, Any]]) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", help="folder for tables, plots, pictures and fields")
+    parser.add_argument("--output", default="out/two_blocks", help="tables, pictures, fields")
     parser.add_argument("--dt", type=float, default=2e-3, help="step [s]")
     parser.add_argument("--t-end", type=float, default=0.2, help="end of the run [s]")
     parser.add_argument("--cells", type=int, nargs=2, default=(4, 3), help="cells along the edges")

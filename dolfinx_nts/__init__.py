@@ -25,6 +25,7 @@ from dolfinx_nts.integrators import (
 )
 from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.motion import BodyMotion, motion_of
 from dolfinx_nts.newton import Newton
 from dolfinx_nts.nts_element import Gap
 from dolfinx_nts.obstacle_pair import ObstaclePair
@@ -33,14 +34,17 @@ from dolfinx_nts.points import Points
 from dolfinx_nts.simulate import Solution, Stepper, simulate
 from dolfinx_nts.step_size import Adapt
 from dolfinx_nts.strain_energy import Isotropic
+from dolfinx_nts.stress import cauchy_stress, von_mises
 from dolfinx_nts.surfaces import Surface
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
+from dolfinx_nts.writer import Writer
 
 __version__ = version("dolfinx_nts")
 __all__ = [
     "Adapt",
     "Body",
+    "BodyMotion",
     "ContactPair",
     "Continuum",
     "Coupling",
@@ -78,8 +82,12 @@ __all__ = [
     "System",
     "Traction",
     "UserFunctionError",
+    "Writer",
     "bodies_from_gmsh",
     "bodies_from_tags",
+    "cauchy_stress",
     "equilibrium",
+    "motion_of",
     "simulate",
+    "von_mises",
 ]

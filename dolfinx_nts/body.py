@@ -43,6 +43,7 @@ class Body(Protocol):
         num_owned: Coordinates this rank owns; the global numbering is contiguous by rank.
         reference: X [m], shape (num_owned,).
         initial_velocity: v at the start [m/s], shape (num_owned,).
+        initial_displacement: u at the start [m], shape (num_owned,); may be missing, and is 0 then.
         nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
         fixed: Positions of the prescribed coordinates among the owned ones.
         rounded: Length [m], the same on all ranks, whose rounding the forces hold beside that of u;

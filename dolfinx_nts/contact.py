@@ -183,8 +183,12 @@ class ContactPair:
         x: FloatArray = positions[0][self.slave.share[found.node]][:, None]
         return x
 
-    def depth(self) -> FloatArray | float:
-        """How deep slaves start inside another body, in facet sizes, wherever. Collective."""
+    def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
+        """How deep slaves start inside another body, in facet sizes, wherever. Collective.
+
+        Args:
+            u: Owned displacements of each of `bodies` at the start [m].
+        """
         return 0.0
 
     def find(

@@ -110,6 +110,9 @@ class Continuum:
         density: Reference density [kg/m^3], > 0.
         velocity: Initial velocity [m/s]: a vector, or a callable x (3, n) -> (3, n) as in DOLFINx's
             interpolate.
+        displacement: Displacement [m] from the stress-free mesh in which the body starts, as
+            `velocity`; prescribed coordinates start where their condition says. `equilibrium` takes
+            it as its first guess, so that its ledger misses the energy stored in the guess.
         bcs: `Dirichlet` conditions, fixed or moving in time.
         name: Name in messages and files.
         degree: Polynomial degree; contact surfaces need 1.
@@ -133,7 +136,8 @@ class Continuum:
     Raises:
         TypeError: `material`, `extra_form`, `name` or a condition is not of the right kind, or what
             the first two make cannot be compiled on this mesh.
-        ValueError: An argument is out of range, or the mesh is not a valid 3D mesh.
+        ValueError: An argument is out of range, the mesh is not a valid 3D mesh, or `displacement`
+            turns a cell inside out.
     """
 
     def __init__(
@@ -143,6 +147,7 @@ class Continuum:
         *,
         density: float,
         velocity: Any = (0.0, 0.0, 0.0),
+        displacement: Any = (0.0, 0.0, 0.0),
         bcs: Sequence[Dirichlet] = (),
         name: str = "body",
         degree: int = 1,
@@ -196,6 +201,7 @@ class Continuum:
             self._at(f"Dirichlet.value of bcs[{k}]", condition.value, 0.0, "m")
         self._set_conditions(bcs)
         self._set_velocity(velocity)
+        self._set_displacement(displacement)
         self._build_constant_forms()
         self._compiled: dict[Integrator, tuple[Any, Any, Any]] = {}
         self._stiffness: FloatArray | None = None
@@ -303,20 +309,42 @@ class Continuum:
         self._condition = owner[self.fixed]
 
     def _set_velocity(self, velocity: Any) -> None:
-        if callable(velocity):
-            # The nodes of Lagrange elements are their interpolation points.
-            x = self.space.tabulate_dof_coordinates().T
-            values = at_points(self.comm, f"velocity of {self.name!r}", velocity, x, (3,))
-            self.v.x.array[:] = values.T.ravel()
-        else:
-            constant = vector("velocity", velocity, "m/s", or_else="a callable x (3, n) -> (3, n)")
-            self.v.x.array[:] = np.tile(constant, len(self.v.x.array) // 3)
+        self._interpolate(self.v, "velocity", velocity, "m/s")
         values = self.v.x.array
         for value, parts in self._conditions:
             for _, dofs in parts if not callable(value) else ():
                 values[dofs] = 0.0
         self.v.x.scatter_forward()
         self.initial_velocity = values[: self.num_owned].copy()
+
+    def _set_displacement(self, displacement: Any) -> None:
+        self._interpolate(self.u, "displacement", displacement, "m")
+        moves = self.comm.allreduce(bool(self.u.x.array.any()), op=MPI.LOR)
+        self.u.x.array[self.fixed] = self.prescribed(0.0)
+        self.u.x.scatter_forward()
+        self.initial_displacement = self.u.x.array[: self.num_owned].copy()
+        if not moves or self.allow_inversion:
+            return
+        smallest = self._determinants.smallest(self.u.x.array)
+        det, place = min(self.comm.allgather(smallest), key=lambda found: found[0])
+        if det <= 0.0:
+            where = ", ".join(f"{x:.4g}" for x in place)
+            raise ValueError(
+                f"displacement of {self.name!r}: with its Dirichlet values at t=0 it turns a cell "
+                f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
+            )
+
+    def _interpolate(self, function: Any, name: str, given: Any, unit: str) -> None:
+        """Fill a Function from a vector or a callable x (3, n) -> (3, n)."""
+        values = function.x.array
+        if callable(given):
+            # The nodes of Lagrange elements are their interpolation points.
+            x = self.space.tabulate_dof_coordinates().T
+            found = at_points(self.comm, f"{name} of {self.name!r}", given, x, (3,))
+            values[:] = found.T.ravel()
+        else:
+            constant = vector(name, given, unit, or_else="a callable x (3, n) -> (3, n)")
+            values[:] = np.tile(constant, len(values) // 3)
 
     def _build_constant_forms(self) -> None:
         # A Constant, not a number: bodies of any density share one compiled form.

@@ -129,18 +129,42 @@ def create_submesh(msh: Any, dim: int, entities: npt.ArrayLike) -> tuple[Any, In
 
 
 # ---- spaces and functions
+@contextmanager
+def _quiet_compiler() -> Iterator[None]:
+    """0.5.2 sends the C compiler's progress to the root logger, whose level it raises itself.
+
+    Of spaces, too: their elements are compiled. Errors are still raised and printed.
+    """
+    before = logging.root.manager.disable
+    logging.disable(logging.INFO)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
 def vector_space(msh: Any, degree: int) -> Any:
     """Continuous Lagrange space of 3-vectors."""
     if _OLD:
-        return fem.VectorFunctionSpace(msh, ("Lagrange", degree), dim=3)
+        with _quiet_compiler():
+            return fem.VectorFunctionSpace(msh, ("Lagrange", degree), dim=3)
     return fem.functionspace(msh, ("Lagrange", degree, (3,)))
 
 
 def scalar_space(msh: Any, family: str, degree: int) -> Any:
     """Scalar space of the family ("Lagrange" or "DG")."""
     if _OLD:
-        return fem.FunctionSpace(msh, (family, degree))
+        with _quiet_compiler():
+            return fem.FunctionSpace(msh, (family, degree))
     return fem.functionspace(msh, (family, degree))
+
+
+def tensor_space(msh: Any, family: str, degree: int) -> Any:
+    """Space of 3 x 3 tensors of the family ("Lagrange" or "DG")."""
+    if _OLD:
+        with _quiet_compiler():
+            return fem.TensorFunctionSpace(msh, (family, degree), shape=(3, 3))
+    return fem.functionspace(msh, (family, degree, (3, 3)))
 
 
 def interpolation_points(space: Any) -> FloatArray:
@@ -187,17 +211,6 @@ def subspace_component_bc(space: Any, component: int, blocked_dofs: IntArray) ->
 
 
 # ---- forms and assembly
-@contextmanager
-def _quiet_compiler() -> Iterator[None]:
-    """0.5.2 sends the C compiler's progress to the root logger, whose level it raises itself."""
-    before = logging.root.manager.disable
-    logging.disable(logging.INFO)
-    try:
-        yield
-    finally:
-        logging.disable(before)
-
-
 def compile_forms(forms: Sequence[Any]) -> list[Any]:
     """Compile forms; signatures first because 0.5.2's depend on what was compiled before."""
     for f in forms:

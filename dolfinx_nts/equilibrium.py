@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,6 +27,7 @@ from dolfinx_nts.validation import (
     require_bool,
     require_positive,
 )
+from dolfinx_nts.writer import Writer
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -97,16 +98,28 @@ class _LoadStepper(Stepper):
         self._rates = [np.zeros_like(u) for u in self.state.u]
         self._forces = [np.zeros_like(u) for u in self.state.u]
         self._accept(replace(self.state, v=tuple(self._rates)))
-        row = balance.first_row(system, self.state)
-        row |= {_reactions(b): b.reactions(np.zeros(b.num_owned)) for b in system.bodies}
-        row["contact_forces"] = np.zeros((len(system.contacts), 3))
-        self.solution = Equilibrium(system, rows=Table([row]), state=self.state)
+        self.solution = Equilibrium(system, rows=self._first_rows(), state=self.state)
+
+    def _first_rows(self) -> Table:
+        bodies, contacts = self.system.bodies, len(self.system.contacts)
+        row = balance.first_row(self.system, self.state)
+        row |= {_reactions(b): b.reactions(np.zeros(b.num_owned)) for b in bodies}
+        return Table([row | {"contact_forces": np.zeros((contacts, 3))}])
 
     def start(self, dt: float) -> None:
-        """Nothing moves at the start."""
+        """Nothing moves at the start, but the user may change a material; later calls do nothing.
+
+        Args:
+            dt: First load step, in pseudo time.
+        """
+        if self._started:
+            return
+        self._call_before(dt)
+        self._materials.changed()
+        self.solution.rows, self._started = self._first_rows(), True
 
     def _step(self, dt: float, time: float) -> None:
-        self._note_materials()
+        self._prepare(dt)
         old = self.state
         step, state, iterations, lost = self._relax(dt, time)
         self._rates = [(a - b) / dt for a, b in zip(state.u, old.u, strict=True)]
@@ -248,9 +261,10 @@ def equilibrium(
     stabilization: float | None = None,
     newton: Newton | None = None,
     petsc_options: Mapping[str, Any] | None = None,
-    output: Sequence[Any] = (),
+    output: Sequence[Writer] = (),
     progress: bool = False,
     watch_overlap: bool = True,
+    before_step: Callable[[float, float], Any] | None = None,
 ) -> Equilibrium:
     """Equilibrium of a system under its loads, reached in load steps of a pseudo time from 0.
 
@@ -266,9 +280,9 @@ def equilibrium(
 
     The ledger closes as the square of the load steps: work is that of the mean of their forces.
 
-    A dynamic run starts from the result, at its pseudo time and with the initial velocities of the
-    bodies: `t_end=1.2` is 0.2 s later, and a motion that begins with the run is a function of
-    `max(t - 1, 0)`. Bodies correspond by name, so that what holds them may differ:
+    A dynamic run starts from the result with the initial velocities of the bodies, at its pseudo
+    time, or at the `start_time` of `simulate`, from which its functions of time count. Bodies
+    correspond by name, so that what holds them may differ:
 
         def block(bcs=()):
             return nts.Continuum(mesh, rubber, density=1e3, bcs=bcs, name="block")
@@ -279,7 +293,9 @@ def equilibrium(
 
         pulled = nts.Dirichlet(top, value=lambda t: (0, 0, -0.02 * t))
         settled = nts.equilibrium(scene(block([pulled])), load_steps=10)
-        run = nts.simulate(scene(block()), nts.EnergyMomentum(), dt=1e-3, t_end=1.2, start=settled)
+        run = nts.simulate(
+            scene(block()), nts.EnergyMomentum(), dt=1e-3, t_end=0.2, start=settled, start_time=0.0
+        )
 
     Args:
         system: The scene.
@@ -290,15 +306,16 @@ def equilibrium(
             forces. 0.1 is a good value.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
-        output: Writers of `dolfinx_nts.output`; each is called after every load step that its
-            cadence asks for.
+        output: Writers, as in `simulate`; all ranks call them after every load step.
         progress: Show a progress line on rank 0.
         watch_overlap: Look whether bodies of a contact end up inside each other, as in `simulate`.
+        before_step: Callable (time, dt) before every attempt at a load step, with the pseudo time
+            at its start and its length; see `simulate`. Loads of a load step are those at its end.
 
     Returns:
         The Equilibrium; the bodies' u hold it. A run that fails says so in `status` and keeps
-        everything computed until then, also where a function of time or a writer raises, on any
-        rank.
+        everything computed until then, also where a function of time, `before_step` or a writer
+        raises, on any rank.
 
     Raises:
         ValueError: An argument is out of range; before any work.
@@ -312,7 +329,7 @@ def equilibrium(
         _check_bodies(system)
     stepper = _LoadStepper(
         system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options,
-        watch_overlap=watch_overlap,
+        watch_overlap=watch_overlap, before_step=before_step,
     )  # fmt: skip
     run(stepper, times, output, dt=times[0], progress=progress, remedy=_REMEDY)
     return stepper.solution

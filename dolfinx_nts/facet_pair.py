@@ -75,11 +75,11 @@ class FacetPair(ContactPair, master=Surface):
         )
         return f"the same facets of {self.master.body.name!r}" if one & two else None
 
-    def depth(self) -> FloatArray | float:
+    def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
         """How deep slaves start inside the master's body, in facet sizes. Collective."""
         if self.slave.body is self.master.body:
             return 0.0
-        depth: FloatArray = self.master.depth(self.slave.reference)
+        depth: FloatArray = self.master.depth(self.slave.positions(u[0]), u[1])
         return depth
 
     def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, ...]:

@@ -1,8 +1,8 @@
 """Writers for `simulate(output=[...])`: fields of the bodies and the balance table.
 
-A writer has `start(stepper)`, `write(stepper, last=...)` and `close(stepper)`, which all ranks call
-together. Rank 0 alone touches files: it gathers owned values and orders them by the numbers of the
-mesh's input, so the files do not depend on the partition.
+They have the `Writer` protocol, which all ranks call together. Rank 0 alone touches files: it
+gathers owned values and orders them by the numbers of the mesh's input, so the files do not depend
+on the partition.
 """
 
 from __future__ import annotations

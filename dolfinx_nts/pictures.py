@@ -8,46 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import ufl
-from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.plots import save_figure
-from dolfinx_nts.strain_energy import green_strain, strain_energy
+from dolfinx_nts.stress import von_mises
 from dolfinx_nts.surfaces import oriented_nodes
 from dolfinx_nts.validation import StrPath, as_path, floats, items, require_bool, require_positive
 
 FloatArray = npt.NDArray[np.float64]
-
-
-def von_mises(body: Any) -> Any:
-    """Von Mises measure of the Cauchy stress F S F^T / J at `body.u`, cell means; collective.
-
-    Args:
-        body: Continuum with any material.
-
-    Returns:
-        Function of degree 0 [Pa].
-    """
-    space = compat.scalar_space(body.mesh, "DG", 0)
-    h = ufl.grad(body.u)
-    f = ufl.Identity(3) + h
-    cauchy = f * strain_energy(body.material).stress(green_strain(h)) * f.T / ufl.det(f)
-    deviator = ufl.dev(cauchy)
-    q = ufl.TestFunction(space)
-    dx = ufl.Measure("dx", body.mesh, metadata={"quadrature_degree": 2 * body.degree})
-    size = ufl.sqrt(1.5 * ufl.inner(deviator, deviator))
-    forms = compat.compile_forms([size * q * dx, q * dx])
-    result, vector = fem.Function(space, name="von_mises"), compat.create_vector(space)
-    owned = space.dofmap.index_map.size_local
-    for form, power in zip(forms, (1.0, -1.0), strict=True):
-        compat.assemble_vector(vector, form)
-        part = vector.array_r**power
-        result.x.array[:owned] = part if power > 0 else part * result.x.array[:owned]
-    vector.destroy()
-    result.x.scatter_forward()
-    return result
 
 
 def picture(

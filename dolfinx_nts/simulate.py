@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -30,11 +30,14 @@ from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
     as_path,
+    call_together,
+    is_finite,
     items,
     known_options,
     require_bool,
     require_positive,
 )
+from dolfinx_nts.writer import Writer
 
 logger = logging.getLogger(__name__)
 
@@ -163,8 +166,10 @@ class Stepper:
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
         start: Result of `equilibrium` to start from; see there.
+        start_time: Time at the start [s]; see `simulate`.
         sleep: Leave bodies that nothing moves out of the steps; see `simulate`.
         watch_overlap: Look whether bodies end up inside each other; see `simulate`.
+        before_step: Called before every attempt at a step; see `simulate`.
 
     Attributes:
         state: Last accepted state.
@@ -181,8 +186,10 @@ class Stepper:
         newton: Newton | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         start: Solution | None = None,
+        start_time: float | None = None,
         sleep: bool = False,
         watch_overlap: bool = True,
+        before_step: Callable[[float, float], Any] | None = None,
     ) -> None:
         if not isinstance(system, System):
             raise TypeError(f"system={system!r}: pass a System([body, ...])")
@@ -206,6 +213,9 @@ class Stepper:
             )
         require_bool("sleep", sleep)
         require_bool("watch_overlap", watch_overlap)
+        if not callable(before_step) and before_step is not None:
+            raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
+        self._before_step = before_step
         self.newton = newton or Newton()
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
@@ -221,7 +231,7 @@ class Stepper:
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._measured: dict[str, balance.Measured] = {}
         self._recent: deque[tuple[float, tuple[FloatArray, ...]]] = deque(maxlen=2)
-        self._accept(_first_state(system, start))
+        self._accept(_first_state(system, start, start_time))
         self.solution = Solution(system, rows=Table([balance.first_row(system, self.state)]))
         self._promises = Promises(
             self.solution,
@@ -246,8 +256,8 @@ class Stepper:
             ValueError: dt is not positive.
             StepFailedError: Not solved even with the smallest step; everything accepted so far is
                 kept.
-            UserFunctionError: A function of time raised or returned no vector on some rank; not
-                tried again, everything is kept.
+            UserFunctionError: A function of time raised or returned no vector on some rank, or
+                `before_step` raised; not tried again, everything is kept.
         """
         require_positive("dt", dt, "s")
         dt = float(dt)
@@ -297,12 +307,11 @@ class Stepper:
             now = self.state.time
             left = end - now
             dt = pace.propose(left)
-            self._note_materials()
-            self.problem.begin(self.state, dt)
+            self._begin(dt)
             part = pace.first_touch(self.problem)
             if part < 1.0:
                 dt *= part
-                self.problem.begin(self.state, dt)
+                self._begin(dt)
             try:
                 trial = self._attempt(dt, end if dt == left else now + dt)
             except StepFailedError as failure:
@@ -332,6 +341,9 @@ class Stepper:
         """
         if self._started:
             return
+        self._call_before(dt)
+        # What the first call sets is what the run begins with.
+        self._materials.changed()
         v = [v.copy() for v in self.state.v]
         for body, values in zip(self.system.bodies, v, strict=True):
             p0, p1, p2 = (body.prescribed(self.state.time + s * dt) for s in (0.0, 0.5, 1.0))
@@ -362,9 +374,24 @@ class Stepper:
         self.state = state
 
     def _step(self, dt: float, time: float) -> None:
-        self._note_materials()
-        self.problem.begin(self.state, dt)
+        self._begin(dt)
         self._take(self._attempt(dt, time))
+
+    def _begin(self, dt: float) -> None:
+        """Fix the equations of a step from the last accepted state."""
+        self._prepare(dt)
+        self.problem.begin(self.state, dt)
+
+    def _prepare(self, dt: float) -> None:
+        """Let the user change what the forms of the step hold, and account for it."""
+        self._call_before(dt)
+        self._note_materials()
+
+    def _call_before(self, dt: float) -> None:
+        if self._before_step is not None:
+            time = self.state.time
+            name = f"before_step at t={time!r} with dt={dt!r}"
+            call_together(self.system.comm, name, self._before_step, time, dt)
 
     def _note_materials(self) -> None:
         """Name in the ledger what changed parameters of materials do to the stored energy."""
@@ -511,14 +538,19 @@ class Stepper:
         self.problem.destroy()
 
 
-def _first_state(system: System, start: Any) -> State:
+def _first_state(system: System, start: Any, time: Any) -> State:
+    if time is not None and not is_finite(time):
+        raise ValueError(f"start_time={time!r}: must be finite [s]")
     if start is None:
+        if time is not None:
+            raise ValueError(f"start_time={time!r}: pass start=, too, or leave it out")
         return system.initial_state()
     if not (isinstance(start, Solution) and hasattr(start, "state")):
         raise TypeError(
             f"start of type {type(start).__name__}: pass the result of equilibrium(...)"
         )
-    return system.state_from(start.system, start.state)
+    state = start.state if time is None else replace(start.state, time=float(time))
+    return system.state_from(start.system, state)
 
 
 def _is_writer(item: Any) -> bool:
@@ -534,15 +566,17 @@ def simulate(
     t_end: float,
     newton: Newton | None = None,
     petsc_options: Mapping[str, Any] | None = None,
-    output: Sequence[Any] = (),
+    output: Sequence[Writer] = (),
     progress: bool = False,
     start: Solution | None = None,
+    start_time: float | None = None,
     accuracy: str | None = None,
     sleep: bool = False,
     adapt: Adapt | None = None,
     watch_overlap: bool = True,
+    before_step: Callable[[float, float], Any] | None = None,
 ) -> Solution:
-    """Run a system from t = 0, or from where an equilibrium ended, to t_end.
+    """Run a system from t = 0, or from an equilibrium, to t_end.
 
     Args:
         system: The scene.
@@ -553,10 +587,25 @@ def simulate(
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix, e.g. {"pc_type":
             "fieldsplit"}.
-        output: Writers of `dolfinx_nts.output`; each is called after every accepted step that its
-            cadence asks for.
+        output: Writers of `dolfinx_nts.output`, or of one's own with the `Writer` protocol, which
+            all ranks call before the first step, after every accepted step and at the end:
+
+                class Heights:
+                    def start(self, stepper):
+                        self.rows = []
+                    def write(self, stepper, *, last=False):
+                        centre = nts.motion_of(stepper.system.bodies[0]).centre
+                        self.rows.append((stepper.state.time, centre[2]))
+                    def close(self, stepper):
+                        print(len(self.rows), "steps;", stepper.solution.status)
+
+                heights = Heights()
+                run = nts.simulate(system, integrator, dt=1e-3, t_end=0.2, output=[heights])
+
         progress: Show a progress line on rank 0.
         start: Result of `equilibrium` to start from; see there.
+        start_time: Time at which a run from `start` begins [s], from which functions of time and
+            `t_end` count; default: the pseudo time of `start`.
         accuracy: In place of `newton`: "exact" closes the ledger to rounding; "balanced" to about
             1e-8 and "fast" to about 1e-5 of the energy, with matrices kept over many steps.
         sleep: Leave a body out of a step while its velocity is exactly zero, its forces balance to
@@ -568,12 +617,31 @@ def simulate(
             boundaries, or an obstacle in the facets that it is the master of, and warn. It costs
             less than one part in fifty of the steps unless the bodies move by a quarter of a facet
             in few of them.
+        before_step: Callable (time, dt) that all ranks call before every attempt at a step, also
+            when it is cut or its length chosen anew, with the time at its start [s] and its length
+            [s]; the last call before a step is with the step's own. It may change the Constants and
+            Functions in a material and in an `extra_form`, here from an old load to a new one in
+            0.1 s:
+
+                load = fem.Constant(mesh, 0.0)
+                body = nts.Continuum(
+                    mesh, rubber, density=1e3, extra_form=lambda u, v, w, t: -load * w[2] * ufl.ds
+                )
+
+                def ramp(time, dt):
+                    load.value = 2e3 * min((time + dt / 2) / 0.1, 1.0)
+
+                run = nts.simulate(system, nts.EnergyMomentum(), ..., before_step=ramp)
+
+            It should depend on its arguments alone, as steps may be tried again. The first call
+            comes before the row of the start. What changes a material's energy later is
+            "material_change" in the balance.
 
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then,
-        also where a function of time or a writer raises, or returns what it must not, on any rank:
-        the run ends there, and all writers are closed. Only a writer that raises between collective
-        calls of its own on some ranks alone makes the others wait for ever.
+        also where a function of time, `before_step` or a writer raises, or returns what it must
+        not, on any rank: the run ends there, and all writers are closed. Only one that raises
+        between collective calls of its own on some ranks alone makes the others wait for ever.
 
     Raises:
         TypeError: An argument is of another type.
@@ -593,8 +661,8 @@ def simulate(
         )
     newton = _newton(newton, accuracy)
     stepper = Stepper(
-        system, integrator, newton=newton, petsc_options=petsc_options, start=start, sleep=sleep,
-        watch_overlap=watch_overlap,
+        system, integrator, newton=newton, petsc_options=petsc_options, start=start,
+        start_time=start_time, sleep=sleep, watch_overlap=watch_overlap, before_step=before_step,
     )  # fmt: skip
     begin = stepper.state.time
     if not t_end > begin:
@@ -625,7 +693,7 @@ def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
 def run(
     stepper: Stepper,
     times: Sequence[float],
-    output: Sequence[Any],
+    output: Sequence[Writer],
     *,
     dt: float,
     progress: bool,
@@ -645,7 +713,7 @@ def run(
     """
     solution, root = stepper.solution, stepper.system.comm.rank == 0
     bar = _progress_bar(None if adapt else len(times), progress and root)
-    started: list[Any] = []
+    started: list[Writer] = []
     try:
         try:
             _march(stepper, times, output, started, dt, adapt, bar)
@@ -672,8 +740,8 @@ def run(
 def _march(
     stepper: Stepper,
     times: Sequence[float],
-    output: Sequence[Any],
-    started: list[Any],
+    output: Sequence[Writer],
+    started: list[Writer],
     dt: float,
     adapt: Adapt | None,
     bar: Any,
@@ -711,7 +779,7 @@ def _stop(stepper: Stepper, reason: str, cause: BaseException | None = None) -> 
 
 
 def _call(
-    stepper: Stepper, output: Sequence[Any], name: str, **options: Any
+    stepper: Stepper, output: Sequence[Writer], name: str, **options: Any
 ) -> tuple[str | None, Exception | None]:
     """Call a method of all writers, also when one raises: what the first raised here, and it."""
     problem, cause = None, None
@@ -727,7 +795,7 @@ def _call(
 
 
 def _call_together(
-    stepper: Stepper, output: Sequence[Any], name: str, **options: Any
+    stepper: Stepper, output: Sequence[Writer], name: str, **options: Any
 ) -> tuple[str | None, Exception | None]:
     """`_call` with the first problem of any rank, on all ranks alike. Every rank must call it."""
     problem, cause = _call(stepper, output, name, **options)
@@ -746,9 +814,10 @@ def _moves(stepper: Stepper, times: Sequence[float], pace: Pace | None) -> Itera
                 yield final and stepper.state.time == time
 
 
-def writers(output: Any) -> tuple[Any, ...]:
+def writers(output: Any) -> tuple[Writer, ...]:
     """The argument `output`, checked."""
-    return items("output", output, _is_writer, "writers of dolfinx_nts.output")
+    wanted = "writers of dolfinx_nts.output, or others with the Writer protocol"
+    return items("output", output, _is_writer, wanted)
 
 
 def _progress_bar(steps: int | None, wanted: bool) -> Any:

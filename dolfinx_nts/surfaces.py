@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
@@ -220,19 +221,25 @@ class Surface:
         start = comm.exscan(len(self.rows)) or 0
         return table[start : start + len(self.rows)]
 
-    def depth(self, x: FloatArray) -> FloatArray:
-        """How deep points lie inside the undeformed body, in facet sizes. Collective.
+    def depth(self, x: FloatArray, u: FloatArray) -> FloatArray:
+        """How deep points lie inside the whole body, in facet sizes. Collective.
 
         Outside, and less than a thousandth of a facet deep, the depth is 0.
 
         Args:
             x: Points [m], shape (n, 3), the same on all ranks.
+            u: Owned displacements of the body [m].
 
         Returns:
             Shape (n,), the same on all ranks.
         """
-        mesh = self.body.mesh
-        corners = mesh.geometry.x[oriented_nodes(mesh, compat.exterior_facets(mesh))]
+        mesh, space = self.body.mesh, self.body.space
+        nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
+        moved = fem.Function(space)
+        moved.x.array[: len(u)] = u
+        moved.x.scatter_forward()
+        blocks = compat.node_blocks(mesh, space)[nodes]
+        corners = mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
         box = np.array(
             [corners.min(axis=(0, 1), initial=np.inf), -corners.max(axis=(0, 1), initial=-np.inf)]
         )

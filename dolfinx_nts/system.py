@@ -115,17 +115,17 @@ class System:
         self._check_overlap()
         start = self.initial_state()
         depths = self.penetration(start)
-        for k, pair in enumerate(self.contacts):
+        for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
             # The search looks half a facet deep; this, the whole body.
-            depths[k] = np.maximum(depths[k], pair.depth())
+            depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
         self._check_penetration(depths)
 
     def initial_state(self) -> State:
-        """Undeformed bodies with their initial velocities at t = 0."""
+        """Bodies with their initial displacements and velocities at t = 0."""
         contacts = tuple(ContactHistory.of_start(len(c.slave.share)) for c in self.contacts)
         return State(
             time=0.0,
-            u=tuple(self._prescribed(b) for b in self.bodies),
+            u=tuple(self._at_start(b) for b in self.bodies),
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
             a=(),
             histories=(contacts, *(joint.start() for joint in self.joints)),
@@ -181,8 +181,9 @@ class System:
         raise_together(body.comm, problem)
 
     @staticmethod
-    def _prescribed(body: Body) -> FloatArray:
-        u = np.zeros(body.num_owned)
+    def _at_start(body: Body) -> FloatArray:
+        given = getattr(body, "initial_displacement", None)
+        u = np.zeros(body.num_owned) if given is None else given.copy()
         u[body.fixed] = body.prescribed(0.0)
         return u
 

@@ -118,6 +118,27 @@ def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tu
     return found
 
 
+def call_together(comm: Any, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """What the user's function returns; what it raises on one rank raises on all.
+
+    Args:
+        comm: MPI communicator.
+        name: Name of the argument, and when it is called.
+        function: What every rank calls.
+        *arguments: Its arguments.
+
+    Raises:
+        UserFunctionError: It raised on some rank.
+    """
+    problem, cause, value = None, None, None
+    try:
+        value = function(*arguments)
+    except Exception as error:  # any: a rank that raises alone would leave the others waiting
+        cause, problem = error, f"{name}: {function!r} raised {error!r}; correct it"
+    raise_together(comm, problem, UserFunctionError, cause)
+    return value
+
+
 def at_time(
     comm: Any, name: str, function: Callable[[float], Any], time: float, unit: str
 ) -> FloatArray:

@@ -59,8 +59,9 @@ def test_all_parts_on_a_plane(where, mpi_tmp_path):
     assert_as_coulomb_says(figures)
     assert figures["ledger"] < 1e-11
     COMM.barrier()
-    tables = {p.name for p in mpi_tmp_path.glob("*.csv")}
-    assert tables == {f"{part}_plane_energy-momentum.csv" for part in demo.PARTS}
+    for file in ("balance.csv", "block.png", "block.xdmf"):
+        folders = {p.parent.name for p in mpi_tmp_path.glob(f"*/{file}")}
+        assert folders == {f"{part}_plane_energy-momentum" for part in demo.PARTS}
     assert (mpi_tmp_path / "sliding_block.png").stat().st_size > 10000
 
 
@@ -99,7 +100,8 @@ def test_what_is_missing_at_rest(integrator, dt, young, elastic):
     figures, motion = demo.level(mesh, {"young": young}, dt=dt, integrator=integrator)
     loss = demo.ROUGH * demo.GRAVITY * motion.time[1]
     left = (demo.SPEED - loss * round(demo.SPEED / loss)) ** 2 / demo.SPEED**2
-    assert left <= (loss / 2 / demo.SPEED) ** 2
+    # With dt = 0.016 it is half of a loss that is left, but for rounding.
+    assert left <= (loss / 2 / demo.SPEED) ** 2 * (1 + 1e-12)
     dissipation = figures["level: dissipation [J/kg]"] / (demo.SPEED**2 / 2)
     assert dissipation == pytest.approx(1 - left, abs=elastic)
     way = motion.way.max() / demo.CLOSED_FORM["level: way [m]"]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.mesh_input import bodies_from_gmsh
 
@@ -63,7 +64,7 @@ def test_scene_has_the_mass_and_momentum_of_the_problem(demo):
         smooth = 0.1 * 2 * np.pi**2 * 76 * (24**2 - 19.5**2)
         # Chords instead of arcs: sin(a)/a around the tube and along the ring.
         assert 0.94 * smooth < mass < smooth
-        assert np.allclose(demo["mean_velocity"](body), velocity, rtol=0, atol=1e-12)
+        assert np.allclose(nts.motion_of(body).velocity, velocity, rtol=0, atol=1e-12)
     cells = [b.mesh.topology.index_map(3).size_local for b in system.bodies]
     assert COMM.allreduce(np.array(cells)).tolist() == [288, 288]
 

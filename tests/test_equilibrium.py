@@ -496,6 +496,52 @@ def test_prescribed_motion_goes_on_from_its_place():
     stepper.close()
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("adapt", [None, nts.Adapt()])
+def test_a_run_counts_from_the_time_it_is_given(adapt):
+    """A body force that grows with the run's time, on a cube that was held: v = 50 t^2 / 2."""
+    held = nts.equilibrium(held_cube((0, 0, 0)))
+    mesh = held.system.bodies[0].mesh
+    body = nts.Continuum(
+        mesh, RUBBER, density=DENSITY, body_force=lambda t: (50 * DENSITY * t, 0, 0), name="cube"
+    )
+    run = nts.simulate(
+        nts.System([body]), nts.EnergyMomentum(), dt=5e-3, t_end=0.02, adapt=adapt, start=held,
+        start_time=0.0,
+    )  # fmt: skip
+    assert run.status == "completed"
+    time, p = run.balance["time"], run.balance["linear_momentum"]
+    assert time[0] == 0.0 and time[-1] == 0.02
+    mass = COMM.allreduce(body.nodal_mass.sum() / 3)
+    assert np.allclose(p[:, 0], mass * 25 * time**2, rtol=1e-9, atol=1e-9 * mass)
+    assert held.state.time == 1.0
+
+
+@pytest.mark.mpi
+def test_supports_are_where_they_say_at_the_time_it_is_given():
+    """Values at pseudo time 1 go on in those of the run's own time."""
+    held = nts.equilibrium(held_cube(lambda t: (0, 0, 0.1 * t)))
+    going_on = held_cube(lambda t: (0, 0, 0.1 + t))
+    rule = nts.EnergyMomentum()
+    run = nts.simulate(going_on, rule, dt=1e-3, t_end=2e-3, start=held, start_time=0.0)
+    assert run.status == "completed"
+    with pytest.raises(ValueError, match=r"^start: the Dirichlet values of body 'cube' at t=0 "):
+        nts.simulate(held.system, rule, dt=1e-3, t_end=2e-3, start=held, start_time=0.0)
+    with pytest.raises(ValueError, match=r"^t_end=0.5: must lie after the start's time 0.7"):
+        nts.simulate(
+            held_cube((0, 0, 0.1)), rule, start=held, dt=0.1, t_end=0.5, start_time=0.7
+        )
+
+
+@pytest.mark.parametrize("value", [np.nan, "0", True, (0.0,)])
+def test_the_time_it_is_given_is_checked(value):
+    cube, rule = held_cube((0, 0, 0)), nts.EnergyMomentum()
+    with pytest.raises(ValueError, match=r"^start_time=.*: must be finite"):
+        nts.simulate(cube, rule, dt=0.1, t_end=1.0, start_time=value)
+    with pytest.raises(ValueError, match=r"^start_time=0.0: pass start=, too"):
+        nts.simulate(cube, rule, dt=0.1, t_end=1.0, start_time=0.0)
+
+
 def held_cube(value, name="cube"):
     body = cube([nts.Dirichlet(at(2, 0.0), value=value)])
     body.name = name

@@ -24,11 +24,11 @@ LEVELS = [
     {"body", "continuum", "materials", "inversion", "mesh_check", "mesh_input"}
     | {"contact", "contact_elements", "contact_search", "facet_pair", "facet_elements"}
     | {"obstacles", "obstacle_pair", "obstacle_elements", "search", "surfaces"}
-    | {"overlap", "intrusion", "elements", "points"},
+    | {"overlap", "intrusion", "elements", "points", "motion", "stress"},
     {"system", "balance"},
     {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"}
     | {"promises", "unknowns"},
-    {"simulate", "equilibrium", "output", "plots", "pictures", "tradeoff", "economy"},
+    {"simulate", "equilibrium", "output", "writer", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]
 LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}

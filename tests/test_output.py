@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
@@ -376,53 +375,7 @@ def test_plots_refuse_what_is_no_balance(tmp_path):
         plots.compare_balances({}, tmp_path / "a.png")
 
 
-# ---- von Mises stress and pictures
-SHEAR = np.array([[1.0, 0.3, 0.0], [0.0, 1.1, 0.0], [0.0, 0.1, 0.9]])
-
-
-def homogeneous(material, degree, cell=CellType.hexahedron, gradient=SHEAR):
-    body = nts.Continuum(
-        box([0.0, 0, 0], [1.0, 2, 1], [2, 1, 2], cell), material, density=1.0, degree=degree
-    )
-    body.u.interpolate(lambda x: (gradient - np.eye(3)) @ x)
-    return body
-
-
-def equivalent(stress):
-    deviator = stress - np.trace(stress) / 3 * np.eye(3)
-    return np.sqrt(1.5 * np.sum(deviator**2))
-
-
-def neo_hooke(f):
-    mu, lam = 1e6 / 2.6, 0.3e6 / (1.3 * 0.4)
-    j = np.linalg.det(f)
-    return (mu * (f @ f.T - np.eye(3)) + lam * np.log(j) * np.eye(3)) / j
-
-
-@mpi
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
-@pytest.mark.fast("hexahedron-2", "tetrahedron-1")
-def test_von_mises_of_a_homogeneous_deformation(cell, degree):
-    stress = pictures.von_mises(homogeneous(RUBBER, degree, cell))
-    assert np.allclose(stress.x.array, equivalent(neo_hooke(SHEAR)), rtol=1e-12)
-
-
-@mpi
-def test_von_mises_of_a_users_energy():
-    stress = pictures.von_mises(homogeneous(lambda c: 5.0 * ufl.tr(c * c), 1))
-    c = SHEAR.T @ SHEAR
-    cauchy = SHEAR @ (2 * 10.0 * c) @ SHEAR.T / np.linalg.det(SHEAR)
-    assert np.allclose(stress.x.array, equivalent(cauchy), rtol=1e-12)
-
-
-@mpi
-def test_a_rotation_is_free_of_stress():
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    stress = pictures.von_mises(homogeneous(RUBBER, 1, gradient=turn))
-    assert np.all(stress.x.array < 1e-8)
-
-
+# ---- pictures
 def coloured(pixels):
     """Pixels that are neither white nor a shade of grey."""
     return np.ptp(pixels[..., :3], axis=-1) > 0.1

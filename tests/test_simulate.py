@@ -1,5 +1,8 @@
 """The time loop: rejected steps, failed runs, the end of a run, moving supports in the ledger."""
 
+import inspect
+import textwrap
+
 import numpy as np
 import pytest
 import two_blocks
@@ -202,3 +205,19 @@ def test_extra_form_is_external_work():
     assert np.isclose(run.balance["linear_momentum"][-1, 0], density * decay, rtol=1e-12)
     assert np.isclose(run.balance["energy"][-1], 0.5 * density * decay**2, rtol=1e-12)
     assert np.abs(run.balance["ledger_residual"]).max() <= 1e-12 * run.balance["energy"][0]
+
+
+@pytest.mark.mpi
+def test_the_writer_that_simulate_shows(capsys):
+    """The example in the docstring, run as it stands: a block in free flight."""
+    text = inspect.getdoc(nts.simulate)
+    end = "output=[heights])"
+    example = text[text.index("class Heights") : text.index(end)] + end
+    system = two_blocks.scene(COMM, cells=(1, 1))
+    start = nts.motion_of(system.bodies[0])
+    names = {"nts": nts, "system": system, "integrator": nts.Midpoint()}
+    exec(textwrap.dedent(" " * 12 + example).replace("t_end=0.2", "t_end=5e-3"), names)
+    rows = np.array(names["heights"].rows)
+    assert np.allclose(rows[:, 0], 1e-3 * np.arange(1, 6), rtol=1e-12)
+    assert np.allclose(rows[:, 1], start.centre[2] + start.velocity[2] * rows[:, 0], rtol=1e-12)
+    assert capsys.readouterr().out == "5 steps; completed\n"

@@ -1,0 +1,228 @@
+"""The hook before each step: loads and materials that it changes, and when it is called."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+DT = 1e-3
+YOUNG, DENSITY = 1e4, 1e3
+
+pytestmark = pytest.mark.mpi
+
+
+def box():
+    return create_box(
+        COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+
+
+def everywhere(x):
+    return np.full(x.shape[1], True)
+
+
+def pulled(bcs=()):
+    """A cube with a Constant that pulls it in z, per volume [N/m^3]."""
+    mesh = box()
+    load = fem.Constant(mesh, 0.0)
+    body = nts.Continuum(
+        mesh, nts.StVenantKirchhoff(YOUNG, 0.0), density=DENSITY, bcs=bcs,
+        extra_form=lambda u, v, w, t: -load * w[2] * ufl.dx,
+    )  # fmt: skip
+    return body, load
+
+
+class Calls(list):
+    """A hook that notes its calls, and fails on the last rank from a time on."""
+
+    def __init__(self, until=np.inf):
+        self.until = until
+
+    def __call__(self, time, dt):
+        self.append((time, dt))
+        if time >= self.until and COMM.rank == COMM.size - 1:
+            raise KeyError("table")
+
+    def last_before(self, ends):
+        """The last call before each step ended, given the number of calls by then."""
+        return np.array([self[n - 1] for n in ends])
+
+
+class Count:
+    """A writer that notes how often a hook had been called after each step."""
+
+    def __init__(self, calls):
+        self.calls, self.ends = calls, []
+
+    def start(self, stepper):
+        pass
+
+    def write(self, stepper, *, last=False):
+        self.ends.append(len(self.calls))
+
+    def close(self, stepper):
+        pass
+
+
+@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
+def test_a_load_that_it_changes(integrator):
+    """The midpoint rule integrates a force linear in time exactly."""
+    body, load = pulled()
+
+    def ramp(time, dt):
+        load.value = 7e3 * (time + 0.5 * dt)
+
+    run = nts.simulate(nts.System([body]), integrator, dt=DT, t_end=5 * DT, before_step=ramp)
+    speed = 7e3 / DENSITY * 0.5 * (5 * DT) ** 2
+    assert run.status == "completed"
+    assert np.allclose(run.balance["linear_momentum"][-1], [0, 0, DENSITY * speed], atol=1e-10)
+    assert np.isclose(run.balance["external_work"][-1], 0.5 * DENSITY * speed**2, rtol=1e-9)
+
+
+def test_the_first_accelerations_feel_it():
+    """Newmark's begin with the load of the first call: v_1 is that of a constant force."""
+    body, load = pulled()
+
+    def pull(time, dt):
+        load.value = 7e3
+
+    run = nts.simulate(nts.System([body]), nts.Newmark(), dt=DT, t_end=DT, before_step=pull)
+    assert np.allclose(run.balance["linear_momentum"][-1], [0, 0, 7e3 * DT], atol=1e-10)
+
+
+def test_it_is_called_for_cut_steps_too():
+    body, _ = pulled()
+    calls = Calls()
+    stepper = nts.Stepper(nts.System([body]), nts.Midpoint(), before_step=calls)
+    solve = stepper.solver.solve
+
+    def failing():
+        if len(calls) == 3:  # the first call comes before the row of the start
+            raise nts.StepFailedError("on purpose")
+        return solve()
+
+    stepper.solver.solve = failing
+    stepper.advance(DT)
+    stepper.advance(DT)
+    stepper.close()
+    assert stepper.solution.retries == 1
+    third = DT / 3
+    expected = [(0, DT), (0, DT), (DT, DT), *((DT + k * third, third) for k in range(3))]
+    assert np.allclose(calls, expected, rtol=1e-12, atol=1e-18)
+
+
+def test_it_is_called_with_chosen_steps():
+    """Two calls at the gap that closes: with the step as proposed, and as it is made."""
+    mesh = box()
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(1e6, 0.3), density=DENSITY, velocity=(0, 0, -1.0), name="cube"
+    )
+    floor = nts.Plane((0, 0, -4.3 * DT), (0, 0, 1))
+    pair = nts.ContactPair(body.surface(lambda x: x[2] < 1e-9), floor)
+    calls = Calls()
+    count = Count(calls)
+    run = nts.simulate(
+        nts.System([body], contacts=[pair]), nts.EnergyMomentum(), dt=DT, t_end=8 * DT,
+        adapt=nts.Adapt(), output=[count], before_step=calls,
+    )  # fmt: skip
+    assert run.status == "completed"
+    time = run.balance["time"]
+    assert np.allclose(
+        calls.last_before(count.ends), np.stack([time[:-1], np.diff(time)], axis=1), rtol=1e-9
+    )
+    assert len(calls) > len(time)
+
+
+@pytest.mark.parametrize("adapt", [None, nts.Adapt()])
+def test_a_run_keeps_what_it_has_if_it_raises(adapt):
+    body, _ = pulled()
+    calls = Calls(until=1.5 * DT)
+    run = nts.simulate(
+        nts.System([body]), nts.Midpoint(), dt=DT, t_end=5 * DT, adapt=adapt, before_step=calls
+    )
+    assert len(set(COMM.allgather(run.status))) == 1
+    assert run.status.startswith(f"before_step at t={calls[-1][0]!r} with dt=")
+    assert "raised KeyError('table'); correct it" in run.status
+    assert run.retries == 0
+    time = run.balance["time"]
+    assert len(time) > 1 and time[-1] == calls[-1][0] and time[-2] < 1.5 * DT
+
+
+def test_a_stepper_learns_the_cause_and_goes_on():
+    body, _ = pulled()
+    calls = Calls(until=0.0)
+    stepper = nts.Stepper(nts.System([body]), nts.Midpoint(), before_step=calls)
+    with pytest.raises(nts.UserFunctionError, match="^before_step at t=0.0 with") as caught:
+        stepper.advance(DT)
+    assert isinstance(caught.value.__cause__, KeyError) == (COMM.rank == COMM.size - 1)
+    calls.until = np.inf
+    assert np.isclose(stepper.advance(DT).time, DT)
+    stepper.close()
+
+
+def test_a_material_that_it_changes_is_in_the_ledger():
+    """A cube held in a stretch of 1.1: its energy is in proportion to the modulus."""
+    mesh = box()
+    young = fem.Constant(mesh, 0.0)
+    bcs = [
+        nts.Dirichlet(lambda x: x[2] > 1 - 1e-9, (0, 0, 0.1), components=(2,)),
+        nts.Dirichlet(lambda x: x[2] < 1e-9, components=(2,)),
+        nts.Dirichlet(everywhere, components=(0, 1)),
+    ]
+    body = nts.Continuum(
+        mesh, lambda c: young / 8 * ufl.inner(c - ufl.Identity(3), c - ufl.Identity(3)),
+        density=DENSITY, bcs=bcs, name="cube",
+    )  # fmt: skip
+    density = (1.1**2 - 1) ** 2 / 8
+
+    def soften(time, dt):
+        young.value = YOUNG if time < 2.5 * DT else 0.5 * YOUNG
+
+    # Under the first modulus, which is 0 until the first call.
+    still = nts.equilibrium(nts.System([body]), before_step=soften)
+    assert np.isclose(still.balance["potential"][-1], YOUNG * density, rtol=1e-9)
+    young.value = 0.0
+    run = nts.simulate(
+        nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=1.0 + 5 * DT, start=still,
+        before_step=lambda time, dt: soften(time - 1.0, dt),
+    )  # fmt: skip
+    assert run.status.startswith("completed")
+    change = run.balance["material_change"]
+    assert np.allclose(change[:4], 0.0) and change.shape == (6,)
+    assert np.allclose(change[4:], -0.5 * YOUNG * density, rtol=1e-9)
+    assert np.isclose(run.balance["potential"][0], YOUNG * density, rtol=1e-9)
+    assert "'cube'" in run.warnings["material changed"].text
+
+
+def test_equilibrium_calls_it_with_pseudo_times():
+    """The pull of a load step is what holds the cube in it, at each of them."""
+    body, load = pulled([nts.Dirichlet(lambda x: x[2] < 1e-9)])
+
+    def ramp(time, dt):
+        load.value = 300.0 * (time + dt)
+
+    run = nts.equilibrium(nts.System([body]), load_steps=4, before_step=ramp)
+    assert run.status == "completed"
+    assert np.allclose(
+        run.reactions[body.name][:, 0, 2], [0, -75, -150, -225, -300], rtol=1e-8, atol=1e-6
+    )
+
+
+def test_equilibrium_keeps_what_it_has_if_it_raises():
+    body, _ = pulled([nts.Dirichlet(lambda x: x[2] < 1e-9)])
+    run = nts.equilibrium(nts.System([body]), load_steps=4, before_step=Calls(until=0.5))
+    assert run.status.startswith("before_step at t=0.5 with dt=0.25: ")
+    assert np.allclose(run.balance["time"], [0, 0.25, 0.5])
+
+
+def test_it_must_be_callable():
+    with pytest.raises(TypeError, match="before_step=3: pass a callable"):
+        nts.simulate(
+            nts.System([pulled()[0]]), nts.Midpoint(), dt=DT, t_end=DT, before_step=3
+        )

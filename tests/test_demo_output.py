@@ -1,0 +1,35 @@
+"""What every demo shows and leaves: a progress line, a picture, and fields for ParaView."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+SMALL = {
+    "bar_impact": {"elements": 4, "t_end": 0.1},
+    "flying_l_block": {"t_end": 2.0},
+    "hertz": {"problems": ("cylinders",), "scales": (0.01,), "refinement": 0.5},
+    "ironing": {"block": (16, 2), "die": (4, 2), "steps": (10, 50), "end": 0.2},
+    "rolling": {"facets": 16, "duration": 0.016},
+    "rotating_cross": {"steps": (0.05,), "t_end": 0.2},
+    "sliding_block": {"floors": ("plane",), "parts": ("verge",), "cells": (2, 2, 1)},
+    "two_blocks": {"t_end": 0.01, "cells": (1, 1)},
+    "two_tori": {"t_end": 0.1},
+}
+DEMOS = Path(__file__).resolve().parents[1] / "demos"
+
+
+def test_all_are_here():
+    assert set(SMALL) == {path.stem for path in DEMOS.glob("*.py")}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_what_a_demo_leaves(name, tmp_path, capfd):
+    demo = importlib.import_module(name)
+    demo.main(output=str(tmp_path), progress=True, **SMALL[name])
+    assert "step/s" in capfd.readouterr().err.replace("s/step", "step/s")
+    for ending in (".png", ".xdmf", ".h5"):
+        sizes = [path.stat().st_size for path in tmp_path.rglob(f"*{ending}")]
+        assert sizes and min(sizes) > 500, ending
+    times = max(path.read_text().count("<Time Value") for path in tmp_path.rglob("*.xdmf"))
+    assert times >= 2

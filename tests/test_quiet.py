@@ -1,0 +1,51 @@
+"""What compilers say is not for the user: a cold cache prints nothing, an error is still told."""
+
+import os
+import subprocess
+import sys
+
+SCRIPT = """
+import ufl
+from dolfinx.mesh import CellType, create_box
+from mpi4py import MPI
+
+from dolfinx_nts import dolfinx_compat as compat
+
+mesh = create_box(MPI.COMM_SELF, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.tetrahedron)
+space = compat.vector_space(mesh, 1)
+compat.scalar_space(mesh, "DG", 0), compat.tensor_space(mesh, "DG", 0)
+w = ufl.TestFunction(space)
+compat.compile_forms([{form}])
+"""
+
+
+def run(form, cache):
+    """Run the script in a new interpreter that does not believe to be an MPI rank of this one."""
+    mpi = ("OMPI_", "PMIX_", "PRTE_", "ORTE_")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(mpi)}
+    environment |= {"XDG_CACHE_HOME": str(cache), "OMPI_ALLOW_RUN_AS_ROOT": "1"}
+    return subprocess.run(
+        [sys.executable, "-c", SCRIPT.replace("{form}", form)],
+        env=environment | {"OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"},
+        cwd=cache,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_a_cold_cache_prints_nothing(tmp_path):
+    done = run("w[2] * ufl.dx", tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert len(list(tmp_path.rglob("*.so"))) >= 4  # the form and the elements of three spaces
+
+
+def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
+    """A compiler that says why and gives up."""
+    broken = tmp_path / "cc"
+    broken.write_text("#!/bin/sh\necho no space left >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("CC", str(broken))
+    done = run("w[2] * ufl.dx", tmp_path)
+    assert done.returncode != 0
+    assert "no space left" in done.stderr and "Error" in done.stderr
