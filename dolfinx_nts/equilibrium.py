@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from dolfinx_nts import balance
 from dolfinx_nts.body import Body
+from dolfinx_nts.free_motion import free_motion
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.newton import Newton
 from dolfinx_nts.simulate import Solution, Stepper, run, writers
@@ -146,7 +147,21 @@ class _LoadStepper(Stepper):
         self._accept(state)
         self._tell_inversion(step)
         self.solution.state = state
+        self._tell_free_motion(step)
         self.look()
+
+    def _tell_free_motion(self, step: Evaluation) -> None:
+        """Warn, once, of motions that nothing resists; stabilization would leave them at rest."""
+        if self._stabilization or "free motion" in self.solution.warnings:
+            return
+        found = free_motion(self.problem, self.solver, step)
+        if found:
+            self.solution.warn(
+                "free motion", self.state.time, 1.0,
+                f"{found}: how far it has moved so is chance; add a Dirichlet condition, or pass "
+                "stabilization=0.1, which leaves it where it is",
+                grave=True,
+            )  # fmt: skip
 
     def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, float]:
         """Solution of a load step, its state, Newton iterations, earlier relaxations' dissipation.

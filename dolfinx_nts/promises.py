@@ -9,6 +9,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts import balance
+from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ _LEAST = 1e-11
 _DOUBTFUL, _OPEN = 1e-3, 1e-2
 #: Part of the energy that contact may bring, in a step or in a run, without a warning.
 _GAIN = 0.01
+#: Part of the energy that contact may take over a run without a word.
+_LOSS = 0.1
 #: Tolerance of Newton's method of accuracy="exact".
 _EXACT = 1e-12
 _EPS = float(np.finfo(float).eps)
@@ -38,17 +41,16 @@ class Promises:
 
     Args:
         solution: Where warnings go.
-        closes: Whether the integrator closes the ledger.
+        integrator: Of the run.
         rtol: Tolerance of Newton's method.
-        exact: Whether its discrete gradient of the stored energy is exact for any W.
     """
 
-    def __init__(self, solution: Solution, *, closes: bool, rtol: float, exact: bool) -> None:
-        self._solution, self._closes = solution, closes
+    def __init__(self, solution: Solution, integrator: Integrator, rtol: float) -> None:
+        self._solution, self._closes = solution, integrator.closes_ledger
         self._remedy = "use a smaller dt" if rtol <= _EXACT else 'pass accuracy="exact"'
-        if not exact:
-            self._remedy += ', or stress="gonzalez": a mean-value stress is exact for some W only'
-        self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if closes else _OPEN
+        self._remedy += integrator.ledger_remedy
+        self._open = f"use EnergyMomentum(){integrator.ledger_remedy}"
+        self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if self._closes else _OPEN
         self._largest, self._rounding = 0.0, 0.0
 
     def hold(self, problem: StepProblem, step: Evaluation, impulses: float) -> None:
@@ -80,8 +82,7 @@ class Promises:
         else:
             text = (
                 f"the energy is {missing:.3g} J, {part:.2g} of the largest, off what work, "
-                "friction and contact account for; this integrator does not keep it: use "
-                "EnergyMomentum(), or a smaller dt"
+                f"friction and contact account for; this integrator does not keep it: {self._open}"
             )
         doubtful = part > (_DOUBTFUL if self._closes else _OPEN)
         self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
@@ -104,6 +105,14 @@ class Promises:
                 f"{total / self._largest:.2g} of the largest energy; {remedy}"
             )
         else:
+            if -total > _LOSS * self._largest:
+                self._solution.warn(
+                    "energy lost to contact", row["time"], -total,
+                    f"gaps that close in mid step have taken {-total:.3g} J, "
+                    f"{-total / self._largest:.2g} of the largest energy: how bodies rebound may "
+                    "depend on it; compare with a smaller dt and a finer mesh, or pass "
+                    "adapt=Adapt(...)",
+                )  # fmt: skip
             return
         self._solution.warn("energy from behind facets", row["time"], gain, text, grave=True)
 

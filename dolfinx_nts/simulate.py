@@ -233,12 +233,7 @@ class Stepper:
         self._recent: deque[tuple[float, tuple[FloatArray, ...]]] = deque(maxlen=2)
         self._accept(_first_state(system, start, start_time))
         self.solution = Solution(system, rows=Table([balance.first_row(system, self.state)]))
-        self._promises = Promises(
-            self.solution,
-            closes=integrator.closes_ledger,
-            rtol=self.newton.rtol,
-            exact=getattr(integrator, "stress", "gonzalez") == "gonzalez",
-        )
+        self._promises = Promises(self.solution, integrator, self.newton.rtol)
         self._materials, self._material_change = MaterialWatch(system), 0.0
 
     def advance(self, dt: float) -> State:

@@ -268,6 +268,10 @@ class StepProblem:
         """PETSc vector of the unknowns, holding the first guess after `begin`."""
         return self._laid.x
 
+    def of_body(self, k: int) -> slice:
+        """Where a body that is awake stands among this rank's unknowns."""
+        return self._laid.of_body(k)
+
     @property
     def _laid(self) -> Unknowns:
         assert self.unknowns is not None, "begin comes first"

@@ -27,7 +27,7 @@ LEVELS = [
     | {"overlap", "intrusion", "elements", "points", "motion", "stress"},
     {"system", "balance"},
     {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"}
-    | {"promises", "unknowns"},
+    | {"promises", "unknowns", "free_motion"},
     {"simulate", "equilibrium", "output", "writer", "plots", "pictures", "tradeoff", "economy"},
     {"__init__"},
 ]

@@ -46,7 +46,7 @@ def test_energy_that_contact_brings_in_small_parts_is_told():
     stepper = nts.Stepper(nts.System([Sprung(1.0)]), nts.EnergyMomentum())
     stepper.problem.begin(stepper.state, 0.05)
     step = stepper.solver.solve()
-    promises = Promises(solution, closes=True, rtol=1e-12, exact=True)
+    promises = Promises(solution, nts.EnergyMomentum(), 1e-12)
     for k in range(1, 11):
         row = dict(stepper.solution.rows[-1], energy=1.0, kinetic=1.0)
         solution.rows = [

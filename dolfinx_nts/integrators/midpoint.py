@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from dolfinx_nts.integrators.rule import MiddleOfStep, stress_of
 from dolfinx_nts.strain_energy import StrainEnergy
@@ -18,6 +18,8 @@ class Midpoint(MiddleOfStep):
     Contact is described directly: the projection is eliminated, the gap multiplier is the only
     unknown.
     """
+
+    ledger_remedy: ClassVar[str] = ", or a smaller dt"
 
     def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
         """First Piola-Kirchhoff stress P = F_m S(E(F_m)) in UFL [Pa] of F = 1 + H."""

@@ -26,6 +26,7 @@ class Integrator(Protocol):
         closes_ledger: Whether the ledger closes to the tolerance of the solver.
         keeps_angular_momentum: Whether it changes by the moments of the step's forces at the middle
             of the step and nothing else.
+        ledger_remedy: What else closes an open ledger, for messages; begins with a comma.
         order: Local error of the motion is of order + 1.
         theta: Where between t_n and t_{n+1} loads, and the direct rule's contact forces, are taken.
         contact_gradient: Rule of the contact forces: "direct", or a discrete gradient's name.
@@ -35,6 +36,7 @@ class Integrator(Protocol):
     accelerations: bool
     closes_ledger: bool
     keeps_angular_momentum: bool
+    ledger_remedy: str
     order: int
     theta: float
     contact_gradient: str
@@ -67,6 +69,7 @@ class InTime:
     accelerations: ClassVar[bool] = False
     closes_ledger: ClassVar[bool] = False
     keeps_angular_momentum: ClassVar[bool] = False
+    ledger_remedy: ClassVar[str] = ""
     contact_gradient: ClassVar[str] = "direct"
 
     def ramp(self, time: float) -> float:

@@ -22,6 +22,7 @@ class Static:
     accelerations: ClassVar[bool] = False
     closes_ledger: ClassVar[bool] = False
     keeps_angular_momentum: ClassVar[bool] = True
+    ledger_remedy: ClassVar[str] = ""
     order: ClassVar[int] = 1
     theta: ClassVar[float] = 1.0
     contact_gradient: ClassVar[str] = "direct"
