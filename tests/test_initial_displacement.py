@@ -97,21 +97,23 @@ def test_what_it_must_not_be():
     bar(lambda x: -1.5 * mode(x, 1.0), name="rod", allow_inversion=True)
 
 
-@pytest.mark.parametrize(("rise", "message"), [(0.0, None), (-0.3, "1 slave nodes? start|start")])
-def test_contact_looks_where_bodies_are(rise, message):
+@pytest.mark.parametrize("rise", [1.001, 0.7])
+def test_contact_looks_where_bodies_are(rise):
     """Two cubes of one mesh, one of them lifted onto the other, or too little."""
     under = nts.Continuum(box((2, 2, 2)), RUBBER, density=DENSITY, name="under")
     over = nts.Continuum(
-        box((2, 2, 2)), RUBBER, density=DENSITY, name="over", displacement=(0, 0, 1.001 + rise)
+        box((2, 2, 2)), RUBBER, density=DENSITY, name="over", displacement=(0, 0, rise)
     )
     pair = nts.ContactPair(over.surface(bottom), under.surface(top))
-    if message is None:
-        gap = nts.System([over, under], contacts=[pair])
-        run = nts.simulate(gap, nts.EnergyMomentum(), dt=1e-3, t_end=1e-3)
-        assert np.allclose(run.balance["potential"], 0.0, atol=1e-9 * YOUNG)
+    if rise < 1.0:
+        with pytest.raises(ValueError, match="slave nodes start inside the master, up to 0.6 of"):
+            nts.System([over, under], contacts=[pair])
         return
-    with pytest.raises(ValueError, match=message):
-        nts.System([over, under], contacts=[pair])
+    run = nts.simulate(
+        nts.System([over, under], contacts=[pair]), nts.EnergyMomentum(), dt=1e-3, t_end=1e-3
+    )
+    assert run.status == "completed"
+    assert np.allclose(run.balance["potential"], 0.0, atol=1e-9 * YOUNG)
 
 
 def test_a_displaced_master_is_where_contact_looks():
