@@ -77,6 +77,7 @@ def _describe(bodies: Any, combination: FloatArray) -> str:
     parts = combination.reshape(-1, 2, 3)
     k, kind = np.unravel_index(np.linalg.norm(parts, axis=2).argmax(), parts.shape[:2])
     vector = parts[k, kind] / np.linalg.norm(parts[k, kind])
+    vector *= np.sign(vector[np.abs(vector).argmax()])
     way = ", ".join(f"{c:.2g}" for c in vector.round(3) + 0.0)
     moves = "turning about" if kind else "moving along"
     return f"nothing resists body {bodies[k].name!r} {moves} ({way})"

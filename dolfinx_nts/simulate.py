@@ -7,13 +7,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts import balance
+from dolfinx_nts import balance, resultants
 from dolfinx_nts.guards import check_momentum
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.inversion import describe, smallest_dets
@@ -47,6 +47,8 @@ FloatArray = npt.NDArray[np.float64]
 _BESIDE = 1e-3
 #: What a step chosen by its error is cut to: halves would soon end where it has failed.
 _CUT = 0.4
+#: Smallest det F below which cells count as crushed.
+_CRUSHED = 0.05
 #: Cuts of a step before nodes that infinite friction holds may slip.
 _CUTS = 3
 #: Searches for contact, each along the motion that came of the one before.
@@ -71,6 +73,7 @@ class Solution:
         exceeded: Steps taken though their motion errs more than `Adapt` asks for: the shortest it
             may take, and those that move nodes out from behind their facets.
         switches: Changes of facet of nodes in contact: the newest 10,000, and sums over all.
+        state: Last accepted state, from which another run may start.
         warnings: What the run has to say against its result, by kind; see `RunWarning`.
     """
 
@@ -82,6 +85,9 @@ class Solution:
     exceeded: int = 0
     switches: balance.Switches = field(default_factory=balance.Switches)
     warnings: RunWarnings = field(default_factory=RunWarnings)
+    state: State | None = None
+    #: Whether its state moves, or a run from it begins with the bodies' initial velocities.
+    moving: ClassVar[bool] = True
 
     @property
     def balance(self) -> dict[str, npt.NDArray[np.float64]]:
@@ -90,6 +96,24 @@ class Solution:
         They are read-only and hold the rows up to now.
         """
         return {name: self.rows.column(name) for name in balance.columns(self.system)}
+
+    @property
+    def reactions(self) -> dict[str, FloatArray]:
+        """Of each body, force of each `Dirichlet` condition on it [N], shape (rows, conditions, 3).
+
+        In dynamics that of each step, with inertia, where the integrator takes its forces. A
+        coordinate that two conditions prescribe counts with the later one.
+        """
+        bodies = self.system.bodies
+        return {b.name: self.rows.column(resultants.reactions_of(b)) for b in bodies}
+
+    @property
+    def contact_forces(self) -> FloatArray:
+        """Resultant of each contact on its slave body [N], shape (rows, contacts, 3).
+
+        In dynamics that of each step; with a consistent mass the forces of single steps alternate.
+        """
+        return self.rows.column(resultants.CONTACT_FORCES)
 
     @property
     def summary(self) -> str:
@@ -165,7 +189,7 @@ class Stepper:
             the user's own with the `Integrator` protocol.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
-        start: Result of `equilibrium` to start from; see there.
+        start: Result of `equilibrium` (see there) or of another run to start from.
         start_time: Time at the start [s]; see `simulate`.
         sleep: Leave bodies that nothing moves out of the steps; see `simulate`.
         watch_overlap: Look whether bodies end up inside each other; see `simulate`.
@@ -227,12 +251,17 @@ class Stepper:
         )
         self.solver = StepSolver(self.problem, self.newton, preset, given)
         self.system = system
-        self._started = False
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._measured: dict[str, balance.Measured] = {}
         self._recent: deque[tuple[float, tuple[FloatArray, ...]]] = deque(maxlen=2)
-        self._accept(_first_state(system, start, start_time))
-        self.solution = Solution(system, rows=Table([balance.first_row(system, self.state)]))
+        self.solution = Solution(system)
+        state = _first_state(system, start, start_time)
+        if not integrator.accelerations:
+            state = replace(state, a=())
+        self._accept(state)
+        # A run that goes on moves on as it did.
+        self._started = start is not None and start.moving
+        self.solution.rows = Table([self._first_row()])
         self._promises = Promises(self.solution, integrator, self.newton.rtol)
         self._materials, self._material_change = MaterialWatch(system), 0.0
 
@@ -320,9 +349,17 @@ class Stepper:
             if not pace.accepts(self.problem, trial.step):
                 self.solution.rejected += 1
                 continue
-            retries = 0
-            self.solution.exceeded += pace.exceeds
+            # Steps shorter than any that is asked for end a run that only they keep alive.
+            retries = 0 if dt >= pace.shortest else retries
             self._take(trial)
+            if pace.exceeds:
+                self.solution.exceeded += 1
+                self.solution.warn(
+                    "step error", self.state.time, dt,
+                    f"a step of {dt:.3g} s errs more than Adapt asks for: it is the shortest one, "
+                    "or it moves a node out from behind its facet; pass a smaller `shortest` or a "
+                    "larger `tolerance`",
+                )  # fmt: skip
             yield
 
     def start(self, dt: float) -> None:
@@ -349,7 +386,7 @@ class Stepper:
             state = replace(state, a=self.problem.accelerations(state, dt))
         self._accept(state)
         self._started = True
-        self.solution.rows = Table([balance.first_row(self.system, self.state)])
+        self.solution.rows = Table([self._first_row()])
 
     def look(self, *, last: bool = False) -> None:
         """Warn if what is in contact is inside each other; only as often as it has moved.
@@ -363,10 +400,13 @@ class Stepper:
                     found.kind, self.state.time, found.depth, found.text, grave=True
                 )
 
+    def _first_row(self) -> dict[str, Any]:
+        return balance.first_row(self.system, self.state) | resultants.at_start(self.system)
+
     def _accept(self, state: State) -> None:
         for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
             body.accept(u, v)
-        self.state = state
+        self.state = self.solution.state = state
 
     def _step(self, dt: float, time: float) -> None:
         self._begin(dt)
@@ -444,7 +484,8 @@ class Stepper:
         terms = balance.step_terms(self.problem, step)
         terms |= {"time": time, "newton_iterations": step.iterations}
         terms["material_change"], self._material_change = self._material_change, 0.0
-        rows.append(balance.next_row(rows[0], rows[-1], trial.measured, terms))
+        row = balance.next_row(rows[0], rows[-1], trial.measured, terms)
+        rows.append(row | resultants.of_step(self.problem, step))
         self._promises.hold(self.problem, step, trial.impulses)
         self.solution.switches.extend(balance.switches(self.problem, step, time))
         forces = tuple(contact.force for contact in state.contacts)
@@ -496,6 +537,10 @@ class Stepper:
             text = describe(self.system, u, smallest_dets(self.system, u))
             text += "; what comes after it may be wrong"
             self.solution.warn("inversion", time, -step.min_det, text, grave=True)
+        elif step.min_det < _CRUSHED:
+            text = describe(self.system, self.state.u, smallest_dets(self.system, self.state.u))
+            text += "; so near to that the result depends on the mesh"
+            self.solution.warn("crushed cells", self.state.time, 1.0 - step.min_det, text)
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
         """State at t_{n+1}."""
@@ -540,12 +585,13 @@ def _first_state(system: System, start: Any, time: Any) -> State:
         if time is not None:
             raise ValueError(f"start_time={time!r}: pass start=, too, or leave it out")
         return system.initial_state()
-    if not (isinstance(start, Solution) and hasattr(start, "state")):
+    if not (isinstance(start, Solution) and start.state is not None):
         raise TypeError(
-            f"start of type {type(start).__name__}: pass the result of equilibrium(...)"
+            f"start of type {type(start).__name__}: pass the result of equilibrium(...) or of "
+            "simulate(...)"
         )
     state = start.state if time is None else replace(start.state, time=float(time))
-    return system.state_from(start.system, state)
+    return system.state_from(start.system, state, moving=start.moving)
 
 
 def _is_writer(item: Any) -> bool:
@@ -598,7 +644,7 @@ def simulate(
                 run = nts.simulate(system, integrator, dt=1e-3, t_end=0.2, output=[heights])
 
         progress: Show a progress line on rank 0.
-        start: Result of `equilibrium` to start from; see there.
+        start: Result of `equilibrium` (see there) or of another run to start from.
         start_time: Time at which a run from `start` begins [s], from which functions of time and
             `t_end` count; default: the pseudo time of `start`.
         accuracy: In place of `newton`: "exact" closes the ledger to rounding; "balanced" to about

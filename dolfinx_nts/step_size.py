@@ -94,13 +94,14 @@ class Pace:
 
     Attributes:
         dt: Size of the next step [s] unless a gap closes or the run ends before.
+        shortest: Smallest size [s] but for cut steps and the last ones.
         exceeds: Whether the last step was accepted though its error is above the tolerance.
     """
 
     def __init__(self, adapt: Adapt, system: System, state: State, dt: float, span: float) -> None:
         self._tolerance, self._span = adapt.tolerance, span
-        self._longest, self._shortest = dt, adapt.shortest * dt
-        self.dt = self._shortest
+        self._longest, self.shortest = dt, adapt.shortest * dt
+        self.dt = self.shortest
         self._top = _norms(system, state.v)[0]
         self._before: tuple[float, tuple[FloatArray, ...]] | None = None
         self._error, self._meets, self.exceeds = 0.0, False, False
@@ -132,7 +133,7 @@ class Pace:
             gap = c.candidates.gap
             closing = (end < 0.0) & (gap > 0.0) & ~late
             part = gap[closing] / (gap[closing] - end[closing])
-            apart = part * problem.dt > self._shortest
+            apart = part * problem.dt > self.shortest
             force = -c.scale[closing] * end[closing] / problem.factor
             lost += float((force * gap[closing])[apart].sum())
             first = min(first, float(part[apart].min(initial=1.0)))
@@ -152,7 +153,7 @@ class Pace:
             for k, (b, v) in enumerate(zip(step.bodies, problem.state.v, strict=True))
         )
         speed, error = self._measure(problem, acceleration)
-        short = h <= self._shortest * (1 + 1e-9)
+        short = h <= self.shortest * (1 + 1e-9)
         if not error <= 1.0 and not short and not self._expels(problem, step):
             self.cut(h * factor(error))
             return False
@@ -164,12 +165,12 @@ class Pace:
         self._top = max(self._top, speed)
         self._before, self._error = (h, acceleration), error
         if self._meets:
-            self._before, self._error, self.dt = None, 0.0, self._shortest
+            self._before, self._error, self.dt = None, 0.0, self.shortest
         return True
 
     def cut(self, dt: float) -> None:
         """Go on with smaller steps, but not below the shortest."""
-        self.dt = max(dt, self._shortest)
+        self.dt = max(dt, self.shortest)
 
     def _measure(
         self, problem: StepProblem, acceleration: tuple[FloatArray, ...]

@@ -131,14 +131,15 @@ class System:
             histories=(contacts, *(joint.start() for joint in self.joints)),
         )
 
-    def state_from(self, other: System, state: State) -> State:
+    def state_from(self, other: System, state: State, *, moving: bool) -> State:
         """State at the displacements and time of another system's state. Collective.
 
-        Bodies correspond by name. Those of this system move with their initial velocities.
+        Bodies and joints correspond by name.
 
         Args:
             other: System with bodies of the same names on the same meshes.
             state: Its state.
+            moving: Whether bodies move on as there; else with their initial velocities.
 
         Raises:
             ValueError: A body has no counterpart, stands off its prescribed displacement, or lies
@@ -160,8 +161,16 @@ class System:
             for j, known in enumerate(other.contacts):
                 if pair.is_like(known):
                     contacts[k] = state.contacts[j]
-        histories = (tuple(contacts), *found.histories[1:])
-        start = replace(found, time=state.time, u=u, histories=histories)
+        known_joints = {j.name: h for j, h in zip(other.joints, state.histories[1:], strict=True)}
+        joints = (
+            known_joints.get(j.name, h)
+            for j, h in zip(self.joints, found.histories[1:], strict=True)
+        )
+        start = replace(found, time=state.time, u=u, histories=(tuple(contacts), *joints))
+        if moving:
+            v = tuple(state.v[index[b.name]].copy() for b in self.bodies)
+            a = tuple(state.a[index[b.name]].copy() for b in self.bodies) if state.a else ()
+            start = replace(start, v=v, a=a)
         self._check_penetration(self.penetration(start))
         return start
 

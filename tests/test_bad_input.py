@@ -623,7 +623,7 @@ def test_slaves_behind_the_master_body_are_not_inside():
     ("action", "known"),
     [
         (lambda o: continuum(**o), "density, velocity"),
-        (lambda o: nts.System([continuum()], **o), "contacts, gravity"),
+        (lambda o: nts.System([continuum()], **o), "contacts, joints, gravity"),
         (lambda o: run(**o), "dt, t_end, newton"),
         (lambda o: nts.Stepper(None, None, **o), "newton, petsc_options"),
         (lambda o: nts.EnergyMomentum(**o), "stress, contact_gradient"),

@@ -25,7 +25,7 @@ LEVELS = [
     | {"contact", "contact_elements", "contact_search", "facet_pair", "facet_elements"}
     | {"obstacles", "obstacle_pair", "obstacle_elements", "search", "surfaces"}
     | {"overlap", "intrusion", "elements", "points", "motion", "stress"},
-    {"system", "balance"},
+    {"system", "balance", "resultants"},
     {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"}
     | {"promises", "unknowns", "free_motion"},
     {"simulate", "equilibrium", "output", "writer", "plots", "pictures", "tradeoff", "economy"},

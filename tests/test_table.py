@@ -2,6 +2,7 @@
 
 import gc
 import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def test_switches_keep_the_newest_and_the_sums():
 def test_summary_says_what_changes_of_facet_cost():
     """A sum of -6 J in absolute values of 4 J on average."""
     table = Table([dict.fromkeys(COLUMNS, 0.0)])
-    run = Solution(None, rows=table)
+    run = Solution(SimpleNamespace(joints=()), rows=table)
     run.switches.extend(Switch(0.1, "c", 1, (2, 3), d) for d in (-8.0, 3.0, -1.0))
     line = "3 changes of facet: contact defect -6 J in all, mean of absolute values 4 J; most -8 J"
     assert line in run.summary

@@ -1,0 +1,57 @@
+"""A run that goes on from another one, and the forces of supports and contacts in dynamics."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from test_friction import rubbing_blocks
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+pytestmark = pytest.mark.mpi
+INTEGRATORS = [nts.EnergyMomentum(), nts.Midpoint(), nts.Newmark(), nts.GeneralizedAlpha()]
+DT = 2e-3
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_two_halves_are_the_whole(integrator):
+    """With friction, in contact where the first half ends; on several ranks MUMPS rounds anew."""
+    newton = nts.Newton(linear_solver="direct", condense=True)
+    whole, system = rubbing_blocks(0.3), rubbing_blocks(0.3)
+    one = nts.simulate(whole, integrator, dt=DT, t_end=20 * DT, newton=newton)
+    first = nts.simulate(system, integrator, dt=DT, t_end=12 * DT, newton=newton)
+    assert first.balance["active"][-1] > 0
+    other = nts.simulate(system, integrator, dt=DT, t_end=20 * DT, newton=newton, start=first)
+    assert other.status == one.status == "completed" or not integrator.closes_ledger
+    assert other.balance["time"][0] == first.balance["time"][-1]
+    for name in ("u", "v"):
+        for a, b in zip(getattr(one.state, name), getattr(other.state, name), strict=True):
+            scale = COMM.allreduce(np.abs(a).max(initial=0.0), op=MPI.MAX)
+            assert np.abs(a - b).max(initial=0.0) <= 1e-11 * scale
+    slip = [r.state.contacts[0].slip for r in (one, other)]
+    assert np.allclose(*slip, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS[:2])
+def test_forces_of_supports_and_contacts(integrator):
+    """Impulses of supports, floor and gravity add up to the change of momentum."""
+    mesh = create_box(
+        COMM, [np.zeros(3), np.ones(3)], [2, 2, 2], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    rail = nts.Dirichlet(lambda x: x[0] < 1e-9, components=(0,))
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(1e6, 0.3), density=1e3, velocity=(0, 1, -1), bcs=[rail]
+    )
+    pair = nts.ContactPair(
+        body.surface(lambda x: x[2] < 1e-9), nts.Plane((0, 0, -1e-3), (0, 0, 1)), friction=0.4
+    )
+    system = nts.System([body], contacts=[pair], gravity=(1.0, 0, -9.81))
+    run = nts.simulate(system, integrator, dt=DT, t_end=30 * DT)
+    forces = run.contact_forces[1:, 0] + run.reactions["body"][1:, 0] + 1e3 * system.gravity
+    momentum = run.balance["linear_momentum"]
+    assert run.balance["active"].max() == 9
+    assert np.abs(np.diff(momentum, axis=0) - DT * forces).max() < 1e-9 * 1e3
+    assert np.abs(run.reactions["body"][1:, 0, 0]).max() > 1.0
+    assert (run.reactions["body"][0] == 0).all() and run.contact_forces.shape == (31, 1, 3)

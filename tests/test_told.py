@@ -1,0 +1,100 @@
+"""What a newcomer got without a word: free motions, lost energy, crushed cells, open ledgers."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from test_single_mass import MASS, SPEED, STEP, mass_on_wall
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+pytestmark = pytest.mark.mpi
+
+
+def box(layers):
+    return create_box(
+        COMM, [np.zeros(3), np.ones(3)], [2, 2, layers], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+
+
+def cube(layers=2, **options):
+    return nts.Continuum(
+        box(layers), nts.NeoHookean(1e6, 0.3), density=1e3, name="cube", **options
+    )
+
+
+def stretched(rate):
+    """All nodes of a cube of one layer are prescribed, those of its top move by rate t."""
+    return [
+        nts.Dirichlet(lambda x: x[2] < 1e-9),
+        nts.Dirichlet(lambda x: x[2] > 1 - 1e-9, value=lambda t: (0, 0, rate * t)),
+    ]
+
+
+def standing(friction=0.0, **options):
+    body = cube(**options)
+    floor = nts.Plane((0, 0, 0), (0, 0, 1))
+    pair = nts.ContactPair(body.surface(lambda x: x[2] < 1e-9), floor, friction=friction)
+    return nts.System([body], contacts=[pair], gravity=(0, 0, -9.81))
+
+
+def held(axis):
+    return nts.Dirichlet(lambda x: x[axis] < 1e-9, components=(axis,))
+
+
+@pytest.mark.parametrize(
+    ("options", "stabilization", "words"),
+    [
+        ({}, None, "nothing resists body 'cube' "),
+        ({"bcs": [held(0)]}, None, "moving along (0, 1, 0)"),
+        ({"bcs": [held(1)]}, None, "moving along (1, 0, 0)"),
+        ({"bcs": [held(0), held(1)]}, None, None),
+        ({"friction": 0.3}, None, None),
+        ({}, 0.1, None),
+    ],
+)
+def test_motions_that_nothing_resists(options, stabilization, words):
+    run = nts.equilibrium(standing(**options), stabilization=stabilization)
+    if words is None:
+        assert run.status == "completed" and "free motion" not in run.warnings
+    else:
+        assert run.status.startswith("completed, but nothing resists")
+        assert words in run.warnings["free motion"].text
+
+
+@pytest.mark.parametrize("theta", [0.02, 0.5])
+def test_energy_lost_to_contact(theta):
+    """A mass that reaches the wall after a part theta of the step loses 4 theta (1 - theta)."""
+    system, _ = mass_on_wall(theta * STEP * SPEED)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=STEP, t_end=2 * STEP)
+    energy = 0.5 * MASS * SPEED**2
+    assert run.status == "completed"
+    assert ("energy lost to contact" in run.warnings) == (theta == 0.5)
+    if theta == 0.5:
+        warning = run.warnings["energy lost to contact"]
+        assert warning.worst == pytest.approx(energy, rel=1e-12) and not warning.grave
+
+
+@pytest.mark.parametrize("low", [0.03, 0.5])
+def test_crushed_cells(low):
+    """All nodes are prescribed: det F falls to `low`."""
+    system = nts.System([cube(1, bcs=stretched(low - 1.0))])
+    run = nts.simulate(system, nts.Midpoint(), dt=0.1, t_end=1.0)
+    assert run.balance["min_det"][-1] == pytest.approx(low, rel=1e-12)
+    assert ("crushed cells" in run.warnings) == (low < 0.05)
+
+
+@pytest.mark.parametrize("load_steps", [1, 20])
+def test_load_steps_that_are_too_few_for_the_ledger(load_steps):
+    """Pulled to twice its length: W = E^2/2 with E = 3/2, the work of one step 1/2 F E."""
+    material = nts.StVenantKirchhoff(1.0, 0.0)
+    body = nts.Continuum(box(1), material, density=1.0, bcs=stretched(1.0))
+    run = nts.equilibrium(nts.System([body]), load_steps=load_steps)
+    assert run.status == "completed"
+    missed = run.balance["ledger_residual"][-1]
+    if load_steps == 1:
+        assert missed == pytest.approx(0.5 * 1.5**2 - 0.5 * 2 * 1.5, rel=1e-12)
+        assert run.warnings["ledger"].worst == pytest.approx(-missed)
+    assert ("ledger" in run.warnings) == (load_steps == 1)
