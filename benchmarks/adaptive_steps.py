@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinx_nts import tradeoff
+from dolfinx_nts.study import tradeoff
 
 #: Choices for all runs, factors of the demo's step, and the factor that adaptive runs start from.
 SCENES: dict[str, tuple[dict[str, Any], tuple[float, ...], float]] = {

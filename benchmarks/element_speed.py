@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dolfinx_nts import facets, nts, patches
+from dolfinx_nts import nts
+from dolfinx_nts.kernels import facets, patches
 
 
 def middle_patch() -> np.ndarray:

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from dolfinx_nts.search import closest_facets
+from dolfinx_nts.contact.search import closest_facets
 
 
 def wavy_surface(n: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from dolfinx_nts import tradeoff
+from dolfinx_nts.study import tradeoff
 
 _SCHEME = {"integrator": "energy-momentum"}
 #: Label -> demo and choices: few and many coordinates, short and long steps, no contact, friction.

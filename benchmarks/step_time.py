@@ -17,11 +17,11 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.assembly import StepMatrix
-from dolfinx_nts.contact_elements import ContactElements
-from dolfinx_nts.continuum import Continuum
-from dolfinx_nts.facet_pair import FacetPair
-from dolfinx_nts.newton import ACCURACY, StepSolver
+from dolfinx_nts.bodies.continuum import Continuum
+from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.contact.facet_pair import FacetPair
+from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.newton import ACCURACY, StepSolver
 
 #: What a step is made of: label -> class and method that are timed.
 PARTS = {

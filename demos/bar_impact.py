@@ -35,7 +35,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import Fields
-from dolfinx_nts.pictures import picture
+from dolfinx_nts.output.pictures import picture
 
 LENGTH, AREA, YOUNG, DENSITY = 10.0, 1.0, 900.0, 1.0
 GAP, SPEED, GRAVITY = 5e-3, 1e-2, 1e-2
@@ -157,7 +157,7 @@ def plot(results, balances, gravity, folder):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from dolfinx_nts.plots import compare_balances
+    from dolfinx_nts.output.plots import compare_balances
 
     folder.mkdir(parents=True, exist_ok=True)
     compare_balances(balances, str(folder / "balance.png"))

@@ -26,7 +26,7 @@ from mpi4py import MPI
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
 from dolfinx_nts.output import Fields
-from dolfinx_nts.pictures import picture
+from dolfinx_nts.output.pictures import picture
 
 LOAD = np.array([256.0, 512.0, 768.0]) / 9
 PEAK, END = 2.5, 5.0
@@ -135,7 +135,7 @@ def main(
     if comm.rank == 0:
         report(results, dt)
     if comm.rank == 0 and output is not None:
-        from dolfinx_nts.plots import compare_balances
+        from dolfinx_nts.output.plots import compare_balances
 
         compare_balances(balances, str(Path(output) / "balance.png"))
     return results

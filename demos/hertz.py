@@ -52,7 +52,7 @@ from mpi4py import MPI
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
 from dolfinx_nts.output import Fields
-from dolfinx_nts.pictures import picture
+from dolfinx_nts.output.pictures import picture
 
 MESHES = runpy.run_path(str(Path(__file__).resolve().parents[1] / "meshes" / "half_round.py"))
 #: Size of the finely meshed block over the half-width of contact.

@@ -38,8 +38,8 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
+from dolfinx_nts.output.pictures import picture
 from dolfinx_nts.parallel import write_on_root
-from dolfinx_nts.pictures import picture
 
 MM = 1e-3
 LENGTH, HEIGHT = 12 * MM, 4 * MM

@@ -35,7 +35,7 @@ from mpi4py import MPI
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
 from dolfinx_nts.output import Fields
-from dolfinx_nts.pictures import picture
+from dolfinx_nts.output.pictures import picture
 
 RADIUS, WIDTH, DENSITY, GRAVITY = 1.0, 0.5, 1e3, 9.81
 SPEED, FRICTION = 3.0, 0.3
@@ -187,7 +187,7 @@ def plot(results, balances, folder):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from dolfinx_nts.plots import compare_balances
+    from dolfinx_nts.output.plots import compare_balances
 
     folder.mkdir(parents=True, exist_ok=True)
     compare_balances(balances, str(folder / "balance.png"))

@@ -26,7 +26,7 @@ from mpi4py import MPI
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
 from dolfinx_nts.output import Fields
-from dolfinx_nts.pictures import picture
+from dolfinx_nts.output.pictures import picture
 
 DENSITY, OMEGA, ARM = 1000.0, 4.0, 3
 INTEGRATORS = {"energy-momentum": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}
@@ -129,7 +129,7 @@ def main(
     if comm.rank == 0:
         report(results)
     if comm.rank == 0 and output is not None:
-        from dolfinx_nts.plots import compare_balances
+        from dolfinx_nts.output.plots import compare_balances
 
         Path(output).mkdir(parents=True, exist_ok=True)
         compare_balances(balances, str(Path(output) / "balance.png"))

@@ -38,8 +38,8 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
+from dolfinx_nts.output.pictures import picture
 from dolfinx_nts.parallel import write_on_root
-from dolfinx_nts.pictures import picture
 
 GRAVITY = 9.81
 SIZE, HEIGHT, DENSITY = 0.2, 0.05, 1000.0

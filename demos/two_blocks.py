@@ -28,8 +28,8 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
-from dolfinx_nts.pictures import picture
-from dolfinx_nts.plots import compare_balances
+from dolfinx_nts.output.pictures import picture
+from dolfinx_nts.output.plots import compare_balances
 
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}

@@ -36,7 +36,7 @@ import numpy as np
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.mesh_input import bodies_from_gmsh
+from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh
 
 MESHES = Path(__file__).resolve().parents[1] / "meshes"
 RADIUS, VELOCITY, DENSITY = 76.0, (30.0, 0.0, 23.0), 0.1
@@ -87,7 +87,7 @@ class Pictures:
 
     def write(self, stepper, last):
         """Draw if it is time."""
-        from dolfinx_nts.pictures import picture
+        from dolfinx_nts.output.pictures import picture
 
         t = stepper.state.time
         if t < self.next - 1e-9 and not last:

@@ -2,9 +2,18 @@
 
 from importlib.metadata import version
 
-from dolfinx_nts.body import Body, Moment
-from dolfinx_nts.contact import ContactPair
-from dolfinx_nts.continuum import Continuum, Dirichlet, Traction
+from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.continuum import Continuum, Dirichlet, Traction
+from dolfinx_nts.bodies.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
+from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.bodies.motion import BodyMotion, motion_of
+from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
+from dolfinx_nts.contact.facet_pair import FacetPair
+from dolfinx_nts.contact.obstacle_pair import ObstaclePair
+from dolfinx_nts.contact.obstacles import Cylinder, Plane, Sphere
+from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.elements import (
     Coupling,
     Elements,
@@ -14,8 +23,6 @@ from dolfinx_nts.elements import (
     PointPart,
     Step,
 )
-from dolfinx_nts.equilibrium import Equilibrium, equilibrium
-from dolfinx_nts.facet_pair import FacetPair
 from dolfinx_nts.integrators import (
     EnergyMomentum,
     GeneralizedAlpha,
@@ -23,22 +30,15 @@ from dolfinx_nts.integrators import (
     Midpoint,
     Newmark,
 )
-from dolfinx_nts.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
-from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
-from dolfinx_nts.motion import BodyMotion, motion_of
-from dolfinx_nts.newton import Newton
-from dolfinx_nts.nts_element import Gap
-from dolfinx_nts.obstacle_pair import ObstaclePair
-from dolfinx_nts.obstacles import Cylinder, Plane, Sphere
-from dolfinx_nts.points import Points
-from dolfinx_nts.simulate import Solution, Stepper, simulate
-from dolfinx_nts.step_size import Adapt
-from dolfinx_nts.strain_energy import Isotropic
-from dolfinx_nts.stress import cauchy_stress, von_mises
-from dolfinx_nts.surfaces import Surface
+from dolfinx_nts.kernels.nts_element import Gap
+from dolfinx_nts.kernels.strain_energy import Isotropic
+from dolfinx_nts.output.writer import Writer
+from dolfinx_nts.run.equilibrium import Equilibrium, equilibrium
+from dolfinx_nts.run.simulate import Solution, Stepper, simulate
+from dolfinx_nts.run.step_size import Adapt
+from dolfinx_nts.step.newton import Newton
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
-from dolfinx_nts.writer import Writer
 
 __version__ = version("dolfinx_nts")
 __all__ = [

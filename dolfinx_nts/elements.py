@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.points import Points
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step import Evaluation
-    from dolfinx_nts.surfaces import Surface
+    from dolfinx_nts.contact.surfaces import Surface
+    from dolfinx_nts.step.problem import Evaluation
     from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]

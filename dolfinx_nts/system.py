@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.body import Body
-from dolfinx_nts.contact import INITIAL_PENETRATION, ContactPair
-from dolfinx_nts.contact_elements import ContactHistory
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.contact.contact_elements import ContactHistory
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.elements import Joint
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import items, known_options, vector

@@ -25,7 +25,7 @@ from mpi4py import MPI
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.output import BalanceCSV, Fields
-from dolfinx_nts.pictures import picture
+from dolfinx_nts.output.pictures import picture
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)

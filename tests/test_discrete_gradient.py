@@ -14,9 +14,9 @@ from dolfinx.mesh import CellType, create_unit_cube
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import discrete_gradient as dg
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.strain_energy import strain_energy
+from dolfinx_nts.kernels import discrete_gradient as dg
+from dolfinx_nts.kernels.strain_energy import strain_energy
 
 YOUNG, POISSON = 1e6, 0.3
 MU, LAM = YOUNG / 2.6, YOUNG * POISSON / (1.3 * 0.4)

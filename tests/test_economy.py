@@ -14,8 +14,9 @@ from test_layout import in_fresh_python
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts import economy, search, tradeoff
-from dolfinx_nts.contact_search import ContactSearch
+from dolfinx_nts.contact import search
+from dolfinx_nts.contact.contact_search import ContactSearch
+from dolfinx_nts.study import economy, tradeoff
 
 COMM = MPI.COMM_WORLD
 FEATURE = {f.name: f for f in economy.FEATURES}

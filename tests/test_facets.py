@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from dolfinx_nts import facets as fc
+from dolfinx_nts.kernels import facets as fc
 
 KINDS = (3, 4)
 FLAT = {

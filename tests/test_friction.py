@@ -9,9 +9,10 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import contact_elements, facets
-from dolfinx_nts.friction import return_map
-from dolfinx_nts.nts_element import invariants, metric, projection
+from dolfinx_nts.contact import contact_elements
+from dolfinx_nts.kernels import facets
+from dolfinx_nts.kernels.friction import return_map
+from dolfinx_nts.kernels.nts_element import invariants, metric, projection
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {

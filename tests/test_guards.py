@@ -10,8 +10,8 @@ from test_single_mass import STEP, mass_on_wall
 from test_two_blocks import fung
 
 import dolfinx_nts as nts
-from dolfinx_nts import balance
-from dolfinx_nts.guards import check_momentum
+from dolfinx_nts.step import balance
+from dolfinx_nts.step.guards import check_momentum
 
 COMM = MPI.COMM_WORLD
 

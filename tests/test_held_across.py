@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.integrators import Static
-from dolfinx_nts.step import StepProblem
+from dolfinx_nts.step.problem import StepProblem
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)

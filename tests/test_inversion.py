@@ -8,10 +8,10 @@ from test_single_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.inversion import smallest_dets
-from dolfinx_nts.newton import ACCURACY
+from dolfinx_nts.bodies.inversion import smallest_dets
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.step import StepProblem
+from dolfinx_nts.step.newton import ACCURACY
+from dolfinx_nts.step.problem import StepProblem
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)

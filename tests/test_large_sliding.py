@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from mpi4py import MPI
 from scipy.integrate import solve_ivp
 from test_single_mass import INTEGRATORS as ALL
@@ -12,6 +12,7 @@ from test_single_mass import MASS, PointMass, PointSurface
 from test_smoothing import SPEED, Sledge
 
 import dolfinx_nts as nts
+from dolfinx_nts.contact.surfaces import locate_facets
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {name: ALL[name] for name in ("midpoint", "energy-momentum")}
@@ -194,9 +195,9 @@ def saddle(height):
         COMM, [[-1, -1, -0.5], [1, 1, 0]], [4, 4, 1], CellType.hexahedron,
         ghost_mode=GhostMode.shared_facet,
     )  # fmt: skip
-    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
+    top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
     one = np.full(len(top), 1, np.int32)
-    tags = nts.continuum.dolfinx_mesh.meshtags(mesh, 2, np.sort(top), one)
+    tags = meshtags(mesh, 2, np.sort(top), one)
     x, y, _ = mesh.geometry.x.T
     mesh.geometry.x[:, 2] += height * x * y
     everywhere = nts.Dirichlet(lambda x: np.full(x.shape[1], True))

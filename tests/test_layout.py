@@ -15,25 +15,20 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "dolfinx_nts"
 
-#: Floors from below; a folder stands for all of its files.
+#: Floors from below: files, and folders that stand for all of theirs.
 LEVELS = [
-    {"parallel", "validation", "dolfinx_compat", "run_warnings", "table", "whole_files"}
-    | {"precise", "strain_energy", "discrete_gradient", "nts_element", "friction", "facets"}
-    | {"patches", "bounded_slope"},
+    {"parallel", "validation", "dolfinx_compat", "kernels"},
     {"integrators"},
-    {"body", "continuum", "materials", "inversion", "mesh_check", "mesh_input"}
-    | {"contact", "contact_elements", "contact_search", "facet_pair", "facet_elements"}
-    | {"obstacles", "obstacle_pair", "obstacle_elements", "search", "surfaces"}
-    | {"overlap", "intrusion", "elements", "points", "motion", "stress"},
-    {"system", "balance", "resultants"},
-    {"newton", "step", "step_size", "assembly", "node_blocks", "linear_solver", "sleep", "guards"}
-    | {"promises", "unknowns", "free_motion"},
-    {"simulate", "equilibrium", "output", "writer", "plots", "pictures", "tradeoff", "economy"},
+    {"bodies", "contact", "elements", "system"},
+    {"step"},
+    {"output"},
+    {"run"},
+    {"study"},
     {"__init__"},
 ]
 LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}
-#: What floor 0 may know of ranks, and of DOLFINx.
-SERVANTS = {"parallel", "validation", "dolfinx_compat"}
+#: What the kernels do without.
+KNOW_RANKS = {"parallel", "dolfinx_compat"}
 
 
 def named(path):
@@ -125,14 +120,14 @@ def test_no_module_imports_the_whole_package(module):
     assert not attributes, f"import from the module that defines {sorted(attributes)}"
 
 
-@pytest.mark.parametrize("module", sorted(LEVELS[0] - SERVANTS))
+@pytest.mark.parametrize("module", [name for name in PRESENT if name.startswith("kernels.")])
 def test_level_0_knows_neither_mpi_nor_petsc(module):
     top = {name.split(".")[0] for name in imported(module)}
     assert not top & {"mpi4py", "petsc4py", "dolfinx"}
-    assert not siblings(module) & {"parallel", "dolfinx_compat"}
+    assert not siblings(module) & KNOW_RANKS
 
 
-@pytest.mark.parametrize("module", sorted(set(PRESENT) - {"assembly", "dolfinx_compat"}))
+@pytest.mark.parametrize("module", sorted(set(PRESENT) - {"step.assembly", "dolfinx_compat"}))
 def test_only_assembly_creates_petsc_matrices(module):
     makes = re.findall(
         r"\bMat\(\)|\.create(?:Seq)?S?B?AIJ\(|\.createNest\(", code_without_text(module)

@@ -9,8 +9,8 @@ from test_friction import difference
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts import linear_solver, node_blocks
-from dolfinx_nts.assembly import StepMatrix
+from dolfinx_nts.step import linear_solver, node_blocks
+from dolfinx_nts.step.assembly import StepMatrix
 
 COMM = MPI.COMM_WORLD
 
@@ -60,7 +60,7 @@ def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
 
     Krylov's method alone cannot solve these steps.
     """
-    caplog.set_level("INFO", logger="dolfinx_nts.newton")
+    caplog.set_level("INFO", logger="dolfinx_nts.step.newton")
     long, short = 0.06, 5e-4
     tables = {}
     for solver in ("auto", "direct"):

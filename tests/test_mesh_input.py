@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)

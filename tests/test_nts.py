@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dolfinx_nts import discrete_gradient, nts_element
-from dolfinx_nts import facets as fc
+from dolfinx_nts.kernels import discrete_gradient, nts_element
+from dolfinx_nts.kernels import facets as fc
 
 #: Triangle, quadrilateral, patch over a quadrilateral.
 KINDS = (3, 4, 16)

@@ -10,7 +10,7 @@ from test_single_mass import INTEGRATORS, MASS, SPEED, STEP, PointMass, PointSur
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import Fields
-from dolfinx_nts.pictures import picture
+from dolfinx_nts.output.pictures import picture
 
 COMM = MPI.COMM_WORLD
 ACCELERATION = 9.81

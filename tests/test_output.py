@@ -10,7 +10,9 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import balance, output, pictures, plots
+from dolfinx_nts.output import pictures, plots
+from dolfinx_nts.output import writers as output
+from dolfinx_nts.step import balance
 
 h5py = pytest.importorskip("h5py")
 image = pytest.importorskip("matplotlib.image")

@@ -12,8 +12,9 @@ from scipy import ndimage
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts import facets, intrusion, overlap
-from dolfinx_nts.obstacles import Obstacle
+from dolfinx_nts.contact import intrusion, overlap
+from dolfinx_nts.contact.obstacles import Obstacle
+from dolfinx_nts.kernels import facets
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}

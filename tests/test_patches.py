@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dolfinx_nts import facets as fc
-from dolfinx_nts import patches
+from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.kernels import patches
 
 LINE = np.linspace(-1.0, 1.0, 9)
 #: Ends of edge k, from corner k to k + 1.

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from test_single_mass import PointMass
 
 import dolfinx_nts as nts
-from dolfinx_nts.promises import Promises
+from dolfinx_nts.step.promises import Promises
 
 COMM = MPI.COMM_WORLD
 

@@ -7,7 +7,7 @@ from mpi4py import MPI
 from test_friction import difference, rubbing_blocks
 
 import dolfinx_nts as nts
-from dolfinx_nts.newton import ACCURACY
+from dolfinx_nts.step.newton import ACCURACY
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}

@@ -9,7 +9,7 @@ from test_single_mass import mass_on_wall
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.run_warnings import RunWarnings
+from dolfinx_nts.run.run_warnings import RunWarnings
 
 
 def test_a_kind_is_counted_and_its_worst_case_kept(caplog):

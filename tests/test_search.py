@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dolfinx_nts import facets as fc
-from dolfinx_nts.search import ROUNDING, closest_facets
+from dolfinx_nts.contact.search import ROUNDING, closest_facets
+from dolfinx_nts.kernels import facets as fc
 
 
 def brute_force(points, corners, reach, current=None, preference=1e-6):
@@ -207,7 +207,7 @@ def test_many_ties_come_in_several_portions(monkeypatch):
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     corners = directions + 0.01 * rng.normal(size=(200, 3, 3))
     points = 0.01 * rng.normal(size=(50, 3))
-    monkeypatch.setattr("dolfinx_nts.search._MAX_PAIRS", 700)
+    monkeypatch.setattr("dolfinx_nts.contact.search._MAX_PAIRS", 700)
     assert_same(closest_facets(points, corners, reach=5.0), brute_force(points, corners, 5.0))
 
 

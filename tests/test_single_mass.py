@@ -14,6 +14,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import dolfinx_nts as nts
+from dolfinx_nts.contact.surfaces import locate_facets
 
 COMM = MPI.COMM_WORLD
 MASS, SPEED, STEP = 2.5, 3.0, 0.02
@@ -100,7 +101,7 @@ def wall(turned=False):
         ghost_mode=GhostMode.shared_facet,
     )  # fmt: skip
     q = turn() if turned else np.eye(3)
-    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
+    top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
     tags = dolfinx.mesh.meshtags(mesh, 2, np.sort(top), np.full(len(top), 1, np.int32))
     mesh.geometry.x[:] = mesh.geometry.x @ q.T
     body = nts.Continuum(

@@ -12,8 +12,8 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts import precise
-from dolfinx_nts.strain_energy import strain_energy
+from dolfinx_nts.kernels import precise
+from dolfinx_nts.kernels.strain_energy import strain_energy
 
 COMM = MPI.COMM_WORLD
 YOUNG, POISSON, STEEPNESS = 1000.0, 0.3, 50.0

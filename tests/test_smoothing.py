@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from mpi4py import MPI
 from test_single_mass import PointMass, PointSurface
 
 import dolfinx_nts as nts
+from dolfinx_nts.contact.surfaces import locate_facets
 
 COMM = MPI.COMM_WORLD
 FACETS, RADIUS, SPEED, WEIGHT = 16, 1.0, 1.0, 1e3
@@ -33,8 +34,8 @@ def plate(shape, facets, uneven):
         COMM, [[-END, -0.1, -0.1], [END, 0.1, 0.0]], [facets, 1, 1], CellType.hexahedron,
         ghost_mode=GhostMode.shared_facet,
     )  # fmt: skip
-    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
-    tags = nts.continuum.dolfinx_mesh.meshtags(
+    top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
+    tags = meshtags(
         mesh, 2, np.sort(top), np.full(len(top), 1, np.int32)
     )
     x, y, z = mesh.geometry.x.T
@@ -162,9 +163,9 @@ def bumpy(comm, smoothing):
     """A block that slides over the waves of a plate; both are free."""
     cells = {"cell_type": CellType.hexahedron, "ghost_mode": GhostMode.shared_facet}
     mesh = create_box(comm, [[0, 0, 0], [1.2, 1, 0.3]], [6, 5, 1], **cells)
-    top = nts.surfaces.locate_facets(mesh, lambda x: x[2] > 0.3 - 1e-9, None, "top")
+    top = locate_facets(mesh, lambda x: x[2] > 0.3 - 1e-9, None, "top")
     one = np.full(len(top), 1, np.int32)
-    tags = nts.continuum.dolfinx_mesh.meshtags(mesh, 2, np.sort(top), one)
+    tags = meshtags(mesh, 2, np.sort(top), one)
     x, y, z = mesh.geometry.x.T
     mesh.geometry.x[:, 2] += 0.03 * np.sin(6 * x) * np.cos(4 * y) * z / 0.3
     rubber = nts.NeoHookean(young=1e6, poisson=0.3)

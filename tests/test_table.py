@@ -10,9 +10,9 @@ from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.balance import COLUMNS, Switch, Switches
-from dolfinx_nts.simulate import Solution
-from dolfinx_nts.table import Table
+from dolfinx_nts.run.simulate import Solution
+from dolfinx_nts.run.table import Table
+from dolfinx_nts.step.balance import COLUMNS, Switch, Switches
 
 COMM = MPI.COMM_WORLD
 

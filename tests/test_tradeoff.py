@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dolfinx_nts import tradeoff
-from dolfinx_nts.newton import ACCURACY
+from dolfinx_nts.step.newton import ACCURACY
+from dolfinx_nts.study import tradeoff
 
 COMM = MPI.COMM_WORLD
 SCRIPT = """

@@ -7,7 +7,7 @@ from mpi4py import MPI
 from test_single_mass import INTEGRATORS, MASS, PointMass, PointSurface
 
 import dolfinx_nts as nts
-from dolfinx_nts import search
+from dolfinx_nts.contact import search
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)

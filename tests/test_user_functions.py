@@ -11,7 +11,8 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import continuum, output
+from dolfinx_nts.bodies import continuum
+from dolfinx_nts.output import writers as output
 
 COMM = MPI.COMM_WORLD
 DT = 1e-3

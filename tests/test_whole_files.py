@@ -15,8 +15,9 @@ from mpi4py import MPI
 from test_output import flying, read, scene
 
 import dolfinx_nts as nts
-from dolfinx_nts import output, pictures
-from dolfinx_nts.whole_files import Draft, amend_file, extend_file, replace_file
+from dolfinx_nts.output import pictures
+from dolfinx_nts.output import writers as output
+from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 
 COMM = MPI.COMM_WORLD
 mpi = pytest.mark.mpi

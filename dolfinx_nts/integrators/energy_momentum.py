@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import ufl
 
-from dolfinx_nts.discrete_gradient import gonzalez_stress, mean_value_stress
 from dolfinx_nts.integrators.rule import MiddleOfStep, choose
-from dolfinx_nts.strain_energy import StrainEnergy, green_strain
+from dolfinx_nts.kernels.discrete_gradient import gonzalez_stress, mean_value_stress
+from dolfinx_nts.kernels.strain_energy import StrainEnergy, green_strain
 from dolfinx_nts.validation import is_whole, known_options
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from dolfinx_nts.integrators.rule import WithAccelerations, stress_of
-from dolfinx_nts.strain_energy import StrainEnergy
+from dolfinx_nts.kernels.strain_energy import StrainEnergy
 from dolfinx_nts.validation import is_finite, known_options
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 
-from dolfinx_nts.strain_energy import StrainEnergy, green_strain
+from dolfinx_nts.kernels.strain_energy import StrainEnergy, green_strain
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.integrators.rule import stress_of
-from dolfinx_nts.strain_energy import StrainEnergy
+from dolfinx_nts.kernels.strain_energy import StrainEnergy
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""Bodies: what a scene asks of them, continua, their materials and meshes, their points."""

@@ -1,0 +1,87 @@
+"""Whether a mesh is fit for a body: its kind, its coordinates, no cell flat or inside out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import mesh as dolfinx_mesh
+from mpi4py import MPI
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact.surfaces import flux, oriented_nodes
+from dolfinx_nts.parallel import raise_together
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Corner -> its three edge neighbours in DOLFINx vertex order.
+_NEIGHBOURS = np.array([[c ^ 1, c ^ 2, c ^ 4] for c in range(8)])
+#: The triple product flips sign at every second corner.
+_PARITY = np.array([1 - 2 * (bin(c).count("1") % 2) for c in range(8)])
+#: Corners of the six faces, cyclic and counter-clockwise seen from outside.
+_FACES = np.array(
+    [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+)
+
+
+def check_mesh(mesh: Any, name: str) -> None:
+    """Raise on every rank unless the mesh is a valid 3D mesh of degree 1.
+
+    Args:
+        mesh: DOLFINx mesh.
+        name: Of its body, for messages.
+
+    Raises:
+        TypeError: It is no mesh.
+        ValueError: Cells of another kind, not finite, inverted or overlapping.
+    """
+    if not isinstance(mesh, dolfinx_mesh.Mesh):
+        raise TypeError(f"mesh={mesh!r}: pass a dolfinx mesh")
+    kind = compat.cell_name(mesh)
+    if kind not in ("hexahedron", "tetrahedron") or mesh.geometry.dim != 3:
+        raise ValueError(
+            f"mesh of {name!r}: {kind} in {mesh.geometry.dim}D; pass 3D hexahedra or tetrahedra"
+        )
+    corners = {"hexahedron": 8, "tetrahedron": 4}[kind]
+    cells = compat.geometry_dofmap(mesh)
+    nodes = mesh.comm.allreduce(cells.shape[1], op=MPI.MAX)
+    if nodes != corners:
+        raise ValueError(
+            f"mesh of {name!r}: {nodes} nodes per {kind}, not {corners}; pass a mesh of degree 1"
+        )
+    nan = np.flatnonzero(~np.isfinite(mesh.geometry.x).all(axis=1))
+    text = f"mesh of {name!r}: {len(nan)} nodes are not finite, e.g. {mesh.geometry.x[nan[:1]]}"
+    raise_together(mesh.comm, f"{text}; check the coordinates for NaN" if len(nan) else None)
+    owned = mesh.topology.index_map(3).size_local
+    _check_cells(mesh, name, mesh.geometry.x[cells[:owned].reshape(owned, corners)])
+
+
+def _check_cells(mesh: Any, name: str, x: FloatArray) -> None:
+    """Raise on every rank if one of the cells with corners x (n, 4 or 8, 3) is inverted."""
+    if x.shape[1] == 8:
+        edges = x[:, _NEIGHBOURS] - x[:, :, None]
+        det = np.linalg.det(edges) * _PARITY
+        volumes = flux(x[:, _FACES] - x[:, :1, None]).sum(axis=1)
+    else:
+        edges = (x[:, 1:] - x[:, :1])[:, None]
+        det = np.linalg.det(edges)
+        volumes = det[:, 0] / 6
+    size = np.linalg.norm(edges, axis=-1).prod(axis=-1)
+    flat = (np.abs(det) <= 1e-12 * size).any(axis=1)
+    bad = np.flatnonzero(flat | (np.abs(np.sign(det).sum(axis=1)) < det.shape[1]))
+    where = f"e.g. the one at x={x[bad[:1]].mean(axis=(0, 1)).tolist()}" if len(bad) else ""
+    text = f"mesh of {name!r}: {len(bad)} inverted or flat cells, {where}; repair the mesh"
+    raise_together(mesh.comm, text if len(bad) else None)
+    # A cell turned inside out as a whole: the volumes add up to more than the boundary encloses.
+    # Seen from a point of the mesh: from a far origin the cones over its boundary would cancel.
+    corner = np.append(mesh.geometry.x, np.full((1, 3), np.inf), axis=0).min(axis=0)
+    mesh.comm.Allreduce(MPI.IN_PLACE, corner, op=MPI.MIN)
+    boundary = mesh.geometry.x[oriented_nodes(mesh, compat.exterior_facets(mesh))] - corner
+    local = np.array([np.abs(volumes).sum(), flux(boundary).sum()])
+    volume, enclosed = mesh.comm.allreduce(local)
+    if abs(volume - enclosed) > 1e-9 * volume:
+        raise ValueError(
+            f"mesh of {name!r}: inverted or overlapping cells, whose volumes add up to "
+            f"{volume:.12g} while the boundary encloses {enclosed:.12g}; repair the mesh"
+        )

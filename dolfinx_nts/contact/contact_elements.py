@@ -1,0 +1,667 @@
+"""What contact of any kind has in common in a step: the laws of the gap and of friction.
+
+The elements of a step share them, whatever the master is: a node's gap, slip and contact force come
+from `_element`, which facets and obstacles each have of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.pair import Candidates, ContactPair
+from dolfinx_nts.kernels import nts_element
+from dolfinx_nts.kernels.friction import length, return_map
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Algorithmic scale c of the return map over the scale of the active set. No result depends on it;
+#: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which
+#: with a consistent mass matrix is a small part of the nodal mass.
+TANGENTIAL_SCALE = 0.05
+#: Largest coefficient of friction in numbers: larger ones are this one, but for infinite friction.
+_LARGEST = 1e8
+#: Coefficient of infinite friction where it has a bound: sticking by more would be rounding's.
+_BOUND = 1e4
+#: Pull over friction that counts as none.
+_NO_PULL = 1e-8
+#: Coefficient from which on friction counts as strong.
+_STRONG = 1.0
+#: Pull over friction up to which a node that sticks is let slip before it is let go.
+_PULL = 0.01
+#: Square of the part of a motion that counts as none.
+_IMMOVABLE = 1e-12
+#: Prescribed slip over the size of the facet that counts as none.
+_STILL = 1e-10
+
+
+#: Changes of one node's state in a step that are no search any more.
+_CYCLE = 8
+_EPS = float(np.finfo(float).eps)
+
+
+class Contribution(NamedTuple):
+    """Step equations of the pairs at an iterate, all rows [kg m] for unknowns in [m].
+
+    Attributes:
+        residual: Shape (n, r), r = 3 (nc + 1) + augmented + constraints.
+        tangent: Shape (n, r, r).
+        multiplier: h^2/2 lambda of the constraints [kg m], shape (n, constraints).
+        gap: g_N at t_{n+1} [m], shape (n,).
+        active: Active set of the iterate, shape (n,).
+        stick: Active pairs that stick, shape (n,).
+        slip: Facet size times f_1 - f_0 [m], shape (n, 2); (n, 0) without friction.
+        distance: Length of the slip in the metric [m], shape (n,); 0 where not active.
+        tangential: Contact force on the slave less its part along the normal [kg m], shape (n, 3).
+    """
+
+    residual: FloatArray
+    tangent: FloatArray
+    multiplier: FloatArray
+    gap: FloatArray
+    active: BoolArray
+    stick: BoolArray
+    slip: FloatArray
+    distance: FloatArray
+    tangential: FloatArray
+
+    @property
+    def status(self) -> BoolArray:
+        """What Newton's method may flip: active and stick, shape (2, n)."""
+        return np.stack([self.active, self.stick])
+
+
+class ContactHistory(NamedTuple):
+    """What a contact remembers from step to step, of each slave node in this rank's share.
+
+    Attributes:
+        facet: Facet in the last step, or -1, shape (n,).
+        force: Contact force p_N [N], >= 0.
+        gap: Gap [m], infinite where a node was no candidate.
+        tangential: Friction force [N], shape (n, 3).
+        stick: Whether it sticks.
+        slip: Distance that it has slipped since the start [m].
+        followed: Whether it is not known to have passed by the surface's edge.
+    """
+
+    facet: IntArray
+    force: FloatArray
+    gap: FloatArray
+    tangential: FloatArray
+    stick: BoolArray
+    slip: FloatArray
+    followed: BoolArray
+
+    @classmethod
+    def of_start(cls, n: int) -> ContactHistory:
+        """Of n nodes that have not touched yet."""
+        off, none = np.zeros(n, dtype=bool), np.zeros(n)
+        return cls(
+            np.full(n, -1), none, np.full(n, np.inf), np.zeros((n, 3)), off, none.copy(), ~off
+        )
+
+
+class Slip(NamedTuple):
+    """Slip and metric in facet sizes with their derivatives by the unknowns of the element."""
+
+    value: FloatArray
+    gradient: FloatArray
+    metric: FloatArray
+    metric_gradient: FloatArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContactElements:
+    """The candidates of one pair in one step, with the rule of the integrator.
+
+    Attributes:
+        pair: Its surfaces.
+        candidates: This rank's slave nodes and their facets.
+        rule: "direct" for the midpoint rule, else the discrete gradient.
+        condense: Whether (d, f) and their multipliers are eliminated pair by pair.
+        x0: Slave, and what the master is interpolated from, at t_n [m], shape (n, nc + 1, 3).
+        scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
+            nodal mass [kg] in dynamics; scales multipliers.
+        theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
+        rounding: Gap [m] that counts as none.
+        force_rounding: Contact force [kg m] that counts as none.
+        bounded: Whether infinite friction has a bound.
+        lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
+    """
+
+    pair: ContactPair
+    candidates: Candidates
+    rule: str
+    condense: bool
+    x0: FloatArray
+    scale: FloatArray
+    theta: float
+    rounding: float = 0.0
+    force_rounding: float = 0.0
+    bounded: bool = False
+    lets_slip: bool = False
+
+    # ---- what a kind of master has of its own
+    @property
+    def num_points(self) -> int:
+        """Points of the master that a pair depends on."""
+        raise NotImplementedError
+
+    @property
+    def num_augmented(self) -> int:
+        """Unknowns d and f per pair."""
+        return 0
+
+    @property
+    def _num_normal(self) -> int:
+        """Constraints per pair but those of friction; that of the gap comes first."""
+        return 1
+
+    def master_numbers(self) -> tuple[tuple[IntArray, BoolArray], ...]:
+        """Global coordinates of the masters' points, shape (n, 3 points), and which are fixed."""
+        raise NotImplementedError
+
+    @property
+    def immovable(self) -> BoolArray:
+        """Whether all coordinates of the pairs' masters are prescribed, shape (n,)."""
+        raise NotImplementedError
+
+    @property
+    def extent(self) -> float:
+        """Length beside the displacements whose rounding enters the gaps [m]."""
+        return self.pair.extent
+
+    def reference(self) -> FloatArray:
+        """Reference positions of slaves and points in the pair's frame [m], (n, points + 1, 3)."""
+        raise NotImplementedError
+
+    def gap(self, x: FloatArray) -> FloatArray:
+        """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""
+        raise NotImplementedError
+
+    def external_work(self, part: Contribution) -> float:
+        """h^2/2 times the work that enters the bodies through the contact [kg m^2]."""
+        return 0.0
+
+    def initial_guess(self, x: FloatArray) -> FloatArray:
+        """Augmented unknowns that fit predicted positions (n, points + 1, 3)."""
+        return np.empty((self.num_elements, 0))
+
+    @property
+    def foot(self) -> FloatArray:
+        """Weights of the control points in the foot at t_n, shape (n, nc)."""
+        raise NotImplementedError
+
+    @property
+    def point_foot(self) -> FloatArray:
+        """Weights of the masters' points in the foot at t_n, shape (n, points)."""
+        return self.foot
+
+    @property
+    def _ease(self) -> FloatArray:
+        """Motion of the foot per force on it [1/kg], shape (n,)."""
+        raise NotImplementedError
+
+    @property
+    def _tangents(self) -> FloatArray:
+        """Tangents of the master at t_n over their size [-], shape (n, 2, 3)."""
+        raise NotImplementedError
+
+    def _control(self, x: FloatArray) -> FloatArray:
+        """Slave and control points from slave and points."""
+        return x
+
+    def _to_points(self, part: Contribution) -> None:
+        """The transpose of `_control`: forces and tangents of control points to their points."""
+
+    def _normal(self, x: FloatArray) -> FloatArray:
+        """Normal where the contact force acts, shape (n, 3)."""
+        raise NotImplementedError
+
+    def _element(
+        self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """Residual and tangent in [kg m] and [m], gap and slip, before the laws of contact."""
+        raise NotImplementedError
+
+    # ---- what they share
+    @property
+    def name(self) -> str:
+        """Of the contact, for messages."""
+        return self.pair.name
+
+    @property
+    def num_elements(self) -> int:
+        """Candidates on this rank."""
+        return len(self.candidates.node)
+
+    @property
+    def num_coordinates(self) -> int:
+        """Coordinates of the slave and the master's points of a pair."""
+        return 3 * (self.num_points + 1)
+
+    @property
+    def num_tangential(self) -> int:
+        """Tangential multipliers per pair, the last ones."""
+        return 2 if self.pair.friction else 0
+
+    @property
+    def num_constraints(self) -> int:
+        """Multipliers per pair."""
+        return self._num_normal + self.num_tangential
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Own unknowns of a pair by field."""
+        return {"augmented": self.num_augmented, "constraints": self.num_constraints}
+
+    @property
+    def pattern(self) -> BoolArray:
+        """Which constraints stand in the rows of which, shape (m, m)."""
+        pattern = np.zeros((self.num_constraints,) * 2, dtype=bool)
+        pattern[0, 0] = True
+        pattern[self._num_normal :, 0] = True
+        pattern[self._num_normal :, self._num_normal :] = True
+        return pattern
+
+    def part(self, chosen: BoolArray) -> ContactElements:
+        """Some of the pairs, shape (n,)."""
+        found = self.candidates.part(chosen)
+        return replace(
+            self, candidates=found, x0=self.x0[chosen], scale=self.scale[chosen]
+        )
+
+    def _coordinates(self) -> list[tuple[IntArray, BoolArray]]:
+        """Global coordinates of slaves (n, 3) and masters, and which of them are prescribed."""
+        slave = self.pair.slave
+        points = slave.share[self.candidates.node]
+        return [(slave.dofs[points], slave.fixed[points]), *self.master_numbers()]
+
+    def dofs(self) -> tuple[IntArray, ...]:
+        """Global coordinates of slaves (n, 3) and masters (n, 3 points); -1 where prescribed."""
+        return tuple(np.where(fixed, -1, numbers) for numbers, fixed in self._coordinates())
+
+    def points(self) -> tuple[IntArray, ...]:
+        """Global coordinates as in `dofs`, prescribed ones included."""
+        return tuple(numbers for numbers, _ in self._coordinates())
+
+    def input_node(self, i: int) -> int:
+        """Number of a pair's slave node in the user's mesh."""
+        slave = self.pair.slave
+        return int(slave.original[slave.share[self.candidates.node[i]]])
+
+    @property
+    def gap_rounding(self) -> FloatArray:
+        """Gap [m] that counts as none, or that a force which does would open, shape (n,)."""
+        gap: FloatArray = np.maximum(self.rounding, self.force_rounding / self._yielding)
+        return gap
+
+    @property
+    def strong(self) -> bool:
+        """Whether friction may hold a node that free motion lets go (Painleve's paradox)."""
+        return self.pair.friction > _STRONG
+
+    @staticmethod
+    def no_pull(friction: FloatArray) -> FloatArray:
+        """Contact force that counts as none beside these friction forces (n, 3), in their unit."""
+        none: FloatArray = _NO_PULL * np.linalg.norm(friction, axis=1)
+        return none
+
+    @property
+    def _endless(self) -> bool:
+        """Whether friction has no bound."""
+        return bool(np.isinf(self.pair.friction)) and not self.bounded
+
+    @cached_property
+    def _free(self) -> BoolArray:
+        """Coordinates of slaves and masters that are not prescribed, shape (n, np + 1, 3)."""
+        fixed = np.concatenate([fixed for _, fixed in self._coordinates()], axis=1)
+        free: BoolArray = ~fixed.reshape(self.num_elements, self.num_points + 1, 3)
+        return free
+
+    @cached_property
+    def _yielding(self) -> FloatArray:
+        """The part of `scale` that a slave and its foot move against each other, shape (n,).
+
+        A master that is much lighter than the slave gives way in its place.
+        """
+        together: FloatArray = self.scale / (1.0 + self.scale * self._ease)
+        return together
+
+    @cached_property
+    def _prescribed(self) -> BoolArray:
+        """Axes along which slave and foot move as prescribed, shape (n, 3)."""
+        square = np.column_stack([np.ones(self.num_elements), self.point_foot]) ** 2
+        part = np.einsum("nk,nki->ni", square, self._free)
+        still: BoolArray = part <= _IMMOVABLE * square.sum(axis=1)[:, None]
+        return still
+
+    @cached_property
+    def _blocked(self) -> FloatArray:
+        """Projector on the tangential parts of the prescribed axes, shape (n, 3, 3).
+
+        Forces there act on prescribed coordinates or along the normal: where the gap is closed, the
+        slip there is prescribed.
+        """
+        if not self._prescribed.any():
+            return np.zeros((self.num_elements, 3, 3))
+        normal = self.candidates.normal
+        along = np.eye(3) - normal[:, :, None] * normal[:, None]
+        part, vector = np.linalg.eigh(np.matmul(along * self._prescribed[:, None], along))
+        vector *= (part > _IMMOVABLE)[:, None]
+        projector: FloatArray = np.matmul(vector, vector.transpose(0, 2, 1))
+        return projector
+
+    @cached_property
+    def blocked(self) -> FloatArray:
+        """Projector on the lambda_T that no free coordinate can tell from zero, shape (n, 2, 2).
+
+        Sticking is no equation there, and lambda_T is set to zero.
+        """
+        tangents = self._tangents
+        metric = np.matmul(tangents, tangents.transpose(0, 2, 1))
+        dual = nts_element.solve(metric, tangents)
+        projector: FloatArray = np.matmul(
+            np.matmul(tangents, self._blocked), dual.transpose(0, 2, 1)
+        )
+        return projector
+
+    def _held(self, x: FloatArray) -> FloatArray:
+        """`blocked` where the slip prescribed there is zero, else zero, shape (n, 2, 2).
+
+        Nodes that slip leave this part of lambda_T out of the trial, too: Coulomb's law says
+        nothing about it, and at the edge of sticking the rows would be singular in it.
+        """
+        if not self._prescribed.any():
+            return self.blocked
+        motion = x - self.x0
+        motion = motion[:, 0] - np.einsum("nk,nki->ni", self.foot, motion[:, 1:])
+        slip = np.einsum("nij,nj->ni", self._blocked, motion * self._prescribed)
+        held: FloatArray = self.blocked.copy()
+        held[np.abs(slip).max(axis=1) > _STILL * self.candidates.length] = 0.0
+        return held
+
+    def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
+        """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
+        c = TANGENTIAL_SCALE * self._yielding
+        if self._endless:
+            return c
+        moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2))
+        s = slip.value[moved]
+        distance = np.sqrt(np.einsum("na,nab,nb->n", s, slip.metric[moved], s))
+        # Where solved, trial and slip are parallel, whatever c: the tangent needs no slope of c.
+        c[moved] = np.maximum(c[moved], 2.0 * bound[moved] / distance)
+        return c
+
+    def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
+        """Multipliers of given contact forces on the slaves [N], shape (n, constraints).
+
+        Args:
+            normal: p_N, shape (n,).
+            tangential: Friction, shape (n, 3).
+        """
+        out = np.zeros((self.num_elements, self.num_constraints))
+        out[:, 0] = -normal
+        if self.num_tangential:
+            out[:, -2:] = -np.einsum("nai,ni->na", self._tangents, tangential)
+        return out
+
+    def rows(self, k: Contribution, name: str) -> FloatArray:
+        """The residual's rows of "augmented" unknowns or "constraints", shape (n, width)."""
+        start = self.num_coordinates
+        middle = start + self.num_augmented
+        return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
+
+    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
+        """Residual and tangent of the pairs; pure.
+
+        Args:
+            x: Slave and the master's points at t_{n+1} [m], shape (n, points + 1, 3).
+            own: "augmented": facet size times (d, f) [m], shape (n, 5) or (n, 0); "constraints":
+                h^2/2 lambda of the scaled constraints, and of lambda_T over the facet size, over
+                `scale` [m], shape (n, constraints).
+        """
+        if not self.num_elements:
+            return self._nothing()
+        scale = self.scale[:, None]
+        multiplier = scale * own["constraints"]
+        x = self._control(x)
+        residual, tangent, gap, slip = self._element(x, own["augmented"], multiplier)
+        part = self._laws(x, residual, tangent, gap, slip, multiplier)
+        if slip is not None:
+            force, normal = -residual[:, :3], self._normal(x)
+            along = np.einsum("ni,ni->n", force, normal)
+            part.tangential[:] = force - along[:, None] * normal
+        self._to_points(part)
+        # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
+        rows = slice(part.residual.shape[1] - self.num_constraints, None)
+        part.residual[:, rows] *= scale
+        part.tangent[:, rows] *= scale[:, None]
+        part.tangent[:, :, rows] *= scale[:, None]
+        return part
+
+    def _nothing(self) -> Contribution:
+        """Of no pairs."""
+        size = self.num_coordinates + self.num_augmented + self.num_constraints
+        none, slip = np.zeros(0), np.zeros((0, self.num_tangential))
+        off = none.astype(bool)
+        return Contribution(
+            np.zeros((0, size)), np.zeros((0, size, size)), np.zeros((0, self.num_constraints)),
+            none, off, off, slip, none, tangential=np.zeros((0, 3)),
+        )  # fmt: skip
+
+    def _laws(
+        self,
+        x: FloatArray,
+        residual: FloatArray,
+        tangent: FloatArray,
+        gap: FloatArray,
+        slip: Slip | None,
+        multiplier: FloatArray,
+    ) -> Contribution:
+        """Semi-smooth laws of contact (theory section 9) and friction (section 6).
+
+        g_N = 0 where active, else lambda_N = 0; there Coulomb's law, else lambda_T = 0.
+        """
+        gap, force, scale = gap.copy(), multiplier[:, 0], self.scale
+        active = -force - self._yielding * gap > self._none(slip, multiplier)
+        off = ~active
+        row = residual.shape[1] - self.num_constraints
+        residual[off, row] = force[off] / scale[off]
+        tangent[off, row] = 0.0
+        tangent[off, row, row] = 1.0 / scale[off]
+        part = Contribution(
+            residual,
+            tangent,
+            multiplier,
+            gap,
+            active,
+            stick=np.zeros_like(active),
+            slip=np.empty((self.num_elements, 0)) if slip is None else slip.value,
+            distance=np.zeros(self.num_elements),
+            tangential=np.zeros((self.num_elements, 3)),
+        )
+        if slip is not None:
+            part.stick[:] = self._coulomb(x, residual, tangent, slip, multiplier, active)
+            square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
+            part.distance[active] = np.sqrt(square[active])
+        return part
+
+    def _none(self, slip: Slip | None, multiplier: FloatArray) -> FloatArray:
+        """Contact force that counts as none [kg m], shape (n,).
+
+        A touch without force has rounding in both, and with strong friction more than one solution
+        (Painleve's paradox): so nodes carry where free motion would close their gaps, or did so in
+        the last step. If no step comes of that (`lets_slip`), a small pull on a node that sticks
+        lets it slip, by the law continued beyond zero force: to let it go would close its gap
+        again. As the law drives such a node along its slip where solved, which is excluded, this
+        adds no solution.
+        """
+        none = self._yielding * self.gap_rounding
+        endless = self._endless
+        if slip is None or not (self.lets_slip or endless):
+            return none
+        t, s = multiplier[:, -2:], TANGENTIAL_SCALE * self._yielding[:, None] * slip.value
+        friction = length(slip.metric, t)
+        resists = friction**2 + np.einsum("na,na->n", t, s) > 0.0
+        resists &= ~self.blocked.any(axis=(1, 2))
+        # Without bound a node may stick by no normal force at all, whose rounding has any sign.
+        return none - np.where(resists, (_NO_PULL if endless else _PULL) * friction, 0.0)
+
+    def _coulomb(
+        self,
+        x: FloatArray,
+        residual: FloatArray,
+        tangent: FloatArray,
+        slip: Slip,
+        multiplier: FloatArray,
+        active: BoolArray,
+    ) -> BoolArray:
+        """Write the rows of lambda_T [m]; returns which pairs stick.
+
+        Of a pair that carries nothing yet, strong friction's bound is mu times the force that its
+        depth asks for, as in the active set: with none it would have to slip at first, by the slope
+        of the bound, which is mu for all active pairs.
+        """
+        endless = self._endless
+        largest = _BOUND if np.isinf(self.pair.friction) else _LARGEST
+        mu, t = min(self.pair.friction, largest), multiplier[:, -2:]
+        force, scale = multiplier[:, 0], self.scale[:, None, None]
+        normal = residual.shape[1] - self.num_constraints
+        new = active & (force >= 0.0) & (mu > _STRONG)
+        bound = mu * np.where(active, -force if mu > _STRONG else np.maximum(-force, 0.0), 0.0)
+        bound[new] -= mu * self._yielding[new] * residual[new, normal]
+        bound[active & endless] = np.inf
+        held = self._held(x)
+        loose = np.eye(2) - held
+        trial = np.einsum("nab,nb->na", loose, t)
+        law = return_map(trial, slip.value, slip.metric, bound, self._c(slip, bound, held))
+        stick = law.stick & active
+        rows = np.einsum("nab,nbz->naz", law.d_slip, slip.gradient)
+        rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)
+        rows[:, :, -2:] += np.matmul(law.d_multiplier, loose)
+        rows[:, :, normal] -= mu * law.d_bound
+        by_gap = law.d_bound[new, :, None] * tangent[new, normal][:, None]
+        rows[new] -= mu * self._yielding[new, None, None] * by_gap
+        value, slipping = law.residual, ~stick
+        value[slipping] /= scale[slipping, 0]
+        rows[slipping] /= scale[slipping]
+        unsaid = np.where(stick[:, None, None], self.blocked, held) / scale
+        value += np.einsum("nab,nb->na", unsaid, t)
+        rows[:, :, -2:] += unsaid
+        value[~active], rows[~active] = t[~active] / scale[~active, 0], 0.0
+        rows[~active, :, -2:] = np.eye(2) / scale[~active]
+        residual[:, -2:], tangent[:, -2:] = value, rows
+        return stick
+
+    # ---- what a step asks of elements once it is solved, or is not
+    def largest(self, part: Contribution) -> list[float]:
+        """Sizes that `ratios` compares: augmented rows, gaps, multipliers and scale."""
+        gaps = self.rows(part, "constraints") / self.scale[:, None]
+        arrays = (self.rows(part, "augmented"), gaps, part.multiplier, self.scale)
+        return [float(np.abs(a).max(initial=0.0)) for a in arrays]
+
+    def ratios(
+        self, largest: FloatArray, motion: float, rounded: float, rtol: float
+    ) -> dict[str, float]:
+        """Residuals of the pairs' own rows over what counts as converged.
+
+        Args:
+            largest: `largest` over all ranks.
+            motion: Largest motion of the step [m].
+            rounded: Length whose rounding is in all positions [m].
+            rtol: Tolerance of Newton's method.
+        """
+        augmented, gap, force, scale = largest.tolist()
+        limit = rtol * motion + 8 * _EPS * (rounded + self.extent)
+        found = {f"{self.name} constraints": over(gap, limit)}
+        if self.num_augmented:
+            limit = rtol * max(force, scale * motion)
+            found[f"{self.name} (d, f)"] = over(augmented, limit)
+        return found
+
+    def ledger(self, part: Contribution, factor: float) -> dict[str, float]:
+        """Works and counts of an accepted step on this rank.
+
+        The contact defect is -sum lambda_N g_0: what activation loses and what a change of facet
+        gains or loses. Friction dissipates sum lambda_T . (f_1 - f_0).
+
+        Args:
+            part: Solution of the step.
+            factor: What the step equations multiply forces by [s^2].
+
+        Returns:
+            external_work, friction_dissipation, contact_defect [J], active, stick, slip.
+        """
+        slipping = part.active & ~part.stick
+        dissipation, counts = 0.0, (0.0, 0.0)
+        if self.num_tangential:
+            dissipation = float((part.multiplier[:, -2:] * part.slip)[slipping].sum())
+            counts = float(part.stick.sum()), float(slipping.sum())
+        defect = -float(part.multiplier[:, 0] @ self.candidates.gap)
+        return {
+            "external_work": self.external_work(part) / factor,
+            "friction_dissipation": dissipation / factor,
+            "contact_defect": defect / factor,
+            "active": float(part.active.sum()),
+            "stick": counts[0],
+            "slip": counts[1],
+        }
+
+    def gains(self, part: Contribution, factor: float) -> FloatArray:
+        """Energy that each pair brings in by starting behind its facet [J], shape (n,)."""
+        gain: FloatArray = part.multiplier[:, 0] * self.candidates.gap / factor
+        return gain
+
+    def history(self, part: Contribution, factor: float, old: ContactHistory) -> ContactHistory:
+        """What the contact remembers of an accepted step."""
+        new = ContactHistory.of_start(len(old.force))
+        node = self.candidates.node
+        new.facet[node], new.gap[node] = self.candidates.facet, part.gap
+        new.stick[node] = part.stick
+        new.force[node] = -np.where(part.active, part.multiplier[:, 0], 0.0) / factor
+        new.tangential[node] = part.tangential / factor
+        new.slip[:] = old.slip
+        new.slip[node] += part.distance
+        return new
+
+    def place(self, i: int) -> str:
+        """Where a pair is, for messages."""
+        return f"node {self.input_node(i)}"
+
+    def describe(self, part: Contribution, flips: IntArray) -> tuple[float, str]:
+        """Weight and text of the pair that flipped most or is worst solved.
+
+        Args:
+            part: Last iterate.
+            flips: How often `Contribution.status` changed, shape (2, n).
+        """
+        rows = np.abs(part.residual[:, self.num_coordinates :]).max(axis=1)
+        weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips.sum(axis=0))
+        i = int(np.argmax(weight))
+        touch, slide = (int(n) for n in flips[:, i])
+        text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
+        if slide:
+            text += f" and {slide} between stick and slip"
+        if max(touch, slide) >= _CYCLE:
+            states = "stick and slip" if slide > touch else "contact and none"
+            text += (
+                f": it flips between {states} and settles in neither; try another dt"
+                f"{', a smaller coefficient of friction' if self.pair.friction else ''} or a finer "
+                "surface"
+            )
+        return float(weight[i]), text
+
+
+def over(value: float, limit: float) -> float:
+    """A size over its limit; 0 over anything is 0."""
+    if value == 0.0:
+        return 0.0
+    return float(value / limit) if limit > 0 else np.inf

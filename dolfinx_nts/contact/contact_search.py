@@ -1,0 +1,285 @@
+"""Which contacts a step may meet: candidates, those that need unknowns, what a solution missed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory, Contribution
+from dolfinx_nts.contact.pair import ContactPair, Motion
+from dolfinx_nts.elements import Step
+from dolfinx_nts.parallel import global_max
+from dolfinx_nts.validation import StepFailedError
+
+if TYPE_CHECKING:
+    from dolfinx_nts.step.problem import Evaluation
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+_EPS = float(np.finfo(float).eps)
+#: In statics a node nearer to its facet than this part of the facet's size starts as active.
+_TOUCHING = 1e-6
+#: A gap of this many roundings of positions, or of forces, that is closed without force is no
+#: contact.
+_TOUCH = 4.0
+#: Difference of two normals, or of two gaps over the facet's size, that counts as none.
+_ONE = 1e-6
+#: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
+_SURELY = 1e-3
+
+
+class ContactSearch:
+    """Makes the elements of all contacts of a system, step after step; see `Coupling`.
+
+    Args:
+        contacts: The contacts.
+        bodies: Numbers of the bodies of each.
+        comm: MPI communicator.
+
+    Attributes:
+        elements: Candidates of each contact that have unknowns in this step.
+        idle: The others, which the step's motion does not bring to their masters.
+        idle_gaps: Gaps [m] of the idle candidates of each contact in the last solution.
+        beside: Of each contact, how deep in facet sizes the deepest of this rank's nodes that
+            passed the surface's edge lies behind it at t_n, and its input number.
+        bounded: Whether infinite friction has a bound, where nothing else solves a step.
+    """
+
+    def __init__(
+        self, contacts: Sequence[ContactPair], bodies: Sequence[tuple[int, ...]], comm: Any
+    ) -> None:
+        self._pairs, self._comm = contacts, comm
+        self.bodies = list(bodies)
+        self.elements: list[ContactElements] = []
+        self.idle: list[ContactElements] = []
+        self.idle_gaps: list[FloatArray] = []
+        self.bounded = False
+        self.beside = [(0.0, -1)] * len(contacts)
+        self._cover = [0.0] * len(contacts)
+        self._known: dict[int, tuple[list[FloatArray], ContactElements]] = {}
+
+    # ---- elements of a step
+    def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
+        """Make the elements of a step, as of `Coupling`. Collective."""
+        self._step, self._old = step, step.state.contacts
+        time = step.state.time
+        self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
+        if again is None:
+            self._aimed = [np.full(len(pair.slave.share), -1) for pair in self._pairs]
+        if search:
+            self._followed = [old.followed for old in self._old]
+            self._found = [self._search(k) for k in range(len(self._pairs))]
+            self._drop_doubles()
+            self._with_unknowns = [self._may_touch(k, c) for k, c in enumerate(self._found)]
+        self._choose()
+
+    def _choose(self) -> None:
+        """Give unknowns to the candidates that are awake."""
+        both = list(zip(self._found, self._with_unknowns, strict=True))
+        self.elements, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
+        if self.bounded:
+            self.elements = [replace(c, bounded=True) for c in self.elements]
+        self.idle_gaps = [np.empty(0) for _ in self.idle]
+        watching = any(c.num_elements for c in self.idle)
+        self._watching = self._comm.allreduce(watching, op=MPI.LOR)
+
+    def touched(self) -> set[int]:
+        """Bodies of contacts that have unknowns, the same on all ranks. Collective."""
+        local = np.array([float(awake.any()) for awake in self._with_unknowns])
+        on = global_max(self._comm, local) > 0.0
+        return set().union(*itertools.compress(self.bodies, on))
+
+    def _reach(self, k: int, motion: FloatArray) -> float:
+        """Bound on the motion of slaves relative to the master [m]."""
+        reach = np.sqrt(3.0) * float(sum(motion[b] for b in self.bodies[k]))
+        return reach + float(np.linalg.norm(np.diff(self._paths[k], axis=0)))
+
+    def _search(self, k: int) -> ContactElements:
+        """Candidates of a contact, found anew unless all its bodies slept and nothing moves."""
+        u = [self._step.state.u[b] for b in self.bodies[k]]
+        known, reach = self._known.pop(k, None), self._reach(k, self._step.motion)
+        if reach > 0.0:
+            return self._find(k, u, reach)
+        if known is None or any(a is not b for a, b in zip(known[0], u, strict=True)):
+            known = u, self._find(k, u, reach)
+        self._known[k] = known
+        return known[1]
+
+    def _find(self, k: int, u: list[FloatArray], reach: float) -> ContactElements:
+        pair, path, bodies, step = self._pairs[k], self._paths[k], self.bodies[k], self._step
+        positions = pair.positions(u)
+        found, self._followed[k], self._cover[k], self.beside[k] = pair.find(
+            positions,
+            self._old[k].facet,
+            path,
+            Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k]),
+            # In statics steps may be of any length, and what they carry inside is looked for.
+            self._old[k].followed if step.integrator.inertia else None,
+        )
+        elements: ContactElements = pair.elements(found, positions, path, step)
+        gap = _EPS * (elements.extent + float(max(step.length[b] for b in bodies)))
+        if elements.strong:
+            # What touches as far as its coordinates tell would stick by their rounding.
+            gap += _EPS * pair.given
+        # A force that is rounding of the bodies' own would stick or slip by its sign.
+        force = step.force_rounding(bodies) if pair.friction else 0.0
+        return replace(elements, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
+
+    def _drop_doubles(self) -> None:
+        """Of two pairs that keep a node out of the same fixed surface, leave one.
+
+        Two constraints on one gap are one too many where no master can yield, as over the seam of
+        two plates. A node stays with the one that carried it.
+        """
+        for i, j in itertools.combinations(range(len(self._found)), 2):
+            a, b = self._found[i], self._found[j]
+            if a.pair.slave.body is not b.pair.slave.body:
+                continue
+            one, two = (c.pair.slave.points[c.pair.slave.share[c.candidates.node]] for c in (a, b))
+            _, ia, ib = np.intersect1d(one, two, return_indices=True)
+            ca, cb = a.candidates.part(ia), b.candidates.part(ib)
+            double = np.einsum("ni,ni->n", ca.normal, cb.normal) > 1.0 - _ONE
+            double &= np.abs(ca.gap - cb.gap) < _ONE * np.minimum(ca.length, cb.length)
+            double &= a.immovable[ia] & b.immovable[ib]
+            stay = self._old[i].force[ca.node] >= self._old[j].force[cb.node]
+            for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
+                if len(there):
+                    self._found[k] = c.part(~np.isin(np.arange(c.num_elements), there))
+
+    def _may_touch(self, k: int, c: ContactElements) -> BoolArray:
+        """Which candidates need unknowns: all within reach, and who had them in the last step.
+
+        In statics, where no motion bounds the next one, all do. Strong friction may hold nodes that
+        free motion lets go (Painleve's paradox), and an iterate's errors would choose which: there
+        only what carries, or what flight presses in, begins with unknowns.
+        """
+        if not self._step.integrator.inertia:
+            return np.ones(c.num_elements, dtype=bool)
+        node, reach = c.candidates.node, self._reach(k, self._step.motion)
+        force = self._old[k].force[node]
+        if c.strong:
+            closes = self._gap(k, c, self._step.first) < -_SURELY * reach
+            return closes | (force > c.no_pull(self._old[k].tangential[node]))
+        # What goes to and fro at the limit would change the layout in every step.
+        had = np.isin(node, self.elements[k].candidates.node) if self.elements else False
+        awake: BoolArray = had | (c.candidates.gap < reach) | (force > 0.0)
+        return awake
+
+    # ---- a solution
+    def wake(self, u1: Sequence[FloatArray]) -> bool:
+        """Whether a solution closes gaps of idle candidates, which then get unknowns. Collective.
+
+        Args:
+            u1: Displacement of each body at t_{n+1} [m].
+        """
+        if not self._watching:
+            return False
+        self.idle_gaps = [self._gap(k, c, u1) for k, c in enumerate(self.idle)]
+        closed = [
+            ~(gap >= -c.gap_rounding) for c, gap in zip(self.idle, self.idle_gaps, strict=True)
+        ]
+        if not self._comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
+            return False
+        for awake, late in zip(self._with_unknowns, closed, strict=True):
+            awake[np.flatnonzero(~awake)[late]] = True
+        self._choose()
+        return True
+
+    def misses(
+        self, e: Evaluation, parts: Sequence[Contribution], motion: FloatArray
+    ) -> bool:
+        """Whether a solved step may have passed by a contact that was no candidate. Collective.
+
+        Raises:
+            StepFailedError: A node went through an obstacle and out of it again.
+        """
+        missed = False
+        for k in range(len(self._pairs)):
+            reach = self._reach(k, motion)
+            missed |= reach > self._cover[k]
+            missed |= self._passed(k, e, parts[k], reach)
+        return missed
+
+    def _passed(self, k: int, e: Evaluation, part: Contribution, reach: float) -> bool:
+        """Whether nodes have come through facets unseen, which are noted. Collective."""
+        pair, bodies, path = self._pairs[k], self.bodies[k], self._paths[k]
+        positions = pair.positions([self._step.state.u[b] for b in bodies])
+        held = np.full(len(pair.slave.share), -1)
+        c, active = self.elements[k].candidates, part.active
+        held[c.node[active]] = c.facet[active]
+        motions = [e.bodies[b].du for b in bodies]
+        try:
+            hit = pair.missed(positions, motions, path, reach, held)
+        except StepFailedError as failure:
+            time, dt = self._step.state.time, self._step.dt
+            raise StepFailedError(f"step from t={time:.6g} with dt={dt:.3g}: {failure}") from None
+        if hit is None:
+            return False
+        new = hit >= 0
+        self._aimed[k] = np.where(new, hit, self._aimed[k])
+        # What is held at a facet that its path led to is to be so again.
+        at = np.where(self._aimed[k] >= 0, held, -1)
+        self._aimed[k] = np.where(new | (at < 0), self._aimed[k], at)
+        return bool(self._comm.allreduce(bool(new.any()), op=MPI.LOR))
+
+    def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
+        """What each contact remembers of an accepted step."""
+        histories = []
+        for k, (c, part) in enumerate(zip(self.elements, parts, strict=True)):
+            new = c.history(part, self._step.factor, self._old[k])
+            idle = self.idle[k].candidates
+            new.facet[idle.node], new.gap[idle.node] = idle.facet, self.idle_gaps[k]
+            histories.append(new._replace(followed=self._followed[k]))
+        return tuple(histories)
+
+    def smallest(self, parts: Sequence[Contribution]) -> dict[str, float]:
+        """The smallest gap of an accepted step on this rank, infinite without candidates."""
+        gaps = [part.gap for part in parts] + self.idle_gaps
+        return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
+
+    # ---- first guesses, and what else solves a step
+    def guess(self, k: int, x: FloatArray) -> FloatArray:
+        """Multipliers of the contact forces of the last step, shape (n, constraints).
+
+        In statics nodes that touch at t_n start as active: without inertia a body may have nothing
+        but its contacts to hold it.
+        """
+        c, old = self.elements[k], self._old[k]
+        node = c.candidates.node
+        force, tangential = old.force[node], old.tangential[node]
+        multipliers = self._step.factor * c.multipliers(force, tangential) / c.scale[:, None]
+        if not self._step.integrator.inertia:
+            near = _TOUCHING * c.candidates.length
+            touching = (force > 0.0) | (c.candidates.gap <= near)
+            augmented = np.empty((c.num_elements, 0))
+            nothing = {"augmented": augmented, "constraints": np.zeros_like(multipliers)}
+            gap = c.evaluate(x, nothing).gap
+            multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
+        return multipliers
+
+    @property
+    def may_slip(self) -> bool:
+        """Whether any contact has friction with a bound."""
+        coefficients = [pair.friction for pair in self._pairs]
+        return any(mu > 0.0 and (self.bounded or np.isfinite(mu)) for mu in coefficients)
+
+    def let_slip(self) -> None:
+        """Solve this step with nodes that slip rather than leave, see `ContactElements`."""
+        self.elements = [replace(c, lets_slip=True) for c in self.elements]
+
+    def flight_gaps(self) -> list[FloatArray]:
+        """Gaps of each contact's candidates after free flight over the step [m]. Collective."""
+        return [self._gap(k, c, self._step.first) for k, c in enumerate(self.elements)]
+
+    def _gap(self, k: int, c: ContactElements, u: Sequence[FloatArray]) -> FloatArray:
+        """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
+        moved = c.pair.positions([u[b] for b in self.bodies[k]])
+        return c.gap(c.pair.points(moved, c.candidates))

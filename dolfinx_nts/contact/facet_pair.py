@@ -1,0 +1,301 @@
+"""Contact of a surface's nodes with the facets of another surface: which node may touch which."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact import search
+from dolfinx_nts.contact.facet_elements import FacetElements
+from dolfinx_nts.contact.pair import (
+    MARGIN,
+    NO_CANDIDATES,
+    Candidates,
+    ContactPair,
+    Found,
+    Motion,
+)
+from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.elements import Step
+from dolfinx_nts.kernels import facets, nts_element, patches
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: A node may project this far (in convective coordinates) beyond an edge that the master surface
+#: ends at ...
+_OVERHANG = 0.05
+#: ... and this far beyond an edge shared with another facet, between the normal cones of a convex
+#: edge, and further by what the node may be away.
+_WEDGE = 0.5
+#: A node this part of a facet behind it, or less, is outside.
+_OUTSIDE = 1e-6
+
+
+class FacetPair(ContactPair, master=Surface):
+    """A `ContactPair` whose master is a surface of a body."""
+
+    def _set_up(self) -> None:
+        slave, master = self.slave, self.master
+        if slave.body is master.body and np.intersect1d(slave.points, master.points).size:
+            raise ValueError(
+                f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
+                "choose disjoint markers"
+            )
+        self.extent = max(self.extent, float(np.abs(master.reference - self.origin).max()))
+        self._free_edges = master.boundary_edges
+        self._joined = patches.neighbours(master.facets, master.reference[master.facets])
+
+    @property
+    def bodies(self) -> tuple[Any, ...]:
+        """The slave's and the master's body."""
+        return self.slave.body, self.master.body
+
+    @property
+    def master_name(self) -> str:
+        """Of the master's body."""
+        name: str = self.master.body.name
+        return name
+
+    def has_master_of(self, other: ContactPair) -> bool:
+        """Whether the masters of both have the same facets."""
+        return np.array_equal(self.master.facets, other.master.facets)
+
+    def shares_master(self, other: ContactPair) -> str | None:
+        """What both have for a master, if they share facets."""
+        if not isinstance(other, FacetPair) or other.master.body is not self.master.body:
+            return None
+        one, two = (
+            {tuple(sorted(f)) for f in m.points[m.facets].tolist()}
+            for m in (self.master, other.master)
+        )
+        return f"the same facets of {self.master.body.name!r}" if one & two else None
+
+    def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
+        """How deep slaves start inside the master's body, in facet sizes. Collective."""
+        if self.slave.body is self.master.body:
+            return 0.0
+        depth: FloatArray = self.master.depth(self.slave.positions(u[0]), u[1])
+        return depth
+
+    def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+        """Positions of all points of both surfaces [m], (p, 3) each, as of `ContactPair`."""
+        both = zip((self.slave, self.master), u, strict=True)
+        return tuple(self._moved(surface, each) for surface, each in both)
+
+    def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
+        """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
+        control = self.master.control_points(positions[1], found.facet)
+        return np.concatenate([super().points(positions, found), control], axis=1)
+
+    def find(
+        self,
+        positions: Sequence[FloatArray],
+        current: IntArray,
+        path: FloatArray,
+        motion: Motion | None = None,
+        followed: BoolArray | None = None,
+    ) -> Found:
+        """Search for this rank's candidates, as of `ContactPair`. Collective."""
+        reach = 0.0 if motion is None else motion.reach
+        every = np.ones(len(self.slave.share), dtype=bool)
+        known = every if followed is None else followed
+        slaves, master = positions
+        corners = master[self.master.facets]
+        sizes = facets.size(corners)
+        radius, cover = (reach + MARGIN * float(s) for s in (sizes.max(), sizes.min()))
+        # Positions of all points are known everywhere, so all ranks leave here or none.
+        if search.apart(slaves, corners, radius):
+            return Found(NO_CANDIDATES, ~every, radius)
+        x = slaves[self.slave.share]
+        closest = search.closest_facets(x, corners, reach=radius, current=current)
+        node = np.flatnonzero(closest.facet >= 0)
+        found, lost = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
+        if motion is not None:
+            found = self._along_paths(found, x, master, motion)
+        beside = (found.gap < -_OUTSIDE * found.length) & ~known[found.node]
+        # What was followed and is out of reach is sought anew from either side.
+        stays = np.zeros_like(every)
+        stays[np.setdiff1d(node, lost)] = known[np.setdiff1d(node, lost)]
+        hidden, deepest = found.part(beside), (0.0, -1)
+        if len(hidden.node):
+            depth = -hidden.gap / hidden.length
+            node = self.slave.share[hidden.node[depth.argmax()]]
+            deepest = float(depth.max()), int(self.slave.original[node])
+        found = found.part(~beside)
+        stays[found.node] = True
+        return Found(found, stays, cover, deepest)
+
+    def elements(
+        self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step
+    ) -> FacetElements:
+        """Equations of candidates in a step. Collective."""
+        rule, master = step.integrator, self.master
+        return FacetElements(
+            pair=self,
+            candidates=found,
+            rule=rule.contact_gradient,
+            condense=step.condense,
+            x0=self.points(positions, found),
+            scale=step.scale(self.slave)[self.slave.share[found.node]],
+            theta=rule.theta,
+            master_scale=step.scale(master)[master.patches[found.facet]],
+        )
+
+    def _along_paths(
+        self, found: Candidates, x: FloatArray, master: FloatArray, motion: Motion
+    ) -> Candidates:
+        """Candidates with the facets that their paths lead to in place of the closest. Collective.
+
+        Args:
+            found: Candidates of the closest facets.
+            x: This rank's slaves at t_n [m], shape (share, 3).
+            master: Points of the master at t_n [m].
+            motion: Expected in the step.
+        """
+        slave_path, master_path = self._gather_paths(motion.paths)
+        change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
+        corners, node = master[self.master.facets], found.node[change]
+        if len(node):
+            start, _ = facets.closest_point(x[node], corners[facet])
+            other, _ = self._measure(x, master, node, facet, start, motion.reach)
+            found = _replace(found, other)
+        aimed = motion.aimed
+        if self.is_long(motion.reach):
+            hit, _ = search.first_hits(
+                x, slave_path, corners, master_path[self.master.facets]
+            )
+            aimed = np.where(hit >= 0, hit, aimed)
+        node = np.flatnonzero(aimed >= 0)
+        if len(node):
+            start, _ = facets.closest_point(x[node], corners[aimed[node]])
+            other, _ = self._measure(x, master, node, aimed[node], start, None)
+            found = _replace(found, other)
+        return found
+
+    def _gather_paths(self, paths: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Displacements of this rank's slaves and of all points of the master [m]. Collective."""
+        slave = self.slave.gather(paths[0])[self.slave.share]
+        return slave, self.master.gather(paths[1])
+
+    def is_long(self, reach: float) -> bool:
+        """Whether a motion may carry a node through a facet that is not the closest."""
+        return reach > MARGIN * self._smallest
+
+    @cached_property
+    def _smallest(self) -> float:
+        """Size of the master's smallest facet in the reference [m]."""
+        return float(facets.size(self.master.reference[self.master.facets]).min())
+
+    def missed(
+        self,
+        positions: Sequence[FloatArray],
+        motions: Sequence[FloatArray],
+        path: FloatArray,
+        reach: float,
+        held: IntArray,
+    ) -> IntArray | None:
+        """Facet that each of the rank's slaves has come through unseen, as of `ContactPair`."""
+        if not self.is_long(reach):
+            return None
+        slaves, master = positions
+        x, corners = slaves[self.slave.share], master[self.master.facets]
+        slave_path, master_path = self._gather_paths(motions)
+        hit, _ = search.first_hits(x, slave_path, corners, master_path[self.master.facets])
+        node = np.flatnonzero((hit >= 0) & (hit != held))
+        control = self.master.control_points(master + master_path, hit[node])
+        end = (x + slave_path)[node]
+        xi, converged = facets.project(end, control, np.zeros((len(node), 2)))
+        foot, _, normal = facets.frame(control, xi)
+        depth = np.einsum("ni,ni->n", normal, foot - end) / facets.size(control)
+        # A node that is held at another facet may end a little behind this one.
+        deep = depth > np.where(held[node] >= 0, MARGIN, _OUTSIDE)
+        hit[np.setdiff1d(np.arange(len(hit)), node[deep | ~converged])] = -1
+        return hit
+
+    def _measure(
+        self,
+        x: FloatArray,
+        master: FloatArray,
+        node: IntArray,
+        facet: IntArray,
+        start: FloatArray,
+        reach: float | None,
+    ) -> tuple[Candidates, IntArray]:
+        """Those of the pairs (node, facet) that may touch, and nodes beyond the surface's edge.
+
+        Projected from `start`; with reach None all may touch whose projection is found.
+        """
+        pair = self.master.control_points(master, facet)
+        xi, converged = facets.project(x[node], pair, start)
+        foot, _, normal = facets.frame(pair, xi)
+        gap = np.einsum("ni,ni->n", normal, x[node] - foot)
+        length = facets.size(pair)
+        legal = converged & self._movable(node, facet)
+        beyond = np.zeros_like(legal)
+        if reach is not None:
+            over, beyond = self._over_facet(facet, xi, reach / length)
+            legal &= over & (gap > -MARGIN * length) & (gap < reach + MARGIN * length)
+        found = Candidates(
+            node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
+        )
+        return found, node[beyond]
+
+    def _crossings(
+        self, c: Candidates, master: FloatArray, slave_motion: FloatArray, master_motion: FloatArray
+    ) -> tuple[IntArray, IntArray]:
+        """Candidates that slide over an edge before the middle of the step, and their next facet.
+
+        A facet that holds the longer part of the path makes g_0 as often positive as negative, so
+        that what changes of facet cost and bring cancels in the long run.
+        """
+        nc = self.master.facets.shape[1]
+        pair = self.master.control_points(master, c.facet)
+        shape, _, _ = facets.shape(c.xi, pair.shape[1])
+        _, tangents, _ = facets.frame(pair, c.xi)
+        motion = slave_motion[c.node]
+        carried = self.master.control_points(master_motion, c.facet)
+        motion = motion - np.einsum("ni,nij->nj", shape, carried)
+        metric = np.einsum("naj,nbj->nab", tangents, tangents)
+        along = np.einsum("naj,nj->na", tangents, motion)
+        slide = nts_element.solve(metric, along[:, :, None])[:, :, 0]
+        before, after = (facets.edge_excess(xi, nc) for xi in (c.xi, c.xi + slide))
+        edge = after.argmax(axis=1)
+        pairs = np.arange(len(edge))
+        joined = self._joined[c.facet, edge]
+        over = (before.max(axis=1) <= 0.0) & (after[pairs, edge] > search.PREFERENCE)
+        change = np.flatnonzero(over & (joined >= 0))
+        return change, joined[change] // nc
+
+    def _over_facet(
+        self, facet: IntArray, xi: FloatArray, reach: FloatArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide.
+
+        And whether they are beyond an edge that the surface ends at.
+        """
+        excess, free = facets.edge_excess(xi, self.master.facets.shape[1]), self._free_edges[facet]
+        wedge = _WEDGE + 2.0 * (reach + MARGIN)
+        beyond: BoolArray = (free & (excess > _OVERHANG)).any(axis=1)
+        inside: BoolArray = (free | (excess <= wedge[:, None])).all(axis=1) & ~beyond
+        return inside, beyond
+
+    def _movable(self, node: IntArray, facet: IntArray) -> BoolArray:
+        """Whether any coordinate of a pair is free; without one there is nothing to solve for."""
+        slave = self.slave.fixed[self.slave.share[node]].all(axis=1)
+        master = self.master.fixed[self.master.patches[facet]].all(axis=(1, 2))
+        return ~(slave & master)
+
+
+def _replace(found: Candidates, other: Candidates) -> Candidates:
+    """Candidates with the others in place of those of the same nodes, in the order of the nodes."""
+    stay = ~np.isin(found.node, other.node)
+    order = np.argsort(np.concatenate([found.node[stay], other.node]))
+    return Candidates(
+        *(np.concatenate([a[stay], b])[order] for a, b in zip(found, other, strict=True))
+    )

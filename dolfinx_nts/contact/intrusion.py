@@ -1,0 +1,371 @@
+"""How deep nodes and edges lie in another body, and facets in an obstacle: arrays in, arrays out.
+
+The depth of a point inside a body is its distance from the boundary; it changes along an edge by at
+most the way, which bounds it between two points and leaves few edges to look at closely.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact import search
+from dolfinx_nts.contact.obstacles import Obstacle
+from dolfinx_nts.contact.surfaces import winding
+from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.kernels.bounded_slope import highest
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Depth in facet sizes that is reported. What contact of nodes leaves by its nature is a few
+#: hundredths: a master that bulges between two slave nodes, a slave's edge over a convex master.
+LEAST = 0.2
+#: Closest points this near to the border of a facet (in convective coordinates) are on it.
+_ON_BORDER = 1e-9
+#: A body is thin where its sides have normals with a cosine below this; an edge that sticks out on
+#: both sides counts from this part of `LEAST` on.
+_OPPOSITE, _THIN = -0.9, 0.01
+#: Part of a body's box that its nearest points are left out of, at most.
+_SHRINK = 0.25
+
+
+class Depth(NamedTuple):
+    """How deep points lie in a body.
+
+    Attributes:
+        value: Distance from the boundary [m], negative outside, shape (n,); -inf beyond reach.
+        facet: Closest facet, shape (n,); -1 beyond reach.
+        normal: Outward normal there, of any length, shape (n, 3).
+        over: Whether the closest point is inside the facet, not on its border, shape (n,).
+    """
+
+    value: FloatArray
+    facet: IntArray
+    normal: FloatArray
+    over: BoolArray
+
+
+class Found(NamedTuple):
+    """Points of one boundary inside the other body; axis 0 = node or edge.
+
+    Attributes:
+        nodes: Both ends of the edge, twice the same for a node; points of the boundary, (n, 2).
+        place: The deepest point of the edge, or the node [m], shape (n, 3).
+        depth: Its distance from the other body's boundary [m], shape (n,).
+        size: The same in facet sizes, the larger of both bodies there [-], shape (n,).
+        facet: Closest facet of the other body, shape (n,).
+    """
+
+    nodes: IntArray
+    place: FloatArray
+    depth: FloatArray
+    size: FloatArray
+    facet: IntArray
+
+    def part(self, chosen: IntArray | BoolArray) -> Found:
+        """Some of them, by number or by a mask."""
+        return Found._make(a[chosen] for a in self)
+
+    @property
+    def is_node(self) -> BoolArray:
+        """Whether each is a node, shape (n,)."""
+        same: BoolArray = self.nodes[:, 0] == self.nodes[:, 1]
+        return same
+
+
+_NOTHING = Found(
+    np.empty((0, 2), np.int64), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.int64)
+)
+
+
+class Boundary:
+    """Facets of a body's boundary and their edges.
+
+    Args:
+        facets: Points of the facets, cyclic, counter-clockwise seen from outside, shape (m, nc).
+
+    Attributes:
+        facets: These.
+        edges: Points of each edge, shape (e, 2).
+        sides: Edge of each side k of a facet (corner k to k + 1), shape (m, nc).
+        beside: The two facets of each edge, the same twice where only one has it, shape (e, 2).
+        closed: Whether every edge has two facets.
+    """
+
+    def __init__(self, facets: IntArray) -> None:
+        self.facets = facets
+        ends = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
+        self.edges, at, inverse = np.unique(
+            np.sort(ends, axis=1), axis=0, return_index=True, return_inverse=True
+        )
+        side = inverse.ravel()
+        nc, number = facets.shape[1], np.arange(len(side))
+        last = np.empty(len(self.edges), dtype=np.int64)
+        last[side] = number
+        self.sides = side.reshape(facets.shape)
+        self.beside = np.column_stack([at, last]) // nc
+        self.closed = bool((self.beside[:, 0] != self.beside[:, 1]).all())
+
+
+class Placed:
+    """A boundary at one instant.
+
+    Args:
+        boundary: Its facets and edges.
+        x: Positions of its points [m], shape (p, 3).
+    """
+
+    def __init__(self, boundary: Boundary, x: FloatArray) -> None:
+        self.boundary, self.x = boundary, x
+
+    @cached_property
+    def box(self) -> FloatArray:
+        """Smallest and largest coordinates [m], shape (2, 3)."""
+        return np.array([self.x.min(axis=0), self.x.max(axis=0)])
+
+    @cached_property
+    def corners(self) -> FloatArray:
+        """Corners of the facets [m], shape (m, nc, 3)."""
+        corners: FloatArray = self.x[self.boundary.facets]
+        return corners
+
+    @cached_property
+    def sizes(self) -> FloatArray:
+        """Mean edge length of each facet [m], shape (m,)."""
+        return fc.size(self.corners)
+
+    def edge_sizes(self, edge: IntArray) -> FloatArray:
+        """Size of the larger facet beside each of the edges [m], shape (n,)."""
+        largest: FloatArray = self.sizes[self.boundary.beside[edge]].max(axis=1)
+        return largest
+
+    def facets_near(self, box: FloatArray) -> IntArray:
+        """Facets whose boxes meet a box (2, 3)."""
+        c = self.corners
+        return np.flatnonzero(_meet(c.min(axis=1), c.max(axis=1), box))
+
+    def depth(
+        self, points: FloatArray, reach: FloatArray | float, chosen: IntArray | None = None
+    ) -> Depth:
+        """How deep points lie in the body, up to the reach.
+
+        The sign is that of the normal at the closest point; on an edge the sum of those of both
+        facets, at a corner weighted by the angles (Baerentzen and Aanaes 2005), without which
+        rounding would decide about points in the plane of a facet beside them. Nothing is known
+        of points over the rim of an open boundary, which count as outside.
+
+        Args:
+            points: Points [m], shape (n, 3).
+            reach: Largest distance of interest [m], one value or shape (n,).
+            chosen: Facets that alone can be so near; all without it.
+        """
+        b, n = self.boundary, len(points)
+        corners = self.corners if chosen is None else self.corners[chosen]
+        result = Depth(np.full(n, -np.inf), np.full(n, -1), np.zeros((n, 3)), np.zeros(n, bool))
+        closest = search.closest_facets(points, corners, reach=reach)
+        near = np.flatnonzero(closest.facet >= 0)
+        facet, xi = closest.facet[near], closest.xi[near]
+        foot, _, normal = fc.frame(corners[facet], xi)
+        facet = facet if chosen is None else chosen[facet]
+        on = fc.edge_excess(xi, b.facets.shape[1]) > -_ON_BORDER
+        count = on.sum(axis=1)
+        edge, corner = np.flatnonzero(count == 1), np.flatnonzero(count > 1)
+        beside = b.beside[b.sides[facet[edge], on[edge].argmax(axis=1)]]
+        normal[edge] = self._normals(beside.ravel()).reshape(-1, 2, 3).sum(axis=1)
+        rim = np.zeros(len(near), dtype=bool)
+        rim[edge] = beside[:, 0] == beside[:, 1]
+        first = (on & np.roll(on, 1, axis=1))[corner].argmax(axis=1)
+        normal[corner], rim[corner] = self._around(b.facets[facet[corner], first])
+        inward = foot - points[near]
+        inside = (np.einsum("ni,ni->n", normal, inward) > 0.0) & ~rim
+        result.value[near] = np.where(inside, 1.0, -1.0) * closest.distance[near]
+        result.facet[near], result.normal[near], result.over[near] = facet, normal, count == 0
+        return result
+
+    def _normals(self, facet: IntArray) -> FloatArray:
+        """Unit normals of facets, of a warped one its mean, shape (n, 3); 0 without an area."""
+        c = self.corners[facet]
+        if c.shape[1] == 4:
+            normal = np.cross(c[:, 2] - c[:, 0], c[:, 3] - c[:, 1])
+        else:
+            normal = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        unit: FloatArray = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+        return unit
+
+    def _around(self, point: IntArray) -> tuple[FloatArray, BoolArray]:
+        """Normals at points, weighted by the facets' angles, (n, 3); which are on a rim, (n,)."""
+        b, (used, inverse) = self.boundary, np.unique(point, return_inverse=True)
+        facet, k = np.nonzero(np.isin(b.facets, used))
+        nc, at = b.facets.shape[1], np.searchsorted(used, b.facets[facet, k])
+        corner = self.corners[facet, k]
+        arms = [self.corners[facet, (k + s) % nc] - corner for s in (1, -1)]
+        area = np.linalg.norm(np.cross(*arms), axis=1)
+        angle = np.arctan2(area, np.einsum("ni,ni->n", *arms))
+        normal, rim = np.zeros((len(used), 3)), np.zeros(len(used), dtype=bool)
+        np.add.at(normal, at, angle[:, None] * self._normals(facet))
+        for side in (k, k - 1):
+            one, two = b.beside[b.sides[facet, side]].T
+            rim[at[one == two]] = True
+        return normal[inverse], rim[inverse]
+
+
+def _meet(low: FloatArray, high: FloatArray, box: FloatArray) -> BoolArray:
+    """Which of the boxes low (n, 3) to high (n, 3) meet a box (2, 3)."""
+    meet: BoolArray = ((low <= box[1]) & (high >= box[0])).all(axis=1)
+    return meet
+
+
+def box_gap(one: FloatArray, two: FloatArray) -> float:
+    """Distance between two boxes (2, 3) [m]."""
+    return float(np.linalg.norm(np.maximum(0.0, np.maximum(one[0] - two[1], two[0] - one[1]))))
+
+
+def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
+    """Nodes and edges of one boundary that lie deeper in another body than facets explain.
+
+    Edges are told where their ends are not as deep; also those that pass right through a body so
+    thin that nothing is deep in it. A body whose whole boundary is inside is found, too.
+
+    Args:
+        a: Boundary whose nodes and edges are looked at.
+        b: Boundary of the other body; of an open one, see `Placed.depth`.
+        least: Depth to report, in facet sizes, > 0.
+    """
+    near = _edges_near(a, b, least)
+    if not near.size:
+        return _NOTHING
+    ends, size = a.x[a.boundary.edges[near]], a.edge_sizes(near)
+    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    node, inverse = np.unique(a.boundary.edges[near], return_inverse=True)
+    end = inverse.reshape(-1, 2)
+    reach, around = np.zeros((2, len(node)))
+    for k in range(2):
+        np.maximum.at(reach, end[:, k], length)
+        np.maximum.at(around, end[:, k], size)
+    widest = float(reach.max())
+    part = b.facets_near(np.array([ends.min(axis=(0, 1)) - widest, ends.max(axis=(0, 1)) + widest]))
+    at = b.depth(a.x[node], reach, part)
+    deep = at.value > least * np.maximum(around, b.sizes[at.facet])
+    enclosed = b.boundary.closed and not (at.facet >= 0).any()
+    if enclosed and winding(a.x[node[0]], b.corners) > 0.5 or b.boundary.closed and deep.any():
+        part = np.arange(len(b.corners))
+        at = b.depth(a.x[node], np.inf)
+        deep = at.value > least * np.maximum(around, b.sizes[at.facet])
+    i = np.flatnonzero(deep)
+    depth, scale = at.value[i], np.maximum(around, b.sizes[at.facet])[i]
+    nodes = np.column_stack([node[i], node[i]])
+    inside = Found(nodes, a.x[node[i]], depth, depth / scale, at.facet[i])
+    start, limit = at.value[end], least * np.maximum(size, b.sizes.min())
+    through = _straddles(at, end) & (start < -limit[:, None]).all(axis=1)
+    limit[through] *= _THIN
+    kept = ~deep[end].any(axis=1) & (start.sum(axis=1) + length > 2.0 * limit)
+    ends, size, start, limit, near = (v[kept] for v in (ends, size, start, limit, near))
+    place, depth, facet = _deepest(ends, start, limit, b, part)
+    size = np.maximum(size, b.sizes[facet])
+    deep = depth > np.where(through[kept], limit, least * size)
+    crossing = Found(a.boundary.edges[near], place, depth, depth / size, facet).part(deep)
+    return Found._make(np.concatenate(pair) for pair in zip(inside, crossing, strict=True))
+
+
+def _edges_near(a: Placed, b: Placed, least: float) -> IntArray:
+    """Edges of `a` that may be as deep in `b`, by boxes."""
+    ends = a.x[a.boundary.edges]
+    if b.boundary.closed:
+        floor = least * max(float(a.sizes.min()), float(b.sizes.min()))
+        shrink = np.minimum(floor, _SHRINK * (b.box[1] - b.box[0]))
+    else:  # what is inside need not be in the box
+        shrink = np.full(3, -float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max()))
+    inner = np.array([b.box[0] + shrink, b.box[1] - shrink])
+    return np.flatnonzero(_meet(ends.min(axis=1), ends.max(axis=1), inner))
+
+
+def _straddles(at: Depth, end: IntArray) -> BoolArray:
+    """Whether the ends (n, 2) of edges are over facets that face opposite ways, shape (n,)."""
+    normal = at.normal[end]
+    cosine = np.einsum("ni,ni->n", normal[:, 0], normal[:, 1])
+    opposite = cosine < _OPPOSITE * np.linalg.norm(normal, axis=2).prod(axis=1)
+    both: BoolArray = opposite & at.over[end].all(axis=1)
+    return both
+
+
+def _deepest(
+    ends: FloatArray, start: FloatArray, limit: FloatArray, b: Placed, chosen: IntArray
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Deepest points of edges in a body, by dividing what may hold a deeper one.
+
+    Args:
+        ends: Ends of the edges [m], shape (n, 2, 3).
+        start: Their depth [m], shape (n, 2).
+        limit: Depth of interest of each edge [m], shape (n,).
+        b: The body.
+        chosen: Its facets that are near.
+
+    Returns:
+        Points [m] (n, 3), depths [m] (n,), and closest facets (n,); where nothing is as deep as
+        the limit, of some point of the edge or with a depth of -inf.
+    """
+    span = ends[:, 1] - ends[:, 0]
+
+    def depth(edge: IntArray, s: FloatArray, reach: FloatArray) -> Depth:
+        return b.depth(ends[edge, 0] + s[:, None] * span[edge], reach, chosen)
+
+    at, value = highest(
+        lambda edge, s, reach: depth(edge, s, reach).value,
+        start, np.linalg.norm(span, axis=1), limit,
+    )  # fmt: skip
+    facet, deep = np.full(len(ends), -1), np.flatnonzero(value > limit)
+    if deep.size:
+        found = depth(deep, at[deep], 2.0 * value[deep])
+        value[deep], facet[deep] = found.value, found.facet
+    return ends[:, 0] + at[:, None] * span, value, facet
+
+
+def sunk(
+    obstacle: Obstacle, corners: FloatArray, limit: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Deepest points of facets in an obstacle.
+
+    A facet is made of straight lines between two opposite sides, or from a corner of a triangle to
+    the side opposite. How deep the deepest point of each lies changes by no more than the way of
+    its ends.
+
+    Args:
+        obstacle: The obstacle.
+        corners: Corners of the facets relative to its motion [m], shape (m, nc, 3).
+        limit: Depth of interest [m], > 0, shape (m,).
+
+    Returns:
+        Points [m] (m, 3) and their depths [m] (m,), to one part in a hundred of the depth; where
+        nothing is as deep as the limit, of some point.
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    d = corners[:, -1] if corners.shape[1] == 4 else a
+    length = np.linalg.norm([d - a, c - b], axis=2).max(axis=0)
+
+    def line(facet: IntArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        one, two = (p[facet] + s[:, None] * (q - p)[facet] for p, q in ((a, d), (b, c)))
+        return one, two
+
+    start = -np.column_stack([obstacle.lowest_gap(a, b), obstacle.lowest_gap(d, c)])
+    at, depth = highest(
+        lambda facet, s, _: -obstacle.lowest_gap(*line(facet, s)), start, length, limit
+    )
+    place: FloatArray = corners.mean(axis=1)
+    deep = np.flatnonzero(depth > limit)
+    if deep.size:
+        one, two = line(deep, at[deep])
+        span = two - one
+        along, _ = highest(
+            lambda k, s, _: -obstacle.gap(one[k] + s[:, None] * span[k]).value,
+            -np.column_stack([obstacle.gap(one).value, obstacle.gap(two).value]),
+            np.linalg.norm(span, axis=1),
+            limit[deep],
+        )
+        place[deep] = one + along[:, None] * span
+    return place, depth

@@ -1,0 +1,108 @@
+"""Contact of a surface's nodes with a rigid obstacle: which node may touch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.obstacle_elements import ObstacleElements
+from dolfinx_nts.contact.obstacles import Obstacle
+from dolfinx_nts.contact.pair import MARGIN, Candidates, ContactPair, Found, Motion
+from dolfinx_nts.elements import Step
+from dolfinx_nts.validation import StepFailedError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: A node passes through an obstacle if its path is longer than this part of the radius, and lies
+#: this part of it deeper than both ends.
+_PASSING = 0.1
+
+
+class ObstaclePair(ContactPair, master=Obstacle):
+    """A `ContactPair` whose master is an obstacle.
+
+    Attributes:
+        obstacle: The master relative to `origin`.
+    """
+
+    def _set_up(self) -> None:
+        self.obstacle: Obstacle = self.master.about(self.origin)
+
+    def has_master_of(self, other: ContactPair) -> bool:
+        """Whether the obstacles of both are equal."""
+        return bool(self.master == other.master)
+
+    def shares_master(self, other: ContactPair) -> str | None:
+        """The obstacle, if both have it."""
+        same = isinstance(other, ObstaclePair) and self.has_master_of(other)
+        return f"the same {self.master.name}" if same else None
+
+    def path(self, start: float, end: float) -> FloatArray:
+        """Displacements of the obstacle at two times [m], shape (2, 3). Collective."""
+        comm = self.slave.body.comm
+        return np.stack([self.master.displacement(t, comm) for t in (start, end)])
+
+    def find(
+        self,
+        positions: Sequence[FloatArray],
+        current: IntArray,
+        path: FloatArray,
+        motion: Motion | None = None,
+        followed: BoolArray | None = None,
+    ) -> Found:
+        """Candidates, as of `ContactPair`. Nothing limits the depth: what is behind is inside."""
+        slave, reach = self.slave, 0.0 if motion is None else motion.reach
+        x = positions[0][slave.share] - path[0]
+        gap, length = self.obstacle.gap(x), np.sqrt(slave.area[slave.share])
+        movable = ~slave.fixed[slave.share].all(axis=1)
+        node = np.flatnonzero(movable & (gap.value < reach + MARGIN * length))
+        only, xi = np.zeros(len(node), dtype=np.int64), np.zeros((len(node), 2))
+        normal = gap.gradient[node, 0]
+        found = Candidates(node, only, xi, normal, gap.value[node], length[node])
+        cover = reach + MARGIN * float(np.sqrt(slave.area.min()))
+        return Found(found, np.ones(len(slave.share), dtype=bool), cover)
+
+    def elements(
+        self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step
+    ) -> ObstacleElements:
+        """Equations of candidates in a step. Collective."""
+        rule = step.integrator
+        return ObstacleElements(
+            pair=self,
+            candidates=found,
+            rule=rule.contact_gradient,
+            condense=step.condense,
+            x0=self.points(positions, found) - path[0],
+            scale=step.scale(self.slave)[self.slave.share[found.node]],
+            theta=rule.theta,
+            displacement=path,
+        )
+
+    def missed(
+        self,
+        positions: Sequence[FloatArray],
+        motions: Sequence[FloatArray],
+        path: FloatArray,
+        reach: float,
+        held: IntArray,
+    ) -> IntArray | None:
+        """None; raises if a node has gone through the obstacle and out of it again."""
+        obstacle = self.obstacle
+        if reach <= _PASSING * obstacle.width:
+            return None
+        x0 = positions[0] - path[0]
+        x1 = positions[0] + self.slave.gather(motions[0]) - path[1]
+        ends = np.minimum(obstacle.gap(x0).value, obstacle.gap(x1).value)
+        passed = obstacle.lowest_gap(x0, x1) < ends - _PASSING * obstacle.width
+        if passed.any():
+            node = int(self.slave.original[np.flatnonzero(passed)[0]])
+            raise StepFailedError(
+                f"contact {self.name!r}: node {node} passes through the obstacle within the step; "
+                "use a smaller dt"
+            )
+        return None

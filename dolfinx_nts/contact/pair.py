@@ -1,0 +1,274 @@
+"""Contact between a surface and a master: what the scene declares, whatever the master is.
+
+A `ContactPair` is part of the scene and holds no history. What depends on the master's kind is in
+`facet_pair` and `obstacle_pair`; another kind of master is one more file like these.
+"""
+
+from __future__ import annotations
+
+import numbers
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.validation import known_options
+
+if TYPE_CHECKING:
+    from dolfinx_nts.elements import Step
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Part of a facet's size by which a slave may penetrate at the start of a run.
+INITIAL_PENETRATION = 0.01
+#: Candidates are sought this part of a facet beyond the reach of the step's motion.
+MARGIN = 0.5
+
+
+class Candidates(NamedTuple):
+    """Slave nodes that may touch in a step, one facet each; axis 0 = pair.
+
+    Attributes:
+        node: Positions in the slave surface's `share`, shape (n,).
+        facet: Facets of the master surface, shape (n,).
+        xi: Orthogonal projection at t_n, shape (n, 2).
+        normal: Outward unit normal of the master there, shape (n, 3).
+        gap: g_0 [m], shape (n,).
+        length: Size of the facet [m], shape (n,).
+    """
+
+    node: IntArray
+    facet: IntArray
+    xi: FloatArray
+    normal: FloatArray
+    gap: FloatArray
+    length: FloatArray
+
+    def part(self, chosen: IntArray | BoolArray) -> Candidates:
+        """Some of them, by number or by a mask."""
+        return Candidates._make(a[chosen] for a in self)
+
+
+NO_CANDIDATES = Candidates(
+    np.empty(0, np.int64), np.empty(0, np.int64),
+    np.empty((0, 2)), np.empty((0, 3)), np.empty(0), np.empty(0),
+)  # fmt: skip
+
+
+class Motion(NamedTuple):
+    """How slaves and masters are expected to move in a step.
+
+    Attributes:
+        reach: Bound on the motion of slaves relative to the master [m].
+        paths: Displacement of each of a pair's bodies over the step [m], owned coordinates.
+        aimed: Facet that a path of an earlier attempt at the step met, or -1, of each of the rank's
+            slave nodes.
+    """
+
+    reach: float
+    paths: Sequence[FloatArray]
+    aimed: IntArray
+
+
+class Found(NamedTuple):
+    """What a search found.
+
+    Attributes:
+        candidates: Slave nodes that may touch.
+        followed: Which of the rank's slave nodes are known not to have passed by the surface's
+            edge, shape (share,).
+        cover: Relative motion [m] for which the search misses no contact, the same on all ranks.
+        beside: How deep, in facet sizes, the deepest node that is let through lies behind its
+            facet, and its input number; (0, -1) without one.
+    """
+
+    candidates: Candidates
+    followed: BoolArray
+    cover: float
+    beside: tuple[float, int] = (0.0, -1)
+
+
+@known_options
+class ContactPair:
+    """Slave nodes of one surface must not penetrate the facets of another (19)-(21).
+
+    Args:
+        slave: Surface whose nodes are kept outside.
+        master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
+        friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact stick, but for
+            those that no step holds or lets go, which a warning tells.
+
+    Attributes:
+        origin: Point of space that positions are relative to [m], shape (3,).
+        extent: Largest of the reference positions' components, relative to it [m].
+        given: Largest of the slave's as they were given, whose rounding they have [m].
+
+    Raises:
+        TypeError: `slave` is no Surface, or `master` of no known kind.
+        ValueError: friction is negative or no number, or the surfaces share nodes.
+    """
+
+    #: Class of pairs for each class of masters.
+    _kinds: ClassVar[dict[type, type[ContactPair]]] = {}
+
+    def __init_subclass__(cls, master: type) -> None:
+        ContactPair._kinds[master] = cls
+
+    def __new__(cls, slave: Any = None, master: Any = None, **_: Any) -> ContactPair:
+        """Make a pair of the kind that the master asks for."""
+        kinds = (pair for kind, pair in cls._kinds.items() if isinstance(master, kind))
+        return super().__new__(next(kinds, cls))
+
+    def __init__(self, slave: Surface, master: Any, *, friction: float = 0.0) -> None:
+        _check_friction(friction)
+        if not isinstance(slave, Surface):
+            other = isinstance(slave, tuple(self._kinds))
+            hint = "; an obstacle is a master" if other else ""
+            raise TypeError(f"slave={slave!r}: pass a Surface, e.g. body.surface(marker){hint}")
+        if type(self) is ContactPair:
+            raise TypeError(
+                f"master={master!r}: pass a Surface, e.g. body.surface(marker), or a Plane, Sphere "
+                "or Cylinder"
+            )
+        self.slave, self.friction = slave, float(friction)
+        self.master: Any = master
+        # What is near is small: gaps keep their digits wherever in space the bodies meet.
+        self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
+        self.extent = float(np.abs(slave.reference - self.origin).max())
+        self._set_up()
+
+    # ---- what a kind of master has of its own
+    def _set_up(self) -> None:
+        """Check the master and prepare the search."""
+
+    @property
+    def bodies(self) -> tuple[Any, ...]:
+        """The slave's body, and the master's if it has one."""
+        return (self.slave.body,)
+
+    @property
+    def master_name(self) -> str:
+        """For messages and files."""
+        name: str = self.master.name
+        return name
+
+    def has_master_of(self, other: ContactPair) -> bool:
+        """Whether the masters of both are equal, also of different systems."""
+        raise NotImplementedError
+
+    def shares_master(self, other: ContactPair) -> str | None:
+        """What both have for a master, for messages, if that is so at least in part."""
+        raise NotImplementedError
+
+    def path(self, start: float, end: float) -> FloatArray:
+        """Displacements of a master that is no body at two times [m], shape (2, 3). Collective."""
+        return np.zeros((2, 3))
+
+    def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+        """Positions of all points of the pair's surfaces [m], (p, 3) each. Collective.
+
+        They are relative to `origin`.
+
+        Args:
+            u: Owned displacements of each of `bodies` [m].
+        """
+        return (self._moved(self.slave, u[0]),)
+
+    def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
+        """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
+        x: FloatArray = positions[0][self.slave.share[found.node]][:, None]
+        return x
+
+    def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
+        """How deep slaves start inside another body, in facet sizes, wherever. Collective.
+
+        Args:
+            u: Owned displacements of each of `bodies` at the start [m].
+        """
+        return 0.0
+
+    def find(
+        self,
+        positions: Sequence[FloatArray],
+        current: IntArray,
+        path: FloatArray,
+        motion: Motion | None = None,
+        followed: BoolArray | None = None,
+    ) -> Found:
+        """Search for this rank's candidates; every rank must call it.
+
+        A node is a candidate behind its facet only if it has come there through the surface. One
+        that has passed by the surface's edge is let through, and followed again once it is outside.
+
+        Args:
+            positions: Of all points at t_n [m], as from `positions`.
+            current: Facet of each of the rank's slave nodes in the last step or -1.
+            path: Displacements of a master that is no body at t_n and t_{n+1} [m], shape (2, 3).
+            motion: Expected in the step; None: only what touches already.
+            followed: Which of the rank's nodes were followed in the last step; None: all.
+        """
+        raise NotImplementedError
+
+    def elements(
+        self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step
+    ) -> Any:
+        """Equations of candidates in a step, see `ContactElements`. Collective.
+
+        Args:
+            found: The candidates.
+            positions: Of all points at t_n [m].
+            path: As of `find`.
+            step: The step.
+        """
+        raise NotImplementedError
+
+    def missed(
+        self,
+        positions: Sequence[FloatArray],
+        motions: Sequence[FloatArray],
+        path: FloatArray,
+        reach: float,
+        held: IntArray,
+    ) -> IntArray | None:
+        """Facet that each of the rank's slaves has come through unseen, or -1. Collective.
+
+        Args:
+            positions: Of all points at t_n [m].
+            motions: Displacement of each of `bodies` in the solved step [m], owned coordinates.
+            path: As of `find`.
+            reach: Bound on the motion of slaves relative to the master [m].
+            held: Facet that each of the rank's slaves is held at in the end, or -1, shape (share,).
+
+        Returns:
+            Shape (share,), or None where no motion as short as this passes a facet.
+
+        Raises:
+            StepFailedError: A node has passed the master, and a shorter step is needed.
+        """
+        raise NotImplementedError
+
+    # ---- what they share
+    @property
+    def name(self) -> str:
+        """Slave body and master, for messages and files."""
+        return f"{self.slave.body.name}-{self.master_name}"
+
+    def is_like(self, other: ContactPair) -> bool:
+        """Whether both hold the same nodes of bodies of the same names out of the same master."""
+        alike = type(self) is type(other) and self.name == other.name
+        same_nodes = alike and np.array_equal(self.slave.points, other.slave.points)
+        return same_nodes and self.has_master_of(other)
+
+    def _moved(self, surface: Surface, u: FloatArray) -> FloatArray:
+        x: FloatArray = surface.reference - self.origin + surface.gather(u)
+        return x
+
+
+def _check_friction(friction: Any) -> None:
+    number = isinstance(friction, numbers.Real) and not isinstance(friction, bool)
+    if not number or not float(friction) >= 0.0:
+        raise ValueError(f"friction={friction!r}: pass a number >= 0 (math.inf: never slips)")

@@ -1,0 +1,322 @@
+"""Contact surfaces: oriented facets and their corner points, known on every rank.
+
+Every point of a body is linear in its coordinates, x = X + B u; on a continuum of nodes B only
+selects, so a surface keeps the node numbers of its corner points. Topology is gathered once;
+positions are gathered when a search needs them.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from mpi4py import MPI
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact import search
+from dolfinx_nts.kernels import facets as facet_math
+from dolfinx_nts.kernels import patches
+from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.validation import at_points, is_whole
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+Marker = Callable[[FloatArray], npt.NDArray[np.bool_]]
+
+_CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
+
+
+def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArray:
+    """This rank's owned exterior facets selected by a marker function or by a tag.
+
+    Args:
+        mesh: dolfinx mesh.
+        marker: Callable x (3, n) -> bool (n,) that must hold at all corners of a facet, or dolfinx
+            meshtags.
+        tag: Value to look for when `marker` is meshtags.
+        what: Name of the argument for messages.
+
+    Raises:
+        TypeError: `marker` is neither callable nor meshtags with a tag.
+        ValueError: The marker raises or returns no truth values, the tags are not facet tags, or
+            no exterior facet is selected, or an interior facet is.
+    """
+    exterior = compat.exterior_facets(mesh)
+    if tag is None:
+        if not callable(marker):
+            raise TypeError(
+                f"{what}={marker!r}: pass a function of x with shape (3, n), or meshtags and a tag"
+            )
+        nodes = compat.entities_to_geometry(mesh, 2, exterior)
+        used, chosen = np.unique(nodes), np.zeros(len(mesh.geometry.x), dtype=bool)
+        chosen[used] = at_points(mesh.comm, what, marker, mesh.geometry.x[used].T, (), "b")
+        found = exterior[chosen[nodes].all(axis=1)]
+        wrong = 0
+    else:
+        if callable(marker):
+            raise TypeError(f"{what}: a function of x takes no tag, but {tag!r} is given")
+        if not hasattr(marker, "find") or marker.dim != 2:
+            raise ValueError(
+                f"{what}={marker!r}: pass facet meshtags (dimension 2), not cell or edge tags"
+            )
+        if not is_whole(tag):
+            raise TypeError(f"{what} (tag {tag!r}): pass a whole number as the tag")
+        tagged = marker.find(tag)
+        found = np.intersect1d(tagged, exterior).astype(np.int32)
+        owned = tagged < mesh.topology.index_map(2).size_local
+        wrong = int(np.count_nonzero(owned) - len(found))
+    total, wrong = (int(n) for n in np.sum(mesh.comm.allgather((len(found), wrong)), axis=0))
+    name = what if tag is None else f"{what} (tag {tag})"
+    if wrong:
+        raise ValueError(
+            f"{name}: {wrong} interior facets selected; a contact surface must lie on the boundary"
+        )
+    if not total:
+        raise ValueError(
+            f"{name}: selects no exterior facet; check the marker's tolerance or the tag"
+        )
+    return found
+
+
+class Surface:
+    """Oriented facets of a body's boundary. Create with `Continuum.surface`.
+
+    Args:
+        body: Its body.
+        local_facets: This rank's owned facets.
+        smoothing: Whether slaves touch the smooth patches over the facets.
+
+    Attributes:
+        body: The body it belongs to.
+        points: Global node numbers of the corner points, sorted, shape (p,).
+        facets: Corner points of the facets as positions in `points`, cyclic and counter-clockwise
+            seen from outside, shape (m, nc); the order does not depend on the partition.
+        patches: Points that the surface over each facet depends on, the corners first: (m, nc), or
+            (m, 16) with smoothing.
+        weights: With smoothing, the patches' control points from these points, shape (m, 16, 16);
+            else None, as corners and control points are the same.
+        original: Input numbers of the points, the same for every number of ranks, shape (p,).
+        reference: Reference positions [m], shape (p, 3).
+        area: Tributary area of each point [m^2], shape (p,).
+        rows: Coordinates of the points that this rank owns among the body's owned ones, in the
+            order of `points`, shape (n, 3).
+        share: Positions in `points` of the nodes whose contact this rank computes, wherever their
+            coordinates are: all ranks have as much to do, however the mesh is divided.
+        fixed: Which coordinates of the points are prescribed, shape (p, 3).
+    """
+
+    def __init__(self, body: Any, local_facets: IntArray, smoothing: bool = False) -> None:
+        mesh, space = body.mesh, body.space
+        self.body = body
+        nodes = oriented_nodes(mesh, local_facets)
+        local = compat.node_blocks(mesh, space)[nodes]
+        index_map = space.dofmap.index_map
+        corners = index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
+        # An empty rank's list would become an array of floats.
+        ids = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[nodes]
+        table = np.stack([corners, ids], axis=-1)
+        table = gather_rows(mesh.comm, table)
+        x = gather_rows(mesh.comm, mesh.geometry.x[nodes])
+        first = table[..., 1].argmin(axis=1)
+        roll = (first[:, None] + np.arange(table.shape[1])) % table.shape[1]
+        table = np.take_along_axis(table, roll[..., None], axis=1)
+        x = np.take_along_axis(x, roll[..., None], axis=1)
+        order = np.lexsort(np.sort(table[..., 1], axis=1).T[::-1])
+        table, x = table[order], x[order]
+
+        self.points, at, inverse = np.unique(table[..., 0], return_index=True, return_inverse=True)
+        self.facets = inverse.reshape(table.shape[:2])
+        self.original = table[..., 1].ravel()[at]
+        self.reference = x.reshape(-1, 3)[at]
+        self.area = facet_math.tributary_areas(self.facets, x, len(self.points))
+        self.patches: IntArray = self.facets
+        self.weights: FloatArray | None = None
+        if smoothing:
+            self._smooth(x)
+        low, high = index_map.local_range
+        own = self.points[(self.points >= low) & (self.points < high)]
+        self.rows = 3 * (own - low)[:, None] + np.arange(3)
+        self.share = np.flatnonzero(_rank_of(self.original, mesh.comm.size) == mesh.comm.rank)
+        prescribed = np.zeros(body.num_owned, dtype=bool)
+        prescribed[body.fixed] = True
+        self.fixed = self.gather(prescribed)
+
+    def _smooth(self, corners: FloatArray) -> None:
+        """Lay patches over the facets with reference corners (m, 4, 3)."""
+        nc = self.facets.shape[1]
+        if nc != 4:
+            raise ValueError(
+                f"smoothing=True: the surface of {self.body.name!r} has triangles; smoothing needs "
+                "quadrilaterals: mesh the body with hexahedra, or leave smoothing out"
+            )
+        self.patches, self.weights, irregular = patches.control_net(self.facets, corners)
+        if irregular.any() and self.body.comm.rank == 0:
+            logger.warning(
+                "surface of %r: %d of %d facets have a corner where other than four facets meet; "
+                "there smoothing leaves edges",
+                self.body.name, irregular.sum(), len(irregular),
+            )  # fmt: skip
+
+    def control_points(self, x: FloatArray, facet: IntArray) -> FloatArray:
+        """What the surface over given facets is interpolated from [m], shape (n, nc or 16, 3).
+
+        Args:
+            x: Positions of all points [m], shape (p, 3).
+            facet: Facets, shape (n,).
+        """
+        return self.combine(x[self.patches[facet]], facet)
+
+    def combine(self, x: FloatArray, facet: IntArray) -> FloatArray:
+        """Control points from the points of the facets' patches [m], both (n, nc or 16, 3)."""
+        if self.weights is None:
+            return x
+        result: FloatArray = np.matmul(self.weights[facet], x)
+        return result
+
+    @property
+    def dofs(self) -> IntArray:
+        """Global coordinate numbers of the points in the body, shape (p, 3)."""
+        dofs: IntArray = 3 * self.points[:, None] + np.arange(3)
+        return dofs
+
+    @property
+    def boundary_edges(self) -> npt.NDArray[np.bool_]:
+        """Whether edge k (corner k to k + 1) of a facet is no other facet's, shape (m, nc)."""
+        edges = np.stack([self.facets, np.roll(self.facets, -1, axis=1)], axis=-1)
+        key = np.sort(edges.reshape(-1, 2), axis=1)
+        _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+        free: npt.NDArray[np.bool_] = (count[inverse.ravel()] == 1).reshape(self.facets.shape)
+        return free
+
+    def gather(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values at all points, shape (p, 3), from this rank's owned body coordinates."""
+        return gather_rows(self.body.comm, values[self.rows])
+
+    def nodal(self, values: FloatArray) -> FloatArray:
+        """Values at all points, shape (p,), from one at each of this rank's owned coordinates."""
+        result: FloatArray = self.gather(values)[:, 0]
+        return result
+
+    @cached_property
+    def mass(self) -> FloatArray:
+        """Mass of the points' nodes [kg], shape (p,). Collective."""
+        return self.nodal(self.body.nodal_mass)
+
+    @cached_property
+    def _dealt(self) -> IntArray:
+        """Shares of all ranks one after another. Collective."""
+        return gather_rows(self.body.comm, self.share)
+
+    def at_own(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values at the points of `rows` from those at the points of `share`. Collective."""
+        comm = self.body.comm
+        table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
+        table[self._dealt] = gather_rows(comm, values)
+        start = comm.exscan(len(self.rows)) or 0
+        return table[start : start + len(self.rows)]
+
+    def depth(self, x: FloatArray, u: FloatArray) -> FloatArray:
+        """How deep points lie inside the whole body, in facet sizes. Collective.
+
+        Outside, and less than a thousandth of a facet deep, the depth is 0.
+
+        Args:
+            x: Points [m], shape (n, 3), the same on all ranks.
+            u: Owned displacements of the body [m].
+
+        Returns:
+            Shape (n,), the same on all ranks.
+        """
+        mesh, space = self.body.mesh, self.body.space
+        nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
+        moved = fem.Function(space)
+        moved.x.array[: len(u)] = u
+        moved.x.scatter_forward()
+        blocks = compat.node_blocks(mesh, space)[nodes]
+        corners = mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
+        box = np.array(
+            [corners.min(axis=(0, 1), initial=np.inf), -corners.max(axis=(0, 1), initial=-np.inf)]
+        )
+        mesh.comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
+        near = np.flatnonzero(((x >= box[0]) & (x <= -box[1])).all(axis=1))
+        closest = search.closest_facets(x[near], corners, reach=np.inf)
+        distance = closest.distance / np.append(facet_math.size(corners), 1.0)[closest.facet]
+        nearest = distance.copy()
+        mesh.comm.Allreduce(MPI.IN_PLACE, distance, op=MPI.MIN)
+        # Only a point behind its nearest facet can be inside, and few are; a winding number costs
+        # all facets.
+        behind = np.zeros(len(near), dtype=np.int32)
+        mine = np.flatnonzero((nearest <= distance) & (closest.facet >= 0))
+        foot, _, normal = facet_math.frame(corners[closest.facet[mine]], closest.xi[mine])
+        side = np.einsum("ni,ni->n", normal, x[near][mine] - foot)
+        behind[mine] = (side < 0.0) & (distance[mine] > 1e-3)
+        mesh.comm.Allreduce(MPI.IN_PLACE, behind, op=MPI.MAX)
+        near, distance = near[behind > 0], distance[behind > 0]
+        turns = np.array([winding(p, corners) for p in x[near]])
+        mesh.comm.Allreduce(MPI.IN_PLACE, turns, op=MPI.SUM)
+        depth = np.zeros(len(x))
+        depth[near] = np.where(turns > 0.5, distance, 0.0)
+        return depth
+
+    def positions(self, u: FloatArray) -> FloatArray:
+        """Positions of all points [m], shape (p, 3), from this rank's owned displacements."""
+        x: FloatArray = self.reference + self.gather(u)
+        return x
+
+
+def _rank_of(nodes: IntArray, size: int) -> IntArray:
+    """Rank that computes the contact of each node (input number), shape (n,).
+
+    As good as by lot, so that every part of a surface is divided, and alike in all surfaces of a
+    body. The mixing is that of Steele, Lea and Flood's SplitMix64.
+    """
+    x = np.asarray(nodes).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
+    rank: IntArray = ((x >> np.uint64(32)) * np.uint64(size) >> np.uint64(32)).astype(int)
+    return rank
+
+
+def flux(corners: FloatArray) -> FloatArray:
+    """Volume of the cone from the origin over oriented facets [m^3], (..., nc, 3) -> (...)."""
+    # Under a bilinear facet lies the mean of its two triangulations.
+    triangles = {3: [[0, 1, 2]], 4: [[0, 1, 2], [0, 2, 3], [0, 1, 3], [1, 2, 3]]}
+    nc = corners.shape[-2]
+    a, b, c = np.moveaxis(corners[..., np.array(triangles[nc]), :], -2, 0)
+    volume: FloatArray = np.einsum("...i,...i->...", a, np.cross(b, c)).sum(axis=-1) / 6
+    return volume if nc == 3 else 0.5 * volume
+
+
+def winding(x: FloatArray, corners: FloatArray) -> float:
+    """How often facets (m, nc, 3) enclose a point: 1 inside a closed surface, 0 outside."""
+    total = 0.0
+    for k in range(1, corners.shape[1] - 1):
+        a, b, c = (corners[:, [0, k, k + 1]] - x).transpose(1, 0, 2)
+        la, lb, lc = (np.linalg.norm(e, axis=1) for e in (a, b, c))
+        ab, bc, ca = ((e * f).sum(axis=1) for e, f in ((a, b), (b, c), (c, a)))
+        volume = (a * np.cross(b, c)).sum(axis=1)
+        total += float(np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum())
+    return total / (2 * np.pi)
+
+
+def oriented_nodes(mesh: Any, local_facets: IntArray) -> IntArray:
+    """Geometry nodes of facets, cyclic and counter-clockwise seen from outside the cell."""
+    nodes = compat.entities_to_geometry(mesh, 2, local_facets)
+    nodes = nodes[:, _CYCLIC[nodes.shape[1]]]
+    if not len(nodes):
+        return nodes
+    to_cell = mesh.topology.connectivity(2, 3)
+    cells = np.array([to_cell.links(f)[0] for f in local_facets], dtype=np.int32)
+    x, centre = mesh.geometry.x, mesh.geometry.x[compat.geometry_dofmap(mesh)[cells]].mean(axis=1)
+    corner = x[nodes]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, -1] - corner[:, 0])
+    inward = np.einsum("ni,ni->n", normal, corner.mean(axis=1) - centre) < 0
+    nodes[inward] = nodes[inward][:, ::-1]
+    return nodes

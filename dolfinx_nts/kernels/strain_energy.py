@@ -1,0 +1,160 @@
+"""W of a material between two strains: what stresses are made of, in one form for all materials.
+
+Everything is a function of Green's strain E = (C - 1)/2, which displacement gradients give without
+cancellation. A material in the invariants of C - 1 (`Isotropic`) keeps that precision; a W(C) sees
+C = 1 + 2 E, which is rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import ufl
+
+from dolfinx_nts.kernels.precise import cofactor, determinant, invariants
+
+
+class Isotropic:
+    """A material that is a function of the invariants I_1, I_2, I_3 of C - 1."""
+
+    def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
+        """W [J/m^3]."""
+        raise NotImplementedError(f"{type(self).__name__} needs a method of_invariants")
+
+    def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
+        """Derivatives of W by the three [Pa]; written out they cost less."""
+        variables = tuple(ufl.variable(i) for i in (i1, i2, i3))
+        energy = self.of_invariants(*variables)
+        first, second, third = (ufl.diff(energy, i) for i in variables)
+        return first, second, third
+
+    def __call__(self, c: Any) -> Any:
+        """W(C) [J/m^3]."""
+        return self.of_invariants(*invariants(0.5 * (c - ufl.Identity(3))))
+
+
+def green_strain(h: Any) -> Any:
+    """E = sym H + H^T H / 2 of a displacement gradient H, free of cancellation (UFL)."""
+    return ufl.sym(h) + 0.5 * (h.T * h)
+
+
+def strain_energy(material: Any) -> StrainEnergy:
+    """The material as a function of E: an `Isotropic`, or any callable C -> W(C)."""
+    return OfInvariants(material) if isinstance(material, Isotropic) else OfC(material)
+
+
+class Path(NamedTuple):
+    """W on the straight way E = E_0 + tau (E_1 - E_0) between two strains (UFL).
+
+    Attributes:
+        power: dW/dtau, a function of tau.
+        middle: Stress dW/dE at tau = 1/2.
+        difference: W(E_1) - W(E_0).
+    """
+
+    power: Callable[[float], Any]
+    middle: Any
+    difference: Any
+
+
+class OfC:
+    """W(C) at C = 1 + 2 E.
+
+    Args:
+        function: Any callable C -> UFL scalar.
+    """
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self._function = function
+
+    def __call__(self, e: Any) -> Any:
+        """W(E)."""
+        return self._function(self.argument(e))
+
+    def argument(self, e: Any) -> Any:
+        """The tensor that W is rounded relative to."""
+        return ufl.Identity(3) + 2 * e
+
+    def stress(self, e: Any) -> Any:
+        """dW/dE, symmetric: the second Piola-Kirchhoff stress."""
+        c = ufl.variable(self.argument(e))
+        return 2 * ufl.sym(ufl.diff(self._function(c), c))
+
+    def along(self, e0: Any, e1: Any) -> Path:
+        """W between two strains."""
+        c0, c1 = self.argument(e0), self.argument(e1)
+
+        def power(tau: float) -> Any:
+            t = ufl.variable(ufl.as_ufl(tau))  # dW : DC, without a derivative by a tensor
+            return ufl.diff(self._function(c0 + t * (c1 - c0)), t)
+
+        middle = self.stress(0.5 * (e0 + e1))
+        return Path(power, middle, self._function(c1) - self._function(c0))
+
+
+class OfInvariants:
+    """W of an `Isotropic` material.
+
+    Args:
+        material: The material.
+    """
+
+    def __init__(self, material: Isotropic) -> None:
+        self._material = material
+
+    def __call__(self, e: Any) -> Any:
+        """W(E)."""
+        return self._material.of_invariants(*invariants(e))
+
+    def argument(self, e: Any) -> Any:
+        """The tensor that W is rounded relative to."""
+        return e
+
+    def stress(self, e: Any) -> Any:
+        """dW/dE, symmetric: the second Piola-Kirchhoff stress."""
+        return self._stress(e, invariants(e))
+
+    def along(self, e0: Any, e1: Any) -> Path:
+        """W between two strains, where the invariants are polynomials of tau."""
+        a, da = 2 * e0, 2 * (e1 - e0)
+        cof, dcof = cofactor(a), cofactor(da)
+        i1 = (ufl.tr(a), ufl.tr(da))
+        i2 = (ufl.tr(cof), i1[0] * i1[1] - ufl.inner(a, da), ufl.tr(dcof))
+        i3 = (
+            determinant(a, cof),
+            ufl.inner(cof, da),
+            ufl.inner(a, dcof),
+            determinant(da, dcof),
+        )
+        polynomials = (i1, i2, i3)
+
+        def at(tau: float) -> list[Any]:
+            return [_polynomial(i, tau) for i in polynomials]
+
+        def power(tau: float) -> Any:
+            rates = [_polynomial([k * c for k, c in enumerate(i)][1:], tau) for i in polynomials]
+            first, *rest = (
+                s * r for s, r in zip(self._material.slopes(*at(tau)), rates, strict=True)
+            )
+            return sum(rest, start=first)
+
+        end, start = (self._material.of_invariants(*at(tau)) for tau in (1.0, 0.0))
+        return Path(power, self._stress(0.5 * (e0 + e1), at(0.5)), end - start)
+
+    def _stress(self, e: Any, i: Sequence[Any]) -> Any:
+        """dW/dE where the invariants are known."""
+        a = 2 * e
+        first, second, third = self._material.slopes(*i)
+        return 2 * ((first + second * i[0]) * ufl.Identity(3) - second * a + third * cofactor(a))
+
+
+def _polynomial(coefficients: Sequence[Any], x: float) -> Any:
+    """Sum of c_k x^k."""
+    value = coefficients[-1]
+    for c in coefficients[-2::-1]:
+        value = c + x * value
+    return value
+
+
+StrainEnergy = OfC | OfInvariants

@@ -1,0 +1,5 @@
+"""Writers of fields and tables, plots and pictures."""
+
+from dolfinx_nts.output.writers import BalanceCSV, Fields
+
+__all__ = ["BalanceCSV", "Fields"]

@@ -1,0 +1,150 @@
+"""Plots of the balance table: energies, ledger and momenta over time, of one or several runs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.output.whole_files import replace_file
+from dolfinx_nts.step import balance as ledger
+from dolfinx_nts.validation import StrPath
+
+FloatArray = npt.NDArray[np.float64]
+Balance = Mapping[str, FloatArray]
+
+
+class _Panel(NamedTuple):
+    """One plot; with `floor`, absolute values on a logarithmic axis, from that value upwards."""
+
+    title: str
+    unit: str
+    lines: dict[str, FloatArray]
+    floor: float | None = None
+    steps: bool = False
+
+
+#: Lower end of logarithmic axes relative to what is compared: nothing below means anything.
+_ROUND_OFF = 0.1 * float(np.finfo(float).eps)
+
+
+def _panels(balance: Balance, several: bool) -> list[_Panel]:
+    missing = sorted(set(ledger.COLUMNS) - set(balance))
+    if missing:
+        raise ValueError(f"balance: columns {missing} are missing; pass Solution.balance")
+    if several:
+        energy = _Panel("Total energy", "[J]", {"": balance["energy"]})
+    else:
+        lines = {"total": balance["energy"]} | {n: balance[n] for n in ("kinetic", "potential")}
+        energy = _Panel("Energy", "[J]", lines)
+    work = {
+        name.replace("_", " "): balance[name]
+        for name in ("contact_defect", "external_work", "friction_dissipation", "material_change")
+        if name == "contact_defect" or balance[name].any()
+    }
+    nodes = {
+        n: balance[n] for n in ("active", "stick", "slip") if n == "active" or balance[n].any()
+    }
+    scale = float(np.abs(balance["energy"]).max()) or 1.0
+    residual = {"": balance["ledger_residual"] / scale}
+    panels = [
+        energy,
+        _Panel("Ledger residual / largest energy", "[-]", residual, _ROUND_OFF),
+        _Panel(", ".join(work).capitalize(), "[J]", work),
+        _Panel("Slave nodes in contact", "[-]", nodes, steps=True),
+    ]
+    for name, unit in (("linear", "kg m/s"), ("angular", "kg m²/s")):
+        value = balance[f"{name}_momentum"]
+        size = float(np.linalg.norm(value, axis=1).max())
+        title = f"Change of {name} momentum (of {size:.3g} {unit})"
+        change = {"": np.linalg.norm(value - value[0], axis=1)}
+        panels.append(_Panel(title, f"[{unit}]", change, _ROUND_OFF * (size or 1.0)))
+    return panels
+
+
+def plot_balance(balance: Balance, path: StrPath) -> None:
+    """Plot energies, ledger residual, defect and work, active nodes, momentum changes over time.
+
+    Call it on one rank; `Solution.plot` sees to that.
+
+    Args:
+        balance: `Solution.balance`.
+        path: Picture file; its ending chooses the format.
+
+    Raises:
+        ValueError: Columns are missing.
+    """
+    _plot({"": balance}, path)
+
+
+def compare_balances(balances: Mapping[str, Balance], path: StrPath) -> None:
+    """Plot several runs together, e.g. both integrators. Call it on one rank.
+
+    Args:
+        balances: Label -> `Solution.balance`.
+        path: Picture file; its ending chooses the format.
+
+    Raises:
+        ValueError: No run, or columns are missing.
+    """
+    if not balances:
+        raise ValueError(
+            f"balances={balances!r}: pass at least one, as {{label: Solution.balance}}"
+        )
+    _plot(balances, path)
+
+
+def _plot(balances: Mapping[str, Balance], path: StrPath) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.5, 7.5), constrained_layout=True)
+    grid = figure.subplots(3, 2, sharex=True)
+    runs = [(run, b["time"], _panels(b, len(balances) > 1)) for run, b in balances.items()]
+    for k, axes in enumerate(grid.T.ravel()):
+        for r, (run, time, panels) in enumerate(runs):
+            _lines(axes, panels[k], time, run, r if len(runs) > 1 else None)
+        _style(axes, runs[0][2][k])
+        if any(not line.get_label().startswith("_") for line in axes.lines):
+            axes.legend(fontsize=8, frameon=False)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]", fontsize=9)
+    save_figure(figure, Path(path), dpi=150)
+
+
+def _lines(axes: Any, panel: _Panel, time: FloatArray, run: str, number: int | None) -> None:
+    """Draw a run; of several, the first is the widest so that coinciding ones stay visible."""
+    for j, (name, values) in enumerate(panel.lines.items()):
+        look: dict[str, Any] = {"color": f"C{j}", "linewidth": 1.4}
+        if number is not None:
+            look = {"color": f"C{number}", "linestyle": ("-", "--", ":")[j]}
+            look["linewidth"] = max(2.6 - 1.4 * number, 1.2)
+        alone = number is not None and len(panel.lines) == 1
+        shown = panel.title == "Total energy" if alone else bool(name)
+        label = ", ".join(filter(None, (run, "" if alone else name))) if shown else "_"
+        where = "steps-post" if panel.steps else "default"
+        if panel.floor is not None:
+            # The start has no change, which a logarithmic axis cannot show.
+            time, values = time[1:], np.maximum(np.abs(values[1:]), panel.floor)
+        axes.plot(time, values, drawstyle=where, label=label, **look)
+
+
+def _style(axes: Any, panel: _Panel) -> None:
+    axes.set_title(panel.title, fontsize=10, loc="left")
+    axes.set_ylabel(panel.unit, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(True, color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    if panel.floor is not None:
+        axes.set_yscale("log")
+
+
+def save_figure(figure: Any, path: Path, **options: Any) -> None:
+    """Save a figure of matplotlib, and make its folder; if that fails, an old picture remains."""
+    kind, image = path.suffix[1:] or figure.canvas.get_default_filetype(), io.BytesIO()
+    figure.savefig(image, format=kind, **options)
+    replace_file(path if path.suffix else path.with_name(f"{path.name}.{kind}"), image.getvalue())

@@ -1,0 +1,315 @@
+"""Writers for `simulate(output=[...])`: fields of the bodies and the balance table.
+
+They have the `Writer` protocol, which all ranks call together. Rank 0 alone touches files: it
+gathers owned values and orders them by the numbers of the mesh's input, so the files do not depend
+on the partition.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
+from dolfinx_nts.parallel import gather_on_root, write_on_root
+from dolfinx_nts.step import balance as ledger
+from dolfinx_nts.system import State
+from dolfinx_nts.validation import StrPath, as_path, is_whole, require_positive
+
+if TYPE_CHECKING:
+    from dolfinx_nts.run.simulate import Stepper
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+
+def _file_name(name: str) -> str:
+    """Of a body: a name without folders, and none that is hidden."""
+    return re.sub(r"^\.+|[^\w.-]+", "_", name)
+
+
+# ---- fields
+_XDMF_HEAD = (
+    '<?xml version="1.0"?>\n<Xdmf Version="3.0"><Domain>\n'
+    '<Grid Name="{}" GridType="Collection" CollectionType="Temporal">\n'
+)
+_XDMF_TAIL = "</Grid>\n</Domain></Xdmf>\n"
+#: XDMF's name of a cell and its order of DOLFINx's vertices.
+_CELLS = {8: ("Hexahedron", [0, 1, 3, 2, 4, 5, 7, 6]), 4: ("Tetrahedron", [0, 1, 2, 3])}
+
+
+class _Series:
+    """Files of one body: NAME.h5 holds the numbers, NAME.xdmf tells ParaView what they are."""
+
+    def __init__(self, body: Any, index: int, contacts: Mapping[str, int], folder: Path) -> None:
+        self.body, self.index, self.contacts = body, index, contacts
+        self.path = folder / _file_name(body.name)
+        self._times = 0
+        blocks = compat.node_blocks(body.mesh, body.space)
+        nodes = np.flatnonzero((blocks >= 0) & (blocks < body.num_owned // 3))
+        self._blocks = blocks[nodes]
+        original = np.asarray(body.mesh.geometry.input_global_indices)
+        everywhere = gather_on_root(body.comm, original[nodes])
+        numbers, self._order = np.unique(everywhere, return_index=True)
+        self._points = self._nodal(body.reference.reshape(-1, 3))
+        owned = body.mesh.topology.index_map(3).size_local
+        cells = gather_on_root(body.comm, original[compat.geometry_dofmap(body.mesh)[:owned]])
+        order = gather_on_root(
+            body.comm, np.asarray(body.mesh.topology.original_cell_index[:owned], dtype=np.int64)
+        )
+        self._cells = np.searchsorted(numbers, cells[np.argsort(order)])
+
+    def _nodal(self, values: FloatArray) -> FloatArray:
+        """Values of owned blocks in the order of the file, on rank 0."""
+        gathered: FloatArray = gather_on_root(self.body.comm, values[self._blocks])[self._order]
+        return gathered
+
+    def create(self) -> None:
+        """Write the mesh; rank 0 only."""
+        import h5py
+
+        self._kind, corners = _CELLS[self._cells.shape[1]]
+        image = io.BytesIO()
+        with h5py.File(image, "w") as file:
+            file["mesh/points"], file["mesh/cells"] = self._points, self._cells[:, corners]
+        replace_file(Path(f"{self.path}.h5"), image.getvalue())
+        head = _XDMF_HEAD.format(self.path.name)
+        replace_file(Path(f"{self.path}.xdmf"), (head + _XDMF_TAIL).encode())
+
+    def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
+        """Nodal fields of the last accepted state on rank 0; collective."""
+        state, owned = stepper.state, self.body.num_owned // 3
+        fields = {
+            "displacement": self._nodal(state.u[self.index].reshape(-1, 3)),
+            "velocity": self._nodal(state.v[self.index].reshape(-1, 3)),
+        }
+        for label, k in self.contacts.items():
+            contact = stepper.system.contacts[k]
+            found = _contact_fields(contact, state, k, stepper.mean_force(k))
+            for name, (elsewhere, values) in found.items():
+                nodal = np.full((owned, *values.shape[1:]), elsewhere)
+                nodal[contact.slave.rows[:, 0] // 3] = contact.slave.at_own(values)
+                fields[f"{name}_{label}"] = self._nodal(nodal)
+        return fields
+
+    def append(self, time: float, fields: Mapping[str, FloatArray]) -> None:
+        """Add one time; rank 0 only. Both files are complete and closed afterwards.
+
+        Raises:
+            OSError: They cannot be written; the times before are still whole.
+        """
+        import h5py
+
+        group, numbers = f"{self._times:06d}", Path(f"{self.path}.h5")
+        with Draft(numbers) as draft:
+            with h5py.File(draft, "r+") as file:
+                if group in file:  # from a call that failed for want of space for the other file
+                    del file[group]
+                for name, values in fields.items():
+                    file[f"{group}/{name}"] = values
+            amend_file(numbers, draft.parts)
+        cells = self._item("mesh/cells", self._cells.shape, "Int")
+        points = self._item("mesh/points", self._points.shape, "Float")
+        lines = [
+            f'<Grid><Time Value="{time:.17g}"/>',
+            f'<Topology TopologyType="{self._kind}" NumberOfElements="{len(self._cells)}">'
+            f"{cells}</Topology>",
+            f'<Geometry GeometryType="XYZ">{points}</Geometry>',
+        ]
+        for name, values in fields.items():
+            kind = "Vector" if values.ndim == 2 else "Scalar"
+            item = self._item(f"{group}/{name}", values.shape, "Float")
+            head = f'<Attribute Name="{name}" AttributeType="{kind}" Center="Node">'
+            lines.append(f"{head}{item}</Attribute>")
+        # One write over the old tail: the file is well-formed whenever the run dies.
+        text, path = "\n".join([*lines, "</Grid>", _XDMF_TAIL]).encode(), Path(f"{self.path}.xdmf")
+        amend_file(path, [(os.path.getsize(path) - len(_XDMF_TAIL), text)])
+        self._times += 1
+
+    def _item(self, dataset: str, shape: tuple[int, ...], number: str) -> str:
+        size = " ".join(map(str, shape))
+        return (
+            f'<DataItem Dimensions="{size}" NumberType="{number}" Precision="8" Format="HDF">'
+            f"{self.path.name}.h5:/{dataset}</DataItem>"
+        )
+
+
+def _contact_fields(
+    pair: ContactPair, state: State, k: int, mean: FloatArray
+) -> dict[str, tuple[float, FloatArray]]:
+    """Name -> value elsewhere and values at this rank's slave nodes."""
+    slave, own = pair.slave, state.contacts[k]
+    force, gap = own.force, own.gap
+    near = np.isfinite(gap)
+    fields = {
+        "contact_force": (0.0, force),
+        "contact_pressure": (0.0, force / slave.area[slave.share]),
+        "contact_force_mean": (0.0, mean),
+        "contact_pressure_mean": (0.0, mean / slave.area[slave.share]),
+        "contact_gap": (np.nan, np.where(near, gap, np.nan)),
+        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + own.stick),
+    }
+    if pair.friction:
+        fields["contact_friction"] = (0.0, own.tangential)
+        fields["contact_slip"] = (0.0, own.slip)
+    return fields
+
+
+class Fields:
+    """Writes each body as a time series FOLDER/NAME.xdmf with NAME.h5, readable in ParaView.
+
+    Displacement [m] and velocity [m/s] at the mesh's nodes. At the slave body of a contact also,
+    with the contact's name appended, contact_force p_N [N], contact_pressure (force per tributary
+    reference area) [Pa], contact_gap [m] (NaN where unknown) and contact_status (-1 not a slave
+    node, 0 far away, 1 near, 2 in contact, 3 sticking); with friction contact_friction, the
+    tangential force on the node [N], and contact_slip, the distance slipped so far [m].
+
+    With a consistent mass the forces of single steps alternate about the right ones, at Courant
+    number 1 by a quarter to two fifths of them and more in shorter steps: contact_force_mean and
+    contact_pressure_mean are means over the time of the last two steps, where that is nearly gone.
+
+    The initial and the last accepted state are always written, and every time is on disk before the
+    run goes on; where it cannot be written (disk full, folder gone), the run ends and all times
+    before are whole. Bodies without a mesh are left out; existing files of the same names are
+    replaced.
+
+    Args:
+        folder: Where the files go; made if missing.
+        every: Write after every `every`-th step, >= 1.
+        interval: Instead of `every`: write after the first step that reaches each multiple of this
+            time [s].
+
+    Raises:
+        ValueError: The cadence is out of range or given twice; from `start`: no body has a mesh,
+            or two bodies' names give one file.
+        OSError: From `start`, before any step and on all ranks: the folder cannot be written.
+    """
+
+    def __init__(self, folder: StrPath, *, every: int = 1, interval: float | None = None) -> None:
+        if not is_whole(every) or every < 1:
+            raise ValueError(f"every={every!r}: pass a whole number of steps >= 1")
+        if interval is not None:
+            require_positive("interval", interval, "s")
+            if every != 1:
+                raise ValueError(f"every={every!r}, interval={interval!r}: pass one of the two")
+        self.folder, self.every, self.interval = as_path("folder", folder), every, interval
+        self._series: list[_Series] = []
+
+    def start(self, stepper: Stepper) -> None:
+        """Create the files with the initial state."""
+        system, contacts = stepper.system, stepper.system.contacts
+        names = [_file_name(c.name) for c in contacts]
+        label = [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
+        self._series = []
+        for i, body in enumerate(system.bodies):
+            if hasattr(body, "mesh"):
+                own = {n: k for k, n in enumerate(label) if contacts[k].slave.body is body}
+                self._series.append(_Series(body, i, own, self.folder))
+        if not self._series:
+            raise ValueError(f"folder={str(self.folder)!r}: no body has a mesh; leave Fields out")
+        files = [s.path.name for s in self._series]
+        if len(set(files)) < len(files):
+            raise ValueError(f"name of bodies: file names {files} are not unique; rename a body")
+        for series in self._series:
+            self._root(stepper, series.create)
+        self._steps, self._next = 0, self.interval or 0.0
+        self._append(stepper)
+
+    def write(self, stepper: Stepper, *, last: bool = False) -> None:
+        """Write the accepted state if the cadence asks for it, or if it is the last."""
+        self._steps += 1
+        due = self._steps % self.every == 0
+        if self.interval is not None:
+            reached = stepper.state.time * (1 + 1e-12)
+            due = reached >= self._next
+            if due:
+                self._next = self.interval * (math.floor(reached / self.interval) + 1)
+        if due or last:
+            self._append(stepper)
+
+    def close(self, stepper: Stepper) -> None:
+        """Write the last accepted state of a run that failed."""
+        # Unlike an exception, a status is the same on all ranks, so that all come here.
+        failed = not stepper.solution.status.startswith(("running", "completed"))
+        if self._series and failed and stepper.state.time > self._tried:
+            self._append(stepper)
+
+    def _append(self, stepper: Stepper) -> None:
+        self._tried = time = stepper.state.time
+        for series in self._series:
+            self._root(stepper, partial(series.append, time, series.fields(stepper)))
+
+    def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
+        write_on_root(stepper.system.comm, f"folder={str(self.folder)!r}", action)
+
+
+# ---- balance table
+_UNITS = {"time": "s", "min_gap": "m"}
+_UNITS |= {"linear_momentum": "kg m/s", "angular_momentum": "kg m^2/s"}
+_UNITS |= dict.fromkeys(("active", "stick", "slip", "min_det", "newton_iterations"), "-")
+
+
+class BalanceCSV:
+    """Writes the balance table: a row for the start and at once one per accepted step, all digits.
+
+    The run's warnings follow as lines that begin with "#".
+
+    Args:
+        path: File; its folder is made if missing, an existing file is replaced.
+
+    Raises:
+        OSError: From `start`, before any step and on all ranks: the file cannot be written.
+    """
+
+    def __init__(self, path: StrPath) -> None:
+        self.path = as_path("path", path)
+        self._open = False
+
+    def start(self, stepper: Stepper) -> None:
+        """Write the header and the row of the initial state."""
+        header, self._rows = [], 0
+        for name in ledger.columns(stepper.system):
+            unit = _UNITS.get(name, "J")
+            vector = np.ndim(stepper.solution.rows[0][name]) > 0
+            header += [f"{name}{s} [{unit}]" for s in (("_x", "_y", "_z") if vector else ("",))]
+        line = ",".join(header) + "\n"
+        self._root(stepper, lambda: replace_file(self.path, line.encode()))
+        self.write(stepper)
+
+    def write(self, stepper: Stepper, *, last: bool = False) -> None:
+        """Add the rows of the steps accepted since the last call."""
+        self._root(stepper, lambda: self._append(stepper))
+
+    def close(self, stepper: Stepper) -> None:
+        """Add rows that are still missing and the warnings, unless the file could not be written.
+
+        Raises:
+            OSError: On rank 0: it can no longer be written.
+        """
+        if self._open:
+            self._append(stepper, (f"# {w}" for w in stepper.solution.warnings.lines))
+        self._open = False
+
+    def _append(self, stepper: Stepper, footer: Iterable[str] = ()) -> None:
+        self._open = False
+        lines = []
+        for row in stepper.solution.rows[self._rows :]:
+            cells = np.concatenate([np.ravel(row[name]) for name in ledger.columns(stepper.system)])
+            lines.append(",".join(f"{x:.17g}" for x in cells.tolist()))
+        extend_file(self.path, "".join(f"{line}\n" for line in (*lines, *footer)).encode())
+        self._rows += len(lines)
+        self._open = True
+
+    def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
+        write_on_root(stepper.system.comm, f"path={str(self.path)!r}", action)

@@ -1,0 +1,1 @@
+"""Runs: the time loop, load steps, adaptive steps, what a run has to say."""

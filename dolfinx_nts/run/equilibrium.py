@@ -1,0 +1,317 @@
+"""Equilibrium of a system: static and quasi-static loading in steps, without inertia."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.integrators import Static
+from dolfinx_nts.output.writer import Writer
+from dolfinx_nts.run.simulate import Solution, Stepper, run, writers
+from dolfinx_nts.run.table import Table
+from dolfinx_nts.step import balance, resultants
+from dolfinx_nts.step.free_motion import free_motion
+from dolfinx_nts.step.newton import Newton
+from dolfinx_nts.step.problem import Evaluation
+from dolfinx_nts.system import State, System
+from dolfinx_nts.validation import (
+    StepFailedError,
+    UserFunctionError,
+    floats,
+    is_whole,
+    known_options,
+    require_bool,
+    require_positive,
+)
+
+FloatArray = npt.NDArray[np.float64]
+
+#: A load step is dropped if it leaves a slave this part of a facet behind one that it was no
+#: candidate of.
+_MISSED = 0.1
+#: Relaxations of one load step before it counts as without equilibrium.
+_RELAXATIONS = 100
+#: From this part of the forces on, the stabilization's moves no node to another facet.
+_NEARLY_AT_REST = 1e-2
+#: A failed relaxation is repeated with a stiffer stabilization, up to this.
+_STIFFEST = 10.0
+#: A relaxation that leaves less than this part of the stabilization's force ...
+_RELIEVED = 0.5
+#: ... lowers the next one's stiffness by this. What falls freely, whose force stays, is held on.
+_RELIEF = 0.1
+
+_REMEDY = (
+    "Try more load steps, or inspect the nodes named here; a body that nothing but contact holds "
+    "must touch at the start, or needs stabilization=0.1"
+)
+#: Part of the stored energy that the work of load steps may miss without a word.
+_OPEN = 0.1
+
+
+@dataclass(eq=False)
+class Equilibrium(Solution):
+    """What `equilibrium` computed, complete up to where it ended.
+
+    `balance` has one row per accepted load step: "time" is the pseudo time, "potential" and
+    "energy" the strain energy, "external_work" that of loads and prescribed motion (of the mean of
+    the forces at both ends of each step), "ledger_residual" what energy and
+    friction_dissipation miss of it; "kinetic" and the momenta are 0, and changes of facet, which
+    cost nothing, are not listed.
+    """
+
+    moving: ClassVar[bool] = False
+
+
+class _LoadStepper(Stepper):
+    """Stepper in pseudo time; a step is relaxed until nothing of the stabilization is left."""
+
+    solution: Equilibrium
+
+    def __init__(self, system: System, stabilization: float, **options: Any) -> None:
+        super().__init__(system, Static(), **options)
+        self._stabilization = stabilization
+        self._rates = [np.zeros_like(u) for u in self.state.u]
+        self._forces = [np.zeros_like(u) for u in self.state.u]
+        self._accept(replace(self.state, v=tuple(self._rates)))
+        self.solution = Equilibrium(system, rows=Table([self._first_row()]), state=self.state)
+
+    def start(self, dt: float) -> None:
+        """Nothing moves at the start, but the user may change a material; later calls do nothing.
+
+        Args:
+            dt: First load step, in pseudo time.
+        """
+        if self._started:
+            return
+        self._call_before(dt)
+        self._materials.changed()
+        self.solution.rows, self._started = Table([self._first_row()]), True
+
+    def _step(self, dt: float, time: float) -> None:
+        self._prepare(dt)
+        old = self.state
+        step, state, iterations, lost = self._relax(dt, time)
+        self._rates = [(a - b) / dt for a, b in zip(state.u, old.u, strict=True)]
+        forces = [t.external.copy() for t in step.bodies]
+        work = 0.0
+        for k, (body, t) in enumerate(zip(self.system.bodies, step.bodies, strict=True)):
+            forces[k][body.fixed] += t.residual[body.fixed]
+            work += 0.5 * float((forces[k] + self._forces[k]) @ (state.u[k] - old.u[k]))
+        self._forces = forces
+        forces_now, before = resultants.of_step(self.problem, step), self.solution.rows[-1]
+        terms = balance.step_terms(self.problem, step)
+        terms["external_work"] = self.system.comm.allreduce(work)
+        terms["friction_dissipation"] += lost
+        for k, pair in enumerate(self.system.contacts):
+            mean = 0.5 * (before["contact_forces"][k] + forces_now["contact_forces"][k])
+            start, end = pair.path(old.time, time)
+            terms["external_work"] += float(mean @ (end - start))
+        terms |= {"time": time, "newton_iterations": iterations}
+        terms |= {"contact_defect": 0.0, "material_change": self._material_change}
+        self._material_change = 0.0
+        rows, measured = self.solution.rows, balance.measure(self.system, state)
+        row = balance.next_row(rows[0], rows[-1], measured, terms)
+        rows.append(row | forces_now)
+        missing, size = abs(row["ledger_residual"]), abs(row["potential"])
+        if missing > _OPEN * max(size, abs(row["external_work"])):
+            self.solution.warn(
+                "ledger", time, missing,
+                f"the work misses {missing:.3g} J of the {size:.3g} J stored, as it is that of the "
+                "mean forces of load steps; use more of them",
+            )  # fmt: skip
+        self._accept(state)
+        self._tell_inversion(step)
+        self._tell_free_motion(step)
+        self.look()
+
+    def _tell_free_motion(self, step: Evaluation) -> None:
+        """Warn, once, of motions that nothing resists; stabilization would leave them at rest."""
+        if self._stabilization or "free motion" in self.solution.warnings:
+            return
+        found = free_motion(self.problem, self.solver, step)
+        if found:
+            self.solution.warn(
+                "free motion", self.state.time, 1.0,
+                f"{found}: how far it has moved so is chance; add a Dirichlet condition, or pass "
+                "stabilization=0.1, which leaves it where it is",
+                grave=True,
+            )  # fmt: skip
+
+    def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, float]:
+        """Solution of a load step, its state, Newton iterations, earlier relaxations' dissipation.
+
+        Each relaxation starts where the last one ended and is held there a little by the
+        stabilization: a proximal-point iteration, whose limit knows nothing of it.
+        """
+        problem, kept, iterations, last = self.problem, self.state, 0, np.inf
+        search, lost, since = True, 0.0, 0.0
+        slipped = [contact.slip for contact in kept.contacts]
+        problem.stabilization = self._stabilization
+        state = replace(kept, v=tuple(self._rates))
+        try:
+            for _ in range(_RELAXATIONS):
+                try:
+                    step = self._solve(state, dt, search)
+                    reached = self._accepted(step, dt, time)
+                    if search:  # else slip still counts from the last search
+                        lost, slipped = lost + since, [contact.slip for contact in state.contacts]
+                    contacts = tuple(
+                        new._replace(slip=start + new.slip - old.slip)
+                        for start, old, new in zip(
+                            slipped, state.contacts, reached.contacts, strict=True
+                        )
+                    )
+                    reached = replace(reached, histories=(contacts, *reached.histories[1:]))
+                    self._check_missed(reached)
+                except UserFunctionError:
+                    raise
+                except StepFailedError:
+                    # Bodies in search of each other move by load over stabilization, whatever dt.
+                    if not 0.0 < problem.stabilization < _STIFFEST:
+                        raise
+                    problem.stabilization /= _RELIEF
+                    continue
+                iterations += step.iterations
+                since = balance.step_terms(problem, step)["friction_dissipation"]
+                state, dt = reached, 0.0
+                unrest = problem.unrest(step)
+                if unrest <= 1.0:
+                    return step, state, iterations, lost
+                if unrest < _RELIEVED * last:
+                    problem.stabilization *= _RELIEF
+                last = unrest
+                # A node on an edge could change its facet for ever, and its place with it.
+                search = unrest * self.newton.rtol > _NEARLY_AT_REST
+        finally:
+            problem.stabilization = 0.0
+        raise StepFailedError(
+            f"step from t={kept.time:.6g}: not at rest after {_RELAXATIONS} relaxations; nothing "
+            "holds a body, or it hops from facet to facet"
+        )
+
+    def _solve(self, state: State, dt: float, search: bool) -> Evaluation:
+        """Solution from a state; contact is sought as far as the bodies turn out to move."""
+        self.problem.begin(state, dt, search=search)
+        step = self.solver.solve()
+        return self._covered(step) if search else step
+
+    def _check_missed(self, state: State) -> None:
+        """Raise if a slave went through a facet whose candidate it was not."""
+        depths = self.system.penetration(state)
+        for pair, depth in zip(self.system.contacts, depths, strict=True):
+            if depth.max(initial=0.0) > _MISSED:
+                node = int(pair.slave.original[depth.argmax()])
+                raise StepFailedError(
+                    f"step from t={self.state.time:.6g}: contact {pair.name!r}: node {node} passed "
+                    f"by its facet and ended {depth.max():.3g} of a facet inside the master"
+                )
+
+
+def _pseudo_times(load_steps: Any) -> list[float]:
+    """End of each load step."""
+    if is_whole(load_steps):
+        if load_steps >= 1:
+            return [(k + 1) / int(load_steps) for k in range(int(load_steps))]
+    elif isinstance(load_steps, Sequence | np.ndarray) and not isinstance(load_steps, str):
+        times = floats(load_steps)
+        good = times.ndim == 1 and times.size and np.isfinite(times).all()
+        if good and (np.diff(times, prepend=0.0) > 0).all():
+            return [float(t) for t in times]
+    raise ValueError(
+        f"load_steps={load_steps!r}: pass a number of steps >= 1, or increasing pseudo times > 0"
+    )
+
+
+def _check_bodies(system: System) -> None:
+    for body in system.bodies:
+        for name in ("nodal_stiffness", "reactions"):
+            if not callable(getattr(body, name, None)):
+                raise TypeError(
+                    f"body {body.name!r} has no {name}(): equilibrium needs it, see Body"
+                )
+
+
+@known_options
+def equilibrium(
+    system: System,
+    *,
+    load_steps: int | Sequence[float] | FloatArray = 1,
+    stabilization: float | None = None,
+    newton: Newton | None = None,
+    petsc_options: Mapping[str, Any] | None = None,
+    output: Sequence[Writer] = (),
+    progress: bool = False,
+    watch_overlap: bool = True,
+    before_step: Callable[[float, float], Any] | None = None,
+) -> Equilibrium:
+    """Equilibrium of a system under its loads, reached in load steps of a pseudo time from 0.
+
+    Constant loads (gravity, body forces, tractions) grow in proportion to the pseudo time and are
+    complete at 1; loads and Dirichlet values given as functions of time are taken at the pseudo
+    time; constant Dirichlet values hold from the start. Velocities and mass play no part. A load
+    step that is not solved is cut, up to `newton.max_retries` times.
+
+    A body that nothing but contact holds has an equilibrium only once the contact is closed: nodes
+    that touch at the start count as closed, so a block that stands on its support needs nothing
+    more, save conditions against sliding and turning. Where bodies have to find each other first,
+    or where directions stay free, pass `stabilization`.
+
+    The ledger closes as the square of the load steps: work is that of the mean of their forces.
+
+    A dynamic run starts from the result with the initial velocities of the bodies, at its pseudo
+    time, or at the `start_time` of `simulate`, from which its functions of time count. Bodies
+    correspond by name, so that what holds them may differ:
+
+        def block(bcs=()):
+            return nts.Continuum(mesh, rubber, density=1e3, bcs=bcs, name="block")
+
+        def scene(block):
+            pair = nts.ContactPair(slave=block.surface(below), master=floor.surface(above))
+            return nts.System([block, floor], contacts=[pair], gravity=(0, 0, -9.81))
+
+        pulled = nts.Dirichlet(top, value=lambda t: (0, 0, -0.02 * t))
+        settled = nts.equilibrium(scene(block([pulled])), load_steps=10)
+        run = nts.simulate(
+            scene(block()), nts.EnergyMomentum(), dt=1e-3, t_end=0.2, start=settled, start_time=0.0
+        )
+
+    Args:
+        system: The scene.
+        load_steps: Number of equal steps from 0 to 1, or the increasing pseudo times where they
+            end.
+        stabilization: Stiffness, over that of its own, that holds each node where it was while a
+            load step is solved; the step is then repeated until nothing of it is left in the
+            forces. 0.1 is a good value.
+        newton: Tolerances and retries.
+        petsc_options: PETSc options of the step's SNES, without prefix.
+        output: Writers, as in `simulate`; all ranks call them after every load step.
+        progress: Show a progress line on rank 0.
+        watch_overlap: Look whether bodies of a contact end up inside each other, as in `simulate`.
+        before_step: Callable (time, dt) before every attempt at a load step, with the pseudo time
+            at its start and its length; see `simulate`. Loads of a load step are those at its end.
+
+    Returns:
+        The Equilibrium; the bodies' u hold it. A run that fails says so in `status` and keeps
+        everything computed until then, also where a function of time, `before_step` or a writer
+        raises, on any rank.
+
+    Raises:
+        ValueError: An argument is out of range; before any work.
+    """
+    times = _pseudo_times(load_steps)
+    if stabilization is not None:
+        require_positive("stabilization", stabilization, "-")
+    require_bool("progress", progress)
+    output = writers(output)
+    if isinstance(system, System):
+        _check_bodies(system)
+    stepper = _LoadStepper(
+        system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options,
+        watch_overlap=watch_overlap, before_step=before_step,
+    )  # fmt: skip
+    run(stepper, times, output, dt=times[0], progress=progress, remedy=_REMEDY)
+    return stepper.solution

@@ -1,0 +1,265 @@
+"""The ledger (theory section 7): momenta, energy and its changes, from states and steps alone."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from dolfinx_nts.bodies.inversion import smallest_dets
+from dolfinx_nts.system import State, System
+
+if TYPE_CHECKING:
+    from dolfinx_nts.step.problem import Evaluation, StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Columns of the balance table; momenta have three components.
+COLUMNS = (
+    "time",
+    "kinetic",
+    "potential",
+    "energy",
+    "external_work",
+    "friction_dissipation",
+    "contact_defect",
+    "material_change",
+    "ledger_residual",
+    "linear_momentum",
+    "angular_momentum",
+    "active",
+    "stick",
+    "slip",
+    "min_gap",
+    "min_det",
+    "newton_iterations",
+)
+
+
+
+def columns(system: System) -> tuple[str, ...]:
+    """Columns of a system's balance table: `COLUMNS`, and what its joints add."""
+    return COLUMNS + tuple(dict.fromkeys(name for j in system.joints for name in j.losses))
+
+
+#: Columns that add up over the steps, and those that count in a step.
+WORKS = ("external_work", "friction_dissipation", "contact_defect")
+COUNTS = ("active", "stick", "slip")
+
+
+class Switch(NamedTuple):
+    """An active node that went over to another facet at the start of a step.
+
+    Attributes:
+        time: End of the step [s].
+        contact: Name of the contact.
+        node: Input number of the slave node.
+        facets: Numbers of the master's facets before and after.
+        defect: What the change adds to contact_defect [J]; negative where it brings energy.
+    """
+
+    time: float
+    contact: str
+    node: int
+    facets: tuple[int, int]
+    defect: float
+
+
+class Switches(Sequence[Switch]):
+    """The newest changes of facet of a run, at most `KEPT` of them, and sums over all.
+
+    Attributes:
+        number: How many there were.
+        defect: What all of them add to contact_defect [J].
+        size: The same of absolute values [J].
+        worst: The one with the largest absolute value, the first of several.
+    """
+
+    #: How many are kept; a run of a million steps may have many millions.
+    KEPT = 10_000
+
+    def __init__(self) -> None:
+        self._newest: deque[Switch] = deque(maxlen=self.KEPT)
+        self.number = 0
+        self.defect = self.size = 0.0
+        self.worst: Switch | None = None
+
+    def extend(self, found: Iterable[Switch]) -> None:
+        """Add changes of facet in the order in which they came."""
+        for switch in found:
+            self._newest.append(switch)
+            self.number += 1
+            self.defect += switch.defect
+            self.size += abs(switch.defect)
+            if self.worst is None or abs(switch.defect) > abs(self.worst.defect):
+                self.worst = switch
+
+    def __len__(self) -> int:
+        return len(self._newest)
+
+    @overload
+    def __getitem__(self, index: int) -> Switch: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Switch]: ...
+    def __getitem__(self, index: int | slice) -> Switch | list[Switch]:
+        return list(self._newest)[index] if isinstance(index, slice) else self._newest[index]
+
+
+#: Of a body: u and v, and its part of the energies and momenta on this rank, shape (8,).
+Measured = tuple[FloatArray, FloatArray, FloatArray]
+
+
+def measure(
+    system: System, state: State, known: dict[str, Measured] | None = None
+) -> dict[str, Any]:
+    """Energies [J] and momenta [kg m/s, kg m^2/s] of a state, the same on all ranks.
+
+    Args:
+        system: Its bodies.
+        state: The state.
+        known: Of each body's name what was measured last, which holds while its arrays are the
+            same objects; brought up to date.
+
+    Returns:
+        kinetic, potential, linear_momentum (3,), angular_momentum (3,).
+    """
+    local, known = np.zeros(8), {} if known is None else known
+    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+        last = known.get(body.name)
+        if last is None or last[0] is not u or last[1] is not v:
+            known[body.name] = last = u, v, _of_body(body, u, v)
+        local += last[2]
+    for joint, bodies in zip(system.joints, system.joint_bodies, strict=True):
+        local[1] += joint.potential([state.u[b] for b in bodies])
+    total = np.empty_like(local)
+    system.comm.Allreduce(local, total, op=MPI.SUM)
+    return {
+        "kinetic": float(total[0]),
+        "potential": float(total[1]),
+        "linear_momentum": total[2:5],
+        "angular_momentum": total[5:],
+    }
+
+
+def _of_body(body: Any, u: FloatArray, v: FloatArray) -> FloatArray:
+    """This rank's part of a body's energies and momenta, shape (8,)."""
+    momentum = body.inertia(v)
+    energies = [0.5 * float(v @ momentum), body.potential(u)]
+    moments = body.linear_momentum(momentum), body.angular_momentum(u, momentum)
+    return np.concatenate([energies, *moments])
+
+
+def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
+    """Works and counts of an accepted step, the same on all ranks. Collective.
+
+    Loads and supports do external work; what elements add, they name, see `Elements.ledger`.
+
+    Returns:
+        By columns of the balance table: works [J] and counts of the step, min_gap [m] (infinite
+        without candidates), min_det (infinite without flexible bodies).
+    """
+    scale = 1.0 / problem.factor
+    sums, smallest = dict.fromkeys((*WORKS, *COUNTS), 0.0), {"min_gap": np.inf}
+    for body, terms in zip(problem.system.bodies, step.bodies, strict=True):
+        work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed]
+        sums["external_work"] += scale * float(work)
+    for elements, part in zip(problem.elements, step.parts, strict=True):
+        for name, value in elements.ledger(part, problem.factor).items():
+            sums[name] = sums.get(name, 0.0) + value
+    for coupling, parts in problem.each(step):
+        smallest |= coupling.smallest(parts)
+    comm = problem.system.comm
+    total = comm.allreduce(np.array(list(sums.values())))
+    least = np.array(list(smallest.values()))
+    comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+    return {
+        **dict(zip(sums, total.tolist(), strict=True)),
+        **dict(zip(smallest, least.tolist(), strict=True)),
+        "min_det": step.min_det,
+    }
+
+
+def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch]:
+    """Changes of facet in an accepted step, the same on all ranks. Every rank must call it.
+
+    Args:
+        problem: Equations of the step.
+        step: Its solution.
+        time: End of the step [s].
+    """
+    if not problem.contacts.elements:
+        return []
+    found = []
+    for contact, part, old in zip(
+        problem.contacts.elements, problem.contact_parts(step), problem.state.contacts, strict=True
+    ):
+        c = contact.candidates
+        before, gain = old.facet[c.node], contact.gains(part, problem.factor)
+        stayed = (old.force[c.node] > 0.0) & part.active
+        for i in np.flatnonzero(stayed & (before >= 0) & (before != c.facet)):
+            facets = (int(before[i]), int(c.facet[i]))
+            node = contact.input_node(i)
+            found.append(Switch(time, contact.name, node, facets, -float(gain[i])))
+    gathered = problem.system.comm.allgather(found)
+    return sorted((s for part in gathered for s in part), key=lambda s: s[:3])
+
+
+def expelled(problem: StepProblem, step: Evaluation) -> str:
+    """The node that brings most energy in by starting behind its facet. Every rank must call it."""
+    best = (0.0, "")
+    for contact, part in zip(problem.contacts.elements, problem.contact_parts(step), strict=True):
+        gain = contact.gains(part, problem.factor)
+        if len(gain) and gain.max() > best[0]:
+            i = int(gain.argmax())
+            where = f"node {contact.input_node(i)} of {contact.name!r}"
+            text = f"{gain[i]:.3g} J by {where}, {-contact.candidates.gap[i]:.3g} m deep"
+            best = float(gain[i]), text
+    return max(problem.system.comm.allgather(best))[1]
+
+
+def first_row(system: System, state: State) -> dict[str, Any]:
+    """Balance table row of the state a run starts from."""
+    row: dict[str, Any] = dict.fromkeys(columns(system), 0.0)
+    row |= measure(system, state)
+    row |= {"time": state.time, "energy": row["kinetic"] + row["potential"]}
+    local = np.zeros(len(COUNTS))
+    for pair, old in zip(system.contacts, state.contacts, strict=True):
+        on = old.force > 0.0
+        slips = (on & ~old.stick).sum() if pair.friction else 0
+        local += on.sum(), (on & old.stick).sum(), slips
+    row |= dict(zip(COUNTS, system.comm.allreduce(local).tolist(), strict=True))
+    smallest = min((float(c.gap.min(initial=np.inf)) for c in state.contacts), default=np.inf)
+    row["min_gap"] = float(system.comm.allreduce(smallest, op=MPI.MIN))
+    return row | {"min_det": float(smallest_dets(system, state.u).min())}
+
+
+def next_row(
+    first: dict[str, Any], last: dict[str, Any], measured: dict[str, Any], terms: dict[str, float]
+) -> dict[str, Any]:
+    """Row of an accepted step; work, dissipation, defect and ledger residual are cumulative.
+
+    Args:
+        first: Row the ledger is opened with.
+        last: Row before the step.
+        measured: `measure` of the new state.
+        terms: `step_terms` of the step.
+    """
+    row = {**last, **measured, **terms}
+    losses = [name for name in terms if name not in COLUMNS]
+    for name in (*WORKS, "material_change", *losses):
+        row[name] = last[name] + terms[name]
+    row["energy"] = row["kinetic"] + row["potential"]
+    row["ledger_residual"] = (
+        row["energy"]
+        - first["energy"]
+        - row["external_work"]
+        - row["material_change"]
+        + row["friction_dissipation"]
+        + row["contact_defect"]
+        + sum(row[name] for name in losses)
+    )
+    return row

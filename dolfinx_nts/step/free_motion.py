@@ -1,0 +1,83 @@
+"""Motions of bodies as rigid ones that nothing resists: equilibrium leaves them undetermined."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+from mpi4py import MPI
+
+from dolfinx_nts.parallel import global_max
+
+if TYPE_CHECKING:
+    from dolfinx_nts.step.newton import StepSolver
+    from dolfinx_nts.step.problem import Evaluation, StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Resistance over the stiffness of a body that counts as none.
+_NONE = 1e-10
+
+
+def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> str | None:
+    """How bodies may move as rigid ones without any force, if they may. Collective.
+
+    The matrix of the equations is applied to three translations and three rotations of each body.
+
+    Args:
+        problem: Equations of a load step.
+        solver: Its solver.
+        step: Its solution.
+    """
+    operator = solver.assemble(step).operator
+    comm, bodies = problem.system.comm, problem.system.bodies
+    direction, result = problem.x.duplicate(), problem.x.duplicate()
+    modes, images, stiffest = [], [], 0.0
+    for k, body in enumerate(bodies):
+        place = (body.reference + step.bodies[k].u1).reshape(-1, 3)
+        for mode in _rigid(place, comm):
+            direction.set(0.0)
+            direction.array_w[problem.of_body(k)] = mode
+            operator.mult(direction, result)
+            modes.append((k, mode))
+            images.append(result.array_r.copy())
+    diagonal = operator.getDiagonal()
+    for k in range(len(bodies)):
+        here = np.abs(diagonal.array_r[problem.of_body(k)])
+        stiffest = max(stiffest, float(here.max(initial=0.0)))
+    for vector in (direction, result, diagonal):
+        vector.destroy()
+    a = np.array(images)
+    sizes = np.zeros((2, len(modes), len(modes)))
+    sizes[0] = a @ a.T
+    for i, (k, x) in enumerate(modes):
+        for j, (m, y) in enumerate(modes):
+            sizes[1, i, j] = x @ y if k == m else 0.0
+    comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.SUM)
+    stiffest = float(global_max(comm, np.array([stiffest]))[0])
+    squares, combinations = scipy.linalg.eigh(sizes[0], sizes[1])
+    if not squares[0] <= (_NONE * stiffest) ** 2:
+        return None
+    return _describe(bodies, combinations[:, 0])
+
+
+def _rigid(place: FloatArray, comm: Any) -> list[FloatArray]:
+    """Three translations and three rotations about the middle of points (n, 3). Collective."""
+    total = comm.allreduce(np.array([*place.sum(axis=0), len(place)]))
+    arm = place - total[:3] / total[3]
+    size = np.sqrt(comm.allreduce(float((arm**2).sum())) / total[3])
+    axes = np.eye(3)
+    translations = [np.tile(axis, len(place)) for axis in axes]
+    return translations + [np.cross(axis, arm / size).ravel() for axis in axes]
+
+
+def _describe(bodies: Any, combination: FloatArray) -> str:
+    parts = combination.reshape(-1, 2, 3)
+    k, kind = np.unravel_index(np.linalg.norm(parts, axis=2).argmax(), parts.shape[:2])
+    vector = parts[k, kind] / np.linalg.norm(parts[k, kind])
+    vector *= np.sign(vector[np.abs(vector).argmax()])
+    way = ", ".join(f"{c:.2g}" for c in vector.round(3) + 0.0)
+    moves = "turning about" if kind else "moving along"
+    return f"nothing resists body {bodies[k].name!r} {moves} ({way})"

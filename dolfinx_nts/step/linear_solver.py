@@ -1,0 +1,369 @@
+"""How the linear systems of a step are solved: presets, the user's PETSc options, their check."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.step.assembly import SchurApproximation, StepMatrix, model_problem
+
+_BODIES = "fieldsplit_bodies_"
+_CONTACT = "fieldsplit_contact_"
+#: What `SchurInverse` factorises with.
+_FACTORS = "factors_"
+#: Name by which its matrix knows the second approximation.
+_SECOND = "dolfinx_nts_second"
+#: What `Newton.linear_solver` may be.
+SOLVERS = ("auto", "direct", "krylov")
+#: Presets; a user's `petsc_options` override them one by one.
+PRESETS: dict[str, dict[str, Any]] = {
+    # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses.
+    "direct": {
+        "snes_linesearch_type": "basic",
+        "ksp_type": "preonly",
+        "pc_type": "lu",
+        "pc_factor_mat_solver_type": "mumps",
+        "mat_mumps_icntl_14": 80,
+    },
+    # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good. "selfp" is
+    # replaced by `SchurApproximation`, but for a user who asks for it, and where options are
+    # checked.
+    "krylov": {
+        "snes_linesearch_type": "basic",
+        "ksp_type": "fgmres",
+        "ksp_pc_side": "right",
+        # Looser costs Newton iterations, and their number then depends on rounding and units.
+        "ksp_rtol": 1e-5,
+        "ksp_gmres_restart": 60,
+        "ksp_max_it": 300,
+        "pc_type": "fieldsplit",
+        "pc_fieldsplit_type": "schur",
+        "pc_fieldsplit_schur_fact_type": "upper",
+        "pc_fieldsplit_schur_precondition": "selfp",
+        _BODIES + "ksp_type": "preonly",
+        _BODIES + "pc_type": "bjacobi",
+        _BODIES + "sub_pc_type": "icc",
+        _CONTACT + "ksp_type": "preonly",
+        _CONTACT + "pc_type": "python",
+        _CONTACT + "pc_python_type": f"{__name__}.SchurInverse",
+        _CONTACT + _FACTORS + "pc_type": "lu",
+        _CONTACT + _FACTORS + "pc_factor_mat_solver_type": "mumps",
+        # Of a user who takes LU for the first of the two approximations alone.
+        _CONTACT + "pc_factor_mat_solver_type": "mumps",
+    },
+}
+# Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
+# wall has more constraints than coordinates.
+#: In place of the preset's on several ranks: parts of the mesh, which overlap by a node. It halves
+#: the iterations of smooth motion; alone there is none.
+_PARTS = {_BODIES + "pc_type": "asm"}
+#: The same where each rank takes whole bodies: as few iterations as on one rank. Their numbering
+#: is that of the parts, which makes incomplete factors poor; of blocks PETSc reorders LU's only.
+_WHOLE = _PARTS | {
+    _BODIES + "pc_asm_type": "basic",
+    _BODIES + "pc_asm_overlap": 0,
+    _BODIES + "sub_pc_type": "ilu",
+    _BODIES + "sub_pc_factor_mat_ordering_type": "rcm",
+}
+PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
+#: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
+#: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.
+_FEW = (100, 600)
+
+
+def choose(size: int, contact: bool, inertia: bool, given: Mapping[str, Any]) -> str:
+    """Preset to begin with: "krylov", but "direct" where that is as good or the user asks for it.
+
+    Without inertia incomplete factors are poor.
+
+    Args:
+        size: Coordinates of all bodies.
+        contact: Whether contacts are declared.
+        inertia: Whether the step equations have inertia.
+        given: The user's PETSc options; those of a linear solver are meant for "direct".
+    """
+    own = any(not name.startswith("snes_") for name in given)
+    return "direct" if own or not inertia or size < _FEW[contact] else "krylov"
+
+
+def most_iterations(size: int) -> int:
+    """Krylov iterations that take as long as MUMPS, measured on blocks of 1e3 to 5e4 coordinates.
+
+    Args:
+        size: Coordinates of all bodies.
+    """
+    return int(60 * max(1.0, size / 1e3) ** 0.4)
+
+
+#: In place of the preset's where the contact unknowns are condensed: without zeros on its diagonal
+#: their small block needs no pivoting, and starting MUMPS takes longer than all else.
+_CONDENSED: Mapping[str, Mapping[str, Any]] = {
+    "krylov": {_CONTACT + _FACTORS + "pc_type": "redundant"},
+}
+#: PETSc's errors "no support", "unknown type", "missing factor": an option has a wrong value.
+_WRONG_VALUE = (56, 86, 92)
+_prefixes = itertools.count()
+
+
+class SolverOptions:
+    """PETSc options of a step's SNES, and which of the user's PETSc has asked for.
+
+    Args:
+        comm: MPI communicator.
+        preset: Name of a preset.
+        condense: Whether the contact unknowns are condensed.
+        given: The user's options without prefix; they override the preset.
+        limit: Krylov iterations of a solve that are one too many, the preset's if None.
+    """
+
+    def __init__(
+        self,
+        comm: Any,
+        preset: str,
+        condense: bool,
+        given: Mapping[str, Any],
+        limit: int | None = None,
+    ) -> None:
+        self._comm, self._given = comm, dict(given)
+        known = dict(PRESETS[preset])
+        if preset == "krylov" and comm.size > 1:
+            known |= _PARTS
+        if limit is not None:
+            known["ksp_max_it"] = limit
+        if condense and preset in _CONDENSED:
+            known = {k: v for k, v in known.items() if not k.startswith(_CONTACT + _FACTORS)}
+            known |= _CONDENSED[preset]
+        self._preset = known
+        self._all = {**known, **given}
+        self._unchecked = set(given)
+        self._entered: dict[str, str] = {}
+
+    @property
+    def schur(self) -> bool:
+        """Whether the preset's Schur complement is to be replaced by `SchurApproximation`."""
+        name, kind = "pc_fieldsplit_schur_precondition", self._all.get("pc_fieldsplit_type")
+        return self.split and kind == "schur" and name in self._all and name not in self._given
+
+    @property
+    def most_iterations(self) -> int:
+        """Iterations of a linear solve, for five digits, that are not too many."""
+        return int(self._all["ksp_max_it"])
+
+    @property
+    def split(self) -> bool:
+        """Whether the preconditioner is a field split, which takes the blocks of a nest."""
+        return bool(self._all["pc_type"] == "fieldsplit")
+
+    @property
+    def blocked(self) -> bool:
+        """Whether the bodies' matrices may be in blocks: their preconditioner is the preset's."""
+        return self.split and not any(k.startswith(("pc_", _BODIES)) for k in self._given)
+
+    def configure(
+        self, snes: Any, matrix: StepMatrix | None, num_bodies: int, *, whole: bool = False
+    ) -> None:
+        """Set a SNES up from the options.
+
+        Without contact unknowns a field split has one part only, so the bodies' options are used.
+
+        Args:
+            snes: The SNES.
+            matrix: Its matrix, if there are contact unknowns to split off.
+            num_bodies: Fields of the matrix that are bodies.
+            whole: Whether each rank's preconditioner takes whole bodies, see `take_bodies`.
+
+        Raises:
+            ValueError: PETSc refuses a value.
+        """
+        self._all = self._preset | (_WHOLE if whole else {}) | self._given
+        options = {k: k for k in self._all}
+        if matrix is None and self.split:
+            outer = {k: k for k in self._all if not k.startswith(("pc_", "fieldsplit_"))}
+            inner = [k for k in self._all if k.startswith(_BODIES)]
+            own = {k.removeprefix(_BODIES): k for k in inner if not k.startswith(_BODIES + "ksp_")}
+            options = outer | own
+        self._set(snes, options)
+        if matrix is not None and self.split:
+            _split(snes, *matrix.field_sets(num_bodies))
+
+    def _set(self, snes: Any, options: Mapping[str, str]) -> None:
+        """Give a SNES options (name -> the user's name) under a new prefix."""
+        prefix = f"nts_{next(_prefixes)}_"
+        snes.setOptionsPrefix(prefix)
+        database = PETSc.Options()
+        for name, source in options.items():
+            database[prefix + name] = self._all[source]
+            self._entered[prefix + name] = source
+        try:
+            snes.setFromOptions()
+        except PETSc.Error as error:
+            raise self._refused(error) from error
+
+    def check(self, snes: Any, matrix: Any) -> None:
+        """Raise on every rank if PETSc asks for one of the user's options nowhere in a solve.
+
+        Nothing is solved yet: most options are asked for when the solver is set up. If some are
+        not, a small model problem with a constraint is solved, which asks for those of the solve
+        itself and of a field split that waits for contact.
+
+        Args:
+            snes: The configured SNES.
+            matrix: Its assembled matrix.
+
+        Raises:
+            ValueError: PETSc does not know an option or its value.
+        """
+        if not self._unchecked:
+            return
+        try:
+            ksp = snes.getKSP()
+            ksp.setOperators(matrix, matrix)
+            ksp.setUp()
+            ksp.setUpOnBlocks()
+            self._forget_used()
+            if self._unchecked:
+                self._solve_model()
+                self._forget_used()
+        except PETSc.Error as error:
+            if error.ierr in _WRONG_VALUE:
+                raise self._refused(error) from error
+            raise
+        for name in sorted(self._unchecked):
+            raise ValueError(
+                f"petsc_options[{name!r}]={self._given[name]!r}: not used by PETSc; "
+                "correct its name or remove it"
+            )
+
+    def _refused(self, error: Exception) -> ValueError:
+        given = {k: self._given[k] for k in sorted(self._unchecked)}
+        why = str(error).splitlines()[-1].split("] ")[-1]
+        return ValueError(f"petsc_options={given!r}: {why}; correct the value")
+
+    def _forget_used(self) -> None:
+        used = {name for key, name in self._entered.items() if compat.option_used(key)}
+        self._unchecked -= set().union(*self._comm.allgather(used))
+
+    def _solve_model(self) -> None:
+        split = self.split
+        matrix, parts = model_problem(self._comm, constraint=split)
+        snes = PETSc.SNES().create(self._comm)
+        x, f = matrix.createVecs()
+        snes.setFunction(lambda _snes, x, f: (matrix.mult(x, f), f.shift(-1.0)), f)
+        snes.setJacobian(lambda *_: None, matrix, matrix)
+        self._set(snes, {k: k for k in self._all})
+        if split:
+            _split(snes, *parts)
+        snes.solve(None, x)
+        for a in (snes, x, f, matrix):
+            a.destroy()
+
+    def remove(self) -> None:
+        """Take the options out of PETSc's global database."""
+        database = PETSc.Options()
+        for key in self._entered:
+            database.delValue(key)
+        self._entered.clear()
+
+
+def _split(snes: Any, *parts: tuple[str, Any]) -> None:
+    snes.getKSP().getPC().setFieldSplitIS(*parts)
+    for _, index in parts:
+        index.destroy()
+
+
+class SchurInverse:
+    """Preconditioner of the contact part: S^-1 ~ F^-1 M F^-1 from two approximations of S.
+
+    With F = D - C W B and M = D - C W A W B this is Newton's (Schulz's) step from F^-1 towards the
+    inverse of D - C (2 W - W A W) B. Where A W maps what B spans into itself, and D = 0, it is
+    exact (the least-squares commutator): about so with consistent mass, for which a polynomial in
+    A alone needs more terms. Without M it is F^-1.
+    """
+
+    def create(self, pc: Any) -> None:
+        """Called by PETSc, as the other methods are."""
+        self._factors = PETSc.PC().create(pc.comm)
+        self._between: Any = None
+        self._work: tuple[Any, ...] = ()
+
+    def setFromOptions(self, pc: Any) -> None:
+        """Options of the factorisation."""
+        self._factors.setOptionsPrefix(f"{pc.getOptionsPrefix() or ''}{_FACTORS}")
+        self._factors.setFromOptions()
+
+    def setUp(self, pc: Any) -> None:
+        """Factorise anew."""
+        _, first = pc.getOperators()
+        if self._between:
+            self._between.destroy()
+        self._between = first.query(_SECOND)
+        self._factors.setOperators(first)
+        self._factors.setUp()
+        if not self._work:
+            self._work = first.createVecs()
+
+    def apply(self, _pc: Any, x: Any, y: Any) -> None:
+        """Approximate S y = x."""
+        if not self._between:
+            self._factors.apply(x, y)
+            return
+        a, b = self._work
+        self._factors.apply(x, a)
+        self._between.mult(a, b)
+        self._factors.apply(b, y)
+
+    def destroy(self, _pc: Any) -> None:
+        """Free what `create` and `setUp` made."""
+        for each in (self._factors, self._between, *self._work):
+            if each:
+                each.destroy()
+
+
+def set_schur(snes: Any, approximation: SchurApproximation) -> None:
+    """Give a Schur field split what its contact part is preconditioned with.
+
+    Args:
+        snes: The SNES.
+        approximation: For `SchurInverse`, whose matrix is the first of the two.
+    """
+    approximation.first.compose(_SECOND, approximation.second)
+    user = PETSc.PC.SchurPreType.USER
+    snes.getKSP().getPC().setFieldSplitSchurPreType(user, approximation.first)
+
+
+def take_bodies(snes: Any, operator: Any, bodies: Sequence[Any], contact: bool) -> None:
+    """Let this rank's preconditioner take whole bodies. Collective, before the first solve.
+
+    Args:
+        snes: Configured with `whole`.
+        operator: What it solves with.
+        bodies: Numbers of each body in the bodies' part of the operator.
+        contact: Whether the preconditioner is a field split.
+    """
+    ksp = snes.getKSP()
+    ksp.setOperators(operator, operator)
+    pc = ksp.getPC()
+    if contact:
+        pc.setUp()
+        pc = pc.getFieldSplitSubKSP()[0].getPC()
+    index = [numbers.astype(PETSc.IntType) for numbers in bodies]
+    parts = [PETSc.IS().createGeneral(numbers, comm=PETSc.COMM_SELF) for numbers in index]
+    pc.setASMLocalSubdomains(len(parts), parts)
+    for part in parts:
+        part.destroy()
+
+
+def keep_bodies(snes: Any, keep: bool) -> None:
+    """Whether a field split keeps the bodies' preconditioner when the matrix changes.
+
+    Args:
+        snes: Has solved a linear system before.
+        keep: Keep it, or make it anew from now on.
+    """
+    pc = snes.getKSP().getPC()
+    if pc.getType() == "fieldsplit":
+        pc.getFieldSplitSubKSP()[0].getPC().setReusePreconditioner(keep)

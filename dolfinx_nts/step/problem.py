@@ -1,0 +1,592 @@
+"""The equations of one step: residual, tangents of bodies, convergence of each block.
+
+What couples bodies comes as `Elements`, of whatever kind they are.
+
+The momentum equation is multiplied by h/2 and the multipliers are h^2/2 lambda (theory section 8),
+which makes the condition number independent of h. Equilibrium has a factor 1 for h^2/2 and no
+inertia: its equations are in [N] where [kg m] stands here, its matrix in [N/m]. Evaluations are
+pure: nothing here changes a State, and history changes only when a step is accepted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.contact.contact_elements import over
+from dolfinx_nts.contact.contact_search import ContactSearch
+from dolfinx_nts.elements import Coupling, Step
+from dolfinx_nts.parallel import global_max
+from dolfinx_nts.step.assembly import solve_mass
+from dolfinx_nts.step.sleep import Sleepers
+from dolfinx_nts.step.unknowns import Unknowns
+from dolfinx_nts.system import State, System
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+_EPS = float(np.finfo(float).eps)
+#: Relative difference of the factors of two equal steps, which differ by rounding.
+EQUAL = 1e-6
+#: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
+_ANOTHER_STEP = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTerms:
+    """Parts of a body's equation at an iterate, owned coordinates, [kg m] except u1 and du [m].
+
+    Attributes:
+        u1: Displacement at t_{n+1}.
+        du: u_1 - u_0.
+        internal: h^2/2 internal forces.
+        external: h^2/2 external forces.
+        coupling: h^2/2 forces of elements, such as contact forces G^T lambda.
+        residual: Complete equation, also at prescribed coordinates, where it is h^2/2 times the
+            reaction.
+    """
+
+    u1: FloatArray
+    du: FloatArray
+    internal: FloatArray
+    external: FloatArray
+    coupling: FloatArray
+    residual: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The step equations at an iterate.
+
+    Attributes:
+        x: Iterate it belongs to, this rank's part.
+        bodies: Terms of each body.
+        parts: Contribution of each batch of elements.
+        iterations: Newton iterations it took.
+        min_det: Smallest det F of all bodies, once solved.
+    """
+
+    x: FloatArray
+    bodies: tuple[BodyTerms, ...]
+    parts: tuple[Any, ...]
+    iterations: int = 0
+    min_det: float = np.inf
+
+
+class StepProblem:
+    """Equations of one step of a system; `begin` fixes the step.
+
+    Args:
+        system: The scene.
+        integrator: Rules of the step, or `Static()`.
+        rtol: Residual of a block that counts as solved, relative to the forces or motions of the
+            step.
+        condense: Eliminate (d, f) and their multipliers pair by pair.
+        sleep: Leave out bodies that nothing moves.
+
+    Attributes:
+        awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
+        contacts: What makes the elements of contacts.
+        couplings: All that makes elements.
+        unknowns: Their layout; made anew whenever the elements' coordinates change.
+        version: Changes whenever `unknowns` does.
+        factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
+        rtol: As given.
+        centre: Middle of all bodies in the reference [m], shape (3,).
+        stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
+    """
+
+    def __init__(
+        self, system: System, integrator: Any, *, rtol: float, condense: bool, sleep: bool = False
+    ) -> None:
+        self.system, self.integrator = system, integrator
+        self.rtol, self.condense = rtol, condense
+        self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
+        self._asleep: dict[int, BodyTerms] = {}
+        self.awake: tuple[int, ...] = ()
+        self._numbers: tuple[Any, ...] | None = None
+        self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
+        self.couplings: list[Coupling] = [self.contacts]
+        for joint, bodies in zip(system.joints, system.joint_bodies, strict=True):
+            self.couplings.append(joint.coupling(bodies))
+        self.unknowns: Unknowns | None = None
+        self.version = 0
+        self.stabilization = 0.0
+        self.centre, self._span = _box(system)
+        self._diagonal, self._diagonal_factor = np.zeros((2, len(system.bodies)))
+
+    # ---- set-up of a step
+    def begin(
+        self, state: State, dt: float, again: Evaluation | None = None, *, search: bool = True
+    ) -> None:
+        """Fix the state at t_n and the step: loads, candidates, layout, first guess.
+
+        Args:
+            state: State at t_n.
+            dt: Step [s].
+            again: Solution of this step whose motion the elements did not cover, see `misses`:
+                contact is sought along that motion in place of the one that velocities predict.
+            search: Seek contacts; False keeps the candidates of the last step, for statics only.
+        """
+        system = self.system
+        self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
+        for k, body in enumerate(system.bodies):
+            body.begin_step(self.integrator, self._moment(k))
+        self._gravity = self.integrator.ramp(self._when) * system.gravity
+        flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
+        self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
+        for body, u1 in zip(system.bodies, self.first, strict=True):
+            u1[body.fixed] = body.prescribed(state.time + dt)
+        local = [
+            [np.abs(x).max(initial=0.0) for x in (u1 - u, b.reference + u1, v, u)]
+            for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
+        ]
+        top = global_max(system.comm, np.array(local)).T
+        self._motion, self._extent, speed, self._moved = top
+        if state.a:
+            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
+            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
+        # In statics v only predicts the first guess.
+        moves = (speed > 0.0) & self.integrator.inertia
+        self._inertia = [
+            self._inertial(b, ahead) if top else np.zeros_like(ahead)
+            for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
+        ]
+        way = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
+        if again is not None:
+            self._motion = np.maximum(self._motion, self.motion(again))
+            way = [terms.du for terms in again.bodies]
+        # Bodies at rest may fall.
+        self._length = self._moved + self._motion + dt**2 * float(np.linalg.norm(self._gravity))
+        # A body at rest beside a moving one gets the rounding of the linear solve for both.
+        for bodies in map(list, system.contact_bodies):
+            self._length[bodies] = self._length[bodies].max()
+        # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
+        old = self._diagonal_factor
+        other = (self.factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * self.factor)
+        self._diagonal[other] = 0.0
+        step = Step(
+            state, dt, self.factor, self.integrator, self.condense, self.first, way,
+            self._motion, self._length, self._force_rounding_of,
+        )  # fmt: skip
+        for coupling in self.couplings:
+            coupling.begin(step, again, search)
+        self._asleep = self._find_asleep(np.maximum(self._motion, speed) == 0.0)
+        self._lay_out()
+
+    @property
+    def elements(self) -> list[Any]:
+        """Batches of elements in the step."""
+        return [batch for coupling in self.couplings for batch in coupling.elements]
+
+    def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
+        """Couplings with their parts of an evaluation."""
+        start = 0
+        for coupling in self.couplings:
+            stop = start + len(coupling.elements)
+            yield coupling, e.parts[start:stop]
+            start = stop
+
+    def contact_parts(self, e: Evaluation) -> tuple[Any, ...]:
+        """Parts of an evaluation that contacts contribute, one of each."""
+        return next(parts for coupling, parts in self.each(e) if coupling is self.contacts)
+
+    def wake(self, e: Evaluation) -> bool:
+        """Whether a solved step asks for more elements, and is to be solved again. Collective.
+
+        Args:
+            e: Solution of the step without them.
+        """
+        u1 = [terms.u1 for terms in e.bodies]
+        if not any([coupling.wake(u1) for coupling in self.couplings]):
+            return False
+        for k in self._asleep.keys() & self._touched():
+            del self._asleep[k]
+        self._lay_out()
+        return True
+
+    def misses(self, e: Evaluation) -> bool:
+        """Whether a solved step may have passed by something. Collective.
+
+        If so, `begin` is to be called again with it.
+
+        Raises:
+            StepFailedError: Only a shorter step helps.
+        """
+        motion = self.motion(e)
+        return any([coupling.misses(e, parts, motion) for coupling, parts in self.each(e)])
+
+    @property
+    def may_slip(self) -> bool:
+        """Whether `let_slip` changes anything."""
+        return any(coupling.may_slip for coupling in self.couplings)
+
+    def let_slip(self) -> None:
+        """Solve this step by a rule that adds no solution but may find one."""
+        for coupling in self.couplings:
+            coupling.let_slip()
+
+    def _touched(self) -> set[int]:
+        """Bodies that elements move, the same on all ranks. Collective."""
+        return set().union(*(coupling.touched() for coupling in self.couplings))
+
+    def _force_rounding_of(self, bodies: Sequence[int]) -> float:
+        """Norm of the forces on some bodies that is rounding [kg m]. Collective."""
+        for k in bodies:
+            if not self._diagonal[k]:
+                self._measure_rounding(k)
+        return float(self.rounding[list(bodies)].sum())
+
+    def _lay_out(self) -> None:
+        """Layout of the unknowns, kept while no rank's elements change, and a first guess."""
+        system = self.system
+        if len(self._asleep) == len(system.bodies):
+            # SNES needs an unknown; at rest it takes no iteration.
+            del self._asleep[0]
+        self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
+        elements = self.elements
+        numbers = (np.array(self.awake), *(a for c in elements for a in c.points()))
+        if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
+            self.destroy()
+            sizes = {k: system.bodies[k].num_owned for k in self.awake}
+            bodies = [of for coupling in self.couplings for of in coupling.bodies]
+            self.unknowns = Unknowns(system.comm, sizes, elements, bodies)
+            self.version += 1
+            self._numbers = numbers
+        self.guess(flight=True)
+
+    @property
+    def x(self) -> Any:
+        """PETSc vector of the unknowns, holding the first guess after `begin`."""
+        return self._laid.x
+
+    def of_body(self, k: int) -> slice:
+        """Where a body that is awake stands among this rank's unknowns."""
+        return self._laid.of_body(k)
+
+    @property
+    def _laid(self) -> Unknowns:
+        assert self.unknowns is not None, "begin comes first"
+        return self.unknowns
+
+    @property
+    def _when(self) -> float:
+        """When the step takes its loads [s]."""
+        return self.state.time + self.integrator.theta * self.dt
+
+    def acceleration(self, k: int) -> FloatArray | None:
+        """Of a body at t_n [m/s^2], if the integrator carries it."""
+        return self.state.a[k] if self.state.a else None
+
+    def _moment(self, k: int) -> Moment:
+        """What a body is told of the step."""
+        rule, state, drift = self.integrator, self.state, None
+        if rule.accelerations:
+            v0 = state.v[k]
+            end, _ = rule.advance(np.zeros_like(v0), v0, self.acceleration(k), self.dt)
+            drift = (1.0 - rule.theta) * v0 + rule.theta * end
+        # Load steps of equilibrium end with some of no length.
+        rate = rule.theta * rule.rate(self.dt) if rule.inertia else 0.0
+        return Moment(state.u[k], self._when, rule.ramp(self._when), rate, drift)
+
+    def accelerations(self, state: State, dt: float) -> tuple[FloatArray, ...]:
+        """Accelerations at a state [m/s^2], under the contact forces of its last step. Collective.
+
+        Args:
+            state: Its own accelerations play no part.
+            dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+        """
+        still = tuple(np.zeros_like(v) for v in state.v)
+        self.begin(replace(state, a=still), dt)
+        self.guess(flight=False, forces=True)
+        contact = [terms.coupling / self.factor for terms in self.evaluate(self.x).bodies]
+        gravity = self.integrator.ramp(state.time) * self.system.gravity
+        out = []
+        for body, u, v, force in zip(
+            self.system.bodies, state.u, state.v, contact, strict=True
+        ):
+            moment = Moment(u, state.time, self.integrator.ramp(state.time), 0.0, v)
+            body.begin_step(self.integrator, moment)
+            right = body.external(u, gravity) - body.internal(u) - force
+            p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
+            a = np.zeros_like(u)
+            a[body.fixed] = 4.0 * (p0 - 2.0 * p1 + p2) / dt**2
+            right -= body.inertia(a)
+            right[body.fixed] = 0.0
+            solved = solve_mass(body.tangent(u, 1.0, 0.0), right)
+            solved[body.fixed] = a[body.fixed]
+            out.append(solved)
+        return tuple(out)
+
+    def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
+        """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
+        if self._sleepers is None:
+            return {}
+        chosen = sorted(set(np.flatnonzero(rest).tolist()) - self._touched())
+        u, f = self.state.u, self.factor
+        found = self._sleepers.find(chosen, u, self._gravity, self._force_rounding)
+        none = {k: np.zeros_like(u[k]) for k in found}
+        return {
+            k: BodyTerms(u[k], none[k], f * a, f * b, none[k], f * (a - b))
+            for k, (a, b) in found.items()
+        }
+
+    def _force_rounding(self, k: int) -> float:
+        """Norm of the forces on a body at rest [N] that is rounding, as in `ratios`.
+
+        A diagonal of another step hardly allows more: it grows with the factor, but less than that.
+        """
+        if not self._diagonal[k]:
+            self._measure_rounding(k)
+        rounding = self._rounding_of(self._moved)[k]
+        return float(rounding / max(self.factor, self._diagonal_factor[k]))
+
+    def _inertial(self, body: Any, du: FloatArray) -> FloatArray:
+        """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
+        if self.integrator.inertia:
+            force: FloatArray = body.inertia(du)
+            return force
+        return self._stabilization(body) * du
+
+    def _stabilization(self, body: Any) -> FloatArray:
+        """Stiffness that holds each free coordinate at t_n [N/m]."""
+        stiffness: FloatArray = self.stabilization * body.nodal_stiffness(self.integrator)
+        stiffness[body.fixed] = 0.0
+        return stiffness
+
+    def guess(self, *, flight: bool, forces: bool | None = None) -> None:
+        """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
+
+        Args:
+            flight: Free flight from t_n under the contact forces of the last step; else the
+                positions of t_n, which free flight of a fast turning or vibrating body may invert,
+                and no forces. Prescribed coordinates are at t_{n+1}.
+            forces: Whether to start with the contact forces of the last step; None: as `flight`.
+        """
+        laid, elements = self._laid, self.elements
+        with self.x as x:
+            x[:] = 0.0
+            for k in self.awake:
+                fixed, u1 = self.system.bodies[k].fixed, self.first[k]
+                start = u1 if flight else self.state.u[k].copy()
+                start[fixed] = u1[fixed]
+                x[laid.of_body(k)] = start
+        forces = flight if forces is None else forces
+        if "constraints" in laid.own and (forces or not self.integrator.inertia):
+            places = iter(laid.positions(self.x, elements))
+            guess = [
+                coupling.guess(k, next(places)).ravel()
+                for coupling in self.couplings
+                for k in range(len(coupling.elements))
+            ]
+            with self.x as x:
+                x[laid.of_elements("constraints")] = np.concatenate(guess)
+        if "augmented" in laid.own:
+            positions = laid.positions(self.x, elements)
+            guess = [c.initial_guess(p).ravel() for c, p in zip(elements, positions, strict=True)]
+            with self.x as x:
+                x[laid.of_elements("augmented")] = np.concatenate(guess)
+
+    # ---- iterates
+    def evaluate(self, x: Any) -> Evaluation:
+        """The step equations at an iterate; pure. Every rank must call it.
+
+        Args:
+            x: PETSc vector of the unknowns.
+        """
+        values, laid, elements = x.array_r.copy(), self._laid, self.elements
+        positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
+        parts = tuple(
+            c.evaluate(y, own)
+            for c, y, own in zip(
+                elements, positions, laid.own_values(values, elements), strict=True
+            )
+        )
+        force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
+        bodies = dict(self._asleep)
+        for k in self.awake:
+            body, u0, here = self.system.bodies[k], self.state.u[k], laid.of_body(k)
+            u1 = values[here]
+            internal = self.factor * body.internal(u1)
+            external = self.factor * body.external(u1, self._gravity)
+            du, coupling = u1 - u0, force[here]
+            residual = self._inertial(body, du) - self._inertia[k] + internal - external + coupling
+            bodies[k] = BodyTerms(u1, du, internal, external, coupling, residual)
+        return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
+
+    def residual(self, e: Evaluation) -> FloatArray:
+        """This rank's part of the residual, zero at prescribed coordinates."""
+        laid = self._laid
+        out = np.zeros(len(e.x))
+        for k in self.awake:
+            out[laid.of_body(k)] = _free(self.system.bodies[k], e.bodies[k].residual)
+        for name in laid.own:
+            rows = [c.rows(p, name).ravel() for c, p in zip(self.elements, e.parts, strict=True)]
+            out[laid.of_elements(name)] = np.concatenate(rows)
+        return out
+
+    def body_tangents(self, e: Evaluation) -> list[Any]:
+        """PETSc matrices of the bodies that are awake at an iterate, without contact."""
+        return [self.body_tangent(k, e.bodies[k].u1) for k in self.awake]
+
+    def body_tangent(self, k: int, u1: FloatArray) -> Any:
+        """PETSc matrix of a body at a displacement, without contact."""
+        mass = 1.0 if self.integrator.inertia else 0.0
+        a = self.system.bodies[k].tangent(u1, mass, self.factor)
+        if self.stabilization:
+            held = a.createVecLeft()
+            held.array_w[:] = self._stabilization(self.system.bodies[k])
+            a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
+            held.destroy()
+        return a
+
+    @property
+    def knows_rounding(self) -> bool:
+        """Whether the rounding of the forces on all bodies in the step has been measured."""
+        return bool((self._diagonal[list(self.awake)] > 0.0).all())
+
+    def measure_rounding(self, e: Evaluation) -> None:
+        """Measure the rounding of the forces anew, for bodies that have stiffened. Collective.
+
+        The bodies' matrices are not those of an iterate any more.
+
+        Args:
+            e: Iterate whose motion is longer than the one that was predicted, at most the extent.
+        """
+        self._length = np.maximum(self._length, self._lengths(e))
+        for k in self.awake:
+            self._measure_rounding(k)
+
+    def _measure_rounding(self, k: int) -> None:
+        """Note the diagonal of a body's matrix in the accepted state, never in an iterate.
+
+        An iterate that runs off may be stiffer by any factor; its rounding excuses no residual.
+        """
+        diagonal = self.body_tangent(k, self.state.u[k]).getDiagonal()
+        self._diagonal[k], self._diagonal_factor[k] = diagonal.norm(), self.factor
+        diagonal.destroy()
+
+    # ---- convergence
+    @property
+    def rounding(self) -> FloatArray:
+        """Of the forces on each body [kg m]: stiffness times length times machine precision.
+
+        Forces come from displacement gradients, so the length is that of the displacement, wherever
+        the body lies and however large it is.
+        """
+        return self._rounding_of(self._length)
+
+    def _rounding_of(self, length: FloatArray) -> FloatArray:
+        """`rounding` at displacements of these lengths [m], shape (bodies,)."""
+        bodies = zip(self.system.bodies, self._extent, strict=True)
+        beside = np.array([getattr(body, "rounded", extent) for body, extent in bodies])
+        rounding: FloatArray = _EPS * self._diagonal * (length + beside)
+        return rounding
+
+    def _lengths(self, e: Evaluation) -> FloatArray:
+        """Largest displacement of each body in an evaluation [m]. Collective.
+
+        An iterate that runs off excuses no more than the positions would.
+        """
+        local = np.array([np.abs(terms.u1).max(initial=0.0) for terms in e.bodies])
+        return np.minimum(global_max(self.system.comm, local), self._extent + self._moved)
+
+    @property
+    def momentum_rounding(self) -> float:
+        """Change of momentum in the step that is rounding [kg m/s]."""
+        rate = self.integrator.rate(self.dt)
+        return float(self.rounding.sum() * np.sqrt(self.system.size) * rate)
+
+    @property
+    def span(self) -> float:
+        """Distance of the bodies' farthest coordinate from `centre` [m], at most."""
+        return self._span + float((self._moved + self._motion).max())
+
+    @property
+    def rounded_length(self) -> float:
+        """Largest length whose rounding enters forces and gaps [m]."""
+        return max(self.span, *(c.extent for c in self.elements), 0.0)
+
+    def motion(self, e: Evaluation) -> FloatArray:
+        """Largest component of each body's motion in the step [m], the same on all ranks."""
+        local = [np.abs(b.du).max(initial=0.0) for b in e.bodies]
+        return global_max(self.system.comm, np.array(local))
+
+    def unrest(self, e: Evaluation) -> float:
+        """Force of the stabilization over what counts as converged, the largest of the bodies."""
+        squares = []
+        for body, t in zip(self.system.bodies, e.bodies, strict=True):
+            parts = (self._stabilization(body) * t.du, t.internal, t.external, t.coupling)
+            squares.append([float(p @ p) for p in parts])
+        norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
+        limits = self.rtol * norms[:, 1:].max(axis=1) + self._rounding_of(self._lengths(e))
+        return max(over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
+
+    def ratios(self, e: Evaluation) -> dict[str, float]:
+        """Residual of each block over what counts as converged there; solved when all are <= 1."""
+        squares = np.zeros((len(e.bodies), 5))
+        for k in self.awake:
+            t, free = e.bodies[k], _free(self.system.bodies[k], e.bodies[k].residual)
+            parts = (free, self._inertia[k], t.internal, t.external, t.coupling)
+            squares[k] = [float(p @ p) for p in parts]
+        norms = np.sqrt(self.system.comm.allreduce(squares))
+        ratio, rounding = {}, self.rounding
+        for k, body in enumerate(self.system.bodies):
+            limit = self.rtol * norms[k, 1:].max() + rounding[k]
+            ratio[body.name] = over(norms[k, 0], limit)
+        if self._laid.own:
+            ratio |= self._element_ratios(e)
+        return ratio
+
+    def _element_ratios(self, e: Evaluation) -> dict[str, float]:
+        """`ratios` of the elements' own unknowns."""
+        moved = max(float(np.abs(b.du).max(initial=0.0)) for b in e.bodies)
+        # MPI's maximum may swallow a NaN, so it travels as a flag.
+        local = [moved, float(any(np.isnan(p.residual).any() for p in e.parts))]
+        for c, part in zip(self.elements, e.parts, strict=True):
+            local += c.largest(part)
+        top = global_max(self.system.comm, np.array(local))
+        motion = max(top[0], float(self._motion.max()))
+        rounded = motion + float(self._moved.max())
+        ratio: dict[str, float] = {}
+        for c, largest in zip(self.elements, top[2:].reshape(-1, 4), strict=True):
+            broken = np.inf if top[1] else 0.0
+            # Several contacts of two bodies have one name.
+            for name, value in c.ratios(largest, motion, rounded, self.rtol).items():
+                ratio[name] = max(value, broken, ratio.get(name, 0.0))
+        return ratio
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, which Python's collector does not."""
+        if self.unknowns is not None:
+            self.unknowns.destroy()
+        self.unknowns, self._numbers = None, None
+
+
+def _free(body: Any, residual: FloatArray) -> FloatArray:
+    """Residual with zeros at the prescribed coordinates, whose equation is the prescription."""
+    free = residual.copy()
+    free[body.fixed] = 0.0
+    return free
+
+
+def _box(system: System) -> tuple[FloatArray, float]:
+    """Middle of the box around all bodies' reference and half its diagonal [m]. Collective."""
+    ends = np.full((2, 3), -np.inf)
+    for body in system.bodies:
+        x = body.reference.reshape(-1, 3)
+        np.maximum(ends, [x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)], ends)
+    high, low = global_max(system.comm, ends) * [[1.0], [-1.0]]
+    return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+
+
+def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:
+    return b is not None and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))

@@ -1,0 +1,141 @@
+"""What a run promises of its energy, held against every accepted step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.step import balance
+from dolfinx_nts.system import System
+
+if TYPE_CHECKING:
+    from dolfinx_nts.run.simulate import Solution
+    from dolfinx_nts.step.problem import Evaluation, StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+#: What the ledger may miss of the energy, over the tolerance of Newton's method ...
+_PER_TOLERANCE = 10.0
+#: ... and at least, as rounding adds up over the steps.
+_LEAST = 1e-11
+#: Part of the energy whose loss from the ledger makes a result doubtful, with a rule that closes
+#: it and with one that does not.
+_DOUBTFUL, _OPEN = 1e-3, 1e-2
+#: Part of the energy that contact may bring, in a step or in a run, without a warning.
+_GAIN = 0.01
+#: Part of the energy that contact may take over a run without a word.
+_LOSS = 0.1
+#: Tolerance of Newton's method of accuracy="exact".
+_EXACT = 1e-12
+_EPS = float(np.finfo(float).eps)
+#: Rounding of a step's energy over that of its forces times its motion.
+_ROUNDING = 10.0
+
+
+class Promises:
+    """Compares the ledger of a run with what its integrator and its accuracy promise.
+
+    Args:
+        solution: Where warnings go.
+        integrator: Of the run.
+        rtol: Tolerance of Newton's method.
+    """
+
+    def __init__(self, solution: Solution, integrator: Integrator, rtol: float) -> None:
+        self._solution, self._closes = solution, integrator.closes_ledger
+        self._remedy = "use a smaller dt" if rtol <= _EXACT else 'pass accuracy="exact"'
+        self._remedy += integrator.ledger_remedy
+        self._open = f"use EnergyMomentum(){integrator.ledger_remedy}"
+        self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if self._closes else _OPEN
+        self._largest, self._rounding = 0.0, 0.0
+
+    def hold(self, problem: StepProblem, step: Evaluation, impulses: float) -> None:
+        """Warn if the last row's ledger misses too much, or contact brought energy. Collective.
+
+        Args:
+            problem: Equations of the step.
+            step: Their solution.
+            impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
+        """
+        row = self._solution.rows[-1]
+        names = ("kinetic", "potential", "external_work", "friction_dissipation")
+        self._largest = max(self._largest, *(abs(row[name]) for name in names))
+        squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
+        moved = np.sqrt(problem.system.comm.allreduce(squares))
+        self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
+        # Where nothing moves, forces still do work over the rounding of positions.
+        self._rounding += _EPS * impulses / problem.dt * problem.rounded_length
+        self._tell_gain(problem, step)
+        missing = abs(row["ledger_residual"])
+        if missing <= self._promise * self._largest + self._rounding:
+            return
+        part = missing / self._largest if self._largest else np.inf
+        if self._closes:
+            text = (
+                f"the ledger misses {missing:.3g} J, {part:.2g} of the largest energy, where this "
+                f"accuracy promises {self._promise:.0e}; {self._remedy}"
+            )
+        else:
+            text = (
+                f"the energy is {missing:.3g} J, {part:.2g} of the largest, off what work, "
+                f"friction and contact account for; this integrator does not keep it: {self._open}"
+            )
+        doubtful = part > (_DOUBTFUL if self._closes else _OPEN)
+        self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
+
+    def _tell_gain(self, problem: StepProblem, step: Evaluation) -> None:
+        """Warn if contact has brought energy, in this step or in all. Collective."""
+        before, row = self._solution.rows[-2:]
+        total = -row["contact_defect"]
+        gain = total + before["contact_defect"]
+        remedy = "use a finer or smoother master, or a smaller, constant dt"
+        if gain > _GAIN * abs(row["energy"]):
+            where = balance.expelled(problem, step)
+            text = (
+                f"nodes that start behind their facets bring {gain:.3g} J to "
+                f"{before['energy']:.3g} J, most {where}; after changes of facet {remedy}"
+            )
+        elif gain > 0.0 and total > _GAIN * self._largest:
+            gain, text = total, (
+                f"nodes that start steps behind their facets have brought {total:.3g} J in all, "
+                f"{total / self._largest:.2g} of the largest energy; {remedy}"
+            )
+        else:
+            if -total > _LOSS * self._largest:
+                self._solution.warn(
+                    "energy lost to contact", row["time"], -total,
+                    f"gaps that close in mid step have taken {-total:.3g} J, "
+                    f"{-total / self._largest:.2g} of the largest energy: how bodies rebound may "
+                    "depend on it; compare with a smaller dt and a finer mesh, or pass "
+                    "adapt=Adapt(...)",
+                )  # fmt: skip
+            return
+        self._solution.warn("energy from behind facets", row["time"], gain, text, grave=True)
+
+
+class MaterialWatch:
+    """Notices that a caller has changed parameters of materials between steps.
+
+    Args:
+        system: The scene; bodies without a method `parameters` are left alone.
+    """
+
+    def __init__(self, system: System) -> None:
+        self._comm = system.comm
+        self._bodies = [b for b in system.bodies if hasattr(b, "parameters")]
+        self._known = self._values()
+
+    def _values(self) -> list[FloatArray]:
+        return [body.parameters() for body in self._bodies]
+
+    def changed(self) -> list[str]:
+        """Names of the bodies whose parameters differ from those of the last call. Collective."""
+        last, self._known = self._known, self._values()
+        differ = [not np.array_equal(a, b) for a, b in zip(last, self._known, strict=True)]
+        flags = np.array(differ, dtype=bool)
+        self._comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.LOR)
+        return [body.name for body, flag in zip(self._bodies, flags, strict=True) if flag]

@@ -1,0 +1,1 @@
+"""Runs of runs: speed against accuracy, and the price of each feature."""
