@@ -9,6 +9,7 @@ from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
+from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Cylinder, Plane, Sphere
@@ -45,6 +46,7 @@ __all__ = [
     "Adapt",
     "Body",
     "BodyMotion",
+    "ContactHistory",
     "ContactPair",
     "Continuum",
     "Coupling",
