@@ -61,9 +61,9 @@ class Promises:
             step: Their solution.
             impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
         """
-        row = self._solution.rows[-1]
         names = ("kinetic", "potential", "external_work", "friction_dissipation")
-        self._largest = max(self._largest, *(abs(row[name]) for name in names))
+        for row in self._solution.rows[-2:]:
+            self._largest = max(self._largest, *(abs(row[name]) for name in names))
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         moved = np.sqrt(problem.system.comm.allreduce(squares))
         self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
