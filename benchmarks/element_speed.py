@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dolfinx_nts import nts
+from dolfinx_nts.kernels import nts_element
 from dolfinx_nts.kernels import facets, patches
 
 
@@ -60,19 +60,19 @@ def main() -> None:
         def direct(x: np.ndarray = x, xi: np.ndarray = xi) -> None:
             """The midpoint rule needs the gap at the middle and at the end."""
             for _ in range(2):
-                nts.gap(x, facets.project(x[:, 0], x[:, 1:], xi)[0])
+                nts_element.gap(x, facets.project(x[:, 0], x[:, 1:], xi)[0])
 
         def element(
             rule: str, z0: np.ndarray = z0, z1: np.ndarray = z1, m: np.ndarray = multiplier
         ) -> object:
-            return nts.element(z0, z1, m, rule)
+            return nts_element.element(z0, z1, m, rule)
 
         rates = [
             rate(lambda r=r: element(r), n, options.seconds) for r in ("mean-value", "gonzalez")
         ]
         rates.append(rate(direct, n, options.seconds))
         smooth = pairs(n, patches.NUM_POINTS)
-        rates.append(rate(lambda a=smooth: nts.element(*a, "mean-value"), n, options.seconds))
+        rates.append(rate(lambda a=smooth: nts_element.element(*a, "mean-value"), n, options.seconds))
         print(f"{n:>8}" + "".join(f"{r:14.0f}" for r in rates), flush=True)
 
 
