@@ -8,8 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dolfinx_nts.kernels import nts_element
-from dolfinx_nts.kernels import facets, patches
+from dolfinx_nts.kernels import facets, nts_element, patches
 
 
 def middle_patch() -> np.ndarray:
@@ -72,7 +71,8 @@ def main() -> None:
         ]
         rates.append(rate(direct, n, options.seconds))
         smooth = pairs(n, patches.NUM_POINTS)
-        rates.append(rate(lambda a=smooth: nts_element.element(*a, "mean-value"), n, options.seconds))
+        element = lambda a=smooth: nts_element.element(*a, "mean-value")  # noqa: E731
+        rates.append(rate(element, n, options.seconds))
         print(f"{n:>8}" + "".join(f"{r:14.0f}" for r in rates), flush=True)
 
 

@@ -687,9 +687,9 @@ FIELD_SPLIT = {
     "fieldsplit_bodies_ksp_type": "preonly",
     "fieldsplit_bodies_pc_type": "gamg",
     "fieldsplit_bodies_mg_levels_ksp_max_it": 3,
-    "fieldsplit_contact_ksp_type": "preonly",
-    "fieldsplit_contact_pc_type": "lu",
-    "fieldsplit_contact_pc_factor_mat_solver_type": "mumps",
+    "fieldsplit_constraints_ksp_type": "preonly",
+    "fieldsplit_constraints_pc_type": "lu",
+    "fieldsplit_constraints_pc_factor_mat_solver_type": "mumps",
 }
 
 
@@ -719,8 +719,8 @@ def test_petsc_options():
         ("snes_linesearch_tpye", "bt", {}),
         ("sub_pc_tpye", "ilu", {"pc_type": "bjacobi", "ksp_type": "gmres"}),
         ("fieldsplit_bodies_pc_tpye", "ilu", FIELD_SPLIT),
-        ("fieldsplit_contact_pc_tpye", "lu", FIELD_SPLIT),
-        ("fieldsplit_contact_pc_factor_mat_slover_type", "mumps", FIELD_SPLIT),
+        ("fieldsplit_constraints_pc_tpye", "lu", FIELD_SPLIT),
+        ("fieldsplit_constraints_pc_factor_mat_slover_type", "mumps", FIELD_SPLIT),
     ],
 )
 def test_misspelt_petsc_options_are_found_before_the_first_step(name, value, others):

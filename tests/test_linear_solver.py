@@ -194,7 +194,7 @@ def test_schur_complement_saves_iterations():
 def test_contact_part_by_a_solver_of_the_user(condense):
     """LU of the first approximation alone: zeros on its diagonal need MUMPS unless condensed."""
     tables = []
-    for options in (None, {"fieldsplit_contact_pc_type": "lu"}):
+    for options in (None, {"fieldsplit_constraints_pc_type": "lu"}):
         newton = nts.Newton(linear_solver="krylov", condense=condense, max_retries=0)
         run = nts.simulate(
             pressed_block(0.3), nts.EnergyMomentum(), dt=1e-3, t_end=0.02, newton=newton,

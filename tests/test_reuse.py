@@ -103,7 +103,7 @@ def test_reuse_with_a_split_of_another_kind():
         "pc_type": "fieldsplit",
         "pc_fieldsplit_type": "multiplicative",
         "fieldsplit_bodies_pc_type": "bjacobi",
-        "fieldsplit_contact_pc_type": "jacobi",
+        "fieldsplit_constraints_pc_type": "jacobi",
     }
     runs = [
         nts.simulate(

@@ -223,10 +223,10 @@ def test_field_split_finds_the_same_solution():
         "fieldsplit_bodies_ksp_type": "preonly",
         "fieldsplit_bodies_pc_type": "lu",
         "fieldsplit_bodies_pc_factor_mat_solver_type": "mumps",
-        "fieldsplit_contact_ksp_type": "gmres",
-        "fieldsplit_contact_ksp_rtol": 1e-10,
-        "fieldsplit_contact_pc_type": "lu",
-        "fieldsplit_contact_pc_factor_mat_solver_type": "mumps",
+        "fieldsplit_constraints_ksp_type": "gmres",
+        "fieldsplit_constraints_ksp_rtol": 1e-10,
+        "fieldsplit_constraints_pc_type": "lu",
+        "fieldsplit_constraints_pc_factor_mat_solver_type": "mumps",
     }
     system = two_blocks.scene(COMM)
     run = nts.simulate(system, ENERGY_MOMENTUM, dt=2e-3, t_end=0.04, petsc_options=options)

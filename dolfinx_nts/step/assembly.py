@@ -211,8 +211,8 @@ class StepMatrix:
         bodies: PETSc matrices of the body fields; contact is added to them in place, unless they
             are stored in blocks.
         elements: Unknowns of each batch of contact elements.
-        split: Whether solvers see a nest of two fields, "bodies" and "contact", from which a field
-            split takes its blocks without a copy; else one matrix.
+        split: Whether solvers see a nest of two fields, "bodies" and "constraints", from which a
+            field split takes its blocks without a copy; else one matrix.
         blocked: Whether the bodies' part may be stored in the 3 x 3 blocks of nodes (BAIJ), with
             which a product takes a third of the time; few of PETSc's preconditioners take it. With
             contact it needs `split`.
@@ -436,7 +436,7 @@ class StepMatrix:
         return mine if load.max() <= _EVENLY * load.mean() else None
 
     def field_sets(self, num_bodies: int) -> tuple[tuple[str, Any], tuple[str, Any]]:
-        """Index sets "bodies" and "contact" of the system vector for a field split."""
+        """Index sets "bodies" and "constraints" of the system vector for a field split."""
         parts = []
         fields = range(self._layout.counts.shape[1])
         for chosen in (
@@ -449,7 +449,7 @@ class StepMatrix:
             start = self._layout.first_owned
             index = (np.concatenate(local) + start).astype(PETSc.IntType)
             parts.append(PETSc.IS().createGeneral(index, comm=self._layout.comm))
-        return ("bodies", parts[0]), ("contact", parts[1])
+        return ("bodies", parts[0]), ("constraints", parts[1])
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
@@ -482,7 +482,7 @@ def model_problem(
         constraint: Whether a multiplier holds the first mass of each rank.
 
     Returns:
-        Its matrix, and the index sets "bodies" and "contact" of its unknowns.
+        Its matrix, and the index sets "bodies" and "constraints" of its unknowns.
     """
     count, extra = 300, int(constraint)
     a = PETSc.Mat().createAIJ(((count + extra, None), (count + extra, None)), nnz=4, comm=comm)
@@ -499,7 +499,7 @@ def model_problem(
     a.assemble()
     bodies = PETSc.IS().createStride(count, start, 1, comm=comm)
     contact = PETSc.IS().createStride(extra, start + count, 1, comm=comm)
-    return a, (("bodies", bodies), ("contact", contact))
+    return a, (("bodies", bodies), ("constraints", contact))
 
 
 def solve_mass(mass: Any, right: FloatArray) -> FloatArray:

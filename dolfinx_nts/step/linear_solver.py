@@ -12,7 +12,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.step.assembly import SchurApproximation, StepMatrix, model_problem
 
 _BODIES = "fieldsplit_bodies_"
-_CONTACT = "fieldsplit_contact_"
+_CONSTRAINTS = "fieldsplit_constraints_"
 #: What `SchurInverse` factorises with.
 _FACTORS = "factors_"
 #: Name by which its matrix knows the second approximation.
@@ -47,13 +47,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         _BODIES + "ksp_type": "preonly",
         _BODIES + "pc_type": "bjacobi",
         _BODIES + "sub_pc_type": "icc",
-        _CONTACT + "ksp_type": "preonly",
-        _CONTACT + "pc_type": "python",
-        _CONTACT + "pc_python_type": f"{__name__}.SchurInverse",
-        _CONTACT + _FACTORS + "pc_type": "lu",
-        _CONTACT + _FACTORS + "pc_factor_mat_solver_type": "mumps",
+        _CONSTRAINTS + "ksp_type": "preonly",
+        _CONSTRAINTS + "pc_type": "python",
+        _CONSTRAINTS + "pc_python_type": f"{__name__}.SchurInverse",
+        _CONSTRAINTS + _FACTORS + "pc_type": "lu",
+        _CONSTRAINTS + _FACTORS + "pc_factor_mat_solver_type": "mumps",
         # Of a user who takes LU for the first of the two approximations alone.
-        _CONTACT + "pc_factor_mat_solver_type": "mumps",
+        _CONSTRAINTS + "pc_factor_mat_solver_type": "mumps",
     },
 }
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
@@ -102,7 +102,7 @@ def most_iterations(size: int) -> int:
 #: In place of the preset's where the contact unknowns are condensed: without zeros on its diagonal
 #: their small block needs no pivoting, and starting MUMPS takes longer than all else.
 _CONDENSED: Mapping[str, Mapping[str, Any]] = {
-    "krylov": {_CONTACT + _FACTORS + "pc_type": "redundant"},
+    "krylov": {_CONSTRAINTS + _FACTORS + "pc_type": "redundant"},
 }
 #: PETSc's errors "no support", "unknown type", "missing factor": an option has a wrong value.
 _WRONG_VALUE = (56, 86, 92)
@@ -135,7 +135,7 @@ class SolverOptions:
         if limit is not None:
             known["ksp_max_it"] = limit
         if condense and preset in _CONDENSED:
-            known = {k: v for k, v in known.items() if not k.startswith(_CONTACT + _FACTORS)}
+            known = {k: v for k, v in known.items() if not k.startswith(_CONSTRAINTS + _FACTORS)}
             known |= _CONDENSED[preset]
         self._preset = known
         self._all = {**known, **given}
