@@ -71,8 +71,8 @@ def main() -> None:
         ]
         rates.append(rate(direct, n, options.seconds))
         smooth = pairs(n, patches.NUM_POINTS)
-        element = lambda a=smooth: nts_element.element(*a, "mean-value")  # noqa: E731
-        rates.append(rate(element, n, options.seconds))
+        patched = lambda a=smooth: nts_element.element(*a, "mean-value")  # noqa: E731
+        rates.append(rate(patched, n, options.seconds))
         print(f"{n:>8}" + "".join(f"{r:14.0f}" for r in rates), flush=True)
 
 
