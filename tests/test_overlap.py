@@ -83,6 +83,13 @@ class Heap:
         inside[within] = self.filled[tuple(cell[within].T)]
         return self.h * np.where(inside, distance, -distance)
 
+    def normal_below(self, point):
+        """Normal of the square nearest to a point."""
+        x = (point - self.centre) @ self.turn / self.h + self.n / 2
+        low, high = self.squares.min(axis=1), self.squares.max(axis=1)
+        s = self.squares[np.linalg.norm(x - x.clip(low, high), axis=1).argmin()]
+        return np.cross(s[1] - s[0], s[2] - s[1])
+
 
 def heaps(seed, nc):
     rng = np.random.default_rng(seed)
@@ -123,7 +130,8 @@ def test_nodes_and_edges_inside_are_those_of_brute_force(seed, nc):
     for a, b in (heap, heap[::-1]):
         found = intrusion.intrusions(a.placed, b.placed, least)
         assert np.abs(found.depth - b.depth(found.place)).max(initial=0.0) < 1e-13
-        assert np.allclose(found.size, found.depth / scale)
+        size = found.depth / scale
+        assert np.allclose(found.size, np.where(found.middle, np.maximum(size, 0.5), size))
         node = found.part(found.is_node)
         deep = b.depth(a.x)
         assert sorted(node.nodes[:, 0]) == np.flatnonzero(deep > least * scale).tolist()
@@ -136,7 +144,11 @@ def test_nodes_and_edges_inside_are_those_of_brute_force(seed, nc):
                 assert (edge in told) == (depth > least * scale)
             if edge in told:
                 assert abs(told.pop(edge) / depth - 1) < 0.02
-        assert not told
+        # What is left passes the middle of a part as thick as two sides of it are apart.
+        passing = {tuple(e) for e in found.nodes[found.middle]}
+        for edge in told:
+            one, two = (b.normal_below(a.x[i]) for i in edge)
+            assert edge in passing and np.allclose(one, -two)
         found_any += len(found.depth)
     assert found_any > 0
 
@@ -168,6 +180,45 @@ def test_a_plate_too_thin_to_be_deep_in_it():
     assert count(box((-0.1, -0.1, 0.0049), (0.1, 0.1, 0.6), (1, 1, 1)), plate) == 0
     for beside in (1.0, 1.0 - 1e-4):
         assert count(box((beside, -0.1, -0.3), (beside + 0.2, 0.1, 0.3), (1, 1, 1)), plate) == 0
+
+
+@pytest.mark.parametrize("at", [(0.13, 0.14), (0.0, 0.0), (0.25, 0.13)])
+@pytest.mark.parametrize("cells", [1, 8])
+def test_a_post_that_ends_in_a_plate_is_told_from_its_middle_on(at, cells):
+    """Also on corners and edges of the plate's facets; up to the middle it may be contact's."""
+    plate = box((-1, -1, -0.01), (1, 1, 0.01), (8, 8, 1))
+    for bottom, told in ((0.002, False), (-0.002, True), (-0.015, True)):
+        post = box((*at, bottom), (*np.add(at, 0.2), 0.6), (1, 1, cells))
+        found = intrusion.intrusions(post, plate)
+        assert bool(len(found.depth)) == told
+        if told:
+            edges = len({tuple(n) for n in found.nodes})
+            assert found.middle.all() and edges >= 4
+            assert np.allclose(found.depth, 0.01, rtol=0.021) and np.allclose(found.size, 0.5)
+
+
+def test_what_comes_a_little_into_the_narrow_side_of_a_plate_is_not_past_its_middle():
+    plate = box((-1, -1, -0.02), (1, 1, 0.02), (8, 8, 1))
+    for depth, told in ((0.004, False), (0.015, False), (0.04, True)):
+        post = box((1 - depth, -0.1, -0.3), (1.2, 0.13, 0.3), (1, 1, 1))
+        assert bool(count(post, plate)) == told
+
+
+def test_a_facet_counts_up_to_the_width_of_a_body_in_it():
+    """In a block with facets of 1 a pin 0.02 wide and a bead of 0.1 are told."""
+    block = box((0, 0, -2), (2, 2, 0), (2, 2, 2))
+    for cells in (1, 20):
+        pin = box((0.3, 0.4, -0.15), (0.32, 0.42, 0.25), (1, 1, cells))
+        found = intrusion.intrusions(pin, block)
+        assert np.isclose(found.depth.max(), 0.15)
+        # Of a square section any width up to the diagonal may count; or the pin's own facets.
+        own = (0.02 + 0.4 / cells) / 2
+        counted = 0.15 / found.size.max()
+        assert max(0.02, own) - 1e-12 <= counted <= max(0.02 * np.sqrt(2), own) + 1e-12
+    bead = box((0.3, 0.4, -0.11), (0.4, 0.5, -0.01), (1, 1, 1))
+    found = intrusion.intrusions(bead, block)
+    assert np.isclose(found.depth.max(), 0.11)
+    assert 1.1 / np.sqrt(3) - 1e-12 <= found.size.max() <= 1.1 + 1e-12
 
 
 def test_a_body_wholly_inside_is_found():
@@ -366,6 +417,73 @@ def test_looks_are_as_rare_as_the_motion_allows(monkeypatch):
     way = (0.1, 0.2, 0.3, 0.0, 0.4, 0.04)
     assert [look(30.3 + x, -0.2) for x in way] == [1, 0, 0, 0, 1, 1]
     assert [look(30.35, -0.2, last=True) for _ in range(2)] == [2, 0]
+
+
+def shot(thick):
+    """A block of 0.2 above a facet of 0.5 of a plate, whose nodes alone are held out of it."""
+    rubber, bodies = nts.NeoHookean(young=1e6, poisson=0.3), []
+    for low, high, cells, name in (
+        ([0.15, 0.15, 0.05], [0.35, 0.35, 0.25], [2, 2, 2], "block"),
+        ([0, 0, -thick], [1, 1, 0], [2, 2, 1], "plate"),
+    ):
+        kind = dict(cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
+        mesh = create_box(COMM, [np.array(low, float), np.array(high, float)], cells, **kind)
+        down = (0, 0, -3.0 if name == "block" else 0.0)
+        bodies.append(nts.Continuum(mesh, rubber, density=1e3, velocity=down, name=name))
+    block, plate = bodies
+    pair = nts.ContactPair(
+        slave=plate.surface(lambda x: x[2] > -1e-9), master=block.surface(lambda x: x[2] < 0.05001)
+    )
+    return nts.System(bodies, contacts=[pair])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("thick", [0.01, 0.04, 0.1, 0.3])
+@pytest.mark.parametrize("step", [0.003, 0.03, 0.3, 3.0])
+def test_a_block_that_passes_a_thin_plate_between_its_nodes_is_told(thick, step):
+    """However long the steps are: also of all of the way in one."""
+    system, found = shot(thick), []
+    watch = overlap.OverlapWatch(system)
+    for z in np.arange(0.0, max(1.0, 1.5 * step), step):
+        found += watch.look(moved(system, (0, 0, -z), (0, 0, 0)))
+    assert {f.bodies for f in found} == {("block", "plate")}
+    # To the next side of the plate, at most half of its thickness.
+    assert max(f.depth for f in found) <= 0.5 * thick + 1e-12
+    assert max(f.size for f in found) >= 0.2
+    assert all(-thick <= f.place[2] <= 0.0 for f in found)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("step", [0.03, 0.3, 3.0])
+def test_a_block_that_passes_beside_a_thin_plate_is_not_warned_of(step):
+    system = shot(0.01)
+    watch = overlap.OverlapWatch(system)
+    for z in np.arange(0.0, max(1.0, 1.5 * step), step):
+        assert watch.look(moved(system, (0.851, 0, -z), (0, 0, 0))) == []
+
+
+@pytest.mark.mpi
+def test_a_run_in_which_a_block_passes_a_thin_plate_says_so(caplog):
+    caplog.set_level(logging.CRITICAL)
+    run = nts.simulate(shot(0.01), nts.EnergyMomentum(), dt=1e-3, t_end=0.12)
+    assert run.balance["active"].max() == 0
+    assert run.status.startswith("completed, but the edge between nodes")
+    assert abs(run.warnings["edge through a body"].worst - 0.005) < 1e-4
+
+
+@pytest.mark.parametrize("part", [0.2, 0.4, 1.0])
+def test_a_thin_plate_bent_over_an_edge_is_not_warned_of(part):
+    """The edge of a block is between the plate's nodes, four hundredths of a facet inside."""
+    plate = box((-1, -1, 0), (1, 1, 0.25 * part), (8, 8, 1))
+    x = plate.x + [0.125, 0.0, 0.0]
+    x[:, 2] -= 0.08 * np.abs(x[:, 0])
+    bent, flank = intrusion.Placed(plate.boundary, x), 0.08 * 0.125
+    roof = box((-1, -2, -1), (1, 2, 0), (2, 8, 2))
+    y = roof.x.copy()
+    y[:, 2] -= 0.08 * np.abs(y[:, 0]) * (y[:, 2] == 0)
+    block = intrusion.Placed(roof.boundary, y)
+    assert flank == 0.04 * 0.25
+    assert count(bent, block) == count(block, bent) == 0
 
 
 def two_in_one(low):
@@ -620,3 +738,40 @@ def test_obstacles_are_looked_at_as_rarely_as_the_motion_allows(monkeypatch):
     assert [look(-z) for z in (0.05, 0.12, 0.12, 0.12, 0.13)] == [0, 0, 0, 1, 0]
     assert [look(-z) for z in (0.5, 0.55)] == [0, 1]
     assert [look(-0.56, last=True) for _ in range(2)] == [1, 0]
+
+
+@pytest.mark.mpi
+def test_what_no_contact_holds_of_a_body_is_told_in_an_obstacle(caplog):
+    """The top is the slave, and the bottom falls 0.25 m into a floor 0.05 m below it."""
+    caplog.set_level(logging.CRITICAL)
+    floor = nts.Plane((0, 0, -0.05), (0, 0, 1))
+    mesh = create_box(
+        COMM, [[-1, -1, 0], [1, 1, 1]], [2, 2, 1],
+        cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    body = nts.Continuum(mesh, rubber, density=1e3, velocity=(0, 0, -5.0), name="block")
+    pair = nts.ContactPair(slave=body.surface(lambda x: x[2] > 0.99), master=floor)
+    system = nts.System([body], contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.06)
+    assert run.status.startswith("completed, but node")
+    (kind,) = run.warnings
+    assert kind == "node in an obstacle" and run.warnings[kind].grave
+    assert abs(run.warnings[kind].worst - 0.25) < 1e-9
+    text = run.warnings[kind].text
+    assert "inside 'plane'" in text and "no contact is declared of it with 'plane'" in text
+
+
+@pytest.mark.mpi
+def test_nodes_that_another_contact_holds_or_that_start_in_an_obstacle_are_not_told():
+    """A plate with two slaves on the same floor, and one whose upper half is behind a wall."""
+    floor = nts.Plane((0, 0, 0), (0, 0, 1))
+    system = above(floor)
+    body = system.bodies[0]
+    alike = nts.Plane((0, 0, 0), (0, 0, 1))
+    rest = nts.ContactPair(slave=body.surface(lambda x: x[2] > 0.49), master=alike)
+    both = nts.System([body], contacts=[*system.contacts, rest])
+    (found,) = overlap.OverlapWatch(both).look(moved(both, (0, 0, -0.8)))
+    assert found.kind == "facet in an obstacle"
+    wall = above(nts.Plane((0, 0, 0.25), (0, 0, -1)))
+    assert overlap.OverlapWatch(wall).look(moved(wall, (0, 0, -0.2))) == []

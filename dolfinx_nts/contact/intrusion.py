@@ -27,10 +27,12 @@ BoolArray = npt.NDArray[np.bool_]
 LEAST = 0.2
 #: Closest points this near to the border of a facet (in convective coordinates) are on it.
 _ON_BORDER = 1e-9
-#: A body is thin where its sides have normals with a cosine below this; an edge that sticks out on
-#: both sides counts from this part of `LEAST` on.
+#: A body is thin where its sides have normals with a cosine below this; an edge that passes its
+#: middle counts from this part of `LEAST` on.
 _OPPOSITE, _THIN = -0.9, 0.01
-#: Part of a body's box that its nearest points are left out of, at most.
+#: The facets around an edge or a corner are one plane where their mean normal is at least so long.
+_FLAT = 0.95
+#: Part of a body's smallest extent that its box is taken smaller by, at most.
 _SHRINK = 0.25
 
 
@@ -41,7 +43,7 @@ class Depth(NamedTuple):
         value: Distance from the boundary [m], negative outside, shape (n,); -inf beyond reach.
         facet: Closest facet, shape (n,); -1 beyond reach.
         normal: Outward normal there, of any length, shape (n, 3).
-        over: Whether the closest point is inside the facet, not on its border, shape (n,).
+        over: Whether the closest point is inside a side of the body, not on its border, shape (n,).
     """
 
     value: FloatArray
@@ -57,8 +59,10 @@ class Found(NamedTuple):
         nodes: Both ends of the edge, twice the same for a node; points of the boundary, (n, 2).
         place: The deepest point of the edge, or the node [m], shape (n, 3).
         depth: Its distance from the other body's boundary [m], shape (n,).
-        size: The same in facet sizes, the larger of both bodies there [-], shape (n,).
+        size: The same in facet sizes, the larger of both bodies there, of which one counts up to
+            the other body's width; past the middle of a thin body at least 0.5 [-], shape (n,).
         facet: Closest facet of the other body, shape (n,).
+        middle: Whether it passes the middle of a thin body, shape (n,).
     """
 
     nodes: IntArray
@@ -66,6 +70,7 @@ class Found(NamedTuple):
     depth: FloatArray
     size: FloatArray
     facet: IntArray
+    middle: BoolArray
 
     def part(self, chosen: IntArray | BoolArray) -> Found:
         """Some of them, by number or by a mask."""
@@ -79,8 +84,9 @@ class Found(NamedTuple):
 
 
 _NOTHING = Found(
-    np.empty((0, 2), np.int64), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.int64)
-)
+    np.empty((0, 2), np.int64), np.empty((0, 3)), np.empty(0), np.empty(0),
+    np.empty(0, np.int64), np.empty(0, bool),
+)  # fmt: skip
 
 
 class Boundary:
@@ -129,6 +135,21 @@ class Placed:
         return np.array([self.x.min(axis=0), self.x.max(axis=0)])
 
     @cached_property
+    def extents(self) -> FloatArray:
+        """Lengths along the principal axes of the points, sorted [m], shape (3,).
+
+        Of a square or a cube all axes are principal, and lengths may be those of diagonals.
+        """
+        x = self.x - self.x.mean(axis=0)
+        along = x @ np.linalg.eigh(x.T @ x)[1]
+        return np.sort(np.ptp(along, axis=0))
+
+    @property
+    def width(self) -> float:
+        """Length of the shorter side of the smallest hole that it fits through flat [m]."""
+        return float(self.extents[1])
+
+    @cached_property
     def corners(self) -> FloatArray:
         """Corners of the facets [m], shape (m, nc, 3)."""
         corners: FloatArray = self.x[self.boundary.facets]
@@ -154,7 +175,7 @@ class Placed:
     ) -> Depth:
         """How deep points lie in the body, up to the reach.
 
-        The sign is that of the normal at the closest point; on an edge the sum of those of both
+        The sign is that of the normal at the closest point; on an edge the mean of those of both
         facets, at a corner weighted by the angles (Baerentzen and Aanaes 2005), without which
         rounding would decide about points in the plane of a facet beside them. Nothing is known
         of points over the rim of an open boundary, which count as outside.
@@ -176,7 +197,7 @@ class Placed:
         count = on.sum(axis=1)
         edge, corner = np.flatnonzero(count == 1), np.flatnonzero(count > 1)
         beside = b.beside[b.sides[facet[edge], on[edge].argmax(axis=1)]]
-        normal[edge] = self._normals(beside.ravel()).reshape(-1, 2, 3).sum(axis=1)
+        normal[edge] = self.normals(beside.ravel()).reshape(-1, 2, 3).mean(axis=1)
         rim = np.zeros(len(near), dtype=bool)
         rim[edge] = beside[:, 0] == beside[:, 1]
         first = (on & np.roll(on, 1, axis=1))[corner].argmax(axis=1)
@@ -184,10 +205,12 @@ class Placed:
         inward = foot - points[near]
         inside = (np.einsum("ni,ni->n", normal, inward) > 0.0) & ~rim
         result.value[near] = np.where(inside, 1.0, -1.0) * closest.distance[near]
-        result.facet[near], result.normal[near], result.over[near] = facet, normal, count == 0
+        flat = ~rim & (np.linalg.norm(normal, axis=1) > _FLAT)
+        result.facet[near], result.normal[near] = facet, normal
+        result.over[near] = (count == 0) | flat
         return result
 
-    def _normals(self, facet: IntArray) -> FloatArray:
+    def normals(self, facet: IntArray) -> FloatArray:
         """Unit normals of facets, of a warped one its mean, shape (n, 3); 0 without an area."""
         c = self.corners[facet]
         if c.shape[1] == 4:
@@ -208,7 +231,8 @@ class Placed:
         area = np.linalg.norm(np.cross(*arms), axis=1)
         angle = np.arctan2(area, np.einsum("ni,ni->n", *arms))
         normal, rim = np.zeros((len(used), 3)), np.zeros(len(used), dtype=bool)
-        np.add.at(normal, at, angle[:, None] * self._normals(facet))
+        turn = np.bincount(at, angle, len(used))[at]
+        np.add.at(normal, at, (angle / turn)[:, None] * self.normals(facet))
         for side in (k, k - 1):
             one, two = b.beside[b.sides[facet, side]].T
             rim[at[one == two]] = True
@@ -229,18 +253,21 @@ def box_gap(one: FloatArray, two: FloatArray) -> float:
 def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
     """Nodes and edges of one boundary that lie deeper in another body than facets explain.
 
-    Edges are told where their ends are not as deep; also those that pass right through a body so
+    Edges are told where their ends are not as deep; also those that pass the middle of a body so
     thin that nothing is deep in it. A body whose whole boundary is inside is found, too.
 
     Args:
         a: Boundary whose nodes and edges are looked at.
         b: Boundary of the other body; of an open one, see `Placed.depth`.
-        least: Depth to report, in facet sizes, > 0.
+        least: Depth to report, in facet sizes as in `Found.size`, > 0.
     """
-    near = _edges_near(a, b, least)
+    # Facets do not explain how deep a body lies in them that is smaller than they are.
+    sizes, floor = np.minimum(b.sizes, a.width), _least_size(a, b)
+    near = _edges_near(a, b, least * floor)
     if not near.size:
         return _NOTHING
-    ends, size = a.x[a.boundary.edges[near]], a.edge_sizes(near)
+    ends = a.x[a.boundary.edges[near]]
+    size = np.minimum(a.edge_sizes(near), b.width)
     length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
     node, inverse = np.unique(a.boundary.edges[near], return_inverse=True)
     end = inverse.reshape(-1, 2)
@@ -248,37 +275,49 @@ def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
     for k in range(2):
         np.maximum.at(reach, end[:, k], length)
         np.maximum.at(around, end[:, k], size)
+    # No deeper than this is a node beside one that is not deep.
+    reach += least * np.maximum(around, sizes.max())
     widest = float(reach.max())
     part = b.facets_near(np.array([ends.min(axis=(0, 1)) - widest, ends.max(axis=(0, 1)) + widest]))
     at = b.depth(a.x[node], reach, part)
-    deep = at.value > least * np.maximum(around, b.sizes[at.facet])
+    deep = at.value > least * np.maximum(around, sizes[at.facet])
     enclosed = b.boundary.closed and not (at.facet >= 0).any()
     if enclosed and winding(a.x[node[0]], b.corners) > 0.5 or b.boundary.closed and deep.any():
         part = np.arange(len(b.corners))
         at = b.depth(a.x[node], np.inf)
-        deep = at.value > least * np.maximum(around, b.sizes[at.facet])
+        deep = at.value > least * np.maximum(around, sizes[at.facet])
     i = np.flatnonzero(deep)
-    depth, scale = at.value[i], np.maximum(around, b.sizes[at.facet])[i]
+    depth, scale = at.value[i], np.maximum(around, sizes[at.facet])[i]
     nodes = np.column_stack([node[i], node[i]])
-    inside = Found(nodes, a.x[node[i]], depth, depth / scale, at.facet[i])
-    start, limit = at.value[end], least * np.maximum(size, b.sizes.min())
-    through = _straddles(at, end) & (start < -limit[:, None]).all(axis=1)
-    limit[through] *= _THIN
+    inside = Found(nodes, a.x[node[i]], depth, depth / scale, at.facet[i], np.zeros(len(i), bool))
+    start, limit = at.value[end], least * np.maximum(size, floor)
+    middle, normal = _straddles(at, end), at.normal[end[:, 0]]
+    limit[middle] *= _THIN
     kept = ~deep[end].any(axis=1) & (start.sum(axis=1) + length > 2.0 * limit)
-    ends, size, start, limit, near = (v[kept] for v in (ends, size, start, limit, near))
+    ends, size, start, limit, near, middle, normal = (
+        v[kept] for v in (ends, size, start, limit, near, middle, normal)
+    )
     place, depth, facet = _deepest(ends, start, limit, b, part)
-    size = np.maximum(size, b.sizes[facet])
-    deep = depth > np.where(through[kept], limit, least * size)
-    crossing = Found(a.boundary.edges[near], place, depth, depth / size, facet).part(deep)
+    size = np.maximum(size, sizes[facet])
+    # What comes a little into the narrow side of a plate is nearer to that than to its middle.
+    middle &= np.abs(_cosine(b.normals(facet), normal)) > -_OPPOSITE
+    deep = depth > np.where(middle, limit, least * size)
+    # Where the middle of a body is passed, half its thickness is the depth.
+    size = np.where(middle, np.maximum(depth / size, 0.5), depth / size)
+    crossing = Found(a.boundary.edges[near], place, depth, size, facet, middle).part(deep)
     return Found._make(np.concatenate(pair) for pair in zip(inside, crossing, strict=True))
 
 
+def _least_size(a: Placed, b: Placed) -> float:
+    """Least facet size that depths of two bodies in each other are compared with [m]."""
+    return max(min(float(a.sizes.min()), b.width), min(float(b.sizes.min()), a.width))
+
+
 def _edges_near(a: Placed, b: Placed, least: float) -> IntArray:
-    """Edges of `a` that may be as deep in `b`, by boxes."""
+    """Edges of `a` that may be that deep [m] in `b`, by boxes."""
     ends = a.x[a.boundary.edges]
     if b.boundary.closed:
-        floor = least * max(float(a.sizes.min()), float(b.sizes.min()))
-        shrink = np.minimum(floor, _SHRINK * (b.box[1] - b.box[0]))
+        shrink = np.full(3, min(least, _SHRINK * float(b.extents[0])))
     else:  # what is inside need not be in the box
         shrink = np.full(3, -float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max()))
     inner = np.array([b.box[0] + shrink, b.box[1] - shrink])
@@ -287,11 +326,17 @@ def _edges_near(a: Placed, b: Placed, least: float) -> IntArray:
 
 def _straddles(at: Depth, end: IntArray) -> BoolArray:
     """Whether the ends (n, 2) of edges are over facets that face opposite ways, shape (n,)."""
-    normal = at.normal[end]
-    cosine = np.einsum("ni,ni->n", normal[:, 0], normal[:, 1])
-    opposite = cosine < _OPPOSITE * np.linalg.norm(normal, axis=2).prod(axis=1)
-    both: BoolArray = opposite & at.over[end].all(axis=1)
+    one, two = at.normal[end].transpose(1, 0, 2)
+    both: BoolArray = (_cosine(one, two) < _OPPOSITE) & at.over[end].all(axis=1)
     return both
+
+
+def _cosine(one: FloatArray, two: FloatArray) -> FloatArray:
+    """Cosine of the angles between vectors (n, 3) each, shape (n,); 0 where one is zero."""
+    length = np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
+    product = np.einsum("ni,ni->n", one, two)
+    cosine: FloatArray = np.divide(product, length, out=np.zeros_like(length), where=length > 0.0)
+    return cosine
 
 
 def _deepest(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,13 +29,17 @@ BoolArray = npt.NDArray[np.bool_]
 #: Bodies whose boxes meet are looked at again after a relative motion of this many facet sizes,
 #: but only after so many steps, which resolve a crossing at all, unless they have moved by a facet.
 _LOOK, _STEPS = 0.25, 4
+#: A motion within which one may pass through the other is looked at after so many of the least of
+#: such motions, but at no more places than this.
+_BETWEEN, _MOST = 0.5, 64
 
 
 class Finding(NamedTuple):
     """The worst of what a look found of a kind.
 
     Attributes:
-        kind: "edge through a body", "node inside a body" or "facet in an obstacle".
+        kind: "edge through a body", "node inside a body", "facet in an obstacle" or "node in an
+            obstacle".
         depth: Of the deepest point [m].
         size: The same in facet sizes [-].
         place: Where it is [m], shape (3,).
@@ -57,12 +61,28 @@ class Pause(NamedTuple):
     """How far two bodies may move relative to each other until the next look.
 
     Attributes:
-        least: [m] At least; a look is due after it and `_STEPS` steps.
-        most: [m] At most, in however few steps.
+        clear: [m] As far they cannot touch.
+        unit: [m] How far one may move in the other.
+        through: [m] Less does not take one through the other.
     """
 
-    least: float
-    most: float
+    clear: float
+    unit: float
+    through: float = np.inf
+
+    @property
+    def least(self) -> float:
+        """A look is due after this motion [m] and `_STEPS` steps."""
+        return self.clear + _LOOK * self.unit
+
+    @property
+    def most(self) -> float:
+        """A look is due after this motion [m], in however few steps."""
+        return self.clear + self.unit
+
+    def shorter(self, other: Pause) -> Pause:
+        """One that is no longer than both."""
+        return Pause(*map(min, self, other))
 
 
 @dataclass
@@ -102,6 +122,31 @@ class _Watched:
             for s in surfaces
         ]
 
+    def passed(
+        self,
+        before: dict[int, FloatArray],
+        after: dict[int, FloatArray],
+        way: float,
+        through: float,
+    ) -> Iterator[Finding]:
+        """What was inside on the way between two looks.
+
+        Args:
+            before: Points of each of the surfaces `needed` at the last look [m], by its id.
+            after: The same now.
+            way: Relative motion between them [m].
+            through: That which may take one through the other [m].
+        """
+        boxes = [
+            [Placed(b, x[id(s)]).box for x in (before, after)]
+            for b, s in zip(self._boundaries, self.surfaces, strict=True)
+        ]
+        first, last = _meeting(*np.array(boxes))
+        number = min(_MOST, int((last - first) * way / (_BETWEEN * through)) + 2)
+        for part in np.linspace(first, last, number) if first < last else ():
+            x = {i: (1.0 - part) * before[i] + part * after[i] for i in after}
+            yield from self.look(x, True)[0]
+
     def look(self, positions: dict[int, FloatArray], both: bool) -> tuple[list[Finding], Pause]:
         """What is inside, and how long nothing else may be.
 
@@ -117,21 +162,25 @@ class _Watched:
         boxes = sides[0].box, sides[1].box
         gap = box_gap(*boxes)
         findings: list[Finding] = []
+        # While one passes through the other, an edge of one of them is past the other's middle.
+        thickness = max(float(s.extents[0]) for s in sides) if self._whole is None else np.inf
         # Boxes of open surfaces do not hold what is behind them.
         if gap > 0.0 and self._whole is None:
-            far = gap + _LOOK * max(float(s.sizes.min()) for s in sides)
-            return findings, Pause(far, far)
+            way = min(max(float(s.sizes.min()) for s in sides), thickness)
+            return findings, Pause(gap, way, thickness)
         self._turn = 1 - self._turn
-        for k in (0, 1) if both else (self._turn,):
-            found = intrusions(sides[k], sides[1 - k])
-            if self._whole is not None:
-                found = self._enclosed(found, k, positions[id(self._whole)])
-            findings += self._worst(found, k)
         common = np.array([np.maximum(*(b[0] for b in boxes)), np.minimum(*(b[1] for b in boxes))])
         near = [s.sizes[s.facets_near(common)] for s in sides]
         smallest = [n.min() if n.size else s.sizes.min() for n, s in zip(near, sides, strict=True)]
         facet = float(max(smallest))
-        return findings, Pause(_LOOK * facet, facet)
+        way = min(facet, thickness)
+        # Of a body smaller than a facet no edge of the other one tells anything.
+        for k in (0, 1) if both or way < facet else (self._turn,):
+            found = intrusions(sides[k], sides[1 - k])
+            if self._whole is not None:
+                found = self._enclosed(found, k, positions[id(self._whole)])
+            findings += self._worst(found, k)
+        return findings, Pause(0.0, way, thickness)
 
     def _enclosed(self, found: Found, k: int, x: FloatArray) -> Found:
         """Those that the body's whole boundary (p, 3) encloses beside the part they lie on.
@@ -184,11 +233,30 @@ class _Watched:
                 "of the slave there, round the edges, or exchange slave and master"
             )
         depth, size = float(found.depth[i]), float(found.size[i])
-        text = (
-            f"{what} lies up to {depth:.3g} m, or {size:.2g} of a facet, inside {two!r} at "
-            f"({_point(found.place[i])}); {remedy}"
-        )
+        if found.middle[i]:
+            where = f"past the middle of {two!r}, up to {depth:.3g} m inside,"
+        else:
+            where = f"up to {depth:.3g} m, or {size:.2g} of a facet, inside {two!r}"
+        text = f"{what} lies {where} at ({_point(found.place[i])}); {remedy}"
         return Finding(kind, depth, size, found.place[i], (one, two), nodes, text)
+
+
+def _meeting(one: FloatArray, two: FloatArray) -> tuple[float, float]:
+    """First and last part of a motion in which boxes may meet; the first is larger if they do not.
+
+    Args:
+        one: Smallest and largest coordinates at the start and at the end [m], shape (2, 2, 3).
+        two: Those of the other box.
+    """
+    # Points that move evenly stay within bounds that move evenly. All of these must be negative.
+    apart = np.concatenate([one[:, 0] - two[:, 1], two[:, 0] - one[:, 1]], axis=1)
+    start, change = apart[0], apart[1] - apart[0]
+    if (apart > 0.0).all(axis=0).any():
+        return 1.0, 0.0
+    zero = np.divide(-start, change, out=np.zeros_like(start), where=change != 0.0)
+    first = zero[(start > 0.0) & (change < 0.0)].max(initial=0.0)
+    last = zero[(start <= 0.0) & (apart[1] > 0.0)].min(initial=1.0)
+    return float(first), float(last)
 
 
 def _point(x: FloatArray) -> str:
@@ -203,6 +271,12 @@ def _belong(surface: Surface, declared: Sequence[Surface]) -> BoolArray:
         if s.body is surface.body:
             result |= np.isin(surface.points, s.points)
     return result
+
+
+def _same_obstacle(one: Any, two: Any) -> bool:
+    """Whether two contacts are of the same body with the same obstacle."""
+    same = one.slave.body is two.slave.body and one.shares_master(two) is not None
+    return same and one.master.motion is two.master.motion
 
 
 class _BodyPair:
@@ -241,23 +315,55 @@ class _BodyPair:
             where: Of `where`.
             both: Look at the nodes and edges of both bodies; else of one and the other in turn.
         """
+        positions = self._positions(where)
+        looks = [part.look(positions, both) for part in self._parts]
+        pause = reduce(Pause.shorter, (pause for _, pause in looks))
+        return [f for found, _ in looks for f in found], pause
+
+    def passed(
+        self, before: list[FloatArray], after: list[FloatArray], way: float, through: float
+    ) -> list[Finding]:
+        """What was inside on the way from one look to the next. Collective.
+
+        Args:
+            before: Of `where`.
+            after: The same now.
+            way: Relative motion between them [m].
+            through: That which may take one through the other [m].
+        """
+        ends = self._positions(before), self._positions(after)
+        return [f for part in self._parts for f in part.passed(*ends, way, through)]
+
+    def _positions(self, where: list[FloatArray]) -> dict[int, FloatArray]:
+        """Points of all surfaces to look at [m], by the surface's id. Collective."""
         of = {id(self._boundary(k).body): u for k, u in zip(self._bodies, where, strict=True)}
         needed = {id(s): s for part in self._parts for s in part.needed}
-        positions = {i: s.positions(of[id(s.body)]) for i, s in needed.items()}
-        looks = [part.look(positions, both) for part in self._parts]
-        return [f for found, _ in looks for f in found], min(pause for _, pause in looks)
+        return {i: s.positions(of[id(s.body)]) for i, s in needed.items()}
 
 
 class _ObstacleContact:
-    """The slave of a contact and its obstacle, between whose nodes the obstacle may pass.
+    """The body of a contact and its obstacle, which may pass between nodes of the slave.
+
+    Nodes of the rest of the boundary, which no contact holds, are looked at, too, save those that
+    are in the obstacle from the start: a floor or a bore is larger in a scene than what it stands
+    for.
 
     Args:
         contact: The contact.
         body: Number of its body.
+        slaves: All slaves of the same obstacle.
+        boundary: The whole boundary of a body by its number. Collective.
     """
 
-    def __init__(self, contact: Any, body: int) -> None:
-        self._contact, self._body = contact, body
+    def __init__(
+        self,
+        contact: Any,
+        body: int,
+        slaves: Sequence[Surface],
+        boundary: Callable[[int], Surface],
+    ) -> None:
+        self._contact, self._body, self._slaves = contact, body, slaves
+        self._boundary = boundary
 
     def where(self, u: Sequence[FloatArray], time: float) -> list[FloatArray]:
         """What moves, each a displacement of its points [m], shape (3 n,). Collective."""
@@ -265,9 +371,65 @@ class _ObstacleContact:
         return [u[self._body], obstacle.displacement(time, slave.body.comm)]
 
     def look(self, where: list[FloatArray], both: bool) -> tuple[list[Finding], Pause]:
+        """The deepest facet of the slave and the deepest node of the rest. Collective."""
+        u, moved = where
+        found, pause = self._facets(u, moved)
+        if self._rest is None:
+            return found, pause
+        nodes, rest = self._nodes(*self._rest, u, moved)
+        return found + nodes, pause.shorter(rest)
+
+    def passed(
+        self, before: list[FloatArray], after: list[FloatArray], way: float, through: float
+    ) -> list[Finding]:
+        """Nothing: contact with obstacles looks at the paths of the slave's nodes itself."""
+        return []
+
+    @cached_property
+    def _rest(self) -> tuple[Surface, IntArray, FloatArray] | None:
+        """Boundary, its points that no contact holds, and their facets' size [m]. Collective."""
+        slave, obstacle = self._contact.slave, self._contact.master
+        if self._slaves[0] is not slave or not hasattr(slave.body, "mesh"):
+            return None  # another contact with the same obstacle looks at them
+        boundary = self._boundary(self._body)
+        x = boundary.reference
+        size = np.zeros(len(x))
+        for corner in boundary.facets.T:
+            np.maximum.at(size, corner, fc.size(x[boundary.facets]))
+        scale = np.minimum(size, obstacle.width)
+        free = ~_belong(boundary, self._slaves) & (obstacle.gap(x).value >= -LEAST * scale)
+        return (boundary, np.flatnonzero(free), scale[free]) if free.any() else None
+
+    def _nodes(
+        self,
+        boundary: Surface,
+        points: IntArray,
+        scale: FloatArray,
+        u: FloatArray,
+        moved: FloatArray,
+    ) -> tuple[list[Finding], Pause]:
+        """The deepest of the points `_rest`, and how long none may be as deep. Collective."""
+        obstacle = self._contact.master
+        x = boundary.positions(u)[points]
+        gap = obstacle.gap(x - moved).value
+        far, smallest = max(0.0, float(gap.min())), float(scale.min())
+        pause = Pause(far, smallest)
+        i = int((gap / scale).argmin())
+        depth, size = -float(gap[i]), -float(gap[i] / scale[i])
+        if size <= LEAST:
+            return [], pause
+        node, name = int(boundary.original[points[i]]), boundary.body.name
+        text = (
+            f"node {node} of {name!r} lies {depth:.3g} m, or {size:.2g} of a facet, inside "
+            f"{obstacle.name!r} at ({_point(x[i])}); no contact is declared of it with "
+            f"{obstacle.name!r}: extend the marker of the slave to it"
+        )
+        bodies = name, obstacle.name
+        return [Finding("node in an obstacle", depth, size, x[i], bodies, (node,), text)], pause
+
+    def _facets(self, u: FloatArray, moved: FloatArray) -> tuple[list[Finding], Pause]:
         """The deepest facet of the slave, and how long none may be as deep. Collective."""
         slave, obstacle = self._contact.slave, self._contact.master
-        u, moved = where
         x = slave.positions(u) - moved
         corners = x[slave.facets]
         size = fc.size(corners)
@@ -278,9 +440,8 @@ class _ObstacleContact:
         near = np.flatnonzero(gap < size)
         smallest = float(scale[near if near.size else slice(None)].min())
         if not near.size:
-            far = float((gap - size).min()) + _LOOK * smallest
-            return [], Pause(far, far)
-        pause = Pause(_LOOK * smallest, smallest)
+            return [], Pause(float((gap - size).min()), smallest)
+        pause = Pause(0.0, smallest)
         limit = LEAST * scale[near]
         place, depth = sunk(obstacle, corners[near], limit)
         deep = depth > limit
@@ -315,10 +476,13 @@ class _ObstacleContact:
 class OverlapWatch:
     """Looks whether bodies that are in a contact with each other end up inside each other.
 
-    Also whether obstacles end up inside facets of a slave that they are the master of. Bodies of
-    which no contact is declared may pass through each other. A look is due when the two have moved
-    relative to each other so far that they can touch; then by a quarter of a facet since the last
-    one, and four steps or a facet. The radius of a small obstacle counts as a facet.
+    Also whether obstacles end up inside facets of a slave that they are the master of, or nodes of
+    its body's remaining boundary in them. Bodies of which no contact is declared may pass through
+    each other. A look is due when the two have moved relative to each other so far that they can
+    touch; then by a quarter of a facet since the last one, and four steps or a facet. The radius of
+    a small obstacle counts as a facet, and so does the thickness of the thicker one of two bodies.
+    Where they have moved by more than that thickness between two looks, the straight way is looked
+    at, too.
 
     Args:
         system: The scene.
@@ -331,7 +495,9 @@ class OverlapWatch:
         self._pairs: list[_BodyPair | _ObstacleContact] = []
         for contact, bodies in zip(system.contacts, system.contact_bodies, strict=True):
             if len(contact.bodies) == 1 and len(contact.slave.facets):
-                self._pairs.append(_ObstacleContact(contact, *bodies))
+                alike = [c.slave for c in system.contacts if _same_obstacle(contact, c)]
+                slaves = [s for s in alike if len(s.facets)]
+                self._pairs.append(_ObstacleContact(contact, bodies[0], slaves, self._boundary))
             elif len(contact.bodies) == 2 and all(hasattr(b, "mesh") for b in contact.bodies):
                 between.setdefault(tuple(sorted(bodies)), []).append(contact)
         self._pairs += [_BodyPair(k, c, self._boundary) for k, c in between.items()]
@@ -349,7 +515,10 @@ class OverlapWatch:
         """
         now = [pair.where(u, time) for pair in self._pairs]
         findings: list[Finding] = []
-        for k in self._due(now, last):
+        for k, way in self._due(now, last):
+            before = self._looked.get(k)
+            if before and way > before.pause.clear + before.pause.through:
+                findings += self._pairs[k].passed(before.where, now[k], way, before.pause.through)
             found, pause = self._pairs[k].look(now[k], last or k not in self._looked)
             findings += found
             self._looked[k] = _Looked(now[k], pause)
@@ -359,9 +528,9 @@ class OverlapWatch:
                 worst[f.kind] = f
         return list(worst.values())
 
-    def _due(self, now: list[list[FloatArray]], last: bool) -> list[int]:
-        """Pairs that have moved enough. Collective."""
-        fresh = [k for k in range(len(now)) if k not in self._looked]
+    def _due(self, now: list[list[FloatArray]], last: bool) -> list[tuple[int, float]]:
+        """Pairs that have moved enough, and how far [m]. Collective."""
+        fresh = [(k, 0.0) for k in range(len(now)) if k not in self._looked]
         if not self._looked:
             return fresh
         # Largest motion in each direction; the opposite ones are the least.
@@ -376,14 +545,13 @@ class OverlapWatch:
         due = []
         for (k, looked), way in zip(self._looked.items(), ways.tolist(), strict=True):
             looked.steps += 1
-            least, most = looked.pause
-            enough = way > (least if looked.steps >= _STEPS else most)
+            enough = way > (looked.pause.least if looked.steps >= _STEPS else looked.pause.most)
             if enough or (last and way > 0.0):
-                due.append(k)
+                due.append((k, way))
         return fresh + due
 
     def _boundary(self, k: int) -> Surface:
-        """The whole boundary of a body. Collective."""
+        """The whole boundary of a body with a mesh. Collective."""
         if k not in self._surfaces:
             body = self._bodies[k]
             self._surfaces[k] = Surface(body, compat.exterior_facets(body.mesh))
