@@ -59,9 +59,11 @@ def test_motions_that_nothing_resists(options, stabilization, words):
     run = nts.equilibrium(standing(**options), stabilization=stabilization)
     if words is None:
         assert run.status == "completed" and "free motion" not in run.warnings
+    elif run.status.startswith("completed"):
+        assert words in run.warnings["free motion"].text and run.warnings["free motion"].grave
     else:
-        assert run.status.startswith("completed, but nothing resists")
-        assert words in run.warnings["free motion"].text
+        # Where rounding makes the matrix singular, the solver says so by itself.
+        assert COMM.size > 1 and "needs stabilization=0.1" in run.status
 
 
 @pytest.mark.parametrize("theta", [0.02, 0.5])

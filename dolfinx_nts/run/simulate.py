@@ -387,6 +387,8 @@ class Stepper:
         self._accept(state)
         self._started = True
         self.solution.rows = Table([self._first_row()])
+        # Where bodies were before the first step, for one that carries them through each other.
+        self.look()
 
     def look(self, *, last: bool = False) -> None:
         """Warn if what is in contact is inside each other; only as often as it has moved.

@@ -47,8 +47,6 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
     for k in range(len(bodies)):
         here = np.abs(diagonal.array_r[problem.of_body(k)])
         stiffest = max(stiffest, float(here.max(initial=0.0)))
-    for vector in (direction, result, diagonal):
-        vector.destroy()
     a = np.array(images)
     sizes = np.zeros((2, len(modes), len(modes)))
     sizes[0] = a @ a.T
@@ -57,10 +55,16 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
             sizes[1, i, j] = x @ y if k == m else 0.0
     comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.SUM)
     stiffest = float(global_max(comm, np.array([stiffest]))[0])
-    squares, combinations = scipy.linalg.eigh(sizes[0], sizes[1])
-    if not squares[0] <= (_NONE * stiffest) ** 2:
-        return None
-    return _describe(bodies, combinations[:, 0])
+    combination = scipy.linalg.eigh(sizes[0], sizes[1])[1][:, 0]
+    # Its square knows half the digits.
+    direction.set(0.0)
+    for part, (k, mode) in zip(combination, modes, strict=True):
+        direction.array_w[problem.of_body(k)] += part * mode
+    operator.mult(direction, result)
+    resistance = result.norm() / direction.norm()
+    for vector in (direction, result, diagonal):
+        vector.destroy()
+    return _describe(bodies, combination) if resistance <= _NONE * stiffest else None
 
 
 def _rigid(place: FloatArray, comm: Any) -> list[FloatArray]:
