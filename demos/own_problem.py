@@ -108,7 +108,7 @@ class Contact:
             self.state, time - self.state.time, 1.0, Static(), True, [u], [0 * u],
             zero + 0.1 * HEIGHT, zero + size, lambda bodies: 0.0,
         )  # fmt: skip
-        self.search.begin(step, None, search=True)
+        self.search.begin(step, self.state.contacts, None, search=True)
         elements = self.search.elements
         self.laid = Unknowns(self.comm, {0: len(u)}, elements, self.search.bodies)
         with self.laid.x as x:

@@ -22,6 +22,16 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 
+_EPS = float(np.finfo(float).eps)
+
+
+def over(value: float, limit: float) -> float:
+    """A size over its limit; 0 over anything is 0."""
+    if value == 0.0:
+        return 0.0
+    return float(value / limit) if limit > 0 else np.inf
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """A step as those know it who make its elements.
@@ -186,7 +196,8 @@ class Joint(Protocol):
 class PointElements:
     """What elements between points of bodies have in common, see `Elements`.
 
-    A kind of its own adds `evaluate`, and what else it has to say.
+    A kind of its own adds `evaluate`, and what else it has to say. Each element is to be on one
+    rank alone: what `body.points` gives is the same on all.
 
     Attributes:
         name: For messages.
@@ -246,7 +257,7 @@ class PointElements:
 
     @property
     def extent(self) -> float:
-        """Length beside the displacements whose rounding enters [m]."""
+        """Length beside the displacements whose rounding enters on this rank [m]."""
         return float(np.abs(self.reference()).max(initial=0.0))
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
@@ -260,14 +271,18 @@ class PointElements:
         return own
 
     def largest(self, part: Any) -> list[float]:
-        """Nothing to compare."""
-        return [0.0] * 4
+        """The largest row of its constraints, which are lengths [m], and its extent."""
+        rows = self.rows(part, "constraints")
+        return [0.0, float(np.abs(rows).max(initial=0.0)), 0.0, self.extent]
 
     def ratios(
         self, largest: FloatArray, motion: float, rounded: float, rtol: float
     ) -> dict[str, float]:
-        """No rows of its own."""
-        return {}
+        """Its constraints over what counts as converged, if it has any."""
+        if not self.widths["constraints"]:
+            return {}
+        limit = rtol * motion + 8 * _EPS * (rounded + float(largest[3]))
+        return {f"{self.name} constraints": over(float(largest[1]), limit)}
 
     def ledger(self, part: Any, factor: float) -> dict[str, float]:
         """Nothing lost."""
@@ -296,7 +311,7 @@ class EveryStep:
 
     Args:
         bodies: Numbers of their bodies in the system.
-        make: Makes the elements of a step.
+        make: Makes the elements of a step from it and from what is remembered.
         remember: What is remembered of an accepted one, from its part; nothing without.
     """
 
@@ -305,15 +320,15 @@ class EveryStep:
     def __init__(
         self,
         bodies: tuple[int, ...],
-        make: Callable[[Step], Any],
+        make: Callable[[Step, Any], Any],
         remember: Callable[[Any], Any] | None = None,
     ) -> None:
         self.bodies, self._make, self._remember = [bodies], make, remember
         self.elements: list[Any] = []
 
-    def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
+    def begin(self, step: Step, history: Any, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step."""
-        self.elements = [self._make(step)]
+        self.elements = [self._make(step, history)]
 
     def touched(self) -> set[int]:
         """All bodies."""
@@ -355,11 +370,12 @@ class Coupling(Protocol):
     elements: list[Any]
     bodies: list[tuple[int, ...]]
 
-    def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
+    def begin(self, step: Step, history: Any, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step. Collective.
 
         Args:
             step: The step.
+            history: What it remembers at t_n.
             again: Solution of this step that was not covered, see `misses`.
             search: Whether what may couple is sought anew.
         """

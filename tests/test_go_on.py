@@ -55,3 +55,28 @@ def test_forces_of_supports_and_contacts(integrator):
     assert np.abs(np.diff(momentum, axis=0) - DT * forces).max() < 1e-9 * 1e3
     assert np.abs(run.reactions["body"][1:, 0, 0]).max() > 1.0
     assert (run.reactions["body"][0] == 0).all() and run.contact_forces.shape == (31, 1, 3)
+
+
+def held(hold):
+    """A cube that flies, and one whose face is held from then on."""
+    bcs = [nts.Dirichlet(lambda x: x[0] < 1e-9, value=hold)] if hold is not None else []
+    return nts.Continuum(
+        MESH, nts.NeoHookean(1e6, 0.3), density=1e3, velocity=(0, 1, 0), bcs=bcs, name="cube"
+    )
+
+
+MESH = create_box(
+    COMM, [np.zeros(3), np.ones(3)], [2, 2, 2], CellType.hexahedron,
+    ghost_mode=GhostMode.shared_facet,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.GeneralizedAlpha()])
+def test_a_face_that_is_held_from_now_on_stands_still(integrator):
+    first = nts.simulate(nts.System([held(None)]), nts.EnergyMomentum(), dt=DT, t_end=10 * DT)
+    way = np.array([0.0, 10 * DT, 0.0])
+    body = held(tuple(way))
+    run = nts.simulate(nts.System([body]), integrator, dt=DT, t_end=20 * DT, start=first)
+    v = run.state.v[0]
+    assert np.abs(v[body.fixed]).max(initial=0.0) < 1e-9
+    assert run.balance["energy"][0] < first.balance["energy"][-1]

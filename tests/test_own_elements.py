@@ -84,7 +84,7 @@ class Spring:
         return np.concatenate(parts, axis=1)
 
     def coupling(self, bodies):
-        def make(step):
+        def make(step, history):
             u0 = [step.state.u[b] for b in bodies]
             return self._elements(step, self._elements(None).reference() + self._gathered(u0))
 
@@ -187,3 +187,93 @@ def test_a_joint_of_a_stranger_is_refused():
         nts.System([a], joints=[spring])
     with pytest.raises(TypeError, match=r"joints\[0\]=3: pass a sequence of joints"):
         nts.System([a], joints=[3])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DriveElements(nts.PointElements):
+    """A point that is drawn along x with a speed: a constraint whose multiplier is its force."""
+
+    speed: float
+    end: float
+
+    @property
+    def widths(self):
+        return {"augmented": 0, "constraints": 1}
+
+    @property
+    def pattern(self):
+        return np.zeros((1, 1), dtype=bool)
+
+    def evaluate(self, x, own):
+        (side,) = self.sides
+        n, k = side.weights.shape
+        along = np.zeros((n, k, 3))
+        along[..., 0] = side.weights
+        along = along.reshape(n, 3 * k)
+        place = np.einsum("nk,nk->n", along, x.reshape(n, -1)) if n else np.zeros(0)
+        start = np.einsum("nk,nk->n", along, self.reference().reshape(n, 3 * k))
+        residual, tangent = np.zeros((n, 3 * k + 1)), np.zeros((n, 3 * k + 1, 3 * k + 1))
+        residual[:, :-1] = MASS * own["constraints"] * along
+        residual[:, -1] = MASS * (place - start - self.speed * self.end)
+        tangent[:, :-1, -1], tangent[:, -1, :-1] = MASS * along, MASS * along
+        return nts.PointPart(residual, tangent)
+
+    def largest(self, part):
+        rows = np.abs(part.residual[:, -1]) / MASS
+        return [0.0, float(rows.max(initial=0.0)), 0.0, self.extent]
+
+
+MASS = 1e3
+
+
+class Drive:
+    """A joint with the ground whose constraint depends on time."""
+
+    losses = ()
+
+    def __init__(self, body, x, speed, name="drive"):
+        self.name, self.bodies, self.speed = name, (body,), speed
+        side = body.points(x)
+        self.side = side if COMM.rank == 0 else nts.Points(*(v[:0] for v in side))
+
+    def start(self):
+        return None
+
+    def potential(self, u):
+        return 0.0
+
+    def coupling(self, bodies):
+        def make(step, history):
+            return DriveElements(
+                name=self.name, sides=(self.side,), speed=self.speed,
+                end=step.state.time + step.dt,
+            )  # fmt: skip
+
+        return nts.EveryStep(bodies, make)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("newton", [{"linear_solver": "direct"}, {"linear_solver": "krylov"}])
+def test_a_drive_moves_what_it_holds(newton):
+    """Constraints of a joint count for convergence, also where nothing else moves."""
+    body, x = cube((0, 0, 0), "a"), np.array([0.3, 0.4, 0.6])
+    system = nts.System([body], joints=[Drive(body, x, 0.1)])
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=5e-3, t_end=0.05, newton=nts.Newton(**newton)
+    )
+    found = body.points(x)
+    u = np.concatenate(COMM.allgather(run.state.u[0])).reshape(-1, 3)
+    moved = found.weights[0] @ u[found.nodes[0]]
+    assert abs(moved[0] - 5e-3) < 1e-14
+    assert run.balance["newton_iterations"][1:].min() >= 1
+
+
+@pytest.mark.mpi
+def test_a_step_with_a_joint_that_fails_is_cut():
+    a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b", velocity=(30.0, 0, 0))
+    spring = Spring(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e7)
+    run = nts.simulate(
+        nts.System([a, b], joints=[spring]), nts.EnergyMomentum(), dt=5e-2, t_end=0.1,
+        newton=nts.Newton(max_iterations=1, max_retries=2),
+    )  # fmt: skip
+    assert run.retries == 2 and "not solved after" in run.status

@@ -100,3 +100,22 @@ def test_load_steps_that_are_too_few_for_the_ledger(load_steps):
         assert missed == pytest.approx(0.5 * 1.5**2 - 0.5 * 2 * 1.5, rel=1e-12)
         assert run.warnings["ledger"].worst == pytest.approx(-missed)
     assert ("ledger" in run.warnings) == (load_steps == 1)
+
+
+@pytest.mark.parametrize("young", [1e1, 1e4])
+def test_a_stiff_body_on_a_soft_one_is_held(young):
+    """Steel that sticks to a pad whose base is fixed: soft is not free."""
+    mesh = create_box(
+        COMM, [np.array([0, 0, -0.5]), np.array([1.0, 1.0, 0.0])], [2, 2, 1], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    pad = nts.Continuum(
+        mesh, nts.NeoHookean(young, 0.3), density=1e3, name="pad",
+        bcs=[nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)],
+    )  # fmt: skip
+    steel = nts.Continuum(box(2), nts.NeoHookean(2e11, 0.3), density=1e-3, name="steel")
+    pair = nts.ContactPair(
+        steel.surface(lambda x: x[2] < 1e-9), pad.surface(lambda x: x[2] > -1e-9), friction=np.inf
+    )
+    run = nts.equilibrium(nts.System([steel, pad], contacts=[pair], gravity=(0, 0, -9.81)))
+    assert "free motion" not in run.warnings

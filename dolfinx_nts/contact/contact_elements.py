@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.contact.pair import Candidates, ContactPair
+from dolfinx_nts.elements import over
 from dolfinx_nts.kernels import nts_element
 from dolfinx_nts.kernels.friction import length, return_map
 
@@ -658,10 +659,3 @@ class ContactElements:
                 "surface"
             )
         return float(weight[i]), text
-
-
-def over(value: float, limit: float) -> float:
-    """A size over its limit; 0 over anything is 0."""
-    if value == 0.0:
-        return 0.0
-    return float(value / limit) if limit > 0 else np.inf

@@ -67,9 +67,15 @@ class ContactSearch:
         self._known: dict[int, tuple[list[FloatArray], ContactElements]] = {}
 
     # ---- elements of a step
-    def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
+    def begin(
+        self,
+        step: Step,
+        history: tuple[ContactHistory, ...],
+        again: Evaluation | None,
+        search: bool,
+    ) -> None:
         """Make the elements of a step, as of `Coupling`. Collective."""
-        self._step, self._old = step, step.state.contacts
+        self._step, self._old = step, history
         time = step.state.time
         self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
         if again is None:

@@ -125,6 +125,7 @@ class _LoadStepper(Stepper):
             )  # fmt: skip
         self._accept(state)
         self._tell_inversion(step)
+        self._tell_slip(step)
         self._tell_free_motion(step)
         self.look()
 

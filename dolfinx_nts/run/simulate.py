@@ -17,7 +17,7 @@ from dolfinx_nts.bodies.inversion import describe, smallest_dets
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.output.writer import Writer
-from dolfinx_nts.parallel import first_problem, write_on_root
+from dolfinx_nts.parallel import first_problem, global_max, write_on_root
 from dolfinx_nts.run.run_warnings import RunWarnings
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.table import Table
@@ -49,6 +49,9 @@ _BESIDE = 1e-3
 _CUT = 0.4
 #: Smallest det F below which cells count as crushed.
 _CRUSHED = 0.05
+#: Part of the speed of supports by which a run that goes on may differ from their motion, as it
+#: does by the error of its steps.
+_JUMP = 0.1
 #: Cuts of a step before nodes that infinite friction holds may slip.
 _CUTS = 3
 #: Searches for contact, each along the motion that came of the one before.
@@ -259,8 +262,7 @@ class Stepper:
         if not integrator.accelerations:
             state = replace(state, a=())
         self._accept(state)
-        # A run that goes on moves on as it did.
-        self._started = start is not None and start.moving
+        self._started, self._goes_on = False, start is not None and start.moving
         self.solution.rows = Table([self._first_row()])
         self._promises = Promises(self.solution, integrator, self.newton.rtol)
         self._materials, self._material_change = MaterialWatch(system), 0.0
@@ -365,6 +367,9 @@ class Stepper:
     def start(self, dt: float) -> None:
         """Give prescribed coordinates the rate of their motion; later calls do nothing.
 
+        In a run that goes on from another one they keep their velocities unless the motion is
+        another one.
+
         As v_1 = 2 (u_1 - u_0)/h - v_0, another start would make their velocities alternate for
         ever. The rate is a one-sided difference of second order, as accurate as the integrators.
 
@@ -380,7 +385,13 @@ class Stepper:
         for body, values in zip(self.system.bodies, v, strict=True):
             p0, p1, p2 = (body.prescribed(self.state.time + s * dt) for s in (0.0, 0.5, 1.0))
             # So written, what does not move has the rate 0, not that of rounding.
-            values[body.fixed] = (4.0 * (p1 - p0) - (p2 - p0)) / dt
+            rate = (4.0 * (p1 - p0) - (p2 - p0)) / dt
+            old = values[body.fixed]
+            sizes = [np.abs(a).max(initial=0.0) for a in (rate - old, rate, old)]
+            off, *size = global_max(self.system.comm, np.array(sizes)).tolist()
+            # A run that goes on moves on as it did, unless its supports do not.
+            if not self._goes_on or off > _JUMP * max(size):
+                values[body.fixed] = rate
         state = replace(self.state, v=tuple(v))
         if self.problem.integrator.accelerations and not state.a:
             state = replace(state, a=self.problem.accelerations(state, dt))

@@ -163,15 +163,17 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
         without candidates), min_det (infinite without flexible bodies).
     """
     scale = 1.0 / problem.factor
-    sums, smallest = dict.fromkeys((*WORKS, *COUNTS), 0.0), {"min_gap": np.inf}
+    losses = (name for joint in problem.system.joints for name in joint.losses)
+    sums, smallest = dict.fromkeys((*WORKS, *COUNTS, *losses), 0.0), {"min_gap": np.inf}
     for body, terms in zip(problem.system.bodies, step.bodies, strict=True):
         work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed]
         sums["external_work"] += scale * float(work)
     for elements, part in zip(problem.elements, step.parts, strict=True):
         for name, value in elements.ledger(part, problem.factor).items():
-            sums[name] = sums.get(name, 0.0) + value
+            sums[name] += value
     for coupling, parts in problem.each(step):
-        smallest |= coupling.smallest(parts)
+        for name, value in coupling.smallest(parts).items():
+            smallest[name] = min(smallest[name], value)
     comm = problem.system.comm
     total = comm.allreduce(np.array(list(sums.values())))
     least = np.array(list(smallest.values()))

@@ -17,14 +17,15 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Resistance over the stiffness of a body that counts as none.
-_NONE = 1e-10
+#: Force against a motion over stiffness times motion that counts as none.
+_NONE = 1e-12
 
 
 def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> str | None:
     """How bodies may move as rigid ones without any force, if they may. Collective.
 
-    The matrix of the equations is applied to three translations and three rotations of each body.
+    The matrix of the equations is applied to three translations and three rotations of each body,
+    each over the body's stiffness, so that soft bodies count beside stiff ones.
 
     Args:
         problem: Equations of a load step.
@@ -34,19 +35,20 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
     operator = solver.assemble(step).operator
     comm, bodies = problem.system.comm, problem.system.bodies
     direction, result = problem.x.duplicate(), problem.x.duplicate()
-    modes, images, stiffest = [], [], 0.0
+    diagonal = operator.getDiagonal()
+    local = [np.abs(diagonal.array_r[problem.of_body(k)]).max(initial=0.0)
+             for k in range(len(bodies))]  # fmt: skip
+    stiffness = global_max(comm, np.array(local))
+    modes, images = [], []
     for k, body in enumerate(bodies):
         place = (body.reference + step.bodies[k].u1).reshape(-1, 3)
-        for mode in _rigid(place, comm):
+        for shape in _rigid(place, comm):
+            mode = shape / stiffness[k]
             direction.set(0.0)
             direction.array_w[problem.of_body(k)] = mode
             operator.mult(direction, result)
-            modes.append((k, mode))
+            modes.append((k, shape))
             images.append(result.array_r.copy())
-    diagonal = operator.getDiagonal()
-    for k in range(len(bodies)):
-        here = np.abs(diagonal.array_r[problem.of_body(k)])
-        stiffest = max(stiffest, float(here.max(initial=0.0)))
     a = np.array(images)
     sizes = np.zeros((2, len(modes), len(modes)))
     sizes[0] = a @ a.T
@@ -54,17 +56,21 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
         for j, (m, y) in enumerate(modes):
             sizes[1, i, j] = x @ y if k == m else 0.0
     comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.SUM)
-    stiffest = float(global_max(comm, np.array([stiffest]))[0])
     combination = scipy.linalg.eigh(sizes[0], sizes[1])[1][:, 0]
     # Its square knows half the digits.
     direction.set(0.0)
     for part, (k, mode) in zip(combination, modes, strict=True):
-        direction.array_w[problem.of_body(k)] += part * mode
+        direction.array_w[problem.of_body(k)] += part / stiffness[k] * mode
     operator.mult(direction, result)
-    resistance = result.norm() / direction.norm()
+    resistance = result.norm()
+    for k, value in enumerate(stiffness):
+        direction.array_w[problem.of_body(k)] *= value
+    forces = direction.norm()
     for vector in (direction, result, diagonal):
         vector.destroy()
-    return _describe(bodies, combination) if resistance <= _NONE * stiffest else None
+    if resistance > _NONE * forces:
+        return None
+    return _describe(bodies, combination.reshape(-1, 2, 3) / stiffness[:, None, None])
 
 
 def _rigid(place: FloatArray, comm: Any) -> list[FloatArray]:
@@ -77,8 +83,8 @@ def _rigid(place: FloatArray, comm: Any) -> list[FloatArray]:
     return translations + [np.cross(axis, arm / size).ravel() for axis in axes]
 
 
-def _describe(bodies: Any, combination: FloatArray) -> str:
-    parts = combination.reshape(-1, 2, 3)
+def _describe(bodies: Any, parts: FloatArray) -> str:
+    """The largest motion; of each body translations and rotations, shape (bodies, 2, 3)."""
     k, kind = np.unravel_index(np.linalg.norm(parts, axis=2).argmax(), parts.shape[:2])
     vector = parts[k, kind] / np.linalg.norm(parts[k, kind])
     vector *= np.sign(vector[np.abs(vector).argmax()])

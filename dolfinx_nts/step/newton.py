@@ -91,7 +91,7 @@ class Newton:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
         if self.linear_solver != "auto":
             return self.linear_solver
-        return choose(system.size, bool(system.contacts), inertia, given)
+        return choose(system.size, bool(system.contacts or system.joints), inertia, given)
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
@@ -503,7 +503,10 @@ class StepSolver:
         gathered = [n for part in problem.system.comm.allgather(notes) for n in part]
         # Of each body and contact the rank with the largest residual speaks, the worst one first.
         best = {name: text for name, _, text in sorted(gathered, key=lambda n: n[1])}
-        trouble = {name: max(r for k, r in ratio.items() if k.startswith(name)) for name in best}
+        trouble = {
+            name: max((r for k, r in ratio.items() if f"{k} ".startswith(f"{name} ")), default=0.0)
+            for name in best
+        }
         top = [best[name] for name in sorted(best, key=lambda name: -trouble[name])[:4]]
         why = f"SNES reason {reason}"
         endless = [

@@ -20,9 +20,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.body import Moment
-from dolfinx_nts.contact.contact_elements import over
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.elements import Coupling, Step
+from dolfinx_nts.elements import Coupling, Step, over
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.step.assembly import solve_mass
 from dolfinx_nts.step.sleep import Sleepers
@@ -167,7 +166,7 @@ class StepProblem:
         # Bodies at rest may fall.
         self._length = self._moved + self._motion + dt**2 * float(np.linalg.norm(self._gravity))
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
-        for bodies in map(list, system.contact_bodies):
+        for bodies in map(list, (*system.contact_bodies, *system.joint_bodies)):
             self._length[bodies] = self._length[bodies].max()
         # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
         old = self._diagonal_factor
@@ -177,8 +176,8 @@ class StepProblem:
             state, dt, self.factor, self.integrator, self.condense, self.first, way,
             self._motion, self._length, self._force_rounding_of,
         )  # fmt: skip
-        for coupling in self.couplings:
-            coupling.begin(step, again, search)
+        for coupling, history in zip(self.couplings, state.histories, strict=True):
+            coupling.begin(step, history, again, search)
         self._asleep = self._find_asleep(np.maximum(self._motion, speed) == 0.0)
         self._lay_out()
 
@@ -253,7 +252,8 @@ class StepProblem:
             del self._asleep[0]
         self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
         elements = self.elements
-        numbers = (np.array(self.awake), *(a for c in elements for a in c.points()))
+        widths = np.array([list(c.widths.values()) for c in elements])
+        numbers = (np.array(self.awake), widths, *(a for c in elements for a in c.points()))
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
             self.destroy()
             sizes = {k: system.bodies[k].num_owned for k in self.awake}
@@ -512,8 +512,9 @@ class StepProblem:
 
     @property
     def rounded_length(self) -> float:
-        """Largest length whose rounding enters forces and gaps [m]."""
-        return max(self.span, *(c.extent for c in self.elements), 0.0)
+        """Largest length whose rounding enters forces and gaps [m]. Collective."""
+        local = max([self.span, *(c.extent for c in self.elements)])
+        return float(global_max(self.system.comm, np.array([local]))[0])
 
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
@@ -589,4 +590,6 @@ def _box(system: System) -> tuple[FloatArray, float]:
 
 
 def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:
-    return b is not None and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+    if b is None or len(a) != len(b):
+        return False
+    return all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
