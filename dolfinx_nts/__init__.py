@@ -33,10 +33,10 @@ from dolfinx_nts.integrators import (
 )
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.strain_energy import Isotropic
-from dolfinx_nts.output.writer import Writer
 from dolfinx_nts.run.equilibrium import Equilibrium, equilibrium
 from dolfinx_nts.run.simulate import Solution, Stepper, simulate
 from dolfinx_nts.run.step_size import Adapt
+from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.step.newton import Newton
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, UserFunctionError

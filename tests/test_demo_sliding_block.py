@@ -49,6 +49,7 @@ ranks = pytest.param(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["serial", ranks])
 def test_all_parts_on_a_plane(where, mpi_tmp_path):
     results = demo.main(

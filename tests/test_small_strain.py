@@ -217,6 +217,7 @@ def test_ledger_far_from_the_origin(away):
     assert impact(2.0, 0.05, away) < 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_ledger_of_an_energy_of_c_far_from_the_origin():
     """Nor does its floor grow with the distance: the same energy as a function of C."""

@@ -273,6 +273,7 @@ def test_metres_millimetres_micrometres():
         assert np.array_equal(run.balance["newton_iterations"], first["newton_iterations"])
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_the_ledger_is_closed_with_friction():
     system = rubbing_blocks(0.3)

@@ -125,6 +125,7 @@ def test_a_bead_at_the_side_of_a_ring_hangs_by_infinite_friction(name, integrato
     assert np.linalg.norm(run.balance["linear_momentum"][-1]) < 1e-4 * MASS
 
 
+@pytest.mark.fast("energy-momentum")
 @pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])
 def test_strong_friction_has_a_limit(integrator):
     """A soft disc released at the side of a ring, whose nodes press next to nothing there."""

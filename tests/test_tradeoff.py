@@ -52,6 +52,7 @@ def test_error_of_the_trajectory_is_of_second_order(script):
     assert tradeoff.recommend(rows)[0][1] in others
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_adaptive_steps_beside_equal_ones(script):
     """`dt` is the largest step; more and smaller steps for a smaller tolerance, less error."""

@@ -31,6 +31,7 @@ def assert_conserved(result, ledger=1e-11):
     assert abs(result["energy_lost"] - result["contact_defect"]) <= ledger
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_demo_reaches_the_reference_figures():
     results = two_blocks.main(COMM)

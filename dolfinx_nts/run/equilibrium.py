@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.integrators import Static
-from dolfinx_nts.output.writer import Writer
 from dolfinx_nts.run.simulate import Solution, Stepper, run, writers
 from dolfinx_nts.run.table import Table
+from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.step import balance, resultants
 from dolfinx_nts.step.free_motion import free_motion
 from dolfinx_nts.step.newton import Newton

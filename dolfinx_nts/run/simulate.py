@@ -16,11 +16,11 @@ from mpi4py import MPI
 from dolfinx_nts.bodies.inversion import describe, smallest_dets
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.output.writer import Writer
 from dolfinx_nts.parallel import first_problem, global_max, write_on_root
 from dolfinx_nts.run.run_warnings import RunWarnings
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.table import Table
+from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.step import balance, resultants
 from dolfinx_nts.step.guards import check_momentum
 from dolfinx_nts.step.newton import ACCURACY, Newton, StepSolver
