@@ -74,6 +74,7 @@ class _LoadStepper(Stepper):
     def __init__(self, system: System, stabilization: float, **options: Any) -> None:
         super().__init__(system, Static(), **options)
         self._stabilization = stabilization
+        self._solved: Evaluation | None = None
         self._rates = [np.zeros_like(u) for u in self.state.u]
         self._forces = [np.zeros_like(u) for u in self.state.u]
         self._accept(replace(self.state, v=tuple(self._rates)))
@@ -126,14 +127,20 @@ class _LoadStepper(Stepper):
         self._accept(state)
         self._tell_inversion(step)
         self._tell_slip(step)
-        self._tell_free_motion(step)
+        self._solved = step
         self.look()
 
-    def _tell_free_motion(self, step: Evaluation) -> None:
-        """Warn, once, of motions that nothing resists; stabilization would leave them at rest."""
-        if self._stabilization or "free motion" in self.solution.warnings:
+    def look(self, *, last: bool = False) -> None:
+        """As of `Stepper`, and at the end for motions that nothing resists."""
+        super().look(last=last)
+        if last:
+            self._tell_free_motion()
+
+    def _tell_free_motion(self) -> None:
+        """Warn of motions that nothing resists; stabilization would leave them at rest."""
+        if self._stabilization or self._solved is None:
             return
-        found = free_motion(self.problem, self.solver, step)
+        found = free_motion(self.problem, self.solver, self._solved)
         if found:
             self.solution.warn(
                 "free motion", self.state.time, 1.0,
