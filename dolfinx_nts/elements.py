@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.body import places_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.integrators import Integrator
 
@@ -60,11 +61,19 @@ class Step:
     length: FloatArray
     force_rounding: Callable[[Sequence[int]], float]
 
+    def mean_scale(self, body: Any) -> float:
+        """The same in the mean over a body's places. Collective."""
+        inertia = self.integrator.inertia
+        values = body.nodal_mass if inertia else body.nodal_stiffness(self.integrator)
+        chosen = values[::3][places_of(body)]
+        total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
+        return float(total[0] / total[1])
+
     def scale(self, surface: Surface) -> FloatArray:
         """Force per motion of a surface's points in the units of the step, (p,). Collective."""
         if self.integrator.inertia:
             return surface.mass
-        return surface.nodal(surface.body.nodal_stiffness(self.integrator))
+        return surface.material.divided(surface.body.nodal_stiffness(self.integrator))
 
 
 class Part(Protocol):
@@ -229,17 +238,11 @@ class PointElements:
 
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates of each body's nodes."""
-        return tuple(self._flat(side.dofs) for side in self.sides)
-
-    @staticmethod
-    def _flat(numbers: IntArray) -> IntArray:
-        n, k, _ = numbers.shape
-        flat: IntArray = numbers.reshape(n, 3 * k)
-        return flat
+        return tuple(side.flat() for side in self.sides)
 
     def dofs(self) -> tuple[IntArray, ...]:
         """The same with -1 where they are prescribed."""
-        return tuple(self._flat(np.where(side.fixed, -1, side.dofs)) for side in self.sides)
+        return tuple(side.flat(prescribed=-1) for side in self.sides)
 
     def reference(self) -> FloatArray:
         """Reference positions of the nodes [m], shape (n, nodes, 3)."""

@@ -56,7 +56,7 @@ class Spring:
         self.name, self.bodies, self.stiffness, self.damping = name, (a, b), stiffness, damping
         self._sides = tuple(body.points(x) for body, x in zip((a, b), points, strict=True))
         if COMM.rank:
-            self._sides = tuple(nts.Points(*(v[:0] for v in side)) for side in self._sides)
+            self._sides = tuple(side.part(slice(0)) for side in self._sides)
         rest = self._elements(None).lengths(self._elements(None).reference())
         self.length = length if length is not None else float(COMM.bcast(rest)[0])
 
@@ -234,7 +234,7 @@ class Drive:
     def __init__(self, body, x, speed, name="drive"):
         self.name, self.bodies, self.speed = name, (body,), speed
         side = body.points(x)
-        self.side = side if COMM.rank == 0 else nts.Points(*(v[:0] for v in side))
+        self.side = side if COMM.rank == 0 else side.part(slice(0))
 
     def start(self):
         return None

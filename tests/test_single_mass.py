@@ -84,8 +84,12 @@ class PointSurface(nts.Surface):
         self.reference = np.array([position], dtype=float)
         self.facets, self.area = np.empty((0, 4), dtype=np.int64), np.ones(1)
         self.share = np.arange(body.num_owned // 3)
-        self.rows = np.arange(body.num_owned).reshape(-1, 3)
+        self.rows = self.share
         self.fixed = np.zeros((1, 3), dtype=bool)
+        one = np.ones((1, 1))
+        self.material = nts.Points(
+            body, np.array([[0]]), one, self.reference[:, None], self.fixed[:, None], one > 0
+        )
 
 
 def turn(angle=0.7):

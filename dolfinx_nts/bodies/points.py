@@ -2,41 +2,120 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import basix
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.parallel import gather_rows, raise_together
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 
-class Points(NamedTuple):
-    """Material points, the same on all ranks; axis 0 = point.
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Material points of a body, or directions in it, the same on all ranks; axis 0 = point.
 
     Attributes:
+        body: The body.
         nodes: Global numbers of the nodes y_a that a point depends on, shape (n, k); their
             coordinates are 3 node, 3 node + 1, 3 node + 2.
         weights: w_a, shape (n, k).
-        reference: Reference positions of the nodes [m], shape (n, k, 3).
+        reference: Reference values of the nodes [m], shape (n, k, 3).
         fixed: Which coordinates of the nodes are prescribed, shape (n, k, 3).
+        places: Whether the nodes are places, t_a = 1, or directors, shape (n, k).
     """
 
+    body: Any
     nodes: IntArray
     weights: FloatArray
     reference: FloatArray
     fixed: BoolArray
+    places: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.nodes)
 
     @property
     def dofs(self) -> IntArray:
         """Global coordinates of the nodes, shape (n, k, 3)."""
         dofs: IntArray = 3 * self.nodes[:, :, None] + np.arange(3)
         return dofs
+
+    def flat(self, prescribed: int | None = None) -> IntArray:
+        """`dofs` as (n, 3 k), with `prescribed` in place of coordinates that are."""
+        numbers = self.dofs if prescribed is None else np.where(self.fixed, prescribed, self.dofs)
+        return numbers.reshape(len(self), 3 * self.nodes.shape[1])
+
+    def part(self, chosen: Any) -> Points:
+        """Some of them, by numbers, a slice or a mask; the ranks may choose differently."""
+        arrays = (self.nodes, self.weights, self.reference, self.fixed, self.places)
+        return Points(self.body, *(a[chosen] for a in arrays))
+
+    def with_weights(self, weights: FloatArray) -> Points:
+        """The same nodes with other weights, shape (n, k)."""
+        return replace(self, weights=weights)
+
+    @cached_property
+    def _table(self) -> tuple[IntArray, IntArray]:
+        """Rows of this rank's nodes among its owned ones, and where each node is. Collective."""
+        used, index = np.unique(self.nodes, return_inverse=True)
+        used = np.unique(gather_rows(self.body.comm, used))
+        index = np.searchsorted(used, self.nodes)
+        count = self.body.num_owned // 3
+        first = (self.body.comm.exscan(count) or 0) if self.body.comm.rank else 0
+        own = used[(used >= first) & (used < first + count)]
+        return own - first, index
+
+    def nodal(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values at the nodes of all points, (n, k, 3), from this rank's coordinates. Collective.
+
+        Args:
+            values: At this rank's owned coordinates, shape (num_owned,).
+        """
+        rows, index = self._table
+        table = gather_rows(self.body.comm, values.reshape(-1, 3)[rows])
+        found: npt.NDArray[Any] = table[index]
+        return found
+
+    def divided(self, values: FloatArray) -> FloatArray:
+        """What the nodes' places have, such as mass, divided among the points, (n,). Collective.
+
+        Args:
+            values: At this rank's owned coordinates, alike in all three directions.
+        """
+        share = np.where(self.places, self.weights, 0.0)
+        total = np.zeros(int(self.nodes.max(initial=-1)) + 1)
+        np.add.at(total, self.nodes, share)
+        per_node = self.nodal(values)[:, :, 0] / np.where(self.places, total[self.nodes], 1.0)
+        result: FloatArray = (share * per_node).sum(axis=1)
+        return result
+
+    def at(self, values: FloatArray) -> FloatArray:
+        """Values at the points, (n, 3), from this rank's coordinates. Collective.
+
+        Args:
+            values: At this rank's owned coordinates, shape (num_owned,).
+        """
+        return self.combine(self.nodal(values))
+
+    def combine(self, values: FloatArray) -> FloatArray:
+        """Values at the points, (n, 3), from those at their nodes (n, k, 3)."""
+        if self.are_nodes:
+            return values[:, 0]
+        combined: FloatArray = np.einsum("na,nai->ni", self.weights, values)
+        return combined
+
+    @cached_property
+    def are_nodes(self) -> bool:
+        """Whether each point is one node."""
+        return self.weights.shape[1] == 1 and bool((self.weights == 1.0).all())
 
 
 def in_mesh(body: Any, x: FloatArray, name: str) -> Points:
@@ -80,4 +159,21 @@ def in_mesh(body: Any, x: FloatArray, name: str) -> Points:
         else None,
     )
     columns = zip(*(found[i] for i in range(len(x))), strict=True)
-    return Points(*(np.array(values) for values in columns))
+    nodes, weights, reference, fixed = (np.array(values) for values in columns)
+    return Points(body, nodes, weights, reference, fixed, np.ones(nodes.shape, dtype=bool))
+
+
+def at_nodes(body: Any, nodes: IntArray, x: FloatArray) -> Points:
+    """Points that are nodes of a body with a Lagrange space. Collective.
+
+    Args:
+        body: The body; it has `comm`, `num_owned` and `fixed`.
+        nodes: Global numbers, sorted, shape (n,), the same on all ranks.
+        x: Reference positions [m], shape (n, 3).
+    """
+    one = np.ones((len(nodes), 1))
+    free = np.zeros((len(nodes), 1, 3), dtype=bool)
+    points = Points(body, nodes[:, None], one, x[:, None], free, one.astype(bool))
+    prescribed = np.zeros(body.num_owned, dtype=bool)
+    prescribed[body.fixed] = True
+    return replace(points, fixed=points.nodal(prescribed))

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.elements import over
 from dolfinx_nts.kernels import nts_element
@@ -52,7 +53,7 @@ class Contribution(NamedTuple):
     """Step equations of the pairs at an iterate, all rows [kg m] for unknowns in [m].
 
     Attributes:
-        residual: Shape (n, r), r = 3 (nc + 1) + augmented + constraints.
+        residual: Shape (n, r), r = coordinates + augmented + constraints.
         tangent: Shape (n, r, r).
         multiplier: h^2/2 lambda of the constraints [kg m], shape (n, constraints).
         gap: g_N at t_{n+1} [m], shape (n,).
@@ -60,7 +61,8 @@ class Contribution(NamedTuple):
         stick: Active pairs that stick, shape (n,).
         slip: Facet size times f_1 - f_0 [m], shape (n, 2); (n, 0) without friction.
         distance: Length of the slip in the metric [m], shape (n,); 0 where not active.
-        tangential: Contact force on the slave less its part along the normal [kg m], shape (n, 3).
+        force: Contact force on the slave [kg m], shape (n, 3).
+        tangential: The same less its part along the normal.
     """
 
     residual: FloatArray
@@ -71,6 +73,7 @@ class Contribution(NamedTuple):
     stick: BoolArray
     slip: FloatArray
     distance: FloatArray
+    force: FloatArray
     tangential: FloatArray
 
     @property
@@ -127,7 +130,7 @@ class ContactElements:
         candidates: This rank's slave nodes and their facets.
         rule: "direct" for the midpoint rule, else the discrete gradient.
         condense: Whether (d, f) and their multipliers are eliminated pair by pair.
-        x0: Slave, and what the master is interpolated from, at t_n [m], shape (n, nc + 1, 3).
+        x0: Slave, and what the master is interpolated from, at t_n [m], (n, control + 1, 3).
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
             nodal mass [kg] in dynamics; scales multipliers.
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
@@ -151,8 +154,8 @@ class ContactElements:
 
     # ---- what a kind of master has of its own
     @property
-    def num_points(self) -> int:
-        """Points of the master that a pair depends on."""
+    def num_control(self) -> int:
+        """Points that the master is interpolated from."""
         raise NotImplementedError
 
     @property
@@ -165,8 +168,14 @@ class ContactElements:
         """Constraints per pair but those of friction; that of the gap comes first."""
         return 1
 
-    def master_numbers(self) -> tuple[tuple[IntArray, BoolArray], ...]:
-        """Global coordinates of the masters' points, shape (n, 3 points), and which are fixed."""
+    @property
+    def master_nodes(self) -> Points | None:
+        """Nodes of the master's body that each pair depends on, if it has a body."""
+        raise NotImplementedError
+
+    @property
+    def _master_fixed(self) -> BoolArray:
+        """Which coordinates of the masters' points are prescribed, shape (n, points, 3)."""
         raise NotImplementedError
 
     @property
@@ -179,10 +188,6 @@ class ContactElements:
         """Length beside the displacements whose rounding enters the gaps [m]."""
         return self.pair.extent
 
-    def reference(self) -> FloatArray:
-        """Reference positions of slaves and points in the pair's frame [m], (n, points + 1, 3)."""
-        raise NotImplementedError
-
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""
         raise NotImplementedError
@@ -192,7 +197,7 @@ class ContactElements:
         return 0.0
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
-        """Augmented unknowns that fit predicted positions (n, points + 1, 3)."""
+        """Augmented unknowns that fit predicted nodes (n, k, 3), as of `reference`."""
         return np.empty((self.num_elements, 0))
 
     @property
@@ -215,12 +220,10 @@ class ContactElements:
         """Tangents of the master at t_n over their size [-], shape (n, 2, 3)."""
         raise NotImplementedError
 
-    def _control(self, x: FloatArray) -> FloatArray:
-        """Slave and control points from slave and points."""
-        return x
-
-    def _to_points(self, part: Contribution) -> None:
-        """The transpose of `_control`: forces and tangents of control points to their points."""
+    @property
+    def _control_weights(self) -> FloatArray | None:
+        """Weights of the masters' nodes in the control points, (n, control, k); None if one."""
+        return None
 
     def _normal(self, x: FloatArray) -> FloatArray:
         """Normal where the contact force acts, shape (n, 3)."""
@@ -245,8 +248,15 @@ class ContactElements:
 
     @property
     def num_coordinates(self) -> int:
-        """Coordinates of the slave and the master's points of a pair."""
-        return 3 * (self.num_points + 1)
+        """Coordinates of the nodes that slave and master of a pair depend on."""
+        master = self.master_nodes
+        slave_nodes: int = self.pair.slave.material.nodes.shape[1]
+        return 3 * (slave_nodes + (0 if master is None else master.nodes.shape[1]))
+
+    @property
+    def _num_places(self) -> int:
+        """Coordinates of the slave and the control points, in which pairs are evaluated."""
+        return 3 * (self.num_control + 1)
 
     @property
     def num_tangential(self) -> int:
@@ -279,24 +289,74 @@ class ContactElements:
             self, candidates=found, x0=self.x0[chosen], scale=self.scale[chosen]
         )
 
-    def _coordinates(self) -> list[tuple[IntArray, BoolArray]]:
-        """Global coordinates of slaves (n, 3) and masters, and which of them are prescribed."""
-        slave = self.pair.slave
-        points = slave.share[self.candidates.node]
-        return [(slave.dofs[points], slave.fixed[points]), *self.master_numbers()]
+    @cached_property
+    def _slave_points(self) -> IntArray:
+        """Positions of the slaves in their surface, shape (n,)."""
+        points: IntArray = self.pair.slave.share[self.candidates.node]
+        return points
 
-    def dofs(self) -> tuple[IntArray, ...]:
-        """Global coordinates of slaves (n, 3) and masters (n, 3 points); -1 where prescribed."""
-        return tuple(np.where(fixed, -1, numbers) for numbers, fixed in self._coordinates())
+    @cached_property
+    def _nodes(self) -> list[Points]:
+        """Nodes that the slaves depend on, and those of the masters."""
+        master = self.master_nodes
+        slave = self.pair.slave.material.part(self._slave_points)
+        return [slave] if master is None else [slave, master]
 
     def points(self) -> tuple[IntArray, ...]:
-        """Global coordinates as in `dofs`, prescribed ones included."""
-        return tuple(numbers for numbers, _ in self._coordinates())
+        """Global coordinates of the slaves' nodes (n, 3 k) and of the masters'."""
+        return tuple(nodes.flat() for nodes in self._nodes)
+
+    def dofs(self) -> tuple[IntArray, ...]:
+        """The same with -1 where they are prescribed."""
+        return tuple(nodes.flat(prescribed=-1) for nodes in self._nodes)
+
+    def reference(self) -> FloatArray:
+        """Reference values of these nodes [m], places in the pair's frame, shape (n, k, 3)."""
+        origin = self.pair.origin
+        each = [n.reference - np.where(n.places[:, :, None], origin, 0.0) for n in self._nodes]
+        return np.concatenate(each, axis=1)
+
+    @cached_property
+    def _map(self) -> FloatArray | None:
+        """Weights of the nodes in slave and control points, (n, control + 1, k); None if one."""
+        slave, control = self._nodes[0], self._control_weights
+        if slave.are_nodes and control is None:
+            return None
+        if control is None:
+            shape = (self.num_elements, self.num_control, self.num_control)
+            control = np.broadcast_to(np.eye(self.num_control), shape)
+        own = slave.nodes.shape[1]
+        both = np.zeros((self.num_elements, self.num_control + 1, own + control.shape[2]))
+        both[:, 0, :own], both[:, 1:, own:] = slave.weights, control
+        return both
+
+    def _control(self, y: FloatArray) -> FloatArray:
+        """Slave and control points (n, control + 1, 3) from nodes (n, k, 3) [m]."""
+        x: FloatArray = y if self._map is None else np.matmul(self._map, y)
+        return x
+
+    def _to_nodes(self, part: Contribution) -> Contribution:
+        """The transpose of `_control`: forces and tangents of nodes from those of points."""
+        if self._map is None:
+            return part
+        n, size = part.residual.shape
+        points, turned = slice(self._num_places), self._map.transpose(0, 2, 1)
+        places, width = (self.num_control + 1, 3), self.num_coordinates
+        force = np.matmul(turned, part.residual[:, points].reshape(n, *places)).reshape(n, width)
+        residual = np.concatenate([force, part.residual[:, self._num_places :]], axis=1)
+        columns = part.tangent[:, :, points].reshape(n, size, *places)
+        columns = np.matmul(turned[:, None], columns).reshape(n, size, width)
+        tangent = np.concatenate([columns, part.tangent[:, :, self._num_places :]], axis=2)
+        wide = tangent.shape[2]
+        rows = np.matmul(turned, tangent[:, points].reshape(n, places[0], 3 * wide))
+        tangent = np.concatenate(
+            [rows.reshape(n, width, wide), tangent[:, self._num_places :]], axis=1
+        )
+        return part._replace(residual=residual, tangent=tangent)
 
     def input_node(self, i: int) -> int:
         """Number of a pair's slave node in the user's mesh."""
-        slave = self.pair.slave
-        return int(slave.original[slave.share[self.candidates.node[i]]])
+        return int(self.pair.slave.original[self._slave_points[i]])
 
     @property
     def gap_rounding(self) -> FloatArray:
@@ -322,9 +382,9 @@ class ContactElements:
 
     @cached_property
     def _free(self) -> BoolArray:
-        """Coordinates of slaves and masters that are not prescribed, shape (n, np + 1, 3)."""
-        fixed = np.concatenate([fixed for _, fixed in self._coordinates()], axis=1)
-        free: BoolArray = ~fixed.reshape(self.num_elements, self.num_points + 1, 3)
+        """Coordinates of slaves and points that are not prescribed, shape (n, points + 1, 3)."""
+        slave = self.pair.slave.fixed[self._slave_points][:, None]
+        free: BoolArray = ~np.concatenate([slave, self._master_fixed], axis=1)
         return free
 
     @cached_property
@@ -424,7 +484,7 @@ class ContactElements:
         """Residual and tangent of the pairs; pure.
 
         Args:
-            x: Slave and the master's points at t_{n+1} [m], shape (n, points + 1, 3).
+            x: Nodes of slave and master at t_{n+1} [m], shape (n, k, 3).
             own: "augmented": facet size times (d, f) [m], shape (n, 5) or (n, 0); "constraints":
                 h^2/2 lambda of the scaled constraints, and of lambda_T over the facet size, over
                 `scale` [m], shape (n, constraints).
@@ -437,10 +497,10 @@ class ContactElements:
         residual, tangent, gap, slip = self._element(x, own["augmented"], multiplier)
         part = self._laws(x, residual, tangent, gap, slip, multiplier)
         if slip is not None:
-            force, normal = -residual[:, :3], self._normal(x)
-            along = np.einsum("ni,ni->n", force, normal)
-            part.tangential[:] = force - along[:, None] * normal
-        self._to_points(part)
+            normal = self._normal(x)
+            along = np.einsum("ni,ni->n", part.force, normal)
+            part.tangential[:] = part.force - along[:, None] * normal
+        part = self._to_nodes(part)
         # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
         rows = slice(part.residual.shape[1] - self.num_constraints, None)
         part.residual[:, rows] *= scale
@@ -455,7 +515,7 @@ class ContactElements:
         off = none.astype(bool)
         return Contribution(
             np.zeros((0, size)), np.zeros((0, size, size)), np.zeros((0, self.num_constraints)),
-            none, off, off, slip, none, tangential=np.zeros((0, 3)),
+            none, off, off, slip, none, np.zeros((0, 3)), np.zeros((0, 3)),
         )  # fmt: skip
 
     def _laws(
@@ -487,6 +547,7 @@ class ContactElements:
             stick=np.zeros_like(active),
             slip=np.empty((self.num_elements, 0)) if slip is None else slip.value,
             distance=np.zeros(self.num_elements),
+            force=-residual[:, :3],
             tangential=np.zeros((self.num_elements, 3)),
         )
         if slip is not None:

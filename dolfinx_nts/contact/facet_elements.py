@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.contact_elements import ContactElements, Contribution, Slip
+from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.contact.contact_elements import ContactElements, Slip
 from dolfinx_nts.kernels import facets, nts_element
 
 FloatArray = npt.NDArray[np.float64]
@@ -42,8 +43,8 @@ class FacetElements(ContactElements):
         )
 
     @property
-    def num_points(self) -> int:
-        """Corners of a facet, or points of its patch."""
+    def num_control(self) -> int:
+        """Corners of a facet, or control points of its patch."""
         return self.pair.master.patches.shape[1]
 
     @property
@@ -60,16 +61,23 @@ class FacetElements(ContactElements):
     def _num_normal(self) -> int:
         return 1 if self._only_normal else nts_element.NUM_CONSTRAINTS
 
-    def master_numbers(self) -> tuple[tuple[IntArray, BoolArray], ...]:
-        """Global coordinates of the facets' points, shape (n, 3 points), and which are fixed."""
+    @cached_property
+    def master_nodes(self) -> Points:
+        """Nodes that the facets depend on."""
+        nodes: Points = self.pair.master.facet_nodes.part(self.candidates.facet)
+        return nodes
+
+    @cached_property
+    def _master_fixed(self) -> BoolArray:
+        """Which coordinates of the facets' points are prescribed, shape (n, points, 3)."""
         master = self.pair.master
-        points, shape = master.patches[self.candidates.facet], (-1, 3 * self.num_points)
-        return ((master.dofs[points].reshape(shape), master.fixed[points].reshape(shape)),)
+        fixed: BoolArray = master.fixed[master.patches[self.candidates.facet]]
+        return fixed
 
     @property
     def immovable(self) -> BoolArray:
         """Whether all coordinates of the pairs' masters are prescribed, shape (n,)."""
-        fixed: BoolArray = self.master_numbers()[0][1].all(axis=1)
+        fixed: BoolArray = self._master_fixed.all(axis=(1, 2))
         return fixed
 
     @property
@@ -82,58 +90,32 @@ class FacetElements(ContactElements):
     @cached_property
     def foot(self) -> FloatArray:
         """Weights of the control points in the foot at t_n, shape (n, nc)."""
-        return facets.shape(self.candidates.xi, self.num_points)[0]
+        return facets.shape(self.candidates.xi, self.num_control)[0]
 
     @property
     def point_foot(self) -> FloatArray:
         """Weights of the masters' points in the foot at t_n, shape (n, points)."""
-        if self._weights is None:
+        weights = self.pair.master.weights
+        if weights is None:
             return self.foot
-        foot: FloatArray = np.einsum("nk,nkp->np", self.foot, self._weights)
+        foot: FloatArray = np.einsum("nk,nkp->np", self.foot, weights[self.candidates.facet])
         return foot
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""
         return nts_element.gap(x, self._projection(x)).value
 
-    def reference(self) -> FloatArray:
-        """Reference positions of slaves and corners in the pair's frame [m], (n, nc + 1, 3)."""
-        c, slave, master = self.candidates, self.pair.slave, self.pair.master
-        nodes = slave.reference[slave.share[c.node]]
-        both = np.concatenate([nodes[:, None], master.reference[master.patches[c.facet]]], axis=1)
-        return both - self.pair.origin
-
     def initial_guess(self, x: FloatArray) -> FloatArray:
-        """Scaled d and f that fit predicted positions x (n, nc + 1, 3), shape (n, augmented)."""
+        """Scaled d and f that fit predicted nodes x (n, k, 3), shape (n, augmented)."""
         if not self.num_augmented:
             return np.empty((self.num_elements, 0))
         return self._augmented(self._control(x))
 
-    def _control(self, x: FloatArray) -> FloatArray:
-        """Slave and control points from slave and points of the patch, both (n, nc + 1, 3)."""
-        control = self.pair.master.combine(x[:, 1:], self.candidates.facet)
-        return np.concatenate([x[:, :1], control], axis=1)
-
-    @cached_property
-    def _weights(self) -> FloatArray | None:
-        """Weights of the points in the control points, shape (n, nc, nc), if they differ."""
-        weights = self.pair.master.weights
+    @property
+    def _control_weights(self) -> FloatArray | None:
+        """Weights of the nodes in the control points, (n, nc, k), if they differ."""
+        weights = self.pair.master.facet_weights
         return None if weights is None else weights[self.candidates.facet]
-
-    def _to_points(self, part: Contribution) -> None:
-        """The transpose of `_control`: forces and tangents of control points to their points."""
-        if self._weights is None:
-            return
-        n, size = part.residual.shape
-        width, middle = self.num_coordinates - 3, (self.num_points, 3)
-        rows = slice(3, self.num_coordinates)
-        w = self._weights.transpose(0, 2, 1)
-        force = np.matmul(w, part.residual[:, rows].reshape(n, *middle))
-        part.residual[:, rows] = force.reshape(n, width)
-        columns = part.tangent[:, :, rows].reshape(n, size, *middle)
-        part.tangent[:, :, rows] = np.matmul(w[:, None], columns).reshape(n, size, width)
-        lines = part.tangent[:, rows].reshape(n, self.num_points, 3 * size)
-        part.tangent[:, rows] = np.matmul(w, lines).reshape(n, width, size)
 
     @cached_property
     def _tangents(self) -> FloatArray:
@@ -170,7 +152,7 @@ class FacetElements(ContactElements):
         self, x: FloatArray, multiplier: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
         """`_element` of (x, multipliers)."""
-        n, size, theta = self.num_elements, self.num_coordinates, self.theta
+        n, size, theta = self.num_elements, self._num_places, self.theta
         middle = self.x0 + theta * (x - self.x0)
         xi_middle, xi_end = self._projection(middle), self._projection(x)
         force, end = nts_element.gap(middle, xi_middle), nts_element.gap(x, xi_end)
@@ -231,7 +213,7 @@ class FacetElements(ContactElements):
         """
         c, n = self.candidates, self.num_elements
         length = c.length[:, None]
-        positions = (n, self.num_coordinates)
+        positions = (n, self._num_places)
         z0 = np.concatenate([self.x0.reshape(positions), c.normal, c.xi], axis=1)
         z1 = np.concatenate([x.reshape(positions), augmented / length], axis=1)
         # One length per pair makes every unknown a length or a force, so blocks compare across
@@ -271,7 +253,7 @@ class FacetElements(ContactElements):
         tangent[:, f, -2:] = np.eye(2)
         gradient = np.zeros((n, 2, residual.shape[1]))
         gradient[:, :, f] = np.eye(2)
-        metric, by_pi = nts_element.metric(e.invariants, self.num_points)
+        metric, by_pi = nts_element.metric(e.invariants, self.num_control)
         metric_gradient = np.zeros((n, 2, 2, residual.shape[1]))
         by_z = np.matmul(by_pi.reshape(n, 4, by_pi.shape[-1]), e.invariant_gradient)
         metric_gradient[..., :size] = by_z.reshape(n, 2, 2, size) * scale_z[:, None, None]
@@ -287,10 +269,10 @@ class FacetElements(ContactElements):
         is the exact tangent.
         """
         residual, tangent, gap, slip = self._invariants(x, self._augmented(x), multiplier)
-        stop = self.num_coordinates + nts_element.NUM_AUGMENTED
+        stop = self._num_places + nts_element.NUM_AUGMENTED
         middle = stop + nts_element.NUM_CONSTRAINTS
-        inner = np.r_[self.num_coordinates : stop, stop + 1 : middle]
-        outer = np.r_[: self.num_coordinates, stop, middle : tangent.shape[1]]
+        inner = np.r_[self._num_places : stop, stop + 1 : middle]
+        outer = np.r_[: self._num_places, stop, middle : tangent.shape[1]]
         among, by_outer = (tangent[:, inner[:, None], columns] for columns in (inner, outer))
         inside = nts_element.solve(among, by_outer)
 

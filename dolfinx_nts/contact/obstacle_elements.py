@@ -41,13 +41,18 @@ class ObstacleElements(ContactElements):
     displacement: FloatArray
 
     @property
-    def num_points(self) -> int:
+    def num_control(self) -> int:
         """None."""
         return 0
 
-    def master_numbers(self) -> tuple[tuple[IntArray, BoolArray], ...]:
+    @property
+    def master_nodes(self) -> None:
         """None."""
-        return ()
+        return None
+
+    @property
+    def _master_fixed(self) -> BoolArray:
+        return np.empty((self.num_elements, 0, 3), dtype=bool)
 
     @property
     def immovable(self) -> BoolArray:
@@ -65,19 +70,12 @@ class ObstacleElements(ContactElements):
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves at t_{n+1}, shape (n, 1, 3)."""
-        value: FloatArray = self.pair.obstacle.gap(self._control(x)[:, 0]).value
+        value: FloatArray = self.pair.obstacle.gap(x[:, 0] - self.displacement[1]).value
         return value
 
-    def reference(self) -> FloatArray:
-        """Reference positions of slaves in the pair's frame [m], shape (n, 1, 3)."""
-        slave = self.pair.slave
-        nodes = slave.reference[slave.share[self.candidates.node]][:, None]
-        x: FloatArray = nodes - self.pair.origin
-        return x
-
-    def _control(self, x: FloatArray) -> FloatArray:
-        """Slave relative to the obstacle's motion."""
-        return x - self.displacement[1]
+    def _control(self, y: FloatArray) -> FloatArray:
+        """Slave relative to the obstacle's motion, shape (n, 1, 3)."""
+        return super()._control(y) - self.displacement[1]
 
     @property
     def extent(self) -> float:
@@ -88,7 +86,7 @@ class ObstacleElements(ContactElements):
     def external_work(self, part: Contribution) -> float:
         """h^2/2 times the work of the contact forces on the obstacle's path [kg m^2]."""
         path = self.displacement[1] - self.displacement[0]
-        return -float((part.residual[:, :3] @ path).sum())
+        return float((part.force @ path).sum())
 
     @cached_property
     def _tangents(self) -> FloatArray:

@@ -18,6 +18,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact import search
 from dolfinx_nts.kernels import facets as facet_math
 from dolfinx_nts.kernels import patches
@@ -105,8 +106,9 @@ class Surface:
         original: Input numbers of the points, the same for every number of ranks, shape (p,).
         reference: Reference positions [m], shape (p, 3).
         area: Tributary area of each point [m^2], shape (p,).
-        rows: Coordinates of the points that this rank owns among the body's owned ones, in the
-            order of `points`, shape (n, 3).
+        material: Its points as functions of the body's coordinates.
+        rows: Points that this rank owns among the mesh's nodes that it owns, in the order of
+            `points`, shape (n,).
         share: Positions in `points` of the nodes whose contact this rank computes, wherever their
             coordinates are: all ranks have as much to do, however the mesh is divided.
         fixed: Which coordinates of the points are prescribed, shape (p, 3).
@@ -142,11 +144,11 @@ class Surface:
             self._smooth(x)
         low, high = index_map.local_range
         own = self.points[(self.points >= low) & (self.points < high)]
-        self.rows = 3 * (own - low)[:, None] + np.arange(3)
+        self.rows = own - low
         self.share = np.flatnonzero(_rank_of(self.original, mesh.comm.size) == mesh.comm.rank)
-        prescribed = np.zeros(body.num_owned, dtype=bool)
-        prescribed[body.fixed] = True
-        self.fixed = self.gather(prescribed)
+        self.material: Points = body.at_nodes(self.points, self.reference)
+        free = ~self.material.fixed & (self.material.weights != 0.0)[:, :, None]
+        self.fixed = ~free.any(axis=1)
 
     def _smooth(self, corners: FloatArray) -> None:
         """Lay patches over the facets with reference corners (m, 4, 3)."""
@@ -180,11 +182,35 @@ class Surface:
         result: FloatArray = np.matmul(self.weights[facet], x)
         return result
 
-    @property
-    def dofs(self) -> IntArray:
-        """Global coordinate numbers of the points in the body, shape (p, 3)."""
-        dofs: IntArray = 3 * self.points[:, None] + np.arange(3)
-        return dofs
+    @cached_property
+    def facet_nodes(self) -> Points:
+        """Nodes of the body that the surface over each facet depends on; their weights are 0."""
+        m = self.material
+        used, at = np.unique(m.nodes, return_index=True)
+        nodes = m.nodes[self.patches]
+        nodes = nodes.reshape(len(nodes), nodes.shape[1] * nodes.shape[2])
+        if m.nodes.shape[1] > 1:
+            nodes = _distinct(nodes)
+        i = at[np.searchsorted(used, nodes)]
+        reference, fixed = (a.reshape(-1, 3)[i] for a in (m.reference, m.fixed))
+        none = np.zeros(nodes.shape)
+        return Points(self.body, nodes, none, reference, fixed, m.places.ravel()[i])
+
+    @cached_property
+    def facet_weights(self) -> FloatArray | None:
+        """Weights of `facet_nodes` in the control points, (m, nc or 16, k); None if they are one.
+
+        Of a node that stands twice the first one counts.
+        """
+        m = self.material
+        if m.are_nodes:
+            return self.weights
+        nodes = self.facet_nodes.nodes
+        first = np.ones(nodes.shape, dtype=bool)
+        first[:, 1:] = nodes[:, 1:] != nodes[:, :1]
+        same = m.nodes[self.patches][..., None] == nodes[:, None, None]
+        of_points = np.einsum("mpk,mpka->mpa", m.weights[self.patches], same & first[:, None, None])
+        return self.combine(of_points, np.arange(len(nodes)))
 
     @property
     def boundary_edges(self) -> npt.NDArray[np.bool_]:
@@ -195,19 +221,14 @@ class Surface:
         free: npt.NDArray[np.bool_] = (count[inverse.ravel()] == 1).reshape(self.facets.shape)
         return free
 
-    def gather(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Values at all points, shape (p, 3), from this rank's owned body coordinates."""
-        return gather_rows(self.body.comm, values[self.rows])
-
-    def nodal(self, values: FloatArray) -> FloatArray:
-        """Values at all points, shape (p,), from one at each of this rank's owned coordinates."""
-        result: FloatArray = self.gather(values)[:, 0]
-        return result
+    def gather(self, values: FloatArray) -> FloatArray:
+        """Values at all points, (p, 3), from this rank's owned body coordinates. Collective."""
+        return self.material.at(values)
 
     @cached_property
     def mass(self) -> FloatArray:
         """Mass of the points' nodes [kg], shape (p,). Collective."""
-        return self.nodal(self.body.nodal_mass)
+        return self.material.divided(self.body.nodal_mass)
 
     @cached_property
     def _dealt(self) -> IntArray:
@@ -237,7 +258,8 @@ class Surface:
         mesh, space = self.body.mesh, self.body.space
         nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
         moved = fem.Function(space)
-        moved.x.array[: len(u)] = u
+        here = self.body.at_mesh(u)
+        moved.x.array[: len(here)] = here
         moved.x.scatter_forward()
         blocks = compat.node_blocks(mesh, space)[nodes]
         corners = mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
@@ -269,6 +291,17 @@ class Surface:
         """Positions of all points [m], shape (p, 3), from this rank's owned displacements."""
         x: FloatArray = self.reference + self.gather(u)
         return x
+
+
+def _distinct(rows: IntArray) -> IntArray:
+    """Different numbers of each row, filled up with its first where it has fewer than others."""
+    rows = np.sort(rows, axis=1)
+    new = np.ones(rows.shape, dtype=bool)
+    new[:, 1:] = rows[:, 1:] != rows[:, :-1]
+    width = int(new.sum(axis=1).max(initial=0))
+    out = np.repeat(rows[:, :1], width, axis=1)
+    out[np.nonzero(new)[0], (new.cumsum(axis=1) - 1)[new]] = rows[new]
+    return out
 
 
 def _rank_of(nodes: IntArray, size: int) -> IntArray:

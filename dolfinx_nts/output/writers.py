@@ -57,12 +57,13 @@ class _Series:
         self.path = folder / _file_name(body.name)
         self._times = 0
         blocks = compat.node_blocks(body.mesh, body.space)
-        nodes = np.flatnonzero((blocks >= 0) & (blocks < body.num_owned // 3))
+        self._owned = body.space.dofmap.index_map.size_local
+        nodes = np.flatnonzero((blocks >= 0) & (blocks < self._owned))
         self._blocks = blocks[nodes]
         original = np.asarray(body.mesh.geometry.input_global_indices)
         everywhere = gather_on_root(body.comm, original[nodes])
         numbers, self._order = np.unique(everywhere, return_index=True)
-        self._points = self._nodal(body.reference.reshape(-1, 3))
+        self._points = self._nodal(body.space.tabulate_dof_coordinates()[: self._owned])
         owned = body.mesh.topology.index_map(3).size_local
         cells = gather_on_root(body.comm, original[compat.geometry_dofmap(body.mesh)[:owned]])
         order = gather_on_root(
@@ -89,17 +90,18 @@ class _Series:
 
     def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
         """Nodal fields of the last accepted state on rank 0; collective."""
-        state, owned = stepper.state, self.body.num_owned // 3
+        state, owned = stepper.state, self._owned
+        u, v = (self.body.at_mesh(w[self.index]) for w in (state.u, state.v))
         fields = {
-            "displacement": self._nodal(state.u[self.index].reshape(-1, 3)),
-            "velocity": self._nodal(state.v[self.index].reshape(-1, 3)),
+            "displacement": self._nodal(u.reshape(-1, 3)),
+            "velocity": self._nodal(v.reshape(-1, 3)),
         }
         for label, k in self.contacts.items():
             contact = stepper.system.contacts[k]
             found = _contact_fields(contact, state, k, stepper.mean_force(k))
             for name, (elsewhere, values) in found.items():
                 nodal = np.full((owned, *values.shape[1:]), elsewhere)
-                nodal[contact.slave.rows[:, 0] // 3] = contact.slave.at_own(values)
+                nodal[contact.slave.rows] = contact.slave.at_own(values)
                 fields[f"{name}_{label}"] = self._nodal(nodal)
         return fields
 

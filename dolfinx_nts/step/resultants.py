@@ -44,7 +44,7 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     """
     bodies, contacts = problem.system.bodies, problem.contact_parts(step)
     parts = [_reactions(b, t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
-    forces = [-part.residual[:, :3].sum(axis=0) for part in contacts]
+    forces = [part.force.sum(axis=0) for part in contacts]
     parts.append(np.reshape(forces, (len(contacts), 3)))
     total = np.concatenate(parts) / problem.factor
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
