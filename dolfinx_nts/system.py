@@ -102,6 +102,8 @@ class System:
                         f"contacts: the {role} body {body.name!r} is not among "
                         f"bodies={names}; add it"
                     )
+        own = (joint for body in self.bodies for joint in getattr(body, "joints", ()))
+        self.joints = (*self.joints, *own)
         labels = [joint.name for joint in self.joints]
         if len(set(labels)) < len(labels):
             raise ValueError(f"joints: names {labels} are not unique; pass name= to each joint")

@@ -11,6 +11,7 @@ from dolfinx_nts.integrators import Integrator
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
 
 
 class Moment(NamedTuple):
@@ -31,6 +32,26 @@ class Moment(NamedTuple):
     drift: FloatArray | None = None
 
 
+def places_of(body: Any) -> BoolArray:
+    """Whether each of this rank's nodes is a place, t_a = 1, or a director (theory section 11)."""
+    given = getattr(body, "places", None)
+    return np.ones(body.num_owned // 3, dtype=bool) if given is None else given
+
+
+def motion_of_points(body: Any, du: FloatArray) -> float:
+    """Bound on the components of the motion of a body's material points on this rank [m].
+
+    It is that of the coordinates unless the body has a method of this name, of `du` alone.
+
+    Args:
+        body: The body.
+        du: Change of its owned coordinates [m].
+    """
+    if hasattr(body, "motion_of_points"):
+        return float(body.motion_of_points(du))
+    return float(np.abs(du).max(initial=0.0))
+
+
 class Body(Protocol):
     """What a System asks of a body with coordinates q = X + u and a constant mass matrix (39).
 
@@ -46,6 +67,9 @@ class Body(Protocol):
         initial_displacement: u at the start [m], shape (num_owned,); may be missing, and is 0 then.
         nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
         fixed: Positions of the prescribed coordinates among the owned ones.
+        places: Which of this rank's nodes are places that move with a translation, t_a = 1, shape
+            (num_owned / 3,); the others are directors, which only turn. May be missing: all are.
+        joints: Constraints among its own coordinates, see `Joint`; may be missing.
         rounded: Length [m], the same on all ranks, whose rounding the forces hold beside that of u;
             may be missing, and is that of the positions then.
     """

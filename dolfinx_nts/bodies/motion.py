@@ -50,7 +50,8 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
             default: `body.u`, the last accepted ones.
         v: Owned velocities [m/s], shape (num_owned,); default: `body.v`.
     """
-    u, v = _owned(body, "u", u), _owned(body, "v", v)
+    known = getattr(body, "accepted", (None, None))
+    u, v = _owned(body, "u", u, known[0]), _owned(body, "v", v, known[1])
     place = body.reference + u
     weights = [body.nodal_mass, body.inertia(place), body.inertia(v)]
     local = np.concatenate([body.linear_momentum(w) for w in weights])
@@ -71,9 +72,13 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
     return BodyMotion(mass, centre, velocity, about, inertia, spin)
 
 
-def _owned(body: Body, name: str, given: FloatArray | None) -> FloatArray:
-    """The given coordinates, or those of the body's dolfinx Function or array of this name."""
-    values: Any = getattr(body, name) if given is None else given
+def _owned(
+    body: Body, name: str, given: FloatArray | None, known: FloatArray | None
+) -> FloatArray:
+    """The given coordinates, or those known, or the body's dolfinx Function or array."""
+    values: Any = known if given is None else given
+    if values is None:
+        values = getattr(body, name)
     array = np.asarray(values.x.array if hasattr(values, "x") else values)
     if array.ndim != 1 or len(array) < body.num_owned:
         raise ValueError(

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import scipy.linalg
 from mpi4py import MPI
 
+from dolfinx_nts.bodies.body import places_of
 from dolfinx_nts.parallel import global_max
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from dolfinx_nts.step.problem import Evaluation, StepProblem
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 #: Force against a motion over stiffness times motion that counts as none.
 _NONE = 1e-12
@@ -41,8 +43,8 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
     stiffness = global_max(comm, np.array(local))
     modes, images = [], []
     for k, body in enumerate(bodies):
-        place = (body.reference + step.bodies[k].u1).reshape(-1, 3)
-        for shape in _rigid(place, comm):
+        y = (body.reference + step.bodies[k].u1).reshape(-1, 3)
+        for shape in _rigid(y, places_of(body), comm):
             mode = shape / stiffness[k]
             direction.set(0.0)
             direction.array_w[problem.of_body(k)] = mode
@@ -73,13 +75,19 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
     return _describe(bodies, combination.reshape(-1, 2, 3) / stiffness[:, None, None])
 
 
-def _rigid(place: FloatArray, comm: Any) -> list[FloatArray]:
-    """Three translations and three rotations about the middle of points (n, 3). Collective."""
-    total = comm.allreduce(np.array([*place.sum(axis=0), len(place)]))
-    arm = place - total[:3] / total[3]
+def _rigid(y: FloatArray, places: BoolArray, comm: Any) -> list[FloatArray]:
+    """Three translations and three rotations about the middle of the places. Collective.
+
+    Args:
+        y: Nodal vectors [m], shape (n, 3).
+        places: Which of them are places; directors only turn.
+        comm: MPI communicator.
+    """
+    total = comm.allreduce(np.array([*y[places].sum(axis=0), places.sum()]))
+    arm = y - np.where(places[:, None], total[:3] / total[3], 0.0)
     size = np.sqrt(comm.allreduce(float((arm**2).sum())) / total[3])
     axes = np.eye(3)
-    translations = [np.tile(axis, len(place)) for axis in axes]
+    translations = [(places[:, None] * axis).ravel() for axis in axes]
     return translations + [np.cross(axis, arm / size).ravel() for axis in axes]
 
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.bodies.body import Moment, motion_of_points, places_of
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.elements import Coupling, Step, over
 from dolfinx_nts.parallel import global_max
@@ -145,7 +145,10 @@ class StepProblem:
         for body, u1 in zip(system.bodies, self.first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
         local = [
-            [np.abs(x).max(initial=0.0) for x in (u1 - u, b.reference + u1, v, u)]
+            [
+                motion_of_points(b, u1 - u),
+                *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
+            ]
             for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
         ]
         top = global_max(system.comm, np.array(local)).T
@@ -518,7 +521,8 @@ class StepProblem:
 
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
-        local = [np.abs(b.du).max(initial=0.0) for b in e.bodies]
+        both = zip(self.system.bodies, e.bodies, strict=True)
+        local = [motion_of_points(body, terms.du) for body, terms in both]
         return global_max(self.system.comm, np.array(local))
 
     def unrest(self, e: Evaluation) -> float:
@@ -583,7 +587,7 @@ def _box(system: System) -> tuple[FloatArray, float]:
     """Middle of the box around all bodies' reference and half its diagonal [m]. Collective."""
     ends = np.full((2, 3), -np.inf)
     for body in system.bodies:
-        x = body.reference.reshape(-1, 3)
+        x = body.reference.reshape(-1, 3)[places_of(body)]
         np.maximum(ends, [x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)], ends)
     high, low = global_max(system.comm, ends) * [[1.0], [-1.0]]
     return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))

@@ -1,0 +1,520 @@
+"""Rigid bodies: centre of mass and three directors, held orthonormal (theory section 12)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.spatial.transform import Rotation
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.bodies.mesh_check import check_mesh
+from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.constraints import Constraints, Equations, rank_of
+from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.validation import (
+    UserFunctionError,
+    at_time,
+    call_together,
+    floats,
+    known_options,
+    require_bool,
+    require_name,
+    require_positive,
+    vector,
+)
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
+
+#: Part of the largest moment by which given moments and axes may miss what they must satisfy.
+_ROUNDED = 1e-9
+#: Part of the mass that the matrix lends to directors without mass where a rotation has no
+#: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
+_LENT = 1e-3
+
+
+@known_options
+class RigidBody:
+    """A rigid body on a DOLFINx mesh, with twelve coordinates and six constraints.
+
+    Its coordinates are those of four nodes: the centre of mass phi and D_i = l d_i, l the radius of
+    gyration and d_i the principal axes, so that all are lengths and the mass matrix is constant and
+    diagonal: m, E_i / l^2 (theory section 12). They live on one rank; the mesh, which may be
+    distributed, serves contact surfaces, fields and pictures.
+
+    Args:
+        mesh: 3D hexahedral or tetrahedral mesh.
+        density: [kg/m^3], > 0.
+        velocity: Of the centre of mass at the start [m/s].
+        angular_velocity: At the start [rad/s].
+        force: Dead force on the centre of mass [N]: a vector, or a function of time.
+        torque: Dead torque [N m]: a vector, or a function of time.
+        motion: Displacement of the centre of mass since the start [m], as a vector, or a function
+            of time; its work is external work. None: the centre is free.
+        rotation: Rotation since the start, as a rotation vector [rad], a matrix (3, 3), or a
+            function of time to one of them. None: the body is free to turn.
+        name: Name in messages and files.
+
+    Attributes:
+        mass: [kg].
+        moments: Principal moments of inertia [kg m^2], shape (3,).
+        centre: Centre of mass in the reference [m], shape (3,).
+        position: Centre of mass of the last accepted state [m], shape (3,), the same on all ranks,
+            as are the next ones.
+        rotation: Its directors d_i, shape (3, 3); its columns are the principal axes.
+        velocity: Of the centre of mass [m/s], shape (3,).
+        angular_velocity: [rad/s], shape (3,).
+        u: Displacement of the mesh [m], dolfinx Function of the last accepted state; of a body with
+            a mesh, as are the next ones.
+        v: Velocity of the mesh [m/s], dolfinx Function.
+        space: Their function space.
+
+    Raises:
+        TypeError: `mesh` is none, or an argument is of another kind.
+        ValueError: An argument is out of range, or the mesh is not a valid 3D mesh.
+    """
+
+    def __init__(self, mesh: Any, *, density: float, name: str = "rigid", **options: Any) -> None:
+        require_name("name", name)
+        require_positive("density", density, "kg/m^3")
+        check_mesh(mesh, name)
+        self.mesh, self.density, self.degree = mesh, density, 1
+        self.space = compat.vector_space(mesh, 1)
+        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
+        self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
+        mass, centre, euler = _measure(self.space, density)
+        moments, axes = np.linalg.eigh(euler)
+        axes[:, 2] *= np.linalg.det(axes)
+        self._set_up(mesh.comm, name, mass, centre, moments, axes, **options)
+
+    @classmethod
+    def from_inertia(
+        cls,
+        mass: float,
+        inertia: Any,
+        centre: Any = (0.0, 0.0, 0.0),
+        axes: Any = None,
+        *,
+        name: str = "rigid",
+        comm: Any = MPI.COMM_WORLD,
+        **options: Any,
+    ) -> RigidBody:
+        """A rigid body without a mesh.
+
+        Args:
+            mass: [kg], > 0.
+            inertia: Principal moments of inertia about the centre of mass [kg m^2], shape (3,), or
+                their tensor, shape (3, 3). Moments of 0 are legal: a rod, a point.
+            centre: Centre of mass at the start [m].
+            axes: Principal axes as the columns of a right-handed orthonormal matrix (3, 3);
+                default: those of x, y, z, or of the tensor.
+            name: Name in messages and files.
+            comm: MPI communicator.
+            **options: velocity, angular_velocity, force, torque, motion and rotation, as of the
+                class.
+
+        Raises:
+            TypeError: An argument is of another kind.
+            ValueError: An argument is out of range: moments that no body has, axes that are not
+                right-handed or not orthonormal.
+        """
+        require_name("name", name)
+        require_positive("mass", mass, "kg")
+        where = vector("centre", centre, "m")
+        moments, columns = _principal(inertia, axes)
+        body = cls.__new__(cls)
+        euler = 0.5 * moments.sum() - moments
+        body._set_up(comm, name, float(mass), where, euler, columns, **options)
+        return body
+
+    def _set_up(
+        self,
+        comm: Any,
+        name: str,
+        mass: float,
+        centre: FloatArray,
+        euler: FloatArray,
+        axes: FloatArray,
+        *,
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        force: VectorInTime = (0.0, 0.0, 0.0),
+        torque: VectorInTime = (0.0, 0.0, 0.0),
+        motion: VectorInTime | None = None,
+        rotation: Any = None,
+    ) -> None:
+        """What both constructors share; `euler` are the principal moments of int rho x x^T dV."""
+        self.name, self.comm, self.mass = name, comm, mass
+        linear = vector("velocity", velocity, "m/s")
+        turning = vector("angular_velocity", angular_velocity, "rad/s")
+        self._force, self._torque, self._motion, self._turn = force, torque, motion, rotation
+        self._given = [("force", force, "N"), ("torque", torque, "N m")]
+        for what, value, unit in self._given:
+            self._vector(what, value, 0.0, unit)
+        # Rounding of a disc's or a rod's moments is no mass.
+        euler = np.where(euler > _ROUNDED * euler.max(), euler, 0.0)
+        self.moments = euler.sum() - euler
+        self.length = float(np.sqrt(euler.sum() / mass)) or 1.0
+        self._axes, self.centre, self._euler = axes, centre, euler
+        self.owner = rank_of(name, comm)
+        here = comm.rank == self.owner
+        self.num_owned = 12 if here else 0
+        self.places = np.array([True, False, False, False])[: self.num_owned // 3]
+        y = np.vstack([centre, self.length * axes.T])
+        masses = np.array([mass, *(euler / self.length**2)])
+        self.reference, self.nodal_mass = (
+            a.ravel()[: self.num_owned] for a in (y, np.repeat(masses, 3))
+        )
+        self._lent = np.zeros(4)
+        if np.count_nonzero(euler) < 2:
+            self._lent[1:][euler == 0.0] = _LENT * mass
+        speeds = np.vstack([linear, np.cross(turning, y[1:])])
+        self.initial_velocity = speeds.ravel()[: self.num_owned]
+        fixed = np.repeat([motion is not None] + 3 * [rotation is not None], 3)
+        self.fixed = np.flatnonzero(fixed[: self.num_owned])
+        self._fixed = fixed
+        self.prescribed(0.0)
+        self.joints: tuple[Any, ...] = () if rotation is not None else (_Triad(self),)
+        self._matrix: Any = None
+        self._reach = np.ones(4)
+        if hasattr(self, "mesh"):
+            x = self.space.tabulate_dof_coordinates()
+            self._mesh_weights = self._weights(x)
+            local = np.abs(self._mesh_weights).max(axis=0, initial=0.0)
+            comm.Allreduce(local, self._reach, op=MPI.MAX)
+        self.accept(np.zeros(self.num_owned), self.initial_velocity)
+
+    # ---- points
+    def _weights(self, x: FloatArray) -> FloatArray:
+        """Weights of the four nodes in points x (n, 3) of the reference, shape (n, 4)."""
+        local = (x - self.centre) @ self._axes / self.length
+        return np.column_stack([np.ones(len(x)), local])
+
+    def _points(self, weights: FloatArray) -> Points:
+        n = len(weights)
+        y = np.vstack([self.centre, self.length * self._axes.T])
+        nodes = np.tile(np.arange(4), (n, 1))
+        fixed = np.tile(self._fixed.reshape(4, 3), (n, 1, 1))
+        places = np.tile([True, False, False, False], (n, 1))
+        return Points(self, nodes, weights, np.tile(y, (n, 1, 1)), fixed, places)
+
+    def points(self, x: Any) -> Points:
+        """Material points, inside the body or not, for joints and springs.
+
+        Args:
+            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
+
+        Raises:
+            ValueError: x is no array of points.
+        """
+        return self._points(self._weights(_rows("x", x, "points")))
+
+    def directions(self, x: Any) -> Points:
+        """Directions that turn with the body, for joints.
+
+        Args:
+            x: At the start [-], shape (3,) or (n, 3), the same on all ranks.
+
+        Raises:
+            ValueError: x is no array of vectors.
+        """
+        local = _rows("x", x, "vectors") @ self._axes / self.length
+        return self._points(np.column_stack([np.zeros(len(local)), local]))
+
+    def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
+        """Nodes of the mesh as material points, for surfaces.
+
+        Args:
+            nodes: Global numbers in `space`, shape (n,).
+            x: Their reference positions [m], shape (n, 3).
+        """
+        return self._points(self._weights(x))
+
+    def at_mesh(self, values: FloatArray) -> FloatArray:
+        """Values at the mesh's nodes on this rank, as of `space`, from the coordinates. Collective.
+
+        Args:
+            values: At the owned coordinates, shape (num_owned,).
+        """
+        owned = self.space.dofmap.index_map.size_local
+        return (self._mesh_weights[:owned] @ self._everywhere(values)).ravel()
+
+    def _everywhere(self, values: FloatArray) -> FloatArray:
+        """Nodal vectors (4, 3) on all ranks. Collective."""
+        return gather_rows(self.comm, values.reshape(-1, 3))
+
+    def surface(self, marker: Any, tag: int | None = None, *, smoothing: bool = False) -> Surface:
+        """A part of the boundary for contact, as of `Continuum.surface`.
+
+        Args:
+            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
+                meshtags.
+            tag: Value in the meshtags.
+            smoothing: Whether slaves touch a smooth surface when this one is the master.
+
+        Raises:
+            TypeError: smoothing is no bool.
+            ValueError: The body has no mesh; no facet, or interior facets; smoothing of triangles.
+        """
+        require_bool("smoothing", smoothing)
+        if not hasattr(self, "mesh"):
+            raise ValueError(
+                f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
+            )
+        found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
+        return Surface(self, found, smoothing)
+
+    def motion_of_points(self, du: FloatArray) -> float:
+        """Bound on the components of the motion of the mesh's points on this rank [m]."""
+        if not self.num_owned:
+            return 0.0
+        return float((self._reach @ np.abs(du).reshape(4, 3)).max())
+
+    # ---- loads and prescribed motion
+    def _vector(self, name: str, value: VectorInTime, time: float, unit: str) -> FloatArray:
+        name = f"{name} of {self.name!r}"
+        if callable(value):
+            return at_time(self.comm, name, value, time, unit)
+        return vector(name, value, unit)
+
+    def prescribed(self, time: float) -> FloatArray:
+        """Displacements of the prescribed coordinates [m]. Collective."""
+        u = np.zeros((4, 3))
+        if self._motion is not None:
+            u[0] = self._vector("motion", self._motion, time, "m")
+        if self._turn is not None:
+            turn = self._rotation_at(time) - np.eye(3)
+            u[1:] = self.length * (turn @ self._axes).T
+        return u.ravel()[self.fixed]
+
+    def _rotation_at(self, time: float) -> FloatArray:
+        """The prescribed rotation since the start, shape (3, 3). Collective."""
+        given, name = self._turn, f"rotation of {self.name!r}"
+        if callable(given):
+            name = f"{name} at t={time!r}"
+            given = call_together(self.comm, name, given, time)
+        kind = UserFunctionError if callable(self._turn) else ValueError
+        array = floats(given)
+        if array.shape not in ((3,), (3, 3)) or not np.isfinite(array).all():
+            raise kind(
+                f"{name}={given!r}: pass a rotation vector (3,) [rad] or a rotation matrix (3, 3)"
+            )
+        if array.shape == (3,):
+            return np.asarray(Rotation.from_rotvec(array).as_matrix())
+        _check_axes(name, array, kind)
+        return array
+
+    # ---- Body protocol
+    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+        """Set the state at t_n and the loads of the step."""
+        self._u0, self._theta = moment.u0, rule.theta
+        now = []
+        for what, value, unit in self._given:
+            part = 1.0 if callable(value) else moment.ramp
+            now.append(part * self._vector(what, value, moment.time, unit))
+        self._load, self._couple = now
+
+    def inertia(self, v: FloatArray) -> FloatArray:
+        """M v [kg m/s for a velocity]."""
+        return self.nodal_mass * v
+
+    def internal(self, u1: FloatArray) -> FloatArray:
+        """None [N]: what holds the directors are constraints."""
+        return np.zeros(self.num_owned)
+
+    def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
+        """Gravity, force, and torque as tau x D_i / (2 l^2) on each director [N]."""
+        f = np.zeros((self.num_owned // 3, 3))
+        if self.num_owned:
+            f[0] = self.mass * gravity + self._load
+            if self._couple.any():
+                u = self._u0 + self._theta * (u1 - self._u0)
+                directors = (self.reference + u).reshape(4, 3)[1:]
+                f[1:] = np.cross(self._couple, directors) / (2.0 * self.length**2)
+        return f.ravel()
+
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+        """Return mass M less stiffness times the derivative of the torque's forces."""
+        if self._matrix is None:
+            size = (self.num_owned, None)
+            self._matrix = PETSc.Mat().createAIJ((size, size), nnz=(12, 0), bsize=3, comm=self.comm)
+        a = np.zeros((4, 3, 4, 3))
+        blocks = np.arange(4)
+        a[blocks, :, blocks] = np.eye(3) * self._masses(mass)[:, None, None]
+        x, y, z = self._couple
+        spin = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        a[blocks[1:], :, blocks[1:]] -= stiffness * self._theta * spin / (2.0 * self.length**2)
+        whole = a.reshape(12, 12)
+        diagonal = float(self._masses(mass).max()) or 1.0
+        whole[self._fixed] = whole[:, self._fixed] = 0.0
+        whole[self._fixed, self._fixed] = diagonal
+        if self.num_owned:
+            numbers = np.arange(12, dtype=PETSc.IntType)
+            self._matrix.setValues(numbers, numbers, whole.ravel())
+        self._matrix.assemble()
+        return self._matrix
+
+    def _masses(self, factor: float) -> FloatArray:
+        """Of the four nodes [kg], with what is lent to directors without mass, shape (4,)."""
+        nodal = np.array([self.mass, *(self._euler / self.length**2)])
+        masses: FloatArray = factor * (nodal + self._lent)
+        return masses
+
+    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
+        """This rank's part of the linear momentum [kg m/s]."""
+        return momentum[:3].copy() if self.num_owned else np.zeros(3)
+
+    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
+        """This rank's part of sum y_a x p_a [kg m^2/s]."""
+        y = (self.reference + u).reshape(-1, 3)
+        moment: FloatArray = np.cross(y, momentum.reshape(-1, 3)).sum(axis=0)
+        return moment
+
+    def potential(self, u: FloatArray) -> float:
+        """None [J]: loads do external work."""
+        return 0.0
+
+    def reactions(self, residual: FloatArray) -> FloatArray:
+        """Force on the prescribed centre on this rank [N], shape (1, 3), or (0, 3)."""
+        if self._motion is None:
+            return np.zeros((0, 3))
+        return residual[:3].reshape(1, 3) if self.num_owned else np.zeros((1, 3))
+
+    def accept(self, u: FloatArray, v: FloatArray) -> None:
+        """Make u and v the body's current state. Collective."""
+        self.accepted = u, v
+        local = np.concatenate([(self.reference + u).reshape(-1, 3), v.reshape(-1, 3)], axis=1)
+        both = gather_rows(self.comm, local)
+        self.position, self.velocity = both[0, :3], both[0, 3:]
+        self.rotation = both[1:, :3].T / self.length
+        turned = np.cross(self.rotation.T, both[1:, 3:] / self.length)
+        self.angular_velocity = 0.5 * turned.sum(axis=0)
+        if hasattr(self, "mesh"):
+            for function, values in ((self.u, u), (self.v, v)):
+                whole = self._everywhere(values)
+                function.x.array[:] = (self._mesh_weights @ whole).ravel()
+
+    def destroy(self) -> None:
+        """Free the PETSc objects; the body is of no use then."""
+        if self._matrix is not None:
+            self._matrix.destroy()
+
+
+class _Triad:
+    """Keeps the directors of a rigid body orthonormal: (D_i . D_j - l^2 delta_ij)/(2 l) = 0.
+
+    Args:
+        body: The body.
+    """
+
+    losses: tuple[str, ...] = ()
+
+    def __init__(self, body: RigidBody) -> None:
+        self.name, self.bodies = f"{body.name} directors", (body,)
+        n, length = int(body.comm.rank == body.owner), body.length
+        self._side = body.points(body.centre).part(slice(0, n))
+        q, target = np.zeros((n, 6, 4, 4)), np.zeros((n, 6))
+        for m, (i, j) in enumerate([(1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (3, 1)]):
+            q[:, m, i, j] += 0.5 / length
+            q[:, m, j, i] += 0.5 / length
+            target[:, m] = 0.5 * length * (i == j)
+        self._equations = Equations(q, np.zeros((n, 6, 4, 3)), target)
+
+    def start(self) -> None:
+        """Nothing to remember."""
+        return None
+
+    def potential(self, u: Sequence[FloatArray]) -> float:
+        """None [J]."""
+        return 0.0
+
+    def coupling(self, bodies: tuple[int, ...]) -> Constraints:
+        """Its constraints in a run."""
+        return Constraints(self.name, bodies, [self._side], self._equations)
+
+
+def _measure(space: Any, density: float) -> tuple[float, FloatArray, FloatArray]:
+    """Mass [kg], centre [m] and Euler tensor about it [kg m^2] of a mesh. Collective."""
+    mesh = space.mesh
+    rho = fem.Constant(mesh, float(density))
+    v, w = ufl.TrialFunction(space), ufl.TestFunction(space)
+    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
+    (form,) = compat.compile_forms([rho * ufl.inner(v, w) * dx])
+    matrix = compat.create_matrix(form)
+    compat.assemble_matrix(matrix, form, (), 0.0)
+    owned = 3 * space.dofmap.index_map.size_local
+    x = space.tabulate_dof_coordinates()[: owned // 3]
+    right, left = matrix.createVecs()
+
+    def weighted(values: FloatArray) -> FloatArray:
+        right.array_w[:] = np.repeat(values, 3)
+        matrix.mult(right, left)
+        return left.array_r[::3].copy()
+
+    total = mesh.comm.allreduce(np.concatenate([[weighted(np.ones(len(x))).sum()],
+                                                x.T @ weighted(np.ones(len(x)))]))  # fmt: skip
+    mass, centre = float(total[0]), total[1:] / total[0]
+    # About the centre: far from the origin a difference of moments would lose digits.
+    off = x - centre
+    euler = mesh.comm.allreduce(np.array([off.T @ weighted(off[:, k]) for k in range(3)]))
+    for a in (matrix, right, left):
+        a.destroy()
+    return mass, centre, 0.5 * (euler + euler.T)
+
+
+def _principal(inertia: Any, axes: Any) -> tuple[FloatArray, FloatArray]:
+    """Principal moments [kg m^2] (3,) and axes (3, 3) of what a user gives."""
+    given = floats(inertia)
+    if given.shape not in ((3,), (3, 3)) or not np.isfinite(given).all():
+        raise ValueError(
+            f"inertia={inertia!r}: pass three principal moments or a tensor (3, 3) [kg m^2]"
+        )
+    columns = np.eye(3)
+    if given.shape == (3, 3):
+        if axes is not None:
+            raise ValueError(f"axes={axes!r}: a tensor has axes of its own; leave axes out")
+        if np.abs(given - given.T).max() > _ROUNDED * np.abs(given).max():
+            raise ValueError(f"inertia={inertia!r}: is not symmetric; pass a symmetric tensor")
+        given, columns = np.linalg.eigh(0.5 * (given + given.T))
+        columns[:, 2] *= np.linalg.det(columns)
+    elif axes is not None:
+        columns = floats(axes)
+        _check_axes(f"axes={axes!r}", columns, ValueError)
+    size = np.abs(given).max()
+    if (given < -_ROUNDED * size).any():
+        raise ValueError(f"inertia={inertia!r}: a principal moment is negative; pass moments >= 0")
+    if (given.sum() - 2.0 * given < -_ROUNDED * size).any():
+        raise ValueError(
+            f"inertia={inertia!r}: one principal moment exceeds the sum of the others, which no "
+            "body has; check the moments"
+        )
+    return np.maximum(given, 0.0), columns
+
+
+def _check_axes(name: str, axes: FloatArray, kind: type[Exception]) -> None:
+    """Raise unless axes are the columns of a right-handed orthonormal matrix."""
+    fits = axes.shape == (3, 3) and np.isfinite(axes).all()
+    if not fits or np.abs(axes.T @ axes - np.eye(3)).max() > _ROUNDED:
+        raise kind(f"{name}: pass a matrix (3, 3) with orthonormal columns")
+    if np.linalg.det(axes) < 0.0:
+        raise kind(f"{name}: the columns are left-handed; turn the sign of one")
+
+
+def _rows(name: str, x: Any, what: str) -> FloatArray:
+    given = np.atleast_2d(floats(x))
+    if given.ndim != 2 or given.shape[1] != 3 or not np.isfinite(given).all():
+        raise ValueError(f"{name}={x!r}: pass {what} of shape (3,) or (n, 3)")
+    return given

@@ -1,0 +1,183 @@
+"""Elements of constraints at most quadratic in the coordinates: triads, joints, ties.
+
+With y_m = (y_0 + y_1)/2, D g(y_m) (y_1 - y_0) = g(y_1) - g(y_0): at the middle of the step their
+forces -D g(y_m)^T lambda do no work but that of a prescribed value (theory section 11).
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.elements import EveryStep, PointElements, Step
+from dolfinx_nts.kernels import quadratic as kernel
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Compliance that the matrix lends to each constraint, over that of the bodies: of equations that
+#: repeat others it leaves the multipliers of least norm, and it costs the rest some 1e-10 of
+#: Newton's contraction.
+SHIFT = 1e-10
+
+
+def rank_of(name: str, comm: Any) -> int:
+    """Rank that has what is of one rank alone, evenly for many names, the same in every run."""
+    return zlib.crc32(name.encode()) % int(comm.size)
+
+
+class Equations(NamedTuple):
+    """Constraints 1/2 Q_ab y_a . y_b + L_a . y_a = c [m]; axis 0 = element.
+
+    Attributes:
+        quadratic: Q [1/m], symmetric, shape (n, m, k, k).
+        linear: L [-], shape (n, m, k, 3).
+        value: c where nothing prescribes it otherwise [m], shape (n, m).
+    """
+
+    quadratic: FloatArray
+    linear: FloatArray
+    value: FloatArray
+
+
+class ConstraintPart(NamedTuple):
+    """What constraints contribute, see `Part`.
+
+    Attributes:
+        residual: Rows of coordinates [kg m], then of multipliers.
+        tangent: Its derivative.
+        multiplier: Factor of the step times lambda [kg m], shape (n, m).
+        gap: g - c at t_{n+1} [m], shape (n, m).
+    """
+
+    residual: FloatArray
+    tangent: FloatArray
+    multiplier: FloatArray
+    gap: FloatArray
+
+    @property
+    def status(self) -> BoolArray:
+        """Nothing flips."""
+        return np.empty((0, len(self.residual)), dtype=bool)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ConstraintElements(PointElements):
+    """Constraints of a step.
+
+    Attributes:
+        equations: Their coefficients.
+        prescribed: c at t_n and t_{n+1} [m], shape (2, n, m).
+        y0: Nodal vectors at t_n [m], shape (n, k, 3).
+        scale: Force per motion in the units of the step: a mass in dynamics.
+        theta: Where between t_n and t_{n+1} the forces act.
+    """
+
+    equations: Equations
+    prescribed: FloatArray
+    y0: FloatArray
+    scale: float
+    theta: float
+
+    @property
+    def widths(self) -> Mapping[str, int]:
+        """One multiplier per constraint."""
+        return {"augmented": 0, "constraints": self.equations.value.shape[1]}
+
+    @cached_property
+    def pattern(self) -> BoolArray:
+        """Which constraints stand in the rows of which: each in its own."""
+        return np.eye(self.widths["constraints"], dtype=bool)
+
+    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> ConstraintPart:
+        """Residual and tangent; the multipliers' unknowns are lengths, factor lambda / scale."""
+        q, b, _ = self.equations
+        n, m, k = b.shape[:3]
+        scale = self.scale
+        multiplier = scale * own["constraints"]
+        force = kernel.gradient(q, b, self.y0 + self.theta * (x - self.y0)).reshape(n, m, 3 * k)
+        end = kernel.gradient(q, b, x).reshape(n, m, 3 * k)
+        gap = kernel.value(q, b, x) - self.prescribed[1]
+        size = 3 * k + m
+        residual, tangent = np.zeros((n, size)), np.zeros((n, size, size))
+        residual[:, : 3 * k] = np.einsum("nm,nmz->nz", multiplier, force)
+        residual[:, 3 * k :] = scale * gap
+        stiffness = self.theta * np.einsum("nm,nmab->nab", multiplier, q)
+        blocks = stiffness[:, :, None, :, None] * np.eye(3)[:, None]
+        tangent[:, : 3 * k, : 3 * k] = blocks.reshape(n, 3 * k, 3 * k)
+        tangent[:, : 3 * k, 3 * k :] = (scale * force).transpose(0, 2, 1)
+        tangent[:, 3 * k :, : 3 * k] = scale * end
+        tangent[:, 3 * k :, 3 * k :] = -SHIFT * scale * np.eye(m)
+        return ConstraintPart(residual, tangent, multiplier, gap)
+
+    def largest(self, part: ConstraintPart) -> list[float]:
+        """The largest row of its constraints [m], and its extent."""
+        return [0.0, float(np.abs(part.gap).max(initial=0.0)), 0.0, self.extent]
+
+    def ledger(self, part: ConstraintPart, factor: float) -> dict[str, float]:
+        """Work of prescribed values, -lambda . (c_1 - c_0)."""
+        change = self.prescribed[1] - self.prescribed[0]
+        return {"external_work": -float((part.multiplier * change).sum()) / factor}
+
+    def describe(self, part: ConstraintPart, flips: IntArray) -> tuple[float, str]:
+        """The constraint that is off most."""
+        size = np.nan_to_num(np.abs(part.gap), nan=np.inf)
+        worst = float(size.max())
+        return worst * self.scale, f"{self.name!r}: off by {worst:.3g} m"
+
+
+class Constraints(EveryStep):
+    """Makes `ConstraintElements` in every step, and remembers their multipliers.
+
+    Args:
+        name: For messages.
+        bodies: Numbers of their bodies in the system.
+        sides: Of each body, the nodes of the elements, here those of this rank.
+        equations: Of this rank's elements.
+        value: c at a time [m], shape (n, m); None: that of the equations. Collective.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        bodies: tuple[int, ...],
+        sides: Sequence[Points],
+        equations: Equations,
+        value: Callable[[float], FloatArray] | None = None,
+    ) -> None:
+        super().__init__(bodies, self._elements, lambda part: part.multiplier / self._factor)
+        self._name, self._sides, self._equations = name, tuple(sides), equations
+        self._value, self._force = value, np.zeros_like(equations.value)
+
+    def _elements(self, step: Step, history: Any) -> ConstraintElements:
+        self._factor = step.factor
+        if history is not None:
+            self._force = history
+        u = [step.state.u[b] for b in self.bodies[0]]
+        y0 = [s.reference + s.nodal(v) for s, v in zip(self._sides, u, strict=True)]
+        return ConstraintElements(
+            name=self._name,
+            sides=self._sides,
+            equations=self._equations,
+            prescribed=np.array([self._at(step.state.time), self._at(step.state.time + step.dt)]),
+            y0=np.concatenate(y0, axis=1),
+            scale=min(step.mean_scale(side.body) for side in self._sides),
+            theta=step.integrator.theta,
+        )
+
+    def _at(self, time: float) -> FloatArray:
+        return self._equations.value if self._value is None else self._value(time)
+
+    def guess(self, k: int, x: FloatArray) -> FloatArray:
+        """Multipliers of the last step."""
+        batch = self.elements[k]
+        guess: FloatArray = self._factor * self._force / batch.scale
+        return guess
