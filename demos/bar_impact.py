@@ -102,7 +102,7 @@ class Recorder:
         pair, state = stepper.system.contacts[0], stepper.state
         bar = stepper.system.bodies[0]
         x = bar.reference[0::3] + state.u[0][0::3]
-        end, slaves = bar.reference[0::3] > GAP + LENGTH - 1e-6, pair.slave.rows[:, 0] // 3
+        end, slaves = bar.reference[0::3] > GAP + LENGTH - 1e-6, pair.slave.rows
         local = [state.contacts[0].force.sum(), x[slaves].sum() / 4, x[end].sum() / 4]
         force, near, far = stepper.system.comm.allreduce(np.array(local))
         self.rows.append((state.time, near, force / AREA, LENGTH - (far - near)))

@@ -23,10 +23,10 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Compliance that the matrix lends to each constraint, over that of the bodies: of equations that
-#: repeat others it leaves the multipliers of least norm, and it costs the rest some 1e-10 of
-#: Newton's contraction.
-SHIFT = 1e-10
+#: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies:
+#: it leaves them the multipliers of least norm, and costs the rest some 1e-7 of Newton's
+#: contraction.
+SHIFT = 1e-7
 
 
 def rank_of(name: str, comm: Any) -> int:
@@ -79,6 +79,7 @@ class ConstraintElements(PointElements):
         y0: Nodal vectors at t_n [m], shape (n, k, 3).
         scale: Force per motion in the units of the step: a mass in dynamics.
         theta: Where between t_n and t_{n+1} the forces act.
+        lent: Compliance over that of the bodies that the matrix lends them, see `SHIFT`.
     """
 
     equations: Equations
@@ -86,6 +87,7 @@ class ConstraintElements(PointElements):
     y0: FloatArray
     scale: float
     theta: float
+    lent: float
 
     @property
     def widths(self) -> Mapping[str, int]:
@@ -115,7 +117,7 @@ class ConstraintElements(PointElements):
         tangent[:, : 3 * k, : 3 * k] = blocks.reshape(n, 3 * k, 3 * k)
         tangent[:, : 3 * k, 3 * k :] = (scale * force).transpose(0, 2, 1)
         tangent[:, 3 * k :, : 3 * k] = scale * end
-        tangent[:, 3 * k :, 3 * k :] = -SHIFT * scale * np.eye(m)
+        tangent[:, 3 * k :, 3 * k :] = -self.lent * scale * np.eye(m)
         return ConstraintPart(residual, tangent, multiplier, gap)
 
     def largest(self, part: ConstraintPart) -> list[float]:
@@ -143,6 +145,7 @@ class Constraints(EveryStep):
         sides: Of each body, the nodes of the elements, here those of this rank.
         equations: Of this rank's elements.
         value: c at a time [m], shape (n, m); None: that of the equations. Collective.
+        redundant: Whether they may repeat others.
     """
 
     def __init__(
@@ -152,9 +155,12 @@ class Constraints(EveryStep):
         sides: Sequence[Points],
         equations: Equations,
         value: Callable[[float], FloatArray] | None = None,
+        *,
+        redundant: bool = True,
     ) -> None:
         super().__init__(bodies, self._elements, lambda part: part.multiplier / self._factor)
         self._name, self._sides, self._equations = name, tuple(sides), equations
+        self._lent = SHIFT if redundant else 0.0
         self._value, self._force = value, np.zeros_like(equations.value)
 
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
@@ -171,6 +177,7 @@ class Constraints(EveryStep):
             y0=np.concatenate(y0, axis=1),
             scale=min(step.mean_scale(side.body) for side in self._sides),
             theta=step.integrator.theta,
+            lent=self._lent,
         )
 
     def _at(self, time: float) -> FloatArray:

@@ -249,6 +249,16 @@ def create_matrix(form: Any) -> Any:
     return fem_petsc.create_matrix(form)
 
 
+def dense_matrix(comm: Any, size: int) -> Any:
+    """New PETSc AIJ matrix of nodes, 3 x 3 blocks, with room for all entries of a rank's own.
+
+    Args:
+        comm: MPI communicator.
+        size: Rows and columns on this rank.
+    """
+    return PETSc.Mat().createAIJ(((size, None), (size, None)), nnz=(size, 0), bsize=3, comm=comm)
+
+
 def without_zeros(a: Any) -> Any:
     """Copy of an assembled matrix without the zeros stored in it; MatFilter only since 3.20."""
     rows, cols, values = a.getValuesCSR()

@@ -22,7 +22,7 @@ from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.mesh_check import check_mesh
-from dolfinx_nts.bodies.points import Points, at_nodes, in_mesh
+from dolfinx_nts.bodies.points import Points, in_mesh
 from dolfinx_nts.contact.surfaces import Surface, locate_facets
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
@@ -257,19 +257,6 @@ class Continuum:
         if given.ndim != 2 or given.shape[1] != 3 or not np.isfinite(given).all():
             raise ValueError(f"x={x!r}: pass points of shape (3,) or (n, 3) [m]")
         return in_mesh(self, given, "x")
-
-    def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
-        """Nodes of the mesh as material points, for surfaces. Collective.
-
-        Args:
-            nodes: Global numbers in `space`, sorted, shape (n,), the same on all ranks.
-            x: Their reference positions [m], shape (n, 3).
-        """
-        return at_nodes(self, nodes, x)
-
-    def at_mesh(self, values: FloatArray) -> FloatArray:
-        """Values at the mesh's nodes on this rank, as of `space`, from owned coordinates."""
-        return values
 
     # ---- set-up
     def _size(self) -> float:

@@ -87,7 +87,19 @@ class RigidBody:
         ValueError: An argument is out of range, or the mesh is not a valid 3D mesh.
     """
 
-    def __init__(self, mesh: Any, *, density: float, name: str = "rigid", **options: Any) -> None:
+    def __init__(
+        self,
+        mesh: Any,
+        *,
+        density: float,
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        force: VectorInTime = (0.0, 0.0, 0.0),
+        torque: VectorInTime = (0.0, 0.0, 0.0),
+        motion: VectorInTime | None = None,
+        rotation: Any = None,
+        name: str = "rigid",
+    ) -> None:
         require_name("name", name)
         require_positive("density", density, "kg/m^3")
         check_mesh(mesh, name)
@@ -98,7 +110,10 @@ class RigidBody:
         mass, centre, euler = _measure(self.space, density)
         moments, axes = np.linalg.eigh(euler)
         axes[:, 2] *= np.linalg.det(axes)
-        self._set_up(mesh.comm, name, mass, centre, moments, axes, **options)
+        self._set_up(
+            mesh.comm, name, mass, centre, moments, axes, velocity, angular_velocity, force,
+            torque, motion, rotation,
+        )  # fmt: skip
 
     @classmethod
     def from_inertia(
@@ -108,9 +123,14 @@ class RigidBody:
         centre: Any = (0.0, 0.0, 0.0),
         axes: Any = None,
         *,
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        force: VectorInTime = (0.0, 0.0, 0.0),
+        torque: VectorInTime = (0.0, 0.0, 0.0),
+        motion: VectorInTime | None = None,
+        rotation: Any = None,
         name: str = "rigid",
         comm: Any = MPI.COMM_WORLD,
-        **options: Any,
     ) -> RigidBody:
         """A rigid body without a mesh.
 
@@ -121,10 +141,14 @@ class RigidBody:
             centre: Centre of mass at the start [m].
             axes: Principal axes as the columns of a right-handed orthonormal matrix (3, 3);
                 default: those of x, y, z, or of the tensor.
+            velocity: As of the class, and so are the next ones.
+            angular_velocity: [rad/s].
+            force: [N].
+            torque: [N m].
+            motion: [m].
+            rotation: [rad], or a matrix.
             name: Name in messages and files.
             comm: MPI communicator.
-            **options: velocity, angular_velocity, force, torque, motion and rotation, as of the
-                class.
 
         Raises:
             TypeError: An argument is of another kind.
@@ -137,7 +161,10 @@ class RigidBody:
         moments, columns = _principal(inertia, axes)
         body = cls.__new__(cls)
         euler = 0.5 * moments.sum() - moments
-        body._set_up(comm, name, float(mass), where, euler, columns, **options)
+        body._set_up(
+            comm, name, float(mass), where, euler, columns, velocity, angular_velocity, force,
+            torque, motion, rotation,
+        )  # fmt: skip
         return body
 
     def _set_up(
@@ -148,13 +175,12 @@ class RigidBody:
         centre: FloatArray,
         euler: FloatArray,
         axes: FloatArray,
-        *,
-        velocity: Any = (0.0, 0.0, 0.0),
-        angular_velocity: Any = (0.0, 0.0, 0.0),
-        force: VectorInTime = (0.0, 0.0, 0.0),
-        torque: VectorInTime = (0.0, 0.0, 0.0),
-        motion: VectorInTime | None = None,
-        rotation: Any = None,
+        velocity: Any,
+        angular_velocity: Any,
+        force: VectorInTime,
+        torque: VectorInTime,
+        motion: VectorInTime | None,
+        rotation: Any,
     ) -> None:
         """What both constructors share; `euler` are the principal moments of int rho x x^T dV."""
         self.name, self.comm, self.mass = name, comm, mass
@@ -349,8 +375,7 @@ class RigidBody:
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """Return mass M less stiffness times the derivative of the torque's forces."""
         if self._matrix is None:
-            size = (self.num_owned, None)
-            self._matrix = PETSc.Mat().createAIJ((size, size), nnz=(12, 0), bsize=3, comm=self.comm)
+            self._matrix = compat.dense_matrix(self.comm, self.num_owned)
         a = np.zeros((4, 3, 4, 3))
         blocks = np.arange(4)
         a[blocks, :, blocks] = np.eye(3) * self._masses(mass)[:, None, None]
@@ -443,7 +468,7 @@ class _Triad:
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run."""
-        return Constraints(self.name, bodies, [self._side], self._equations)
+        return Constraints(self.name, bodies, [self._side], self._equations, redundant=False)
 
 
 def _measure(space: Any, density: float) -> tuple[float, FloatArray, FloatArray]:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.constraints import SHIFT
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.elements import over
 from dolfinx_nts.kernels import nts_element
@@ -44,6 +45,8 @@ _IMMOVABLE = 1e-12
 _STILL = 1e-10
 
 
+#: Largest ratio of normal forces by which friction of a rigid body's nodes is divided.
+_UNEVEN = 100.0
 #: Changes of one node's state in a step that are no search any more.
 _CYCLE = 8
 _EPS = float(np.finfo(float).eps)
@@ -225,6 +228,7 @@ class ContactElements:
         """Weights of the masters' nodes in the control points, (n, control, k); None if one."""
         return None
 
+
     def _normal(self, x: FloatArray) -> FloatArray:
         """Normal where the contact force acts, shape (n, 3)."""
         raise NotImplementedError
@@ -363,6 +367,22 @@ class ContactElements:
         """Gap [m] that counts as none, or that a force which does would open, shape (n,)."""
         gap: FloatArray = np.maximum(self.rounding, self.force_rounding / self._yielding)
         return gap
+
+    @cached_property
+    def _lent(self) -> FloatArray:
+        """Compliance that the matrix lends to what holds a pair [1/kg], shape (n,), see `SHIFT`."""
+        return SHIFT / self.scale if self.pair.redundant else np.zeros(self.num_elements)
+
+    def _lent_to_stick(self, force: FloatArray, stick: BoolArray) -> FloatArray:
+        """`_lent` of those that stick, so that friction divides as the normal forces do.
+
+        A brick at rest on a slope just below the limit needs that of all its nodes.
+        """
+        pressed = np.maximum(-force[stick], 0.0)
+        mean = pressed.mean() if pressed.size else 0.0
+        part = np.divide(mean, pressed, out=np.full_like(pressed, _UNEVEN), where=pressed > 0.0)
+        lent: FloatArray = self._lent[stick] * np.clip(part, 1.0 / _UNEVEN, _UNEVEN)
+        return lent
 
     @property
     def strong(self) -> bool:
@@ -538,6 +558,7 @@ class ContactElements:
         residual[off, row] = force[off] / scale[off]
         tangent[off, row] = 0.0
         tangent[off, row, row] = 1.0 / scale[off]
+        tangent[active, row, row] -= self._lent[active]
         part = Contribution(
             residual,
             tangent,
@@ -588,16 +609,17 @@ class ContactElements:
     ) -> BoolArray:
         """Write the rows of lambda_T [m]; returns which pairs stick.
 
-        Of a pair that carries nothing yet, strong friction's bound is mu times the force that its
-        depth asks for, as in the active set: with none it would have to slip at first, by the slope
-        of the bound, which is mu for all active pairs.
+        Of a pair that carries nothing yet, the bound of strong friction, and that of a rigid body,
+        is mu times the force that its depth asks for, as in the active set: with none it would have
+        to slip at first, by the slope of the bound, which is mu for all active pairs. Points of a
+        rigid body that rest would go on so, by rounding and against each other.
         """
         endless = self._endless
         largest = _BOUND if np.isinf(self.pair.friction) else _LARGEST
         mu, t = min(self.pair.friction, largest), multiplier[:, -2:]
         force, scale = multiplier[:, 0], self.scale[:, None, None]
         normal = residual.shape[1] - self.num_constraints
-        new = active & (force >= 0.0) & (mu > _STRONG)
+        new = active & (force >= 0.0) & (mu > _STRONG or self.pair.redundant)
         bound = mu * np.where(active, -force if mu > _STRONG else np.maximum(-force, 0.0), 0.0)
         bound[new] -= mu * self._yielding[new] * residual[new, normal]
         bound[active & endless] = np.inf
@@ -618,6 +640,7 @@ class ContactElements:
         unsaid = np.where(stick[:, None, None], self.blocked, held) / scale
         value += np.einsum("nab,nb->na", unsaid, t)
         rows[:, :, -2:] += unsaid
+        rows[stick, :, -2:] -= np.eye(2) * self._lent_to_stick(force, stick)[:, None, None]
         value[~active], rows[~active] = t[~active] / scale[~active, 0], 0.0
         rows[~active, :, -2:] = np.eye(2) / scale[~active]
         residual[:, -2:], tangent[:, -2:] = value, rows

@@ -261,6 +261,9 @@ class ContactSearch:
         c, old = self.elements[k], self._old[k]
         node = c.candidates.node
         force, tangential = old.force[node], old.tangential[node]
+        if c.pair.redundant:
+            # Else rounding adds up over the steps in what sticking nodes hold among themselves.
+            tangential = np.zeros_like(tangential)
         multipliers = self._step.factor * c.multipliers(force, tangential) / c.scale[:, None]
         if not self._step.integrator.inertia:
             near = _TOUCHING * c.candidates.length

@@ -57,6 +57,11 @@ class FacetPair(ContactPair, master=Surface):
         return self.slave.body, self.master.body
 
     @property
+    def redundant(self) -> bool:
+        """Whether more points may touch than their bodies have freedom for, as of rigid ones."""
+        return super().redundant or not self.master.material.are_nodes
+
+    @property
     def master_name(self) -> str:
         """Of the master's body."""
         name: str = self.master.body.name

@@ -151,6 +151,11 @@ class ContactPair:
         return (self.slave.body,)
 
     @property
+    def redundant(self) -> bool:
+        """Whether more points may touch than their bodies have freedom for, as of rigid ones."""
+        return not self.slave.material.are_nodes
+
+    @property
     def master_name(self) -> str:
         """For messages and files."""
         name: str = self.master.name

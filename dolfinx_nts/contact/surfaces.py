@@ -18,7 +18,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.bodies.points import Points, at_mesh, at_nodes
 from dolfinx_nts.contact import search
 from dolfinx_nts.kernels import facets as facet_math
 from dolfinx_nts.kernels import patches
@@ -146,7 +146,7 @@ class Surface:
         own = self.points[(self.points >= low) & (self.points < high)]
         self.rows = own - low
         self.share = np.flatnonzero(_rank_of(self.original, mesh.comm.size) == mesh.comm.rank)
-        self.material: Points = body.at_nodes(self.points, self.reference)
+        self.material = at_nodes(body, self.points, self.reference)
         free = ~self.material.fixed & (self.material.weights != 0.0)[:, :, None]
         self.fixed = ~free.any(axis=1)
 
@@ -258,7 +258,7 @@ class Surface:
         mesh, space = self.body.mesh, self.body.space
         nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
         moved = fem.Function(space)
-        here = self.body.at_mesh(u)
+        here = at_mesh(self.body, u)
         moved.x.array[: len(here)] = here
         moved.x.scatter_forward()
         blocks = compat.node_blocks(mesh, space)[nodes]

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.points import at_mesh
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
@@ -91,7 +92,7 @@ class _Series:
     def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
         """Nodal fields of the last accepted state on rank 0; collective."""
         state, owned = stepper.state, self._owned
-        u, v = (self.body.at_mesh(w[self.index]) for w in (state.u, state.v))
+        u, v = (at_mesh(self.body, w[self.index]) for w in (state.u, state.v))
         fields = {
             "displacement": self._nodal(u.reshape(-1, 3)),
             "velocity": self._nodal(v.reshape(-1, 3)),

@@ -56,8 +56,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         _CONSTRAINTS + "pc_factor_mat_solver_type": "mumps",
     },
 }
-# Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
-# wall has more constraints than coordinates.
 #: In place of the preset's on several ranks: parts of the mesh, which overlap by a node. It halves
 #: the iterations of smooth motion; alone there is none.
 _PARTS = {_BODIES + "pc_type": "asm"}
@@ -69,7 +67,12 @@ _WHOLE = _PARTS | {
     _BODIES + "sub_pc_type": "ilu",
     _BODIES + "sub_pc_factor_mat_ordering_type": "rcm",
 }
-PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
+# Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
+# wall has more constraints than coordinates. Where many do, as of a rigid body, it puts off so many
+# pivots that the workspace it guesses is far too small.
+PRESETS |= {
+    "null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1, "mat_mumps_icntl_14": 2000}
+}
 #: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
 #: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.
 _FEW = (100, 600)

@@ -91,7 +91,9 @@ class Newton:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
         if self.linear_solver != "auto":
             return self.linear_solver
-        return choose(system.size, bool(system.contacts or system.joints), inertia, given)
+        flexible = [b for b in system.bodies if not getattr(b, "joints", ())]
+        size = int(system.comm.allreduce(sum(b.num_owned for b in flexible)))
+        return choose(size, bool(system.contacts or system.joints), inertia, given)
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
@@ -151,11 +153,13 @@ class StepSolver:
     ) -> None:
         self.problem, self.newton, self._given = problem, newton, petsc_options
         # What takes over where a linear solve fails: in turn MUMPS, and MUMPS without what repeats.
-        mumps = ("direct", "null-pivots")
+        mumps: tuple[str, ...] = ("direct", "null-pivots")
+        if any(pair.redundant for pair in problem.system.contacts):
+            mumps = mumps[1:]
         own = petsc_options.keys() & {"ksp_type", "pc_type", "pc_factor_mat_solver_type"}
         self._presets: tuple[str, ...] = ("krylov",)
         if preset == "direct":
-            self._presets = ("direct",) if own else mumps
+            self._presets = mumps[:1] if own else mumps
         elif newton.linear_solver == "auto":
             self._presets += mumps
         self._chosen, self._patience = 0, 0

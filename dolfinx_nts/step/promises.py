@@ -68,7 +68,7 @@ class Promises:
         moved = np.sqrt(problem.system.comm.allreduce(squares))
         self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
         # Where nothing moves, forces still do work over the rounding of positions.
-        self._rounding += _EPS * impulses / problem.dt * problem.rounded_length
+        self._rounding += _ROUNDING * _EPS * impulses / problem.dt * problem.rounded_length
         self._tell_gain(problem, step)
         missing = abs(row["ledger_residual"])
         if missing <= self._promise * self._largest + self._rounding:
@@ -93,19 +93,19 @@ class Promises:
         total = -row["contact_defect"]
         gain = total + before["contact_defect"]
         remedy = "use a finer or smoother master, or a smaller, constant dt"
-        if gain > _GAIN * abs(row["energy"]):
+        if gain > _GAIN * abs(row["energy"]) + self._rounding:
             where = balance.expelled(problem, step)
             text = (
                 f"nodes that start behind their facets bring {gain:.3g} J to "
                 f"{before['energy']:.3g} J, most {where}; after changes of facet {remedy}"
             )
-        elif gain > 0.0 and total > _GAIN * self._largest:
+        elif gain > 0.0 and total > _GAIN * self._largest + self._rounding:
             gain, text = total, (
                 f"nodes that start steps behind their facets have brought {total:.3g} J in all, "
                 f"{total / self._largest:.2g} of the largest energy; {remedy}"
             )
         else:
-            if -total > _LOSS * self._largest:
+            if -total > _LOSS * self._largest + self._rounding:
                 self._solution.warn(
                     "energy lost to contact", row["time"], -total,
                     f"gaps that close in mid step have taken {-total:.3g} J, "
