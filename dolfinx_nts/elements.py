@@ -129,7 +129,7 @@ class Elements(Protocol):
         """Augmented unknowns that fit predicted positions, shape (n, augmented)."""
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Part:
-        """Residual and tangent; pure.
+        """Residual and tangent; pure. All ranks call it.
 
         Args:
             x: Reference plus displacement at t_{n+1} [m], shape (n, k / 3, 3).

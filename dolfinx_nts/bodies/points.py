@@ -69,7 +69,7 @@ class Points:
         used = np.unique(gather_rows(self.body.comm, used))
         index = np.searchsorted(used, self.nodes)
         count = self.body.num_owned // 3
-        first = (self.body.comm.exscan(count) or 0) if self.body.comm.rank else 0
+        first = self.body.comm.exscan(count) or 0
         own = used[(used >= first) & (used < first + count)]
         return own - first, index
 

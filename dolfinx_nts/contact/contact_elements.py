@@ -373,16 +373,24 @@ class ContactElements:
         """Compliance that the matrix lends to what holds a pair [1/kg], shape (n,), see `SHIFT`."""
         return SHIFT / self.scale if self.pair.redundant else np.zeros(self.num_elements)
 
-    def _lent_to_stick(self, force: FloatArray, stick: BoolArray) -> FloatArray:
-        """`_lent` of those that stick, so that friction divides as the normal forces do.
+    def _lent_to_stick(self, mean: float, force: FloatArray, stick: BoolArray) -> FloatArray:
+        """`_lent` of those that stick, so that friction divides as normal forces of this mean do.
 
         A brick at rest on a slope just below the limit needs that of all its nodes.
         """
-        pressed = np.maximum(-force[stick], 0.0)
-        mean = pressed.mean() if pressed.size else 0.0
-        part = np.divide(mean, pressed, out=np.full_like(pressed, _UNEVEN), where=pressed > 0.0)
+        part = np.full(np.count_nonzero(stick), _UNEVEN)
+        np.divide(mean, -force[stick], out=part, where=force[stick] < 0.0)
         lent: FloatArray = self._lent[stick] * np.clip(part, 1.0 / _UNEVEN, _UNEVEN)
         return lent
+
+    def _mean_force(self, own: Mapping[str, FloatArray]) -> float:
+        """Mean normal force of a rigid body's nodes on all ranks [kg m]. Collective."""
+        if not (self.pair.redundant and self.num_tangential):
+            return 0.0
+        pressed = np.maximum(-self.scale * own["constraints"][:, 0], 0.0)
+        local = np.array([pressed.sum(), np.count_nonzero(pressed)])
+        total = self.pair.slave.body.comm.allreduce(local)
+        return float(total[0] / max(total[1], 1.0))
 
     @property
     def strong(self) -> bool:
@@ -501,7 +509,7 @@ class ContactElements:
         return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
-        """Residual and tangent of the pairs; pure.
+        """Residual and tangent of the pairs; pure. Collective.
 
         Args:
             x: Nodes of slave and master at t_{n+1} [m], shape (n, k, 3).
@@ -509,13 +517,14 @@ class ContactElements:
                 h^2/2 lambda of the scaled constraints, and of lambda_T over the facet size, over
                 `scale` [m], shape (n, constraints).
         """
+        mean = self._mean_force(own)
         if not self.num_elements:
             return self._nothing()
         scale = self.scale[:, None]
         multiplier = scale * own["constraints"]
         x = self._control(x)
         residual, tangent, gap, slip = self._element(x, own["augmented"], multiplier)
-        part = self._laws(x, residual, tangent, gap, slip, multiplier)
+        part = self._laws(x, residual, tangent, gap, slip, multiplier, mean)
         if slip is not None:
             normal = self._normal(x)
             along = np.einsum("ni,ni->n", part.force, normal)
@@ -546,6 +555,7 @@ class ContactElements:
         gap: FloatArray,
         slip: Slip | None,
         multiplier: FloatArray,
+        mean: float,
     ) -> Contribution:
         """Semi-smooth laws of contact (theory section 9) and friction (section 6).
 
@@ -572,7 +582,7 @@ class ContactElements:
             tangential=np.zeros((self.num_elements, 3)),
         )
         if slip is not None:
-            part.stick[:] = self._coulomb(x, residual, tangent, slip, multiplier, active)
+            part.stick[:] = self._coulomb(x, residual, tangent, slip, multiplier, active, mean)
             square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
             part.distance[active] = np.sqrt(square[active])
         return part
@@ -606,6 +616,7 @@ class ContactElements:
         slip: Slip,
         multiplier: FloatArray,
         active: BoolArray,
+        mean: float,
     ) -> BoolArray:
         """Write the rows of lambda_T [m]; returns which pairs stick.
 
@@ -640,7 +651,7 @@ class ContactElements:
         unsaid = np.where(stick[:, None, None], self.blocked, held) / scale
         value += np.einsum("nab,nb->na", unsaid, t)
         rows[:, :, -2:] += unsaid
-        rows[stick, :, -2:] -= np.eye(2) * self._lent_to_stick(force, stick)[:, None, None]
+        rows[stick, :, -2:] -= np.eye(2) * self._lent_to_stick(mean, force, stick)[:, None, None]
         value[~active], rows[~active] = t[~active] / scale[~active, 0], 0.0
         rows[~active, :, -2:] = np.eye(2) / scale[~active]
         residual[:, -2:], tangent[:, -2:] = value, rows
