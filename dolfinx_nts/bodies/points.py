@@ -84,6 +84,12 @@ class Points:
         found: npt.NDArray[Any] = table[index]
         return found
 
+    def extent(self, origin: FloatArray) -> float:
+        """Largest length whose rounding is in a point's position relative to an origin (3,) [m]."""
+        arms = self.reference - np.where(self.places[:, :, None], origin, 0.0)
+        sizes = np.einsum("na,nai->ni", np.abs(self.weights), np.abs(arms))
+        return float(sizes.max(initial=0.0))
+
     def divided(self, values: FloatArray) -> FloatArray:
         """What the nodes' places have, such as mass, divided among the points, (n,). Collective.
 

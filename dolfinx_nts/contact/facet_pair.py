@@ -47,7 +47,7 @@ class FacetPair(ContactPair, master=Surface):
                 f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
                 "choose disjoint markers"
             )
-        self.extent = max(self.extent, float(np.abs(master.reference - self.origin).max()))
+        self.extent = max(self.extent, master.material.extent(self.origin))
         self._free_edges = master.boundary_edges
         self._joined = patches.neighbours(master.facets, master.reference[master.facets])
 

@@ -138,7 +138,7 @@ class ContactPair:
         self.master: Any = master
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
-        self.extent = float(np.abs(slave.reference - self.origin).max())
+        self.extent = slave.material.extent(self.origin)
         self._set_up()
 
     # ---- what a kind of master has of its own
