@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,9 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import EveryStep, PointElements, Step
 from dolfinx_nts.kernels import quadratic as kernel
+
+if TYPE_CHECKING:
+    from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -182,6 +185,36 @@ class Constraints(EveryStep):
 
     def _at(self, time: float) -> FloatArray:
         return self._equations.value if self._value is None else self._value(time)
+
+    @property
+    def no_forces(self) -> FloatArray:
+        """Multipliers that are zero, shape (n, m)."""
+        return np.zeros_like(self._equations.value)
+
+    def kinematics(self, state: State, dt: float) -> tuple[FloatArray, FloatArray, float]:
+        """First and second derivative in time of g - c at a state. Collective.
+
+        Args:
+            state: The state; without accelerations they count as zero.
+            dt: Time in which prescribed values are told [s].
+
+        Returns:
+            [m/s] and [m/s^2], both (n, m), and the speed of the coordinates in it [m/s].
+        """
+        q, b, _ = self._equations
+        u, v = ([values[k] for k in self.bodies[0]] for values in (state.u, state.v))
+        y = [s.reference + s.nodal(w) for s, w in zip(self._sides, u, strict=True)]
+        speed = np.concatenate(
+            [s.nodal(w) for s, w in zip(self._sides, v, strict=True)], axis=1
+        )
+        c0, c1, c2 = (self._at(state.time + part * dt) for part in (0.0, 0.5, 1.0))
+        gradient = kernel.gradient(q, b, np.concatenate(y, axis=1))
+        first = np.einsum("nmai,nai->nm", gradient, speed) - (4.0 * (c1 - c0) - (c2 - c0)) / dt
+        second = np.einsum("nmab,nai,nbi->nm", q, speed, speed) - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
+        if state.a:
+            a = [s.nodal(state.a[k]) for s, k in zip(self._sides, self.bodies[0], strict=True)]
+            second += np.einsum("nmai,nai->nm", gradient, np.concatenate(a, axis=1))
+        return first, second, float(np.abs(speed).max(initial=0.0))
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the last step."""

@@ -21,7 +21,7 @@ from dolfinx_nts.run.run_warnings import RunWarnings
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.run.writer import Writer
-from dolfinx_nts.step import balance, resultants
+from dolfinx_nts.step import balance, consistent, resultants
 from dolfinx_nts.step.guards import check_momentum
 from dolfinx_nts.step.newton import ACCURACY, Newton, StepSolver
 from dolfinx_nts.step.problem import Evaluation, StepProblem
@@ -197,6 +197,7 @@ class Stepper:
         sleep: Leave bodies that nothing moves out of the steps; see `simulate`.
         watch_overlap: Look whether bodies end up inside each other; see `simulate`.
         before_step: Called before every attempt at a step; see `simulate`.
+        project_start: Project velocities that joints do not allow; see `simulate`.
 
     Attributes:
         state: Last accepted state.
@@ -217,6 +218,7 @@ class Stepper:
         sleep: bool = False,
         watch_overlap: bool = True,
         before_step: Callable[[float, float], Any] | None = None,
+        project_start: bool = False,
     ) -> None:
         if not isinstance(system, System):
             raise TypeError(f"system={system!r}: pass a System([body, ...])")
@@ -240,6 +242,8 @@ class Stepper:
             )
         require_bool("sleep", sleep)
         require_bool("watch_overlap", watch_overlap)
+        require_bool("project_start", project_start)
+        self._project_start = project_start
         if not callable(before_step) and before_step is not None:
             raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
         self._before_step = before_step
@@ -393,13 +397,34 @@ class Stepper:
             if not self._goes_on or off > _JUMP * max(size):
                 values[body.fixed] = rate
         state = replace(self.state, v=tuple(v))
+        state = self._consistent(state, dt)
         if self.problem.integrator.accelerations and not state.a:
-            state = replace(state, a=self.problem.accelerations(state, dt))
+            state = replace(state, a=consistent.accelerations(self.problem, state, dt))
         self._accept(state)
         self._started = True
         self.solution.rows = Table([self._first_row()])
         # Where bodies were before the first step, for one that carries them through each other.
         self.look()
+
+    def _consistent(self, state: State, dt: float) -> State:
+        """A start whose velocities fit the joints.
+
+        Raises:
+            ValueError: They do not, and are not to be projected.
+        """
+        if not self.system.joints or self._goes_on:
+            return state
+        still = tuple(np.zeros_like(v) for v in state.v)
+        self.problem.begin(replace(state, a=state.a or still), dt)
+        found = consistent.violation(self.problem, state, dt)
+        if found is None:
+            return state
+        if not self._project_start:
+            raise ValueError(
+                f"velocity: at the start joint {found[1]!r} is violated at {found[0]:.3g} m/s; "
+                "give its bodies velocities that fit, or pass project_start=True"
+            )
+        return replace(state, v=consistent.projection(self.problem, state, dt))
 
     def look(self, *, last: bool = False) -> None:
         """Warn if what is in contact is inside each other; only as often as it has moved.
@@ -629,6 +654,7 @@ def simulate(
     adapt: Adapt | None = None,
     watch_overlap: bool = True,
     before_step: Callable[[float, float], Any] | None = None,
+    project_start: bool = False,
 ) -> Solution:
     """Run a system from t = 0, or from an equilibrium, to t_end.
 
@@ -691,6 +717,9 @@ def simulate(
             comes before the row of the start. What changes a material's energy later is
             "material_change" in the balance.
 
+        project_start: Start with the nearest velocities, in the kinetic energy, that the joints
+            allow; else a start that violates a joint is refused with its name.
+
     Returns:
         The Solution. A run that fails says so in `status` and keeps everything computed until then,
         also where a function of time, `before_step` or a writer raises, or returns what it must
@@ -717,6 +746,7 @@ def simulate(
     stepper = Stepper(
         system, integrator, newton=newton, petsc_options=petsc_options, start=start,
         start_time=start_time, sleep=sleep, watch_overlap=watch_overlap, before_step=before_step,
+        project_start=project_start,
     )  # fmt: skip
     begin = stepper.state.time
     if not t_end > begin:

@@ -502,6 +502,31 @@ def model_problem(
     return a, (("bodies", bodies), ("constraints", contact))
 
 
+def solve_saddle(matrix: Any, right: FloatArray) -> FloatArray:
+    """Solution of A x = right with MUMPS, without equations that repeat others. Collective.
+
+    Args:
+        matrix: PETSc AIJ matrix.
+        right: Owned entries.
+    """
+    x, b = matrix.createVecs()
+    b.array_w[:] = right
+    ksp = PETSc.KSP().create(matrix.getComm())
+    ksp.setType("preonly")
+    ksp.setOperators(matrix)
+    pc = ksp.getPC()
+    pc.setType("lu")
+    pc.setFactorSolverType("mumps")
+    pc.setFactorSetUpSolverType()
+    for option, value in ((14, 2000), (24, 1)):
+        pc.getFactorMatrix().setMumpsIcntl(option, value)
+    ksp.solve(b, x)
+    solution: FloatArray = x.array_r.copy()
+    for a in (x, b, ksp):
+        a.destroy()
+    return solution
+
+
 def solve_mass(mass: Any, right: FloatArray) -> FloatArray:
     """Solution of M x = right, owned entries. Collective.
 

@@ -23,7 +23,6 @@ from dolfinx_nts.bodies.body import Moment, motion_of_points, places_of
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.elements import Coupling, Step, over
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.step.assembly import solve_mass
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.system import State, System
@@ -300,12 +299,16 @@ class StepProblem:
         rate = rule.theta * rule.rate(self.dt) if rule.inertia else 0.0
         return Moment(state.u[k], self._when, rule.ramp(self._when), rate, drift)
 
-    def accelerations(self, state: State, dt: float) -> tuple[FloatArray, ...]:
-        """Accelerations at a state [m/s^2], under the contact forces of its last step. Collective.
+    def forces(self, state: State, dt: float) -> list[tuple[FloatArray, FloatArray]]:
+        """Forces that accelerate bodies at a state, with contact's of its last step. Collective.
 
         Args:
             state: Its own accelerations play no part.
             dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+
+        Returns:
+            Of each body the forces [N], less the inertia of its prescribed coordinates, and
+            accelerations that hold but those [m/s^2].
         """
         still = tuple(np.zeros_like(v) for v in state.v)
         self.begin(replace(state, a=still), dt)
@@ -324,10 +327,8 @@ class StepProblem:
             a[body.fixed] = 4.0 * (p0 - 2.0 * p1 + p2) / dt**2
             right -= body.inertia(a)
             right[body.fixed] = 0.0
-            solved = solve_mass(body.tangent(u, 1.0, 0.0), right)
-            solved[body.fixed] = a[body.fixed]
-            out.append(solved)
-        return tuple(out)
+            out.append((right, a))
+        return out
 
     def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
         """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""

@@ -1,0 +1,98 @@
+"""Velocities and accelerations that fit the constraints at a start (theory section 11)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.parallel import global_max
+from dolfinx_nts.step.assembly import StepMatrix, solve_mass, solve_saddle
+from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.step.unknowns import Unknowns
+from dolfinx_nts.system import State
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Part of the velocities by which a start may violate a constraint.
+_OFF = 1e-9
+
+
+def violation(problem: StepProblem, state: State, dt: float) -> tuple[float, str] | None:
+    """The worst violation of a constraint by the velocities, and its joint's name. Collective.
+
+    Args:
+        problem: Equations of the first step, after `begin`.
+        state: At the start.
+        dt: First step [s].
+
+    Returns:
+        [m/s], or None where all constraints hold.
+    """
+    worst, name = 0.0, ""
+    for joint, coupling in zip(problem.system.joints, problem.couplings[1:], strict=True):
+        if not hasattr(coupling, "kinematics"):
+            continue
+        rate, _, size = coupling.kinematics(state, dt)
+        local = np.array([np.abs(rate).max(initial=0.0), size])
+        off, size = global_max(problem.system.comm, local).tolist()
+        if off > _OFF * size and off > worst:
+            worst, name = off, joint.name
+    return (worst, name) if name else None
+
+
+def accelerations(problem: StepProblem, state: State, dt: float) -> tuple[FloatArray, ...]:
+    """M a + G^T lambda = f with the second derivative of the constraints zero [m/s^2]. Collective.
+
+    Args:
+        problem: Equations of the run.
+        state: At the start; its own accelerations play no part.
+        dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+    """
+    forces, held = zip(*problem.forces(state, dt), strict=True)
+    solved = _solve(problem, replace(state, a=held), forces, 1, dt)
+    return tuple(a + given for a, given in zip(solved, held, strict=True))
+
+
+def projection(problem: StepProblem, state: State, dt: float) -> tuple[FloatArray, ...]:
+    """The nearest velocities, in the kinetic energy, that fit the constraints. Collective."""
+    none = [np.zeros_like(v) for v in state.v]
+    change = _solve(problem, state, none, 0, dt)
+    return tuple(v + dv for v, dv in zip(state.v, change, strict=True))
+
+
+def _solve(
+    problem: StepProblem, state: State, forces: Sequence[FloatArray], order: int, dt: float
+) -> tuple[FloatArray, ...]:
+    """M x + G^T lambda = forces, G x = - the rate (0) or the second derivative (1)."""
+    system = problem.system
+    masses = [b.tangent(u, 1.0, 0.0) for b, u in zip(system.bodies, state.u, strict=True)]
+    chosen: list[Any] = [c for c in problem.couplings[1:] if hasattr(c, "kinematics")]
+    if not chosen:
+        return tuple(solve_mass(m, f) for m, f in zip(masses, forces, strict=True))
+    elements = [batch for c in chosen for batch in c.elements]
+    of = [bodies for c in chosen for bodies in c.bodies]
+    laid = Unknowns(system.comm, {k: len(u) for k, u in enumerate(state.u)}, elements, of)
+    right = np.zeros(laid.layout.num_owned)
+    for k, force in enumerate(forces):
+        right[laid.of_body(k)] = force
+    rows = [c.elements[0].scale * c.kinematics(state, dt)[order].ravel() for c in chosen]
+    right[laid.of_elements("constraints")] = -np.concatenate(rows)
+    tangents = []
+    for c in chosen:
+        batch = c.elements[0]
+        own = {"augmented": np.empty((batch.num_elements, 0)), "constraints": c.no_forces}
+        tangents.append(batch.evaluate(batch.y0, own).tangent)
+    matrix = StepMatrix(laid.layout, masses, laid.blocks)
+    matrix.assemble(tangents)
+    solution = solve_saddle(matrix.operator, right)
+    out = tuple(solution[laid.of_body(k)].copy() for k in range(len(forces)))
+    for k, body in enumerate(system.bodies):
+        out[k][body.fixed] = 0.0
+    matrix.withdraw()
+    matrix.destroy()
+    laid.destroy()
+    return out
