@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.body import Body, places_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -59,9 +59,10 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
     mass = float(masses[0])
     centre, velocity = first / mass, momentum / mass
     # About the centre: far from the origin a difference of moments about it would lose digits.
-    nodes = body.num_owned // 3
-    arm, off = place.reshape(-1, 3) - centre, u - np.tile(centre, nodes)
-    turning = [v - np.tile(velocity, nodes), *(np.cross(axis, arm).ravel() for axis in np.eye(3))]
+    moves = places_of(body)[:, None]
+    arm, off = place.reshape(-1, 3) - moves * centre, u - (moves * centre).ravel()
+    turning = [v - (moves * velocity).ravel()]
+    turning += [np.cross(axis, arm).ravel() for axis in np.eye(3)]
     local = np.concatenate([body.angular_momentum(off, body.inertia(w)) for w in turning])
     about, *columns = body.comm.allreduce(local).reshape(4, 3)
     inertia = 0.5 * (np.array(columns) + np.transpose(columns))
