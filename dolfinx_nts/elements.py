@@ -47,6 +47,7 @@ class Step:
         ahead: Motion of each body along which contact is sought [m].
         motion: Largest component of each body's motion [m], shape (bodies,).
         length: Of each body, the displacement whose rounding its forces have [m], shape (bodies,).
+        stiffness: Of a body, that of each of its coordinates' neighbourhood [N/m]; for statics.
         force_rounding: Of some bodies, the norm of forces that is rounding [kg m]. Collective.
     """
 
@@ -59,12 +60,13 @@ class Step:
     ahead: Sequence[FloatArray]
     motion: FloatArray
     length: FloatArray
+    stiffness: Callable[[Any], FloatArray]
     force_rounding: Callable[[Sequence[int]], float]
 
     def mean_scale(self, body: Any) -> float:
         """The same in the mean over a body's places. Collective."""
         inertia = self.integrator.inertia
-        values = body.nodal_mass if inertia else body.nodal_stiffness(self.integrator)
+        values = body.nodal_mass if inertia else self.stiffness(body)
         chosen = values[::3][places_of(body)]
         total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
         return float(total[0] / total[1])
@@ -73,7 +75,7 @@ class Step:
         """Force per motion of a surface's points in the units of the step, (p,). Collective."""
         if self.integrator.inertia:
             return surface.mass
-        return surface.material.divided(surface.body.nodal_stiffness(self.integrator))
+        return surface.material.divided(self.stiffness(surface.body))
 
 
 class Part(Protocol):

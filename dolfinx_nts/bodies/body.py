@@ -102,9 +102,10 @@ class Body(Protocol):
         """
 
     def nodal_stiffness(self, rule: Integrator) -> FloatArray:
-        """Stiffness of each node's neighbourhood at rest [N/m], > 0, shape (num_owned,).
+        """Stiffness of each node's neighbourhood at rest [N/m], shape (num_owned,).
 
         What the nodal mass is in dynamics, a scale, is this in statics, which alone asks for it.
+        Where it is 0, as of rigid bodies, that of the other bodies counts.
         """
 
     def prescribed(self, time: float) -> FloatArray:

@@ -398,6 +398,10 @@ class RigidBody:
         masses: FloatArray = factor * (nodal + self._lent)
         return masses
 
+    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+        """None [N/m]."""
+        return np.zeros(self.num_owned)
+
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of the linear momentum [kg m/s]."""
         return momentum[:3].copy() if self.num_owned else np.zeros(3)

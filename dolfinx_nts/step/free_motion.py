@@ -41,6 +41,7 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
     local = [np.abs(diagonal.array_r[problem.of_body(k)]).max(initial=0.0)
              for k in range(len(bodies))]  # fmt: skip
     stiffness = global_max(comm, np.array(local))
+    stiffness[stiffness == 0.0] = stiffness.max() or 1.0
     modes, images = [], []
     for k, body in enumerate(bodies):
         y = (body.reference + step.bodies[k].u1).reshape(-1, 3)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -176,7 +177,7 @@ class StepProblem:
         self._diagonal[other] = 0.0
         step = Step(
             state, dt, self.factor, self.integrator, self.condense, self.first, way,
-            self._motion, self._length, self._force_rounding_of,
+            self._motion, self._length, self._stiffness, self._force_rounding_of,
         )  # fmt: skip
         for coupling, history in zip(self.couplings, state.histories, strict=True):
             coupling.begin(step, history, again, search)
@@ -360,9 +361,28 @@ class StepProblem:
             return force
         return self._stabilization(body) * du
 
+    def _stiffness(self, body: Any) -> FloatArray:
+        """Stiffness of each coordinate's neighbourhood [N/m]; where there is none, of the others.
+        """
+        own: FloatArray = body.nodal_stiffness(self.integrator)
+        return np.where(own > 0.0, own, self._mean_stiffness)
+
+    @cached_property
+    def _mean_stiffness(self) -> float:
+        """Of all flexible bodies [N/m], or weight over size where all are rigid. Collective."""
+        local = np.zeros(3)
+        for body in self.system.bodies:
+            own = body.nodal_stiffness(self.integrator)
+            local += own.sum(), np.count_nonzero(own), body.nodal_mass.max(initial=0.0)
+        total, number, mass = self.system.comm.allreduce(local).tolist()
+        if number:
+            return float(total / number)
+        weight = mass * float(np.linalg.norm(self.system.gravity))
+        return weight / self._span if weight and self._span else 1.0
+
     def _stabilization(self, body: Any) -> FloatArray:
         """Stiffness that holds each free coordinate at t_n [N/m]."""
-        stiffness: FloatArray = self.stabilization * body.nodal_stiffness(self.integrator)
+        stiffness = self.stabilization * self._stiffness(body)
         stiffness[body.fixed] = 0.0
         return stiffness
 
