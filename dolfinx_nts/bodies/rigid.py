@@ -72,11 +72,6 @@ class RigidBody:
         mass: [kg].
         moments: Principal moments of inertia [kg m^2], shape (3,).
         centre: Centre of mass in the reference [m], shape (3,).
-        position: Centre of mass of the last accepted state [m], shape (3,), the same on all ranks,
-            as are the next ones.
-        rotation: Its directors d_i, shape (3, 3); its columns are the principal axes.
-        velocity: Of the centre of mass [m/s], shape (3,).
-        angular_velocity: [rad/s], shape (3,).
         u: Displacement of the mesh [m], dolfinx Function of the last accepted state; of a body with
             a mesh, as are the next ones.
         v: Velocity of the mesh [m/s], dolfinx Function.
@@ -116,6 +111,7 @@ class RigidBody:
         )  # fmt: skip
 
     @classmethod
+    @known_options
     def from_inertia(
         cls,
         mass: float,
@@ -204,9 +200,9 @@ class RigidBody:
         self.reference, self.nodal_mass = (
             a.ravel()[: self.num_owned] for a in (y, np.repeat(masses, 3))
         )
-        self._lent = np.zeros(4)
+        self._lent = np.zeros(self.num_owned)
         if np.count_nonzero(euler) < 2:
-            self._lent[1:][euler == 0.0] = _LENT * mass
+            self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * mass
         speeds = np.vstack([linear, np.cross(turning, y[1:])])
         self.initial_velocity = speeds.ravel()[: self.num_owned]
         fixed = np.repeat([motion is not None] + 3 * [rotation is not None], 3)
@@ -222,6 +218,29 @@ class RigidBody:
             local = np.abs(self._mesh_weights).max(axis=0, initial=0.0)
             comm.Allreduce(local, self._reach, op=MPI.MAX)
         self.accept(np.zeros(self.num_owned), self.initial_velocity)
+
+    # ---- the last accepted state
+    @property
+    def position(self) -> FloatArray:
+        """Centre of mass [m], shape (3,), the same on all ranks."""
+        return self._y[0].copy()
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Velocity of the centre of mass [m/s], shape (3,), the same on all ranks."""
+        return self._v[0].copy()
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Directors d_i as columns, shape (3, 3), the same on all ranks."""
+        turned: FloatArray = self._y[1:].T / self.length
+        return turned
+
+    @property
+    def angular_velocity(self) -> FloatArray:
+        """1/2 sum d_i x v_i [rad/s], shape (3,), the same on all ranks."""
+        spin: FloatArray = 0.5 * _cross(self._y[1:], self._v[1:]).sum(axis=0) / self.length**2
+        return spin
 
     # ---- points
     def _weights(self, x: FloatArray) -> FloatArray:
@@ -347,7 +366,7 @@ class RigidBody:
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         self._u0, self._theta = moment.u0, rule.theta
-        now = []
+        now: list[FloatArray] = []
         for what, value, unit in self._given:
             part = 1.0 if callable(value) else moment.ramp
             now.append(part * self._vector(what, value, moment.time, unit))
@@ -369,34 +388,26 @@ class RigidBody:
             if self._couple.any():
                 u = self._u0 + self._theta * (u1 - self._u0)
                 directors = (self.reference + u).reshape(4, 3)[1:]
-                f[1:] = np.cross(self._couple, directors) / (2.0 * self.length**2)
+                f[1:] = _cross(np.tile(self._couple, (3, 1)), directors) / (2.0 * self.length**2)
         return f.ravel()
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """Return mass M less stiffness times the derivative of the torque's forces."""
         if self._matrix is None:
             self._matrix = compat.dense_matrix(self.comm, self.num_owned)
-        a = np.zeros((4, 3, 4, 3))
-        blocks = np.arange(4)
-        a[blocks, :, blocks] = np.eye(3) * self._masses(mass)[:, None, None]
-        x, y, z = self._couple
-        spin = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        a[blocks[1:], :, blocks[1:]] -= stiffness * self._theta * spin / (2.0 * self.length**2)
-        whole = a.reshape(12, 12)
-        diagonal = float(self._masses(mass).max()) or 1.0
-        whole[self._fixed] = whole[:, self._fixed] = 0.0
-        whole[self._fixed, self._fixed] = diagonal
         if self.num_owned:
+            whole = np.diag(mass * (self.nodal_mass + self._lent))
+            if self._couple.any():
+                x, y, z = stiffness * self._theta * self._couple / (2.0 * self.length**2)
+                for k in (3, 6, 9):
+                    whole[k : k + 3, k : k + 3] += [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+            if self.fixed.size:
+                whole[self.fixed] = whole[:, self.fixed] = 0.0
+                whole[self.fixed, self.fixed] = mass * self.mass or 1.0
             numbers = np.arange(12, dtype=PETSc.IntType)
             self._matrix.setValues(numbers, numbers, whole.ravel())
         self._matrix.assemble()
         return self._matrix
-
-    def _masses(self, factor: float) -> FloatArray:
-        """Of the four nodes [kg], with what is lent to directors without mass, shape (4,)."""
-        nodal = np.array([self.mass, *(self._euler / self.length**2)])
-        masses: FloatArray = factor * (nodal + self._lent)
-        return masses
 
     def nodal_stiffness(self, rule: Integrator) -> FloatArray:
         """None [N/m]."""
@@ -409,7 +420,7 @@ class RigidBody:
     def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum y_a x p_a [kg m^2/s]."""
         y = (self.reference + u).reshape(-1, 3)
-        moment: FloatArray = np.cross(y, momentum.reshape(-1, 3)).sum(axis=0)
+        moment: FloatArray = _cross(y, momentum.reshape(-1, 3)).sum(axis=0)
         return moment
 
     def potential(self, u: FloatArray) -> float:
@@ -427,10 +438,7 @@ class RigidBody:
         self.accepted = u, v
         local = np.concatenate([(self.reference + u).reshape(-1, 3), v.reshape(-1, 3)], axis=1)
         both = gather_rows(self.comm, local)
-        self.position, self.velocity = both[0, :3], both[0, 3:]
-        self.rotation = both[1:, :3].T / self.length
-        turned = np.cross(self.rotation.T, both[1:, 3:] / self.length)
-        self.angular_velocity = 0.5 * turned.sum(axis=0)
+        self._y, self._v = both[:, :3], both[:, 3:]
         if hasattr(self, "mesh"):
             for function, values in ((self.u, u), (self.v, v)):
                 whole = self._everywhere(values)
@@ -473,6 +481,13 @@ class _Triad:
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run."""
         return Constraints(self.name, bodies, [self._side], self._equations, redundant=False)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products of vectors (n, 3); numpy's takes five times as long for a few."""
+    one, two = [1, 2, 0], [2, 0, 1]
+    product: FloatArray = a[:, one] * b[:, two] - a[:, two] * b[:, one]
+    return product
 
 
 def _measure(space: Any, density: float) -> tuple[float, FloatArray, FloatArray]:

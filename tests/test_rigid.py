@@ -1,0 +1,239 @@
+"""Rigid bodies without contact: Euler's equations, degenerate inertia, loads, prescribed motion."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import dolfinx_nts as nts
+from dolfinx_nts.output import Fields
+from dolfinx_nts.output.pictures import picture
+
+COMM = MPI.COMM_WORLD
+RULES = {
+    "energy-momentum": nts.EnergyMomentum(),
+    "midpoint": nts.Midpoint(),
+    "newmark": nts.Newmark(),
+    "generalized-alpha": nts.GeneralizedAlpha(rho_inf=0.8),
+}
+
+
+def box(low=(0, 0, 0), size=(1, 1, 1), n=(1, 1, 1), turn=None, kind=CellType.hexahedron, **options):
+    low = np.array(low, dtype=float)
+    mesh = create_box(
+        COMM, [low, low + np.array(size)], list(n), kind, ghost_mode=GhostMode.shared_facet
+    )
+    if turn is not None:
+        mesh.geometry.x[:] = mesh.geometry.x @ Rotation.from_rotvec(turn).as_matrix().T
+    return nts.RigidBody(mesh, density=options.pop("density", 1e3), **options)
+
+
+def euler(moments, w, t):
+    """Rotation matrix of a free body at a time, by SciPy."""
+
+    def rate(_, s):
+        r, w = s[:9].reshape(3, 3), s[9:]
+        return np.concatenate([(r @ hat(w)).ravel(), -np.cross(w, moments * w) / moments])
+
+    def hat(w):
+        return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+    start = np.concatenate([np.eye(3).ravel(), w])
+    end = solve_ivp(rate, (0, t), start, rtol=1e-13, atol=1e-14, method="DOP853").y[:, -1]
+    return end[:9].reshape(3, 3)
+
+
+MOMENTS, SPIN = np.array([1.0, 2.0, 3.0]), np.array([0.01, 1.0, 0.01])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("dt", "figure"), [(0.2, 3.796e-2), (0.1, 9.643e-3), (0.05, 2.420e-3)])
+def test_a_free_body_errs_as_an_independent_program_does(dt, figure):
+    """Theory section 12: largest entry of the rotation at t = 10 s against Euler's equations."""
+    body = nts.RigidBody.from_inertia(1.0, MOMENTS, angular_velocity=SPIN)
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=dt, t_end=10.0)
+    error = np.abs(body.rotation - euler(MOMENTS, SPIN, 10.0)).max()
+    table = run.balance
+    assert run.status == "completed" and error == pytest.approx(figure, rel=2e-4)
+    assert np.ptp(table["energy"]) < 1e-12 * table["energy"][0]
+    assert np.ptp(table["angular_momentum"], axis=0).max() < 1e-12
+    assert np.abs(body.rotation.T @ body.rotation - np.eye(3)).max() < 1e-13
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_all_rules_are_of_second_order(rule):
+    """First accelerations know the forces of the directors' constraints."""
+    exact, errors = euler(MOMENTS, SPIN, 4.0), []
+    for dt in (0.1, 0.05):
+        body = nts.RigidBody.from_inertia(1.0, MOMENTS, angular_velocity=SPIN)
+        nts.simulate(nts.System([body]), RULES[rule], dt=dt, t_end=4.0)
+        errors.append(np.abs(body.rotation - exact).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_steps_do_not_drift():
+    body = nts.RigidBody.from_inertia(1.0, MOMENTS, angular_velocity=SPIN)
+    stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum(), watch_overlap=False)
+    for _ in range(100_000):
+        stepper.advance(0.05)
+    first, last = stepper.solution.rows[0], stepper.solution.rows[-1]
+    assert abs(last["energy"] / first["energy"] - 1.0) < 1e-10
+    change = last["angular_momentum"] - first["angular_momentum"]
+    assert np.abs(change).max() < 1e-10 * np.abs(first["angular_momentum"]).max()
+    assert np.abs(body.rotation.T @ body.rotation - np.eye(3)).max() < 1e-12
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("kind", [CellType.hexahedron, CellType.tetrahedron])
+def test_mass_centre_and_inertia_of_a_box(kind):
+    a, b, c = 1.0, 2.0, 0.5
+    turn = np.array([0.3, -0.5, 0.2])
+    body = box(size=(a, b, c), n=(2, 3, 2), turn=turn, kind=kind)
+    r = Rotation.from_rotvec(turn).as_matrix()
+    assert body.mass == pytest.approx(1e3 * a * b * c, rel=1e-13)
+    assert np.abs(body.position - r @ (0.5 * np.array([a, b, c]))).max() < 1e-13
+    exact = body.mass / 12 * np.array([b * b + c * c, a * a + c * c, a * a + b * b])
+    assert np.sort(body.moments) == pytest.approx(np.sort(exact), rel=1e-12)
+    assert np.linalg.det(body.rotation) == pytest.approx(1.0, rel=1e-13)
+    whole = body.rotation @ np.diag(body.moments) @ body.rotation.T
+    assert np.abs(whole - r @ np.diag(exact) @ r.T).max() < 1e-11 * exact.max()
+
+
+@pytest.mark.mpi
+def test_motion_of_a_rigid_body_is_that_of_its_coordinates():
+    body = box(size=(1, 2, 0.5), velocity=(1, 2, 3), angular_velocity=(0.5, -1, 2))
+    found = nts.motion_of(body)
+    assert found.mass == pytest.approx(body.mass, rel=1e-13)
+    for one, two in (
+        (found.centre, body.position), (found.velocity, [1, 2, 3]), (found.spin, [0.5, -1, 2]),
+        (body.angular_velocity, [0.5, -1, 2]),
+    ):  # fmt: skip
+        assert np.abs(np.array(one) - two).max() < 1e-12
+    whole = body.rotation @ np.diag(body.moments) @ body.rotation.T
+    assert np.abs(found.inertia - whole).max() < 1e-10
+
+
+@pytest.mark.parametrize("moments", [(1, 1, 2), (1, 1, 0), (0, 0, 0)], ids=["disc", "rod", "point"])
+def test_degenerate_inertia_flies_and_keeps_what_it_must(moments):
+    w = (1.0, 2.0, 0.0 if moments[2] == 0 else 3.0)
+    body = nts.RigidBody.from_inertia(
+        2.0, moments, velocity=(1, 0, 2), angular_velocity=w, force=(0, 1, 0)
+    )
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=0.05, t_end=2.0)
+    table, spin = run.balance, table_spin(run)
+    assert run.status == "completed"
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][0]
+    assert body.velocity == pytest.approx([1, 1, 2], abs=1e-12)
+    assert np.abs(body.position - [2, 1, 4]).max() < 1e-12
+    assert np.ptp(spin, axis=0).max() < 1e-11 * max(1.0, np.abs(spin).max())
+
+
+def table_spin(run):
+    """Angular momentum about the moving centre: J - x cross p, from the table."""
+    t, table = run.balance["time"], run.balance
+    x = np.outer(t, [1, 0, 2]) + np.outer(0.25 * t**2, [0, 1, 0])
+    return table["angular_momentum"] - np.cross(x, table["linear_momentum"])
+
+
+@pytest.mark.parametrize("rule", ["energy-momentum", "midpoint"])
+def test_a_torque_turns_and_its_work_is_in_the_ledger(rule):
+    errors = []
+    for dt in (0.1, 0.05):
+        body = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), torque=(0, 0, 1.5), force=(1, 0, 0))
+        run = nts.simulate(nts.System([body]), RULES[rule], dt=dt, t_end=2.0)
+        errors.append(abs(body.angular_velocity[2] - 1.5 * 2 / 2.5))
+        assert np.abs(run.balance["ledger_residual"]).max() < 1e-12 * run.balance["energy"][-1]
+        assert body.velocity == pytest.approx([1, 0, 0], abs=1e-12)
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.mpi
+def test_prescribed_motion_does_external_work():
+    """The body follows; the work is that of the forces that accelerate it."""
+    body = nts.RigidBody.from_inertia(
+        2.0, (1, 2, 2.5), motion=lambda t: (0.5 * t**2, 0, 0),
+        rotation=lambda t: (0, 0, 0.25 * t**2),
+    )  # fmt: skip
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=0.01, t_end=2.0)
+    table = run.balance
+    assert run.status == "completed" and body.position[0] == pytest.approx(2.0, rel=1e-12)
+    turned = Rotation.from_rotvec([0, 0, 1.0]).as_matrix()
+    assert np.abs(body.rotation - turned).max() < 1e-12
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][-1]
+    exact = 0.5 * 2.0 * 2.0**2 + 0.5 * 2.5 * 1.0**2
+    assert table["energy"][-1] == pytest.approx(exact, rel=1e-3)
+    assert run.reactions["rigid"][-1, 0, 0] == pytest.approx(2.0, rel=1e-8)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6], ids=["m", "mm", "um"])
+def test_units_do_not_matter(unit):
+    """Lengths in m, mm and um, masses in kg: the same iterations and motion."""
+    body = nts.RigidBody.from_inertia(
+        2.0, np.array([1.0, 2.0, 2.5]) * unit**2, velocity=np.array([1.0, 2.0, 0.5]) * unit,
+        angular_velocity=(1, 2, 3),
+    )  # fmt: skip
+    gravity = np.array([0, 0, -9.81]) * unit
+    run = nts.simulate(nts.System([body], gravity=gravity), nts.EnergyMomentum(), dt=0.05, t_end=1)
+    assert run.balance["newton_iterations"][1:].tolist() == [3.0] * 20
+    assert body.position / unit == pytest.approx([1, 2, 0.5 - 4.905], abs=1e-12)
+
+
+@pytest.mark.mpi
+def test_fields_and_pictures_show_the_mesh(mpi_tmp_path):
+    import h5py
+
+    body = box(n=(2, 2, 2), angular_velocity=(0, 0, np.pi), name="spinning")
+    bare, start = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="bare"), body.rotation
+    run = nts.simulate(
+        nts.System([body, bare]), nts.EnergyMomentum(), dt=0.05, t_end=0.5,
+        output=[Fields(mpi_tmp_path)],
+    )  # fmt: skip
+    picture([body], mpi_tmp_path / "spinning.png")
+    assert run.status == "completed"
+    if COMM.rank == 0:
+        with h5py.File(mpi_tmp_path / "spinning.h5") as file:
+            x, u = file["mesh/points"][:], file["000010/displacement"][:]
+        turned = (x - 0.5) @ (body.rotation @ start.T).T + 0.5
+        assert np.abs(x + u - turned).max() < 1e-12
+        assert not (mpi_tmp_path / "bare.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"mass": 0.0}, "mass=0.0"),
+        ({"mass": np.nan}, "mass=nan"),
+        ({"inertia": (1, 1)}, "inertia=(1, 1)"),
+        ({"inertia": (-1, 1, 1)}, "negative"),
+        ({"inertia": (1, 1, 3)}, "exceeds the sum of the others"),
+        ({"inertia": [[1, 1, 0], [0, 1, 0], [0, 0, 1]]}, "not symmetric"),
+        ({"axes": np.diag([1, 1, -1.0])}, "left-handed"),
+        ({"axes": np.diag([1, 1, 2.0])}, "orthonormal"),
+        ({"inertia": np.eye(3), "axes": np.eye(3)}, "leave axes out"),
+        ({"centre": (0, 0)}, "centre=(0, 0)"),
+        ({"velocity": (0, np.inf, 0)}, "velocity="),
+        ({"angular_velocity": 3.0}, "angular_velocity=3.0"),
+        ({"force": (1, 2)}, "force of 'rigid'=(1, 2)"),
+        ({"torque": "much"}, "torque of 'rigid'='much'"),
+        ({"rotation": (1, 2)}, "rotation of 'rigid'=(1, 2)"),
+        ({"rotation": np.diag([1, 1, -1.0])}, "left-handed"),
+        ({"motion": lambda t: (1, 2)}, "motion of 'rigid' at t=0.0=(1, 2)"),
+        ({"name": ""}, "name=''"),
+    ],
+)
+def test_bad_input_is_told(options, words):
+    given = {"mass": 1.0, "inertia": (1, 1, 1)} | options
+    with pytest.raises(ValueError) as told:  # noqa: PT011 the words are tested
+        nts.RigidBody.from_inertia(**given)
+    assert words in str(told.value)
+
+
+def test_a_body_without_a_mesh_has_no_surface():
+    body = nts.RigidBody.from_inertia(1.0, (1, 1, 1))
+    with pytest.raises(ValueError, match="has no mesh"):
+        body.surface(lambda x: x[0] > 0)
+    with pytest.raises(TypeError, match="colour=1: unknown option"):
+        nts.RigidBody.from_inertia(1.0, (1, 1, 1), colour=1)
