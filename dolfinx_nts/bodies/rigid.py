@@ -387,7 +387,7 @@ class RigidBody:
             f[0] = self.mass * gravity + self._load
             if self._couple.any():
                 u = self._u0 + self._theta * (u1 - self._u0)
-                directors = (self.reference + u).reshape(4, 3)[1:]
+                directors: FloatArray = (self.reference + u).reshape(4, 3)[1:]
                 f[1:] = _cross(np.tile(self._couple, (3, 1)), directors) / (2.0 * self.length**2)
         return f.ravel()
 
