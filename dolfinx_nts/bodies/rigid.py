@@ -197,9 +197,8 @@ class RigidBody:
         self.places = np.array([True, False, False, False])[: self.num_owned // 3]
         y = np.vstack([centre, self.length * axes.T])
         masses = np.array([mass, *(euler / self.length**2)])
-        self.reference, self.nodal_mass = (
-            a.ravel()[: self.num_owned] for a in (y, np.repeat(masses, 3))
-        )
+        self.reference: FloatArray = y.ravel()[: self.num_owned]
+        self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
         self._lent = np.zeros(self.num_owned)
         if np.count_nonzero(euler) < 2:
             self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * mass
@@ -387,7 +386,7 @@ class RigidBody:
             f[0] = self.mass * gravity + self._load
             if self._couple.any():
                 u = self._u0 + self._theta * (u1 - self._u0)
-                directors: FloatArray = (self.reference + u).reshape(4, 3)[1:]
+                directors = (self.reference + u).reshape(4, 3)[1:]
                 f[1:] = _cross(np.tile(self._couple, (3, 1)), directors) / (2.0 * self.length**2)
         return f.ravel()
 

@@ -1,0 +1,234 @@
+"""Rigid bodies in contact: at rest, falling, sliding, stacked, with flexible bodies."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from scipy.spatial.transform import Rotation
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+FLOOR = nts.Plane((0, 0, 0), (0, 0, 1))
+G = 9.81
+
+
+def grid(low, size, n, turn=None):
+    low = np.array(low, dtype=float)
+    mesh = create_box(
+        COMM, [low, low + np.array(size)], list(n), CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    if turn is not None:
+        mesh.geometry.x[:] = mesh.geometry.x @ Rotation.from_rotvec(turn).as_matrix().T
+    return mesh
+
+
+def rigid(low, size, n=(1, 1, 1), turn=None, **options):
+    return nts.RigidBody(grid(low, size, n, turn), density=1e3, **options)
+
+
+def below(body, z=0.0):
+    return body.surface(lambda x: x[2] < z + 1e-9 * max(1.0, abs(z)))
+
+
+def above(body, z):
+    return body.surface(lambda x: x[2] > z - 1e-9)
+
+
+def everywhere(x):
+    return np.full(x.shape[1], True)
+
+
+def energies(table):
+    names = ("kinetic", "potential", "external_work")
+    return max(float(np.abs(table[name]).max()) for name in names)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("nodes", [2, 3, 10])
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_a_box_at_rest_stays(nodes, friction):
+    """On 4, 9 and 100 nodes: the weight is carried and nothing moves, however they are divided."""
+    body = rigid((0, 0, 0), (1, 1, 1), (nodes - 1, nodes - 1, 1))
+    pair = nts.ContactPair(slave=below(body), master=FLOOR, friction=friction)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.3)
+    weight = body.mass * G
+    assert run.status == "completed" and run.retries == 0 and not run.warnings.lines
+    assert np.abs(run.contact_forces[1:, 0] - [0, 0, weight]).max() < 1e-10 * weight
+    assert np.abs(body.position - body.centre).max() < 1e-13
+    force = run.state.contacts[0].force
+    everyone = np.concatenate(COMM.allgather(force))
+    assert np.abs(everyone - weight / nodes**2).max() < 1e-2 * weight / nodes**2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nodes", [2, 3, 10])
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_a_box_rests_for_a_thousand_steps(nodes, friction):
+    body = rigid((0, 0, 0), (1, 1, 1), (nodes - 1, nodes - 1, 1))
+    pair = nts.ContactPair(slave=below(body), master=FLOOR, friction=friction)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=10.0)
+    assert run.status == "completed" and not run.warnings.lines
+    assert np.abs(run.contact_forces[1:, 0, 2] - body.mass * G).max() < 1e-10 * body.mass * G
+    assert np.abs(body.position - body.centre).max() < 1e-12
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize(
+    "turn", [(0, 0, 0), (0, 0.6, 0), (0.6, 0.5, 0.2)], ids=["flat", "edge", "corner"]
+)
+def test_a_box_dropped_closes_the_ledger(turn, friction):
+    mesh = grid((-0.5, -0.5, -0.5), (1, 1, 1), (2, 2, 2), turn)
+    low = COMM.allreduce(mesh.geometry.x[:, 2].min(), op=MPI.MIN)
+    mesh.geometry.x[:, 2] += 0.02 - low
+    body = nts.RigidBody(mesh, density=1e3)
+    pair = nts.ContactPair(slave=body.surface(everywhere), master=FLOOR, friction=friction)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.2)
+    table = run.balance
+    assert run.status == "completed" and table["active"].max() > 0
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * energies(table)
+    assert table["min_gap"].min() > -1e-14
+    assert np.abs(body.rotation.T @ body.rotation - np.eye(3)).max() < 1e-12
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("part", [0.999, 1.001])
+def test_a_brick_on_a_slope_slides_below_the_limit_alone(part):
+    """B5: mu = tan(angle) less and plus one part in a thousand."""
+    angle = 0.3
+    mu = part * np.tan(angle)
+    body = rigid((0, 0, 0), (0.2, 0.1, 0.05), (2, 2, 1))
+    pair = nts.ContactPair(slave=below(body), master=FLOOR, friction=mu)
+    gravity = (G * np.sin(angle), 0, -G * np.cos(angle))
+    system = nts.System([body], contacts=[pair], gravity=gravity)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-2, t_end=1.0)
+    pull = G * (np.sin(angle) - mu * np.cos(angle))
+    exact = 0.5 * pull if pull > 0.0 else 0.0
+    assert run.status == "completed"
+    assert body.position[0] - body.centre[0] == pytest.approx(exact, rel=1e-6, abs=1e-13)
+
+
+@pytest.mark.mpi
+def test_a_tower_of_five_stands():
+    bodies = [
+        rigid((0, 0, k), (1, 1, 1), (1 + k % 2, 1 + k % 2, 1), name=f"b{k}") for k in range(5)
+    ]
+    pairs = [nts.ContactPair(slave=below(bodies[0]), master=FLOOR, friction=0.5)]
+    pairs += [
+        nts.ContactPair(
+            slave=below(bodies[k + 1], k + 1), master=above(bodies[k], k + 1), friction=0.5
+        )
+        for k in range(4)
+    ]
+    system = nts.System(bodies, contacts=pairs, gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-2, t_end=0.4)
+    carried = run.contact_forces[-1, :, 2] / (bodies[0].mass * G)
+    assert run.status == "completed" and carried == pytest.approx([5, 4, 3, 2, 1], rel=1e-9)
+    assert max(np.abs(b.position - b.centre).max() for b in bodies) < 1e-12
+
+
+@pytest.mark.slow
+def test_a_tower_of_five_stands_for_ten_seconds():
+    bodies = [
+        rigid((0, 0, k), (1, 1, 1), (1 + k % 2, 1 + k % 2, 1), name=f"b{k}") for k in range(5)
+    ]
+    pairs = [nts.ContactPair(slave=below(bodies[0]), master=FLOOR, friction=0.5)]
+    pairs += [
+        nts.ContactPair(
+            slave=below(bodies[k + 1], k + 1), master=above(bodies[k], k + 1), friction=0.5
+        )
+        for k in range(4)
+    ]
+    system = nts.System(bodies, contacts=pairs, gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=10.0)
+    assert run.status == "completed"
+    assert max(np.abs(b.position - b.centre).max() for b in bodies) < 1e-10
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    "rule", [nts.EnergyMomentum(), nts.Midpoint()], ids=["energy-momentum", "midpoint"]
+)
+@pytest.mark.parametrize("slave", ["rigid", "soft"])
+def test_momenta_with_a_flexible_body(slave, rule):
+    """A turning rigid box on a soft cube with friction, as slave and as master."""
+    one = rigid(
+        (0.1, 0.1, 1.01), (0.6, 0.7, 0.5), (2, 2, 2), velocity=(1, 0, -3),
+        angular_velocity=(0, 1, 0), name="rigid",
+    )  # fmt: skip
+    two = nts.Continuum(
+        grid((0, 0, 0), (1, 1, 1), (3, 3, 3)), nts.NeoHookean(1e6, 0.3), density=1e3, name="soft"
+    )
+    sides = below(one, 1.01), above(two, 1.0)
+    if slave == "soft":
+        sides = sides[::-1]
+    pair = nts.ContactPair(slave=sides[0], master=sides[1], friction=0.3)
+    run = nts.simulate(nts.System([one, two], contacts=[pair]), rule, dt=2e-3, t_end=0.04)
+    table = run.balance
+    assert run.status.startswith("completed") and table["slip"].max() > 0
+    for name in ("linear_momentum", "angular_momentum"):
+        size = np.abs(table[name]).max()
+        assert np.ptp(table[name], axis=0).max() < 1e-12 * max(size, 1e3)
+    if rule.closes_ledger:
+        assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+
+
+@pytest.mark.parametrize("push", [0.99, 1.01])
+def test_a_brick_tips_at_b_over_h_times_g(push):
+    """Pushed by a base acceleration, here as inclined gravity: it tips above b/h g alone."""
+    b, h = 0.1, 0.4
+    body = rigid((0, 0, 0), (b, 0.1, h), (2, 1, 2))
+    pair = nts.ContactPair(slave=below(body), master=FLOOR, friction=2.0)
+    system = nts.System([body], contacts=[pair], gravity=(push * b / h * G, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=1.0)
+    turned = np.abs(body.rotation - nts.RigidBody(body.mesh, density=1e3).rotation).max()
+    assert run.status.startswith("completed")
+    assert (turned > 1e-2) if push > 1 else (turned < 1e-12)
+
+
+def iterations_and_place(unit):
+    """Of a brick that falls and turns, with lengths in this unit."""
+    size = np.array([0.2, 0.1, 0.05]) * unit
+    mesh = grid((0, 0, 0.01 * unit), size, (2, 2, 1))
+    body = nts.RigidBody(mesh, density=1e3 / unit**3, angular_velocity=(0, 1, 0))
+    slave = body.surface(lambda x: x[2] < 0.01 * unit * (1 + 1e-9))
+    pair = nts.ContactPair(slave=slave, master=FLOOR, friction=0.3)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -G * unit))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.1)
+    return run.balance["newton_iterations"][1:].tolist(), run.retries, body.position / unit
+
+
+def test_units_do_not_matter():
+    in_m, *others = (iterations_and_place(unit) for unit in (1.0, 1e3, 1e6))
+    for other in others:
+        assert other[:2] == in_m[:2]
+        assert other[2] == pytest.approx(in_m[2], rel=1e-9)
+
+
+@pytest.mark.mpi
+def test_equilibrium_on_a_soft_cube():
+    """The rigid box settles; what carries it is its weight."""
+    soft = nts.Continuum(
+        grid((0, 0, 0), (1, 1, 1), (2, 2, 2)), nts.NeoHookean(1e6, 0.3), density=1e3, name="soft",
+        bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9)],
+    )  # fmt: skip
+    for friction in (0.3, 0.0):
+        body = rigid((0.2, 0.2, 1.0), (0.6, 0.6, 0.5), (2, 2, 2), name="rigid")
+        pair = nts.ContactPair(slave=below(body, 1.0), master=above(soft, 1.0), friction=friction)
+        system = nts.System([body, soft], contacts=[pair], gravity=(0, 0, -G))
+        found = nts.equilibrium(system)
+        assert found.contact_forces[-1, 0] == pytest.approx([0, 0, body.mass * G], abs=1e-8)
+        assert 1.2 < body.position[2] < 1.25
+        assert found.status == "completed"
+
+
+def test_equilibrium_names_a_rigid_body_that_may_slide():
+    body = rigid((0, 0, 0), (0.2, 0.1, 0.05), (2, 2, 1), name="brick")
+    pair = nts.ContactPair(slave=below(body), master=FLOOR)
+    found = nts.equilibrium(nts.System([body], contacts=[pair], gravity=(0, 0, -G)))
+    assert "nothing resists body 'brick' moving along" in found.status
