@@ -68,11 +68,12 @@ _WHOLE = _PARTS | {
     _BODIES + "sub_pc_factor_mat_ordering_type": "rcm",
 }
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
-# wall has more constraints than coordinates. Where many do, as of a rigid body, it puts off so many
-# pivots that the workspace it guesses is far too small.
-PRESETS |= {
-    "null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1, "mat_mumps_icntl_14": 2000}
-}
+# wall has more constraints than coordinates.
+PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
+# Where many do, as of a rigid body, it would put off all pivots of the compliance that they are
+# lent (`constraints.SHIFT`), and run out of workspace. With them a contact costs 12 coordinates of
+# the body and no more.
+PRESETS |= {"redundant": PRESETS["null-pivots"] | {"mat_mumps_cntl_1": 1e-9}}
 #: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
 #: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.
 _FEW = (100, 600)

@@ -155,7 +155,7 @@ class StepSolver:
         # What takes over where a linear solve fails: in turn MUMPS, and MUMPS without what repeats.
         mumps: tuple[str, ...] = ("direct", "null-pivots")
         if any(pair.redundant for pair in problem.system.contacts):
-            mumps = mumps[1:]
+            mumps = ("redundant", "null-pivots")
         own = petsc_options.keys() & {"ksp_type", "pc_type", "pc_factor_mat_solver_type"}
         self._presets: tuple[str, ...] = ("krylov",)
         if preset == "direct":
