@@ -211,6 +211,11 @@ def subspace_component_bc(space: Any, component: int, blocked_dofs: IntArray) ->
 
 
 # ---- forms and assembly
+#: No result changes: without errno and traps a branch that is not taken is not computed. Python's
+#: own flags ask for what only debuggers need, which takes a fifth of the compiler's time.
+C_FLAGS = ["-O2", "-g0", "-fno-math-errno", "-fno-trapping-math"]
+
+
 def compile_forms(forms: Sequence[Any]) -> list[Any]:
     """Compile forms; signatures first because 0.5.2's depend on what was compiled before."""
     for f in forms:
@@ -219,9 +224,7 @@ def compile_forms(forms: Sequence[Any]) -> list[Any]:
             for domain in f.ufl_domains():
                 domain.ufl_coordinate_element()._sub_element._variant = "equispaced"
         f.signature()
-    # No result changes; without errno and traps a branch that is not taken is not computed.
-    flags = ["-O2", "-fno-math-errno", "-fno-trapping-math"]
-    options = {"cffi_extra_compile_args": flags, "timeout": 600}
+    options = {"cffi_extra_compile_args": C_FLAGS, "timeout": 600}
     if _OLD:
         with _quiet_compiler():
             return [fem.form(f, form_compiler_params={}, jit_params=options) for f in forms]

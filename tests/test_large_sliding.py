@@ -428,6 +428,7 @@ def test_drawn_along_it_loses_its_motion_across(integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("energy-momentum-True", "midpoint-False")
 def test_far_away_and_on_ranks_without_facets(integrator, condense):
     """A plate of one cell, which one rank owns, and another that nothing comes near."""
     near = plate(n=(1, 1), name="near")

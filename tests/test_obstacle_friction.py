@@ -94,6 +94,7 @@ def test_a_mass_slides_down_an_incline(integrator):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("part", [0.999, 1.001, np.inf])
+@pytest.mark.fast("0.999-energy-momentum", "1.001-midpoint", "inf-gonzalez")
 def test_a_mass_sticks_if_mu_is_at_least_the_slope(integrator, part):
     angle = np.pi / 6
     normal, along = np.array([np.sin(angle), 0, np.cos(angle)]), [np.cos(angle), 0, -np.sin(angle)]
@@ -130,7 +131,7 @@ def test_a_mass_slides_to_rest(integrator):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", ["sphere", "cylinder"])
-@pytest.mark.fast("sphere-energy-momentum", "cylinder-midpoint")
+@pytest.mark.fast("sphere-energy-momentum")
 def test_a_bead_in_a_hoop_slows_down_as_an_exponential_of_its_angle(name, integrator):
     """Without gravity p = m v^2 / R and m v' = -mu p: v = v0 exp(-mu phi), at second order."""
     hollow = {

@@ -353,7 +353,7 @@ def test_a_rising_floor_lifts_a_mass(integrator):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", OBSTACLES)
-@pytest.mark.fast("bowl", "cylinder")
+@pytest.mark.fast("bowl")
 def test_ledger_closes_with_a_shaking_obstacle(name):
     """Hit, lifted and dropped by an obstacle that shakes: every loss is an activation."""
     shaken = changed(
@@ -485,6 +485,7 @@ def test_bad_obstacles(make, message):
 @pytest.mark.mpi
 @pytest.mark.parametrize("place", [(1e6, 0.0, 1e6), (3e6, -2e6, 1e6)])
 @pytest.mark.parametrize("name", ["plane", "sphere", "cylinder"])
+@pytest.mark.fast("plane-place0", "sphere-place1", "cylinder-place1")
 def test_an_obstacle_may_be_anywhere(name, place):
     """At 1e-6 g a cube settles by 1e-8 m, a hundred roundings of coordinates 1e6 m away."""
     works = []

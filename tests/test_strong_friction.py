@@ -28,6 +28,9 @@ def box(low, high, parts, name, velocity=(0, 0, 0), bcs=()):
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("friction", [50.0, 1e6, np.inf])
 @pytest.mark.parametrize("meshed", [False, True])
+@pytest.mark.fast(
+    "False-50.0-balanced", "False-inf-exact", "True-1000000.0-exact", "True-inf-balanced",
+)  # fmt: skip
 def test_a_cube_flush_with_a_wall_falls_freely(meshed, friction, accuracy):
     """No force presses it to the wall, so none of friction's acts: v = -g t."""
     cube = box((0, 0, 0), (1, 1, 1), (2, 2, 2), "cube")
@@ -111,6 +114,7 @@ def test_a_cube_that_touches_as_far_as_coordinates_tell_falls_freely(meshed, fri
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", ["sphere", "cylinder"])
+@pytest.mark.fast("sphere-midpoint", "cylinder-energy-momentum", "cylinder-gonzalez")
 def test_a_bead_at_the_side_of_a_ring_hangs_by_infinite_friction(name, integrator):
     """v_t = sqrt(g R / mu) is the speed at which m v^2 / R carries it: zero without bound."""
     ring = {
@@ -161,6 +165,7 @@ def _disc(friction, integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("gap", [0.05, 0.0499])
+@pytest.mark.fast("0.05-exact", "0.0499-balanced")
 def test_cubes_that_meet_at_the_end_of_a_step(gap, accuracy):
     """mu = 1e6 binds as no bound does; at 5 m/s a gap of 0.05 m closes after five steps."""
     energies = []
@@ -182,6 +187,7 @@ def test_cubes_that_meet_at_the_end_of_a_step(gap, accuracy):
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.3, 5.0, np.inf])
 @pytest.mark.parametrize("place", [-4e-4, 0.0, 0.062])
+@pytest.mark.fast("-0.0004-inf", "0.0-0.3", "0.062-5.0")
 def test_one_large_element_stands_on_small_facets(place, friction):
     """Its nodes are 1e5 times heavier than the plate's: c belongs to what yields, the plate.
 

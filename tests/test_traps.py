@@ -156,6 +156,10 @@ def test_slaves_that_cannot_move(master, integrator, friction):
 
 @pytest.mark.parametrize("gap", [0.0, 0.001])
 @rubbing
+@pytest.mark.fast(
+    "energy-momentum-0.0-0.001", "energy-momentum-0.3-0.0", "midpoint-0.0-0.0",
+    "midpoint-0.3-0.001",
+)  # fmt: skip
 def test_nothing_can_move(gap, integrator, friction):
     held = [nts.Dirichlet(everywhere)]
     table = run(scene(gap=gap, cube=held, plate=held, friction=friction), integrator)

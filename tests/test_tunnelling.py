@@ -255,6 +255,7 @@ def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator)
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("dt", [2e-3, 1e-3])
+@pytest.mark.fast("0.002")
 def test_cubes_off_centre_win_no_energy(dt):
     """Slaves at the rim pass below the master's rim and come back: half the energy was won."""
     bodies = [

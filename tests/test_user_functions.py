@@ -89,6 +89,10 @@ def same_on_all_ranks(value):
 @pytest.mark.parametrize("ranks", ["all", "last"])
 @pytest.mark.parametrize("fails", FAILURES)
 @pytest.mark.parametrize("what", NAMES)
+@pytest.mark.fast(
+    "Dirichlet-raises-all", "Dirichlet-nan-last", "Traction-nan-all", "Traction-two_numbers-last",
+    "body_force-raises-last", "body_force-two_numbers-all", "motion-raises-last", "motion-nan-all",
+)  # fmt: skip
 def test_a_run_keeps_what_it_has(what, fails, ranks):
     system = scene(what, until_late(fails, ranks))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=DT, t_end=5 * DT)

@@ -20,7 +20,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.inversion import Determinants
-from dolfinx_nts.bodies.materials import misfit
+from dolfinx_nts.bodies.materials import misfit, with_constants
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.points import Points, in_mesh
 from dolfinx_nts.contact.surfaces import Surface, locate_facets
@@ -347,8 +347,9 @@ class Continuum:
             values[:] = np.tile(constant, len(values) // 3)
 
     def _build_constant_forms(self) -> None:
-        # A Constant, not a number: bodies of any density share one compiled form.
+        # Constants, not numbers: bodies of any density and stiffness share compiled forms.
         self._rho = fem.Constant(self.mesh, float(self.density))
+        self._law = strain_energy(with_constants(self.material, self.mesh))
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         mesh = self.mesh
         self._loads = [fem.Constant(mesh, np.zeros(3)) for _ in range(1 + len(self._traction))]
@@ -379,7 +380,7 @@ class Continuum:
         """W at a strain in UFL; what is wrong with it raises on every rank."""
         problem, cause, energy = None, None, None
         try:
-            energy = ufl.as_ufl(strain_energy(self.material)(e))
+            energy = ufl.as_ufl(self._law(e))
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
             problem, cause = f"raised {error!r}; return a UFL scalar", error
         else:
@@ -419,13 +420,14 @@ class Continuum:
         if rule not in self._compiled:
             if not self._compiled:
                 self._u0, self._u1, self._drift = (fem.Function(self.space) for _ in range(3))
-                # What multiplies mass and stiffness; change of the velocity with u_1; time.
-                self._a, self._b, self._rate, self._time = (
-                    fem.Constant(self.mesh, 0.0) for _ in range(4)
-                )
+                # What multiplies mass and stiffness: in one Constant, as UFL sorts several by their
+                # counts as text, and a form would be compiled again where 9 and 10 meet.
+                self._factors = fem.Constant(self.mesh, np.zeros(2))
+                # Change of the velocity with u_1; time.
+                self._rate, self._time = (fem.Constant(self.mesh, 0.0) for _ in range(2))
             du, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
-            energy, h0, h1 = strain_energy(self.material), ufl.grad(self._u0), ufl.grad(self._u1)
-            work = ufl.inner(rule.piola(energy, h0, h1), ufl.grad(w)) * self._dx
+            h0, h1 = ufl.grad(self._u0), ufl.grad(self._u1)
+            work = ufl.inner(rule.piola(self._law, h0, h1), ufl.grad(w)) * self._dx
             virtual, extra = work, None
             if self._extra_form is not None:
                 moved = self._u1 - self._u0
@@ -434,9 +436,9 @@ class Continuum:
                     velocity += self._drift
                 extra = self._extra_form(place, velocity, w, self._time)
                 virtual = work + extra
-            tangent = self._b * ufl.derivative(virtual, self._u1, du)
+            tangent = self._factors[1] * ufl.derivative(virtual, self._u1, du)
             if rule.inertia:
-                tangent += self._a * self._rho * ufl.inner(du, w) * self._dx
+                tangent += self._factors[0] * self._rho * ufl.inner(du, w) * self._dx
             forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
             self._compiled[rule] = forms[0], forms[1], forms[2] if extra is not None else None
             if not hasattr(self, "_matrix"):
@@ -523,7 +525,7 @@ class Continuum:
         if not mass:
             diagonal = stiffness * self._mean(self.nodal_stiffness(self._rule))
         self._fill(self._u1, u1)
-        self._a.value, self._b.value = mass, stiffness
+        self._factors.value = mass, stiffness
         compat.assemble_matrix(self._matrix, self._forms[1], self._bcs, diagonal)
         return self._matrix
 
@@ -539,7 +541,7 @@ class Continuum:
             kept = [f.x.array.copy() for f in (self._u0, self._u1)]
             for u in (self._u0, self._u1):
                 self._fill(u, np.zeros(self.num_owned))
-            self._a.value, self._b.value, self._rate.value = 0.0, 1.0, 0.0
+            self._factors.value, self._rate.value = (0.0, 1.0), 0.0
             compat.assemble_matrix(self._matrix, tangent, (), 0.0)
             diagonal = self._matrix.getDiagonal()
             # The mean of a node's three entries does not depend on the directions of the axes.

@@ -18,12 +18,16 @@ for this, here `log1p_remainder`. A rubber that stiffens exponentially:
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 import ufl
+from dolfinx import fem
 from ufl.constantvalue import RealValue
 from ufl.corealg.traversal import traverse_unique_terminals
 
@@ -78,14 +82,19 @@ class StVenantKirchhoff(Isotropic):
     def __post_init__(self) -> None:
         _check_elastic(self.young, self.poisson)
 
+    @cached_property
+    def moduli(self) -> tuple[Any, ...]:
+        """Lame's mu and lambda [Pa]."""
+        return _lame(self.young, self.poisson)
+
     def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
         """W [J/m^3], with tr E = I_1/2 and E : E = (I_1^2 - 2 I_2)/4."""
-        mu, lam = _lame(self.young, self.poisson)
+        mu, lam = self.moduli
         return lam / 8 * i1**2 + mu / 4 * (i1**2 - 2 * i2)
 
     def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
         """Derivatives of W [Pa]."""
-        mu, lam = _lame(self.young, self.poisson)
+        mu, lam = self.moduli
         return (lam / 4 + mu / 2) * i1, -mu / 2, ufl.as_ufl(0)
 
 
@@ -108,15 +117,20 @@ class NeoHookean(Isotropic):
     def __post_init__(self) -> None:
         _check_elastic(self.young, self.poisson)
 
+    @cached_property
+    def moduli(self) -> tuple[Any, ...]:
+        """Lame's mu and lambda [Pa]."""
+        return _lame(self.young, self.poisson)
+
     def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
         """W [J/m^3]."""
-        mu, lam = _lame(self.young, self.poisson)
+        mu, lam = self.moduli
         d = i1 + i2 + i3
         return mu / 2 * (log1p_remainder(d) - i2 - i3) + lam / 8 * log1p(d) ** 2
 
     def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
         """Derivatives of W [Pa]."""
-        mu, lam = _lame(self.young, self.poisson)
+        mu, lam = self.moduli
         d = i1 + i2 + i3
         first = (mu / 2 * d + lam / 4 * log1p(d)) / (1 + d)
         return first, first - mu / 2, first - mu / 2
@@ -153,17 +167,40 @@ class MooneyRivlin(Isotropic):
             raise ValueError(f"a + b={shear!r}: must be positive [Pa]: half the shear modulus")
         require_positive("c", self.c, "Pa")
 
+    @cached_property
+    def moduli(self) -> tuple[Any, ...]:
+        """The coefficients a, b and c [Pa]."""
+        return self.a, self.b, self.c
+
     def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
         """W [J/m^3]."""
+        a, b, c = self.moduli
         d = i1 + i2 + i3
         change = d / (1 + ufl.sqrt(1 + d))  # J - 1
-        linear = self.a + 2 * self.b
-        isochoric = linear * (log1p_remainder(d) - i3) - (self.a + self.b) * i2
-        return isochoric + self.c / 2 * change**2
+        linear = a + 2 * b
+        isochoric = linear * (log1p_remainder(d) - i3) - (a + b) * i2
+        return isochoric + c / 2 * change**2
 
     def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
         """Derivatives of W [Pa]."""
+        a, b, c = self.moduli
         d = i1 + i2 + i3
-        j, linear = ufl.sqrt(1 + d), self.a + 2 * self.b
-        first = (linear + self.c / 2 * j / (1 + j)) * d / (1 + d)
-        return first, first - (self.a + self.b), first - linear
+        j, linear = ufl.sqrt(1 + d), a + 2 * b
+        first = (linear + c / 2 * j / (1 + j)) * d / (1 + d)
+        return first, first - (a + b), first - linear
+
+
+def with_constants(material: Any, mesh: Any) -> Any:
+    """A material of this package with its moduli in a Constant: all moduli share compiled forms.
+
+    Args:
+        material: Any; others are returned as they are.
+        mesh: DOLFINx mesh of the forms.
+    """
+    if type(material) not in (StVenantKirchhoff, NeoHookean, MooneyRivlin):
+        return material
+    shared, moduli = copy.copy(material), material.moduli
+    # In one: UFL sorts several by their counts as text, and compiles again where 9 and 10 meet.
+    constants = fem.Constant(mesh, np.array(moduli, dtype=np.float64))
+    vars(shared)["moduli"] = tuple(constants[k] for k in range(len(moduli)))
+    return shared
