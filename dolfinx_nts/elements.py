@@ -188,11 +188,12 @@ class Joint(Protocol):
     def start(self) -> Any:
         """What it remembers at the start."""
 
-    def potential(self, u: Sequence[FloatArray]) -> float:
-        """Stored energy on this rank [J].
+    def potential(self, u: Sequence[FloatArray], history: Any) -> float:
+        """Stored energy on this rank [J]. Collective.
 
         Args:
             u: Owned displacements of each of its bodies [m].
+            history: What it remembers there, such as the turns of an angle.
         """
 
     def coupling(self, bodies: tuple[int, ...]) -> Coupling:
