@@ -16,6 +16,7 @@ import ufl
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 _EPS = float(np.finfo(float).eps)
 
@@ -40,7 +41,7 @@ _POINTS = 5
 _LAST = {k: (2 * k + 1) * _GAUSS[_POINTS][1] * _legendre(k, _POINTS) for k in (3, 4)}
 #: ... and these parts of the integrand's size stand for an error of machine precision.
 _RESOLVED = {k: _EPS ** (k / 10) for k in _LAST}
-#: Relative strain increment below which the coefficients of a W(C) may hold nothing but rounding.
+#: Relative increment (of strain) below which the coefficients may hold nothing but rounding.
 _SMALL_STRAIN = 1e-7
 
 
@@ -81,6 +82,33 @@ def _combine(weights: FloatArray, values: list[Any]) -> Any:
     """Weighted sum of UFL expressions."""
     first, *rest = (w * v for w, v in zip(weights.tolist(), values, strict=True))
     return sum(rest, start=first)
+
+
+def resolved_mean(
+    a: FloatArray,
+    b: FloatArray,
+    function: Callable[[FloatArray], FloatArray],
+    slope: Callable[[FloatArray], FloatArray],
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Mean of a function of one variable between a and b, its derivative by b, whether it is exact.
+
+    As in `gonzalez_stress`, five points are where the samples say that they are, to rounding, and
+    where a and b are so near that the samples' differences hold nothing but rounding.
+
+    Args:
+        a: One end, shape (n,).
+        b: The other end, shape (n,).
+        function: Of an array of any length.
+        slope: Its derivative.
+    """
+    tau, weight = _GAUSS[_POINTS]
+    x = a + tau[:, None] * (b - a)
+    samples, slopes = (f(x.ravel()).reshape(x.shape) for f in (function, slope))
+    left = -weight @ samples**2
+    for k in _LAST:
+        left += (_LAST[k] @ samples / _RESOLVED[k]) ** 2
+    near = np.abs(b - a) < _SMALL_STRAIN * np.maximum(np.abs(a), np.abs(b))
+    return weight @ samples, (weight * tau) @ slopes, (left <= 0.0) | near
 
 
 def mean_value(
