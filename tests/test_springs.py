@@ -67,7 +67,6 @@ ITEMS = {
 }
 
 
-@pytest.mark.mpi
 @pytest.mark.parametrize("rule", [*RULES, "static"])
 @pytest.mark.parametrize("item", ITEMS)
 @pytest.mark.parametrize("ground", [None, 0, 1])
@@ -118,7 +117,6 @@ def test_tumbling_bodies_keep_energy_and_momenta(law):
         assert np.abs(table[name] - table[name][0]).max() < 1e-11 * size
 
 
-@pytest.mark.mpi
 def test_an_energy_that_is_linear_is_a_linear_spring():
     """Also where steps are so small that differences of energies are rounding."""
     for dt, end in ((1e-2, 0.5), (1e-9, 2e-8)):
@@ -135,7 +133,6 @@ def test_an_energy_that_is_linear_is_a_linear_spring():
         assert np.array_equal(found[0][1], found[1][1])
 
 
-@pytest.mark.mpi
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("damping", [0.0, 1.5])
 def test_oscillator(rule, damping):
@@ -206,7 +203,6 @@ def test_a_spring_of_no_length_passes_through_it():
     assert np.abs(run.balance["ledger_residual"]).max() < 1e-13 * run.balance["energy"][0]
 
 
-@pytest.mark.mpi
 @pytest.mark.parametrize("rule", ["energy-momentum", "midpoint", "generalised alpha"])
 def test_torsion_pendulum_over_several_turns(rule):
     """V = k/2 phi^2 + c (1 - cos phi), not periodic: turns count."""
@@ -272,7 +268,6 @@ def test_two_wheels_on_one_axis():
     assert np.abs(moment - moment[0]).max() < 1e-11 * np.abs(moment).max()
 
 
-@pytest.mark.mpi
 def test_an_angle_counts_turns_from_where_a_run_goes_on():
     def scene():
         wheel = nts.RigidBody.from_inertia(1.0, (0.3, 0.4, 0.5), angular_velocity=(0, 0, 9.0))
@@ -288,7 +283,6 @@ def test_an_angle_counts_turns_from_where_a_run_goes_on():
     assert abs(stored[0] - stored[1]) < 1e-12 * stored[0]
 
 
-@pytest.mark.mpi
 def test_any_units():
     """m, mm and um: the same iterations, energies by the square of the length."""
     found = [in_units(size) for size in (1.0, 1e3, 1e6)]

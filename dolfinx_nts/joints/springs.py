@@ -161,7 +161,7 @@ class _SpringElements(PointElements):
             ends=(at_a, at_b),
             gradient=gradient,
             share=2.0 * rule.theta if direct else 1.0,
-            speed=way.directed(self.drift + rate * du).reshape(n, -1),
+            speed=way.directed(self.drift + rate * du).reshape(n, 3 * len(way.weights)),
             rate=rate,
             time=None if direct else self.step.dt,
         )
