@@ -335,6 +335,16 @@ def test_a_mass_hangs_on_a_spring(law):
 
 
 @pytest.mark.mpi
+def test_a_rigid_mass_hangs_on_a_spring():
+    body = mass((0.0, 0.0, 0.0))
+    spring = nts.Spring(None, body, [(0, 0, 1.5), (0, 0, 0.5)], stiffness=100.0)
+    system = nts.System([body], joints=[spring], gravity=(0.0, 0.0, -9.81))
+    run = nts.equilibrium(system, stabilization=0.1)
+    assert run.status == "completed"
+    assert np.abs(body.position - [0.0, 0.0, -2.0 * 9.81 / 100.0]).max() < 1e-10
+
+
+@pytest.mark.mpi
 def test_a_body_rests_on_springs_of_no_length():
     """Their mean sag is m g/(4 k), whatever the body's shape; they hold it in all directions."""
     g, k = 9.81, 2e4
