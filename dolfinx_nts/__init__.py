@@ -32,6 +32,7 @@ from dolfinx_nts.integrators import (
     Midpoint,
     Newmark,
 )
+from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.strain_energy import Isotropic
 from dolfinx_nts.run.equilibrium import Equilibrium, equilibrium
@@ -52,6 +53,7 @@ __all__ = [
     "Continuum",
     "Coupling",
     "Cylinder",
+    "Damper",
     "Dirichlet",
     "Elements",
     "EnergyMomentum",
@@ -77,6 +79,7 @@ __all__ = [
     "RigidBody",
     "Solution",
     "Sphere",
+    "Spring",
     "StVenantKirchhoff",
     "State",
     "Step",
@@ -84,6 +87,8 @@ __all__ = [
     "Stepper",
     "Surface",
     "System",
+    "TorsionDamper",
+    "TorsionSpring",
     "Traction",
     "UserFunctionError",
     "Writer",

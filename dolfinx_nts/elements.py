@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import places_of
+from dolfinx_nts.bodies.body import Moment, places_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.integrators import Integrator
 
@@ -48,6 +48,7 @@ class Step:
         motion: Largest component of each body's motion [m], shape (bodies,).
         length: Of each body, the displacement whose rounding its forces have [m], shape (bodies,).
         stiffness: Of a body, that of each of its coordinates' neighbourhood [N/m]; for statics.
+        moments: Of each body, when its forces are taken and how fast it moves there.
         force_rounding: Of some bodies, the norm of forces that is rounding [kg m]. Collective.
     """
 
@@ -61,6 +62,7 @@ class Step:
     motion: FloatArray
     length: FloatArray
     stiffness: Callable[[Any], FloatArray]
+    moments: Sequence[Moment]
     force_rounding: Callable[[Sequence[int]], float]
 
     def mean_scale(self, body: Any) -> float:
@@ -188,11 +190,12 @@ class Joint(Protocol):
     def start(self) -> Any:
         """What it remembers at the start."""
 
-    def potential(self, u: Sequence[FloatArray]) -> float:
-        """Stored energy on this rank [J].
+    def potential(self, u: Sequence[FloatArray], history: Any) -> float:
+        """Stored energy on this rank [J]. Collective.
 
         Args:
             u: Owned displacements of each of its bodies [m].
+            history: What it remembers there, such as the turns of an angle.
         """
 
     def coupling(self, bodies: tuple[int, ...]) -> Coupling:

@@ -70,7 +70,7 @@ class Spring:
     def start(self):
         return None
 
-    def potential(self, u):
+    def potential(self, u, history):
         batch = self._elements(None)
         at = batch.reference() + self._gathered(u)
         return float((0.5 * self.stiffness * (batch.lengths(at) - self.length) ** 2).sum())
@@ -240,7 +240,7 @@ class Drive:
     def start(self):
         return None
 
-    def potential(self, u):
+    def potential(self, u, history):
         return 0.0
 
     def coupling(self, bodies):

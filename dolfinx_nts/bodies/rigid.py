@@ -473,7 +473,7 @@ class _Triad:
         """Nothing to remember."""
         return None
 
-    def potential(self, u: Sequence[FloatArray]) -> float:
+    def potential(self, u: Sequence[FloatArray], history: Any) -> float:
         """None [J]."""
         return 0.0
 

@@ -16,6 +16,7 @@ import ufl
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 _EPS = float(np.finfo(float).eps)
 
@@ -32,15 +33,19 @@ _GAUSS = {
     n: tuple(
         0.5 * (x + s) for x, s in zip(np.polynomial.legendre.leggauss(n), (1.0, 0.0), strict=True)
     )
-    for n in range(1, 8)
+    for n in (*range(1, 8), 10)
 }
-_POINTS = 5
-#: Legendre coefficients of an integrand from its values at these points, shape (2, points). Where
-#: coefficients fall like r^k the rule's error falls like r^10, so the last two tell it ...
-_LAST = {k: (2 * k + 1) * _GAUSS[_POINTS][1] * _legendre(k, _POINTS) for k in (3, 4)}
+#: Points of the stored energies in UFL, and of functions of arrays.
+_POINTS, _MANY = 5, 10
+#: By the number of points n: Legendre coefficients of an integrand from its values there, (2, n).
+#: Where coefficients fall like r^k the rule's error falls like r^2n, so the last two tell it ...
+_LAST = {
+    n: {k: (2 * k + 1) * _GAUSS[n][1] * _legendre(k, n) for k in (n - 2, n - 1)}
+    for n in (_POINTS, _MANY)
+}
 #: ... and these parts of the integrand's size stand for an error of machine precision.
-_RESOLVED = {k: _EPS ** (k / 10) for k in _LAST}
-#: Relative strain increment below which the coefficients of a W(C) may hold nothing but rounding.
+_RESOLVED = {n: {k: _EPS ** (k / (2 * n)) for k in last} for n, last in _LAST.items()}
+#: Relative increment (of strain) below which the coefficients may hold nothing but rounding.
 _SMALL_STRAIN = 1e-7
 
 
@@ -66,8 +71,8 @@ def gonzalez_stress(energy: StrainEnergy, e0: Any, e1: Any) -> Any:
     size, argument = ufl.inner(de, de), energy.argument(em)
     scale = ufl.inner(argument, argument)
     left = -_combine(weight, [f**2 for f in samples])
-    for k in _LAST:
-        left += (_combine(_LAST[k], samples) / _RESOLVED[k]) ** 2
+    for k, last in _LAST[_POINTS].items():
+        left += (_combine(last, samples) / _RESOLVED[_POINTS][k]) ** 2
     left *= ufl.conditional(ufl.lt(size, _SMALL_STRAIN**2 * scale), 0.0, 1.0)
     by_quadrature = _combine(weight, samples) - middle
     bracket = ufl.conditional(ufl.le(left, 0.0), by_quadrature, path.difference - middle)
@@ -81,6 +86,34 @@ def _combine(weights: FloatArray, values: list[Any]) -> Any:
     """Weighted sum of UFL expressions."""
     first, *rest = (w * v for w, v in zip(weights.tolist(), values, strict=True))
     return sum(rest, start=first)
+
+
+def resolved_mean(
+    a: FloatArray,
+    b: FloatArray,
+    function: Callable[[FloatArray], FloatArray],
+    slope: Callable[[FloatArray], FloatArray],
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Mean of a function of one variable between a and b, its derivative by b, whether it is exact.
+
+    As in `gonzalez_stress`, quadrature is where the samples say so, to rounding, and where a and b
+    are so near that the samples' differences hold nothing but rounding. Many points let it be so
+    next to a zero of the function, too, where its integral is small beside what is differentiated.
+
+    Args:
+        a: One end, shape (n,).
+        b: The other end, shape (n,).
+        function: Of an array of any length.
+        slope: Its derivative.
+    """
+    tau, weight = _GAUSS[_MANY]
+    x = a + tau[:, None] * (b - a)
+    samples, slopes = (f(x.ravel()).reshape(x.shape) for f in (function, slope))
+    left = -weight @ samples**2
+    for k, last in _LAST[_MANY].items():
+        left += (last @ samples / _RESOLVED[_MANY][k]) ** 2
+    near = np.abs(b - a) < _SMALL_STRAIN * np.maximum(np.abs(a), np.abs(b))
+    return weight @ samples, (weight * tau) @ slopes, (left <= 0.0) | near
 
 
 def mean_value(

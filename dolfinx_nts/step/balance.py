@@ -133,8 +133,9 @@ def measure(
         if last is None or last[0] is not u or last[1] is not v:
             known[body.name] = last = u, v, _of_body(body, u, v)
         local += last[2]
-    for joint, bodies in zip(system.joints, system.joint_bodies, strict=True):
-        local[1] += joint.potential([state.u[b] for b in bodies])
+    joints = zip(system.joints, system.joint_bodies, state.histories[1:], strict=True)
+    for joint, bodies, history in joints:
+        local[1] += joint.potential([state.u[b] for b in bodies], history)
     total = np.empty_like(local)
     system.comm.Allreduce(local, total, op=MPI.SUM)
     return {

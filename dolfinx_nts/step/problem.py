@@ -124,7 +124,13 @@ class StepProblem:
 
     # ---- set-up of a step
     def begin(
-        self, state: State, dt: float, again: Evaluation | None = None, *, search: bool = True
+        self,
+        state: State,
+        dt: float,
+        again: Evaluation | None = None,
+        *,
+        search: bool = True,
+        moments: Sequence[Moment] | None = None,
     ) -> None:
         """Fix the state at t_n and the step: loads, candidates, layout, first guess.
 
@@ -134,11 +140,14 @@ class StepProblem:
             again: Solution of this step whose motion the elements did not cover, see `misses`:
                 contact is sought along that motion in place of the one that velocities predict.
             search: Seek contacts; False keeps the candidates of the last step, for statics only.
+            moments: Where the forces on each body are taken; None: as the integrator's step has it.
         """
         system = self.system
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
-        for k, body in enumerate(system.bodies):
-            body.begin_step(self.integrator, self._moment(k))
+        if moments is None:
+            moments = [self._moment(k) for k in range(len(system.bodies))]
+        for body, moment in zip(system.bodies, moments, strict=True):
+            body.begin_step(self.integrator, moment)
         self._gravity = self.integrator.ramp(self._when) * system.gravity
         flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
         self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
@@ -177,7 +186,7 @@ class StepProblem:
         self._diagonal[other] = 0.0
         step = Step(
             state, dt, self.factor, self.integrator, self.condense, self.first, way,
-            self._motion, self._length, self._stiffness, self._force_rounding_of,
+            self._motion, self._length, self._stiffness, moments, self._force_rounding_of,
         )  # fmt: skip
         for coupling, history in zip(self.couplings, state.histories, strict=True):
             coupling.begin(step, history, again, search)
@@ -312,16 +321,16 @@ class StepProblem:
             accelerations that hold but those [m/s^2].
         """
         still = tuple(np.zeros_like(v) for v in state.v)
-        self.begin(replace(state, a=still), dt)
+        ramp = self.integrator.ramp(state.time)
+        moments = [
+            Moment(u, state.time, ramp, 0.0, v) for u, v in zip(state.u, state.v, strict=True)
+        ]
+        self.begin(replace(state, a=still), dt, moments=moments)
         self.guess(flight=False, forces=True)
         contact = [terms.coupling / self.factor for terms in self.evaluate(self.x).bodies]
-        gravity = self.integrator.ramp(state.time) * self.system.gravity
+        gravity = ramp * self.system.gravity
         out = []
-        for body, u, v, force in zip(
-            self.system.bodies, state.u, state.v, contact, strict=True
-        ):
-            moment = Moment(u, state.time, self.integrator.ramp(state.time), 0.0, v)
-            body.begin_step(self.integrator, moment)
+        for body, u, force in zip(self.system.bodies, state.u, contact, strict=True):
             right = body.external(u, gravity) - body.internal(u) - force
             p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
             a = np.zeros_like(u)

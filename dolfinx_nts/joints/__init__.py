@@ -1,0 +1,1 @@
+"""What couples bodies beside contact: springs and dampers."""

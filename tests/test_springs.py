@@ -1,0 +1,504 @@
+"""Springs and dampers between points and about axes, against closed forms and SciPy."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+from scipy.integrate import quad, solve_ivp
+
+import dolfinx_nts as nts
+from dolfinx_nts.integrators import Static
+
+COMM = MPI.COMM_WORLD
+RULES = {
+    "energy-momentum": nts.EnergyMomentum(),
+    "midpoint": nts.Midpoint(),
+    "newmark": nts.Newmark(),
+    "generalised alpha": nts.GeneralizedAlpha(rho_inf=0.8),
+}
+MIDDLE = ("energy-momentum", "midpoint")
+LAWS = {
+    "linear": {"stiffness": 50.0, "length": 2.0},
+    "Lennard-Jones": {"energy": lambda x: 20.0 * ((2.0 / x) ** 8 - 2.0 * (2.0 / x) ** 4)},
+    "cubic": {
+        "energy": lambda x: 5.0 * (x - 2.0) ** 2 + 3.0 * (x - 2.0) ** 3 + 4.0 * (x - 2.0) ** 4,
+        "force": lambda x: 10.0 * (x - 2.0) + 9.0 * (x - 2.0) ** 2 + 16.0 * (x - 2.0) ** 3,
+    },
+}
+Z = (0.0, 0.0, 1.0)
+
+
+def tumbling(name="", **options):
+    one = nts.RigidBody.from_inertia(
+        2.0, (1.0, 2.0, 2.5), velocity=(0.1, 0.0, 0.0), angular_velocity=(3.0, 1.0, 2.0),
+        name=f"one{name}", **options,
+    )  # fmt: skip
+    other = nts.RigidBody.from_inertia(
+        1.0, (0.5, 0.6, 0.7), (3.0, 0.5, 0.0), velocity=(0.0, 0.3, 0.0),
+        angular_velocity=(-1.0, 2.0, 0.5), name=f"other{name}", **options,
+    )  # fmt: skip
+    return one, other
+
+
+POINTS = [(0.5, 0.3, -0.2), (2.2, 0.1, 0.4)]
+
+
+def cube(side=1.0, **options):
+    mesh = create_box(
+        COMM, [np.zeros(3), np.full(3, side)], [2, 2, 2], CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    return nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=1e3, name="cube", **options)
+
+
+def mass(x, name="mass", **options):
+    return nts.RigidBody.from_inertia(2.0, (0.3, 0.4, 0.5), x, name=name, **options)
+
+
+ITEMS = {
+    "spring": lambda a, b: nts.Spring(a, b, POINTS, stiffness=50.0, length=1.5),
+    "energy": lambda a, b: nts.Spring(a, b, POINTS, **LAWS["Lennard-Jones"]),
+    "force": lambda a, b: nts.Spring(a, b, POINTS, **LAWS["cubic"]),
+    "no length": lambda a, b: nts.Spring(a, b, POINTS, stiffness=50.0, length=0.0),
+    "damper": lambda a, b: nts.Damper(a, b, POINTS, damping=3.0),
+    "torsion": lambda a, b: nts.TorsionSpring(a, b, axis=(1, 2, 3), stiffness=7.0, angle=0.4),
+    "torsion energy": lambda a, b: nts.TorsionSpring(a, b, axis=Z, energy=lambda x: -np.cos(x)),
+    "torsion damper": lambda a, b: nts.TorsionDamper(a, b, axis=(1, 2, 3), damping=3.0),
+}
+
+
+@pytest.mark.parametrize("rule", [*RULES, "static"])
+@pytest.mark.parametrize("item", ITEMS)
+@pytest.mark.parametrize("ground", [None, 0, 1])
+def test_tangents_are_derivatives(item, rule, ground):
+    a, b = tumbling()
+    ends = [None if k == ground else body for k, body in enumerate((a, b))]
+    rng = np.random.default_rng(3)
+    system = nts.System([a, b], joints=[ITEMS[item](*ends)])
+    stepper = nts.Stepper(system, RULES.get(rule, RULES["midpoint"]))
+    problem = stepper.problem
+    if rule == "static":
+        problem.integrator = Static()
+    state, h = stepper.state, 0.1
+    if getattr(problem.integrator, "accelerations", False):
+        a0 = tuple(rng.normal(size=v.shape) for v in state.v)
+        state = nts.State(state.time, state.u, state.v, a0, state.histories)
+    # Rigid bodies have no stiffness that scales their constraints: these are left out in statics.
+    problem.couplings = problem.couplings[:2]
+    state = nts.State(state.time, state.u, state.v, state.a, state.histories[:2])
+    problem.begin(state, h)
+    (batch,) = problem.elements
+    shape = batch.reference().shape
+    for size in (0.3, 0.0):
+        x = batch.reference() + size * rng.normal(size=shape)
+        tangent = batch.evaluate(x, {}).tangent
+        way = rng.normal(size=shape)
+        ends = [batch.evaluate(x + s * 1e-6 * way, {}).residual for s in (1.0, -1.0)]
+        expected = (ends[0] - ends[1]) / 2e-6
+        found = np.einsum("nij,nj->ni", tangent, way.reshape(shape[0], -1))
+        assert np.abs(found - expected).max(initial=0.0) <= 1e-7 * np.abs(tangent).max(initial=0.0)
+    stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("law", LAWS)
+def test_tumbling_bodies_keep_energy_and_momenta(law):
+    a, b = tumbling()
+    spring = nts.Spring(a, b, POINTS, **LAWS[law])
+    run = nts.simulate(nts.System([a, b], joints=[spring]), RULES["energy-momentum"],
+                       dt=0.01, t_end=1.0)  # fmt: skip
+    table = run.balance
+    assert run.status == "completed" and table["newton_iterations"].max() <= 4
+    kinetic = table["kinetic"][0]
+    assert np.ptp(table["potential"]) > 0.05 * kinetic
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * kinetic
+    for name in ("linear_momentum", "angular_momentum"):
+        size = np.abs(table[name]).max()
+        assert np.abs(table[name] - table[name][0]).max() < 1e-11 * size
+
+
+def test_an_energy_that_is_linear_is_a_linear_spring():
+    """Also where steps are so small that differences of energies are rounding."""
+    for dt, end in ((1e-2, 0.5), (1e-9, 2e-8)):
+        found = []
+        for law in ({"stiffness": 50.0, "length": 2.0},
+                    {"energy": lambda x: 25.0 * (x - 2.0) ** 2}):  # fmt: skip
+            a, b = tumbling()
+            spring = nts.Spring(a, b, POINTS, **law)
+            run = nts.simulate(nts.System([a, b], joints=[spring]), RULES["energy-momentum"],
+                               dt=dt, t_end=end)  # fmt: skip
+            assert run.status == "completed"
+            found.append((a.velocity, run.balance["newton_iterations"]))
+        assert np.allclose(found[0][0], found[1][0], rtol=0.0, atol=1e-12)
+        assert np.array_equal(found[0][1], found[1][1])
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("damping", [0.0, 1.5])
+def test_oscillator(rule, damping):
+    """Order, and what the damper takes, by the closed form; ends change places."""
+    m, k, start, v0, end = 2.0, 30.0, 0.3, 0.8, 1.6
+    decay = damping / (2 * m)
+    omega = np.sqrt(k / m - decay**2)
+    c, s = start, (v0 + decay * start) / omega
+    place = np.exp(-decay * end) * (c * np.cos(omega * end) + s * np.sin(omega * end))
+    speed = np.exp(-decay * end) * (
+        (-decay * c + omega * s) * np.cos(omega * end)
+        - (decay * s + omega * c) * np.sin(omega * end)
+    )
+    lost = 0.5 * (k * start**2 + m * v0**2) - 0.5 * (k * place**2 + m * speed**2)
+    errors = []
+    for n, dt in enumerate((0.04, 0.02)):
+        body = mass((1.0 + start, 0.0, 0.0), velocity=(v0, 0.0, 0.0))
+        ends, points = (body, None), [(1.0 + start, 0, 0), (0, 0, 0)]
+        order = slice(None, None, -1 if n else 1)
+        joints = [nts.Spring(*ends[order], points[order], stiffness=k, length=1.0)]
+        if damping:
+            joints.append(nts.Damper(*ends[order], points[order], damping=damping))
+        run = nts.simulate(nts.System([body], joints=joints), RULES[rule], dt=dt, t_end=end)
+        assert run.status == "completed"
+        table = run.balance
+        error = [body.position[0] - 1.0 - place, body.velocity[0] - speed]
+        taken = table.get("damping_dissipation", np.zeros(2))
+        lost_by = taken[-1] - lost
+        if rule in MIDDLE:
+            assert (np.diff(taken) >= 0.0).all()
+            assert np.abs(table["ledger_residual"]).max() < 1e-13 * table["energy"][0]
+            error += [lost_by] if damping else []
+        # Works of forces off the middle of the step are of first order, as those of loads.
+        assert abs(lost_by) < 0.5 * dt * lost + 1e-12
+        errors.append(np.abs(error))
+    assert errors[1].max() < 1e-2
+    assert np.abs(np.log2(errors[0] / errors[1]) - 2.0).max() < 0.1
+
+
+@pytest.mark.mpi
+def test_damped_tumbling_closes_the_ledger():
+    a, b = tumbling()
+    joints = [nts.Spring(a, b, POINTS, **LAWS["Lennard-Jones"]),
+              nts.Damper(a, b, POINTS, damping=2.0)]  # fmt: skip
+    run = nts.simulate(nts.System([a, b], joints=joints), RULES["energy-momentum"],
+                       dt=0.01, t_end=2.0)  # fmt: skip
+    table, kinetic = run.balance, run.balance["kinetic"][0]
+    lost = table["damping_dissipation"]
+    assert run.status == "completed" and lost[-1] > 0.1 * kinetic
+    assert (np.diff(lost) >= 0.0).all()
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * kinetic
+    moment = table["angular_momentum"]
+    assert np.abs(moment - moment[0]).max() < 1e-11 * np.abs(moment).max()
+
+
+@pytest.mark.mpi
+def test_a_spring_of_no_length_passes_through_it():
+    """It starts at length 0 and comes back there; V = k/2 l^2 is smooth."""
+    k, v0 = 50.0, 0.7
+    omega, h = np.sqrt(k / 2.0), 0.02
+    phase = 2.0 * np.arctan(omega * h / 2.0)
+    body = mass((0.3, 0.2, 0.1), velocity=(v0, 0.0, 0.0))
+    spring = nts.Spring(None, body, [(0.3, 0.2, 0.1)] * 2, stiffness=k)
+    run = nts.simulate(nts.System([body], joints=[spring]), RULES["energy-momentum"],
+                       dt=h, t_end=50 * h)  # fmt: skip
+    assert run.status == "completed"
+    assert abs(body.position[0] - 0.3 - v0 / omega * np.sin(50 * phase)) < 1e-12
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-13 * run.balance["energy"][0]
+
+
+@pytest.mark.parametrize("rule", ["energy-momentum", "midpoint", "generalised alpha"])
+def test_torsion_pendulum_over_several_turns(rule):
+    """V = k/2 phi^2 + c (1 - cos phi), not periodic: turns count."""
+    inertia, k, c, damping, spin, end = 0.5, 0.02, 0.3, 0.02, 8.0, 2.5
+
+    def right(t, y):
+        return [y[1], -(k * y[0] + c * np.sin(y[0]) + damping * y[1]) / inertia]
+
+    exact = solve_ivp(right, (0.0, end), [0.0, spin], rtol=1e-12, atol=1e-12, dense_output=True)
+    angle, speed = exact.y[:, -1]
+    assert exact.y[0].max() > 5.0 * np.pi
+    lost = damping * quad(lambda t: exact.sol(t)[1] ** 2, 0.0, end, epsabs=1e-10, limit=200)[0]
+    errors = []
+    for dt in (0.03125, 0.015625):
+        wheel = nts.RigidBody.from_inertia(
+            1.0, (0.3, 0.4, inertia), (1.0, 0.0, 0.0), motion=(0, 0, 0),
+            angular_velocity=(0, 0, spin),
+        )  # fmt: skip
+        joints = [
+            nts.TorsionSpring(wheel, None, axis=(0, 0, 3), stiffness=k),
+            nts.TorsionSpring(None, wheel, axis=Z, energy=lambda x: -c * np.cos(x), name="gravity"),
+            nts.TorsionDamper(None, wheel, axis=Z, damping=damping),
+        ]
+        run = nts.simulate(nts.System([wheel], joints=joints), RULES[rule], dt=dt, t_end=end)
+        table = run.balance
+        assert run.status == "completed"
+        stored = 0.5 * k * angle**2 - c * np.cos(angle)
+        turned = np.arctan2(wheel.rotation[1, 0], wheel.rotation[0, 0]) - angle
+        turned -= 2 * np.pi * np.round(turned / (2 * np.pi))
+        error = [turned, wheel.angular_velocity[2] - speed, table["potential"][-1] - stored]
+        lost_by = table["damping_dissipation"][-1] - lost
+        errors.append(np.linalg.norm([*error, lost_by if rule in MIDDLE else 0.0]))
+        assert abs(lost_by) < dt * lost
+        if rule == "energy-momentum":
+            assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["kinetic"][0]
+    assert errors[1] < 2e-3 * angle
+    assert abs(np.log2(errors[0] / errors[1]) - 2.0) < 0.1
+
+
+@pytest.mark.mpi
+def test_two_wheels_on_one_axis():
+    """They turn against each other by more than half a turn; their angular momentum stays."""
+    k, axis, spins = 2.0, np.array([2.0, 1.0, 2.0]) / 3.0, (9.0, -2.0)
+    inertias, end = (0.5, 0.7), 1.5
+    frame = np.linalg.qr(np.column_stack([axis, np.eye(3)[:, :2]]))[0][:, ::-1]
+    frame[:, 2] = axis
+    frame[:, 0] = np.cross(frame[:, 1], axis)
+    omega = np.sqrt(k * (1 / inertias[0] + 1 / inertias[1]))
+    stored = 0.5 * k * ((spins[0] - spins[1]) / omega * np.sin(omega * end)) ** 2
+    errors = []
+    for h in (0.03, 0.015):
+        wheels = [
+            nts.RigidBody.from_inertia(
+                1.0, (0.3, 0.45, inertia), c * axis, frame, angular_velocity=spin * axis,
+                name=f"{c}",
+            )  # fmt: skip
+            for c, inertia, spin in zip((0.0, 1.0), inertias, spins, strict=True)
+        ]
+        spring = nts.TorsionSpring(*wheels, axis=axis, stiffness=k)
+        run = nts.simulate(nts.System(wheels, joints=[spring]), RULES["energy-momentum"],
+                           dt=h, t_end=end)  # fmt: skip
+        table = run.balance
+        assert np.sqrt(2 * table["potential"].max() / k) > 1.1 * np.pi
+        errors.append(table["potential"][-1] - stored)
+        assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][0]
+        moment = table["angular_momentum"]
+        assert np.abs(moment - moment[0]).max() < 1e-11 * np.abs(moment).max()
+    assert abs(np.log2(errors[0] / errors[1]) - 2.0) < 0.1
+
+
+def test_an_angle_counts_turns_from_where_a_run_goes_on():
+    def scene():
+        wheel = nts.RigidBody.from_inertia(1.0, (0.3, 0.4, 0.5), angular_velocity=(0, 0, 9.0))
+        spring = nts.TorsionSpring(None, wheel, axis=Z, stiffness=0.02)
+        return nts.System([wheel], joints=[spring])
+
+    options = {"dt": 0.02, "t_end": 2.0}
+    whole = nts.simulate(scene(), RULES["energy-momentum"], **options)
+    half = nts.simulate(scene(), RULES["energy-momentum"], **(options | {"t_end": 1.0}))
+    rest = nts.simulate(scene(), RULES["energy-momentum"], **options, start=half)
+    stored = [run.balance["potential"][-1] for run in (whole, rest)]
+    assert stored[0] > 0.5 * 0.02 * (4 * np.pi) ** 2
+    assert abs(stored[0] - stored[1]) < 1e-12 * stored[0]
+
+
+def test_any_units():
+    """m, mm and um: the same iterations, energies by the square of the length."""
+    found = [in_units(size) for size in (1.0, 1e3, 1e6)]
+    assert found[0][0] == found[1][0] == found[2][0]
+    energies = [energy for _, energy in found]
+    assert np.ptp(energies) < 1e-11 * energies[0]
+
+
+def in_units(size):
+    a = nts.RigidBody.from_inertia(2.0, np.array([1.0, 2.0, 2.5]) * size**2,
+                                   angular_velocity=(3.0, 1.0, 2.0), name="a")  # fmt: skip
+    b = nts.RigidBody.from_inertia(1.0, np.array([0.5, 0.6, 0.7]) * size**2,
+                                   (3.0 * size, 0.5 * size, 0.0), name="b")  # fmt: skip
+    points = np.array(POINTS) * size
+    joints = [
+        nts.Spring(a, b, points, energy=lambda x: 20.0 * size**2 * np.exp(-((x / size) ** 2))),
+        nts.Spring(a, None, points, stiffness=4.0),
+        nts.Damper(a, b, points, damping=2.0),
+    ]
+    run = nts.simulate(nts.System([a, b], joints=joints), RULES["energy-momentum"],
+                       dt=0.01, t_end=0.5)  # fmt: skip
+    table = run.balance
+    assert run.status == "completed"
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][0]
+    return table["newton_iterations"].tolist(), table["energy"][-1] / size**2
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("law", ["stiffness", "energy"])
+def test_a_mass_hangs_on_a_spring(law):
+    """Its length is L + m g/k, whatever the body's shape; a damper does nothing."""
+    g, k, rest = 9.81, 5e4, 1.0
+    body = cube()
+    held = {"stiffness": k, "length": rest} if law == "stiffness" else {
+        "energy": lambda x: 0.5 * k * (x - rest) ** 2}  # fmt: skip
+    points = [(0.5, 0.5, 1.0), (0.5, 0.5, 2.0)]
+    joints = [nts.Spring(body, None, points, **held), nts.Damper(body, None, points, damping=1e5)]
+    system = nts.System([body], joints=joints, gravity=(0.0, 0.0, -g))
+    run = nts.equilibrium(system, stabilization=0.1, load_steps=2)
+    assert run.status == "completed"
+    down = -body.points(points[0]).at(run.state.u[0])[0]
+    assert np.abs(down[:2]).max() < 1e-8
+    assert abs(down[2] - 1e3 * g / k) < 1e-9 * rest
+    assert run.balance["damping_dissipation"][-1] == 0.0
+
+
+@pytest.mark.mpi
+def test_a_rigid_mass_hangs_on_a_spring():
+    body = mass((0.0, 0.0, 0.0))
+    spring = nts.Spring(None, body, [(0, 0, 1.5), (0, 0, 0.5)], stiffness=100.0)
+    system = nts.System([body], joints=[spring], gravity=(0.0, 0.0, -9.81))
+    run = nts.equilibrium(system, stabilization=0.1)
+    assert run.status == "completed"
+    assert np.abs(body.position - [0.0, 0.0, -2.0 * 9.81 / 100.0]).max() < 1e-10
+
+
+@pytest.mark.mpi
+def test_a_body_rests_on_springs_of_no_length():
+    """Their mean sag is m g/(4 k), whatever the body's shape; they hold it in all directions."""
+    g, k = 9.81, 2e4
+    body = cube()
+    corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], dtype=float)
+    joints = [nts.Spring(body, None, (x, x), stiffness=k, name=f"foot {x}") for x in corners]
+    system = nts.System([body], joints=joints, gravity=(0.0, 0.0, -g))
+    run = nts.equilibrium(system)
+    assert run.status == "completed" and not run.warnings
+    sag = -body.points(corners).at(run.state.u[0])
+    assert np.abs(sag.mean(axis=0) - [0, 0, 1e3 * g / (4 * k)]).max() < 1e-11
+    assert abs(run.balance["potential"][-1] - 0.5 * k * (sag**2).sum() - body_energy(run)) < 1e-8
+
+
+def body_energy(run):
+    return COMM.allreduce(run.system.bodies[0].potential(run.state.u[0]))
+
+
+@pytest.mark.mpi
+def test_a_spring_within_a_flexible_body():
+    """Its ends are points of one body: an inner force that adds no momentum."""
+    body = cube(velocity=(0.3, 0.0, 0.0))
+    points = [(0.1, 0.2, 0.3), (0.9, 0.7, 0.8)]
+    joints = [nts.Spring(body, body, points, stiffness=1e4, length=0.5),
+              nts.Damper(body, body, points, damping=50.0)]  # fmt: skip
+    run = nts.simulate(nts.System([body], joints=joints), RULES["energy-momentum"],
+                       dt=5e-3, t_end=0.1)  # fmt: skip
+    table = run.balance
+    assert run.status == "completed" and table["damping_dissipation"][-1] > 1.0
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+    for name, zero in (("linear_momentum", 300.0), ("angular_momentum", 150.0)):
+        assert np.abs(table[name] - table[name][0]).max() < 1e-11 * zero
+
+
+@pytest.mark.mpi
+def test_a_rigid_body_on_a_flexible_one():
+    body, ball = cube(velocity=(0.3, 0.0, 0.0)), mass((0.5, 0.5, 2.0), angular_velocity=(3, 2, 1))
+    points = [(0.4, 0.5, 1.0), (0.6, 0.5, 1.7)]
+    joints = [nts.Spring(body, ball, points, stiffness=1e3, length=0.4),
+              nts.Damper(ball, body, points[::-1], damping=5.0)]  # fmt: skip
+    run = nts.simulate(nts.System([ball, body], joints=joints), RULES["energy-momentum"],
+                       dt=5e-3, t_end=0.1)  # fmt: skip
+    table = run.balance
+    assert run.status == "completed" and table["damping_dissipation"][-1] > 0.1
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+    for name in ("linear_momentum", "angular_momentum"):
+        assert np.abs(table[name] - table[name][0]).max() < 1e-10 * np.abs(table[name]).max()
+
+
+@pytest.mark.mpi
+def test_an_energy_that_raises_ends_the_run_on_all_ranks():
+    def energy(x):
+        if (np.real(x) > 1.2).any():
+            raise RuntimeError("too long")
+        return (x - 1.0) ** 2
+
+    body = mass((1.0, 0.0, 0.0), velocity=(1.0, 0.0, 0.0))
+    spring = nts.Spring(body, None, [(1, 0, 0), (0, 0, 0)], energy=energy)
+    run = nts.simulate(nts.System([body], joints=[spring]), RULES["energy-momentum"],
+                       dt=0.01, t_end=1.0)  # fmt: skip
+    assert "energy of 'Spring of mass and ground'" in run.status and "too long" in run.status
+    assert 0.1 < run.balance["time"][-1] < 0.25
+
+
+class Hinge:
+    """What `about` asks of a joint."""
+
+    ends, axis = (None, None), (0, 0, 2)
+
+
+@pytest.mark.mpi
+def test_about_a_joint():
+    wheel = mass((0, 0, 0))
+    hinge = Hinge()
+    hinge.ends = (wheel, None)
+    spring = nts.TorsionSpring.about(hinge, stiffness=2.0, name="clock")
+    assert spring.bodies == (wheel,) and spring.name == "clock"
+    assert isinstance(nts.TorsionDamper.about(hinge, damping=2.0), nts.TorsionDamper)
+    with pytest.raises(TypeError, match=r"joint=3: pass a joint with an axis, such as Revolute"):
+        nts.TorsionSpring.about(3, stiffness=2.0)
+
+
+APART = [(0, 0, 0), (1, 0, 0)]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    "make, kind, message",
+    [
+        (lambda a: nts.Spring(a, None, APART, stiffness=0.0), ValueError,
+         r"stiffness=0.0: must be"),
+        (lambda a: nts.Spring(a, None, APART, stiffness="k"), ValueError,
+         r"stiffness='k': must be"),
+        (lambda a: nts.Spring(a, None, APART, stiffness=1.0, length=-1.0), ValueError,
+         r"length=-1.0: must be >= 0"),
+        (lambda a: nts.Spring(a, None, APART), ValueError,
+         r"stiffness=None, energy=None: pass one of them"),
+        (lambda a: nts.Spring(a, None, APART, stiffness=1.0, energy=np.exp), ValueError,
+         r"stiffness=1.0, energy=.*: pass one of them"),
+        (lambda a: nts.Spring(a, None, APART, stiffness=1.0, force=np.exp), ValueError,
+         r"force=.*: belongs to energy="),
+        (lambda a: nts.Spring(a, None, APART, energy=np.exp, length=1.0), ValueError,
+         r"length=1.0: belongs to stiffness="),
+        (lambda a: nts.Spring(a, None, APART, energy=3.0), TypeError,
+         r"energy=3.0: pass a function of an array"),
+        (lambda a: nts.Spring(a, None, APART, energy=np.exp, force=3.0), TypeError,
+         r"force=3.0: pass a function of an array"),
+        (lambda a: nts.Spring(a, None, APART, energy=lambda x: np.abs(x) ** 2), ValueError,
+         r"energy of 'Spring of mass and ground': changes by 0.0201 J .* pass force=dV/dl"),
+        (lambda a: nts.Spring(a, None, APART, energy=lambda x: x**2, force=lambda x: -2 * x),
+         ValueError, r"its derivative says -0.0201 J"),
+        (lambda a: nts.Spring(a, None, APART, energy=lambda x: x + np.nan), ValueError,
+         r"energy of 'Spring of mass and ground': it or its derivative is not finite at 1"),
+        (lambda a: nts.Spring(a, None, APART, energy=lambda x: np.full(3, x)),
+         nts.UserFunctionError, r"energy of 'Spring of mass and ground': .* raised ValueError"),
+        (lambda a: nts.Spring(None, None, APART, stiffness=1.0), ValueError,
+         r"a=None, b=None: a Spring needs a body"),
+        (lambda a: nts.Spring(a, a, APART, stiffness=1.0), ValueError,
+         r"a=b='mass': a rigid body does not change its size"),
+        (lambda a: nts.Spring(a, 7, APART, stiffness=1.0), TypeError, r"b=7: pass a body, or None"),
+        (lambda a: nts.Spring(a, None, (0, 0, 0), stiffness=1.0), ValueError,
+         r"points=\(0, 0, 0\): pass two points"),
+        (lambda a: nts.Spring(a, None, [(0, 0, 0), (1, 0)], stiffness=1.0), ValueError,
+         r"points\[1\]=\(1, 0\): pass three finite components"),
+        (lambda a: nts.Spring(a, None, [(1, 0, 0), (1, 0, 1e-12)], stiffness=1.0, length=0.1),
+         ValueError, r"they coincide, and a spring of length=0.1 has no direction there"),
+        (lambda a: nts.Spring(a, None, [(1, 0, 0)] * 2, energy=np.exp), ValueError,
+         r"they coincide, and a force of one's own has no direction there"),
+        (lambda a: nts.Damper(a, None, [(1, 0, 0)] * 2, damping=1.0), ValueError,
+         r"points of 'Damper of mass and ground': they coincide"),
+        (lambda a: nts.Damper(a, None, APART, damping=-1.0), ValueError, r"damping=-1.0: must be"),
+        (lambda a: nts.Damper(a, None, APART, damping=1.0, name=""), ValueError,
+         r"name='': is empty"),
+        (lambda a: nts.Damper(a, None, APART, damping=1.0, friction=2), TypeError,
+         r"friction=2: unknown option of Damper; choose from a, b, points, damping, name"),
+        (lambda a: nts.TorsionSpring(a, None, axis=(0, 0, 0), stiffness=1.0), ValueError,
+         r"axis=\(0, 0, 0\): has no direction"),
+        (lambda a: nts.TorsionSpring(a, None, axis=Z, stiffness=1.0, angle=np.inf), ValueError,
+         r"angle=inf: must be finite"),
+        (lambda a: nts.TorsionSpring(a, None, axis=Z, stiffness=-1.0), ValueError,
+         r"stiffness=-1.0: must be positive and finite \[N m\]"),
+        (lambda a: nts.TorsionDamper(a, None, axis=Z, damping=0.0), ValueError,
+         r"damping=0.0: must be positive and finite \[N m s\]"),
+    ],
+)  # fmt: skip
+def test_bad_input(make, kind, message):
+    with pytest.raises(kind, match=message):
+        make(mass((0.0, 0.0, 0.0)))
+
+
+@pytest.mark.mpi
+def test_bad_input_of_flexible_bodies():
+    body = cube()
+    with pytest.raises(ValueError, match=r"b='cube': a flexible body has no directions for"):
+        nts.TorsionSpring(None, body, axis=Z, stiffness=1.0)
+    with pytest.raises(ValueError, match=r"points of 'Spring of cube and ground': .*lies in no"):
+        nts.Spring(body, None, [(3, 0, 0), (0, 0, 0)], stiffness=1.0)
