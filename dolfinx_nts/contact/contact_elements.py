@@ -29,6 +29,8 @@ BoolArray = npt.NDArray[np.bool_]
 #: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which
 #: with a consistent mass matrix is a small part of the nodal mass.
 TANGENTIAL_SCALE = 0.05
+#: The same where all points share nodes, as of rigid bodies, whose mass is divided among them.
+_OF_SHARED = 0.5
 #: Largest coefficient of friction in numbers: larger ones are this one, but for infinite friction.
 _LARGEST = 1e8
 #: Coefficient of infinite friction where it has a bound: sticking by more would be rounding's.
@@ -368,6 +370,10 @@ class ContactElements:
         gap: FloatArray = np.maximum(self.rounding, self.force_rounding / self._yielding)
         return gap
 
+    @property
+    def _tangential_scale(self) -> float:
+        return TANGENTIAL_SCALE if self.pair.yields else _OF_SHARED
+
     @cached_property
     def _lent(self) -> FloatArray:
         """Compliance that the matrix lends to what holds a pair [1/kg], shape (n,), see `SHIFT`."""
@@ -479,7 +485,7 @@ class ContactElements:
 
     def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
         """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
-        c = TANGENTIAL_SCALE * self._yielding
+        c = self._tangential_scale * self._yielding
         if self._endless:
             return c
         moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2))
@@ -601,7 +607,7 @@ class ContactElements:
         endless = self._endless
         if slip is None or not (self.lets_slip or endless):
             return none
-        t, s = multiplier[:, -2:], TANGENTIAL_SCALE * self._yielding[:, None] * slip.value
+        t, s = multiplier[:, -2:], self._tangential_scale * self._yielding[:, None] * slip.value
         friction = length(slip.metric, t)
         resists = friction**2 + np.einsum("na,na->n", t, s) > 0.0
         resists &= ~self.blocked.any(axis=(1, 2))

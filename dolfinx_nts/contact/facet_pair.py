@@ -62,6 +62,11 @@ class FacetPair(ContactPair, master=Surface):
         return super().redundant or not self.master.material.are_nodes
 
     @property
+    def yields(self) -> bool:
+        """Whether points of a surface can move against each other, as of `ContactPair`."""
+        return super().yields or self.master.material.are_nodes
+
+    @property
     def master_name(self) -> str:
         """Of the master's body."""
         name: str = self.master.body.name

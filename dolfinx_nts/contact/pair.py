@@ -156,6 +156,12 @@ class ContactPair:
         return not self.slave.material.are_nodes
 
     @property
+    def yields(self) -> bool:
+        """Whether points of a surface can move against each other, as those of rigid bodies cannot.
+        """
+        return self.slave.material.are_nodes
+
+    @property
     def master_name(self) -> str:
         """For messages and files."""
         name: str = self.master.name
