@@ -157,8 +157,7 @@ class ContactPair:
 
     @property
     def yields(self) -> bool:
-        """Whether points of a surface can move against each other, as those of rigid bodies cannot.
-        """
+        """Whether points of a surface may move against each other; rigid bodies' may not."""
         return self.slave.material.are_nodes
 
     @property

@@ -371,8 +371,7 @@ class StepProblem:
         return self._stabilization(body) * du
 
     def _stiffness(self, body: Any) -> FloatArray:
-        """Stiffness of each coordinate's neighbourhood [N/m]; where there is none, of the others.
-        """
+        """Stiffness of each coordinate's surroundings [N/m]; where there is none, of the others."""
         own: FloatArray = body.nodal_stiffness(self.integrator)
         return np.where(own > 0.0, own, self._mean_stiffness)
 
