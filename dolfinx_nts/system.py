@@ -107,6 +107,9 @@ class System:
         labels = [joint.name for joint in self.joints]
         if len(set(labels)) < len(labels):
             raise ValueError(f"joints: names {labels} are not unique; pass name= to each joint")
+        both = sorted(set(labels) & set(names))
+        if both:
+            raise ValueError(f"joints, bodies: both have the names {both}; rename the joints")
         for joint in self.joints:
             for body in joint.bodies:
                 if not any(body is b for b in self.bodies):

@@ -502,3 +502,31 @@ def test_bad_input_of_flexible_bodies():
         nts.TorsionSpring(None, body, axis=Z, stiffness=1.0)
     with pytest.raises(ValueError, match=r"points of 'Spring of cube and ground': .*lies in no"):
         nts.Spring(body, None, [(3, 0, 0), (0, 0, 0)], stiffness=1.0)
+
+
+@pytest.mark.mpi
+def test_forces_of_joints_supports_and_contacts_are_written(mpi_tmp_path):
+    """A mass that hangs and one that stands: the spring pulls, the floor carries, a row a step."""
+    from dolfinx_nts.output import ForcesCSV
+
+    hangs = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), centre=(1, 0, 0), name="hangs")
+    held = nts.RigidBody.from_inertia(3.0, (1, 1, 1), motion=(0, 0, 0), name="held")
+    spring = nts.Spring(
+        hangs, None, ((1, 0, 0), (1, 0, 2)), stiffness=100.0, length=2.0 - 0.02 * 9.81, name="pull"
+    )
+    system = nts.System([hangs, held], joints=[spring], gravity=(0, 0, -9.81))
+    path = mpi_tmp_path / "forces.csv"
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=0.01, t_end=0.05, output=[ForcesCSV(path)]
+    )
+    # The spring is stretched by m g / k: it carries the weight at rest.
+    assert run.reactions["pull"][1:, 0] == pytest.approx(np.tile([0, 0, 2 * 9.81], (5, 1)))
+    assert run.reactions["held"][1:, 0] == pytest.approx(np.tile([0, 0, 3 * 9.81], (5, 1)))
+    if COMM.rank == 0:
+        head, *rows = path.read_text().splitlines()
+        names = head.split(",")
+        values = dict(zip(names, map(float, rows[-1].split(",")), strict=True))
+        assert len(rows) == 6 and values["time [s]"] == pytest.approx(0.05)
+        assert values["pull_force_z [N]"] == pytest.approx(2 * 9.81)
+        assert values["pull_moment_x [N m]"] == 0.0
+        assert values["held_0_z [N]"] == pytest.approx(3 * 9.81)

@@ -1,5 +1,5 @@
 """Writers of fields and tables, plots and pictures."""
 
-from dolfinx_nts.output.writers import BalanceCSV, Fields
+from dolfinx_nts.output.writers import BalanceCSV, Fields, ForcesCSV
 
-__all__ = ["BalanceCSV", "Fields"]
+__all__ = ["BalanceCSV", "Fields", "ForcesCSV"]

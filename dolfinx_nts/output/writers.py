@@ -25,6 +25,7 @@ from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.step import balance as ledger
+from dolfinx_nts.step import resultants
 from dolfinx_nts.system import State
 from dolfinx_nts.validation import StrPath, as_path, is_whole, require_positive
 
@@ -281,14 +282,20 @@ class BalanceCSV:
 
     def start(self, stepper: Stepper) -> None:
         """Write the header and the row of the initial state."""
-        header, self._rows = [], 0
-        for name in ledger.columns(stepper.system):
-            unit = _UNITS.get(name, "J")
-            vector = np.ndim(stepper.solution.rows[0][name]) > 0
-            header += [f"{name}{s} [{unit}]" for s in (("_x", "_y", "_z") if vector else ("",))]
+        self._rows = 0
+        self._columns, header = self._of(stepper)
         line = ",".join(header) + "\n"
         self._root(stepper, lambda: replace_file(self.path, line.encode()))
         self.write(stepper)
+
+    def _of(self, stepper: Stepper) -> tuple[tuple[str, ...], list[str]]:
+        """Columns of the table to write, and their headings."""
+        columns, header = ledger.columns(stepper.system), []
+        for name in columns:
+            unit = _UNITS.get(name, "J")
+            vector = np.ndim(stepper.solution.rows[0][name]) > 0
+            header += [f"{name}{s} [{unit}]" for s in (("_x", "_y", "_z") if vector else ("",))]
+        return columns, header
 
     def write(self, stepper: Stepper, *, last: bool = False) -> None:
         """Add the rows of the steps accepted since the last call."""
@@ -308,7 +315,7 @@ class BalanceCSV:
         self._open = False
         lines = []
         for row in stepper.solution.rows[self._rows :]:
-            cells = np.concatenate([np.ravel(row[name]) for name in ledger.columns(stepper.system)])
+            cells = np.concatenate([np.ravel(row[name]) for name in self._columns])
             lines.append(",".join(f"{x:.17g}" for x in cells.tolist()))
         extend_file(self.path, "".join(f"{line}\n" for line in (*lines, *footer)).encode())
         self._rows += len(lines)
@@ -316,3 +323,33 @@ class BalanceCSV:
 
     def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
         write_on_root(stepper.system.comm, f"path={str(self.path)!r}", action)
+
+
+class ForcesCSV(BalanceCSV):
+    """Writes the forces of supports, joints and contacts: a row for the start and one per step.
+
+    Of each body the force of each of its conditions, of each joint force and moment on the first of
+    its bodies, about its point, of each contact the force on its slave; see `Solution.reactions`
+    and `Solution.contact_forces`.
+
+    Args:
+        path: File; its folder is made if missing, an existing file is replaced.
+
+    Raises:
+        OSError: From `start`, before any step and on all ranks: the file cannot be written.
+    """
+
+    def _of(self, stepper: Stepper) -> tuple[tuple[str, ...], list[str]]:
+        system, header = stepper.system, ["time [s]"]
+        joints = [system.joints[k] for k in resultants.declared_joints(system)]
+        columns = [resultants.reactions_of(item) for item in (*system.bodies, *joints)]
+        labels = [
+            f"{body.name}_{k}_{{}} [N]"
+            for body, column in zip(system.bodies, columns, strict=False)
+            for k in range(len(stepper.solution.rows[0][column]))
+        ]
+        for joint in joints:
+            labels += [f"{joint.name}_force_{{}} [N]", f"{joint.name}_moment_{{}} [N m]"]
+        labels += [f"contact_{pair.name}_{{}} [N]" for pair in system.contacts]
+        header += [label.format(axis) for label in labels for axis in "xyz"]
+        return ("time", *columns, resultants.CONTACT_FORCES), header

@@ -104,11 +104,17 @@ class Solution:
     def reactions(self) -> dict[str, FloatArray]:
         """Of each body, force of each `Dirichlet` condition on it [N], shape (rows, conditions, 3).
 
+        Of each joint, by its name, force [N] and moment about its point [N m] on the first of its
+        bodies, shape (rows, 2, 3).
+
         In dynamics that of each step, with inertia, where the integrator takes its forces. A
         coordinate that two conditions prescribe counts with the later one.
         """
-        bodies = self.system.bodies
-        return {b.name: self.rows.column(resultants.reactions_of(b)) for b in bodies}
+        joints = [self.system.joints[k] for k in resultants.declared_joints(self.system)]
+        return {
+            item.name: self.rows.column(resultants.reactions_of(item))
+            for item in (*self.system.bodies, *joints)
+        }
 
     @property
     def contact_forces(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Resultant forces of supports and contacts, columns of the balance table beside the ledger's."""
+"""Resultants of supports, joints and contacts, columns of the balance table beside the ledger's."""
 
 from __future__ import annotations
 
@@ -19,15 +19,23 @@ FloatArray = npt.NDArray[np.float64]
 CONTACT_FORCES = "contact_forces"
 
 
-def reactions_of(body: Any) -> str:
-    """Column of the reactions of a body."""
-    return f"reactions of {body.name}"
+def reactions_of(item: Any) -> str:
+    """Column of the reactions of a body or a joint."""
+    return f"reactions of {item.name}"
+
+
+def declared_joints(system: System) -> list[int]:
+    """Numbers of the joints that are no body's own."""
+    own = {id(joint) for body in system.bodies for joint in getattr(body, "joints", ())}
+    return [k for k, joint in enumerate(system.joints) if id(joint) not in own]
 
 
 def at_start(system: System) -> dict[str, FloatArray]:
     """Zeros of the right shapes, for the row of the start."""
     row = {reactions_of(b): np.zeros_like(_reactions(b, np.zeros(b.num_owned)))
            for b in system.bodies}  # fmt: skip
+    joints = (system.joints[k] for k in declared_joints(system))
+    row |= {reactions_of(joint): np.zeros((2, 3)) for joint in joints}
     return row | {CONTACT_FORCES: np.zeros((len(system.contacts), 3))}
 
 
@@ -39,18 +47,49 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
         step: Their solution.
 
     Returns:
-        By column: of each body's conditions, shape (conditions, 3), and of each contact on its
-        slave body, shape (contacts, 3).
+        By column: of each body's conditions, shape (conditions, 3), of each joint on the first of
+        its bodies, force [N] and moment about its point [N m], shape (2, 3), and of each contact on
+        its slave body, shape (contacts, 3).
     """
     bodies, contacts = problem.system.bodies, problem.contact_parts(step)
+    joints = declared_joints(problem.system)
     parts = [_reactions(b, t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
     forces = [part.force.sum(axis=0) for part in contacts]
     parts.append(np.reshape(forces, (len(contacts), 3)))
-    total = np.concatenate(parts) / problem.factor
+    held = list(problem.each(step))[1:]
+    parts += [_of_joint(problem, step, *held[k]) for k in joints]
+    total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-    names = [*map(reactions_of, bodies), CONTACT_FORCES]
     split = np.split(total, np.cumsum([len(part) for part in parts])[:-1])
-    return dict(zip(names, split, strict=True))
+    names = [*map(reactions_of, bodies), CONTACT_FORCES]
+    found = {name: value / problem.factor for name, value in zip(names, split, strict=False)}
+    for k, (force, moment, places, count) in zip(joints, split[len(names) :], strict=True):
+        point = places / max(count[0], 1.0)
+        both = np.array([force, moment - np.cross(point, force)])
+        found[reactions_of(problem.system.joints[k])] = both / problem.factor
+    return found
+
+
+def _of_joint(
+    problem: StepProblem, step: Evaluation, coupling: Any, parts: tuple[Any, ...]
+) -> FloatArray:
+    """Of a joint on its first body on this rank. Collective.
+
+    Returns:
+        Factor of the step times force and moment about the origin, the sum of its points [m], and
+        their number, shape (4, 3); zeros if its elements are not between points.
+    """
+    out = np.zeros((4, 3))
+    if len(parts) != 1 or not hasattr(coupling.elements[0], "sides"):
+        return out
+    side, k = coupling.elements[0].sides[0], coupling.bodies[0][0]
+    u = problem.state.u[k] + problem.integrator.theta * step.bodies[k].du
+    y = side.reference + side.nodal(u)
+    force = -parts[0].residual[:, : y[0].size if len(y) else 0].reshape(y.shape)
+    out[0] = force[side.places].sum(axis=0)
+    out[1] = np.cross(y, force).sum(axis=(0, 1))
+    out[2], out[3] = side.combine(y).sum(axis=0), len(y)
+    return out
 
 
 def _reactions(body: Any, residual: FloatArray) -> FloatArray:
