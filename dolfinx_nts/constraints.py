@@ -26,9 +26,11 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies:
-#: it leaves them the multipliers of least norm, and costs the rest some 1e-7 of Newton's
-#: contraction.
+#: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies,
+#: beside their gap times their curvature. Equations that repeat others agree at the solution; before
+#: it they miss each other by the square of the gap, and multipliers change by that over the
+#: compliance: a fixed one makes them huge. One that vanishes with the gap leaves Newton's method its
+#: order (Levenberg-Marquardt: Yamashita and Fukushima 2001).
 SHIFT = 1e-7
 
 
@@ -126,7 +128,9 @@ class ConstraintElements(PointElements):
         tangent[:, : 3 * k, : 3 * k] = blocks.reshape(n, 3 * k, 3 * k)
         tangent[:, : 3 * k, 3 * k :] = (scale * force).transpose(0, 2, 1)
         tangent[:, 3 * k :, : 3 * k] = scale * slope
-        tangent[:, 3 * k :, 3 * k :] = -self.lent * scale * np.eye(m)
+        if self.lent:
+            lent = self.lent + np.abs(gap) * np.abs(bent).max(axis=(2, 3), initial=0.0)
+            tangent[:, 3 * k :, 3 * k :] = -scale * lent[:, :, None] * np.eye(m)
         return ConstraintPart(residual, tangent, multiplier, gap)
 
     def largest(self, part: ConstraintPart) -> list[float]:
