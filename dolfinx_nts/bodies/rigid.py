@@ -43,7 +43,7 @@ VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
 _ROUNDED = 1e-9
 #: Part of the mass that the matrix lends to directors without mass where a rotation has no
 #: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
-_LENT = 1e-3
+_LENT = 1e-8
 
 
 @known_options
