@@ -29,8 +29,8 @@ BoolArray = npt.NDArray[np.bool_]
 #: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies,
 #: beside their gap times their curvature. Equations that repeat others agree at the solution; before
 #: it they miss each other by the square of the gap, and multipliers change by that over the
-#: compliance: a fixed one makes them huge. One that vanishes with the gap leaves Newton's method its
-#: order (Levenberg-Marquardt: Yamashita and Fukushima 2001).
+#: compliance: a fixed one makes them huge. One that vanishes with the gap leaves Newton's method
+#: its order (Levenberg-Marquardt: Yamashita and Fukushima 2001).
 SHIFT = 1e-7
 
 
