@@ -364,3 +364,329 @@ def test_a_planar_four_bar_with_four_revolutes(thick):
         assert np.abs(2.0 * rocker - now - FAR).max() < 1e-12
     ratio = (angles[0] - angles[1]) / (angles[1] - angles[2])
     assert abs(np.log2(ratio) - 2.0) < 0.1
+
+
+@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
+def test_a_slider_crank(integrator):
+    """Three revolutes and a prismatic joint, also redundant, on the closed kinematics."""
+    angle, length, rate = 0.7, 0.8, 20.0
+    b = tip(angle)
+    v_b = rate * np.cross(Z, b)
+
+    def slide(b):
+        return np.array([b[0] + np.sqrt(length**2 - b[1] ** 2), 0.0, 0.0])
+
+    c = slide(b)
+    v_c = np.array([v_b[0] - b[1] * v_b[1] / (c - b)[0], 0.0, 0.0])
+    crank, link = rod("crank", (0, 0, 0), b, at_q=v_b), rod("link", b, c, v_b, v_c)
+    slider = nts.RigidBody.from_inertia(0.5, (1e-3,) * 3, c, velocity=v_c, name="slider")
+    joints = [
+        nts.Revolute(crank, None, point=(0, 0, 0), axis=Z),
+        nts.Revolute(crank, link, point=b, axis=Z),
+        nts.Revolute(link, slider, point=c, axis=Z),
+        nts.Prismatic(slider, None, point=c, axis=(1, 0, 0)),
+    ]
+    system = nts.System([crank, link, slider], joints=joints)
+    stepper = nts.Stepper(system, integrator)
+    for _ in range(100):
+        stepper.advance(4e-3)
+        b = 2.0 * crank.position
+        assert abs(np.linalg.norm(b) - CRANK) < 1e-12
+        assert np.abs(slider.position - slide(b)).max() < 1e-12
+        assert np.abs(2.0 * link.position - b - slide(b)).max() < 1e-12
+    energy = stepper.solution.balance["energy"]
+    assert np.abs(energy - energy[0]).max() < 1e-11 * energy[0]
+    stepper.close()
+
+
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1), (0, 1, 1), (0, 0, 1)], dtype=float)
+HINGES = np.array([(0, 1, 0), (0, 0, 1), (1, 0, 0)] * 2, dtype=float)
+
+
+def bricard(**options):
+    """Six hinges along the edges of a cube: mobile though counting says it is not."""
+    bars = [rod(f"bar {i}", CORNERS[i], CORNERS[i + 1], **options) for i in range(5)]
+    ends = itertools.pairwise([None, *bars, None])
+    joints = [
+        nts.Revolute(*pair, point=p, axis=n, name=f"hinge {i}")
+        for i, (pair, p, n) in enumerate(zip(ends, CORNERS, HINGES, strict=True))
+    ]
+    return nts.System(bars, joints=joints, gravity=(0, -G, 0)), bars
+
+
+def force_columns(stepper):
+    """Columns of all constraints in the forces of the last step, and their multipliers [N]."""
+    system, columns, multipliers = stepper.system, [], []
+    couplings = zip(
+        stepper.problem.elements, system.joint_bodies, stepper.state.histories[1:], strict=True
+    )
+    for batch, bodies, found in couplings:
+        u1 = [stepper.state.u[b].reshape(1, 4, 3) for b in bodies]
+        x = batch.reference() + np.concatenate(u1, axis=1)
+        c = batch.num_coordinates
+        slopes = batch.evaluate(x, {"constraints": np.zeros_like(found)}).tangent[0, :c, c:]
+        column = np.zeros((12 * len(system.bodies), found.size))
+        for k, b in enumerate(bodies):
+            column[12 * b : 12 * b + 12] = slopes[12 * k : 12 * k + 12] / batch.scale
+        columns.append(column)
+        multipliers.append(found[0])
+    return np.concatenate(columns, axis=1), np.concatenate(multipliers)
+
+
+@pytest.mark.parametrize("thick", [0.0, 0.1])
+def test_a_bricard_mechanism(thick):
+    """One equation repeats others in another way at each time: order 2, and its closure."""
+    ways = []
+    for dt in (1e-2, 5e-3, 2.5e-3):
+        system, bars = bricard(thick=thick)
+        start = [bar.rotation.copy() for bar in bars]
+        stepper = nts.Stepper(system, nts.EnergyMomentum())
+        for _ in range(round(0.5 / dt)):
+            stepper.advance(dt)
+        ways.append(np.array([bar.position for bar in bars]))
+        table = stepper.solution.balance
+        assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["kinetic"].max()
+        assert table["newton_iterations"].mean() < 3.5
+        # Every other hinge turns alike, by x and y: sin x - sin y + sin x sin y = 0.
+        turns = [np.eye(3), *(b.rotation @ s.T for b, s in zip(bars, start, strict=True))]
+        sines = []
+        for n, one, other in zip(HINGES, turns, [*turns[1:], np.eye(3)], strict=True):
+            m = np.roll(n, 1)
+            assert np.abs((one - other) @ n).max() < 1e-12
+            sines.append(abs(np.cross(one @ m, other @ m) @ one @ n))
+        x, y = sines[:2]
+        assert x > 0.2 and np.abs(np.array(sines) - 3 * [x, y]).max() < 1e-12
+        assert abs(x - y + x * y) < 1e-12
+        # What repeats others has one multiplier too many, which stays of the size of the others.
+        columns, found = force_columns(stepper)
+        least = np.linalg.lstsq(columns, columns @ found, rcond=1e-9)[0]
+        assert np.linalg.matrix_rank(columns, tol=1e-9) == len(found) - 1
+        assert np.abs(found - least).max() < 0.3 * np.abs(least).max()
+        stepper.close()
+    ratio = np.abs(ways[0] - ways[1]).max() / np.abs(ways[1] - ways[2]).max()
+    assert abs(np.log2(ratio) - 2.0) < 0.1
+
+
+# ---- prescribed motion
+def drive(kind, f):
+    """A brick that its joint with the ground moves."""
+    body = brick("body", (0.4, 0.1, 0.2))
+    made = {
+        "spherical": lambda: nts.Spherical(body, None, point=P, displacement=lambda t: f(t) * M1),
+        "revolute": lambda: nts.Revolute(body, None, point=P, axis=N, angle=f),
+        "prismatic": lambda: nts.Prismatic(body, None, point=P, axis=N, displacement=f),
+        "distance": lambda: nts.Distance(
+            body, None, points=(P, Q), length=lambda t: np.linalg.norm(P - Q) + f(t)
+        ),
+    }
+    return body, made[kind]()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("kind", ["spherical", "revolute", "prismatic", "distance"])
+def test_a_drive(kind):
+    """It goes where it is told, also over many turns, and the ledger knows its work."""
+    speed = 12.0 if kind == "revolute" else 0.3
+
+    def f(t):
+        return speed * t**2
+
+    body, joint = drive(kind, f)
+    follow, stepper = Follow(body), nts.Stepper(nts.System([body], joints=[joint]),
+                                                nts.EnergyMomentum())  # fmt: skip
+    for _ in range(75):
+        t = stepper.advance(2e-2).time
+        p, turn = follow.point(body, P), follow.turn(body)
+        if kind == "revolute":
+            right = np.cos(f(t)) * M1 + np.sin(f(t)) * M2
+            assert np.abs([p - P, turn @ N - N, turn @ M1 - right]).max() < 1e-12
+        elif kind == "distance":
+            assert abs(np.linalg.norm(p - Q) - np.linalg.norm(P - Q) - f(t)) < 1e-12
+        else:
+            assert np.abs(p - P - f(t) * (M1 if kind == "spherical" else N)).max() < 1e-12
+    table = stepper.solution.balance
+    assert table["kinetic"][-1] > 0.1
+    size = np.abs(table["external_work"]).max()
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * size
+    stepper.close()
+
+
+def test_the_work_of_a_drive_is_that_of_its_motion():
+    """Accelerated translation: m v^2/2; the turns of a hinge: J w^2/2 about it."""
+    for kind, speed in (("prismatic", 0.3), ("revolute", 12.0)):
+        body, joint = drive(kind, lambda t, speed=speed: speed * t**2)
+        run = nts.simulate(
+            nts.System([body], joints=[joint]), nts.EnergyMomentum(), dt=1e-2, t_end=1.0
+        )
+        inertia = body.mass
+        if kind == "revolute":
+            arm = np.cross(body.centre - P, N)
+            inertia = body.mass * (0.1 + arm @ arm)
+        right = 0.5 * inertia * (2.0 * speed) ** 2
+        assert abs(run.balance["external_work"][-1] / right - 1.0) < 1e-2
+
+
+# ---- flexible bodies
+def cube(low, name, cells=2, **options):
+    low = np.asarray(low, dtype=float)
+    mesh = create_box(
+        COMM, [low, low + 1.0], [cells] * 3, CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    return nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=1.0, name=name, **options)
+
+
+def at(body, x):
+    """Where a material point of a flexible body is."""
+    points = body.points(x)
+    return points.combine(points.reference)[0] + points.at(body.u.x.array[: body.num_owned])[0]
+
+
+@pytest.mark.mpi
+def test_points_of_a_flexible_body():
+    """A cube on a ball joint, and a rod without mass between it and a rigid body."""
+    soft, body = cube((0, 0, 0), "soft", velocity=(0.0, 0.0, 1.0)), brick("rigid", (2, 0.4, 0.5))
+    ends = np.array([[0.9, 0.7, 0.6], [1.8, 0.3, 0.5]])
+    joints = [
+        nts.Spherical(soft, None, point=(0.2, 0.2, 0.1), displacement=lambda t: (0.0, 0.0, t)),
+        nts.Distance(soft, body, points=ends),
+    ]
+    stepper = nts.Stepper(nts.System([soft, body], joints=joints), nts.EnergyMomentum())
+    follow = Follow(body)
+    for _ in range(20):
+        t = stepper.advance(1e-2).time
+        assert np.abs(at(soft, (0.2, 0.2, 0.1)) - (0.2, 0.2, 0.1 + t)).max() < 1e-12
+        far = np.linalg.norm(at(soft, ends[0]) - follow.point(body, ends[1]))
+        assert abs(far - np.linalg.norm(ends[0] - ends[1])) < 1e-12
+    table = stepper.solution.balance
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"].max()
+    assert np.linalg.norm(body.velocity) > 0.05
+    stepper.close()
+
+
+@pytest.mark.mpi
+def test_a_tie():
+    """A cube tied to a rigid body by a face; both fly and turn, and the face stays as it was."""
+    turning = np.array([1.0, 2.0, -1.0])
+    soft = cube((0, 0, 0), "soft", velocity=lambda x: np.cross(turning, x.T).T)
+    body = brick("rigid", (1.3, 0.5, 0.5), turning=turning)
+    face = soft.surface(lambda x: x[0] > 1 - 1e-9)
+    system = nts.System([soft, body], joints=[nts.Tie(body, face)])
+    stepper, follow = nts.Stepper(system, nts.EnergyMomentum()), Follow(body)
+    for _ in range(20):
+        state = stepper.advance(1e-2)
+        x = face.positions(state.u[0])
+        right = [follow.point(body, p) for p in face.reference]
+        assert np.abs(x - right).max() < 1e-12
+    table = stepper.solution.balance
+    energy = table["energy"]
+    assert np.abs(energy - energy[0]).max() < 1e-11 * energy[0]
+    assert table["potential"].max() > 1e-4 * energy[0]
+    for name in ("linear_momentum", "angular_momentum"):
+        size = np.abs(table[name]).max()
+        assert np.abs(table[name] - table[name][0]).max() < 1e-12 * size
+    stepper.close()
+
+
+def test_a_distance_far_from_the_origin():
+    """The difference of two points is formed before it is squared."""
+    iterations = []
+    for shift in (0.0, 1e4):
+        off = np.array([shift, -shift, shift])
+        a, b = brick("a", off), brick("b", off + Q, moving=0.5 * np.cross(N, Q))
+        joint = nts.Distance(a, b, points=(off + 0.1 * M1, off + Q))
+        run = nts.simulate(
+            nts.System([a, b], joints=[joint], gravity=(0, 0, -1.0)), nts.EnergyMomentum(),
+            dt=1e-2, t_end=0.2,
+        )  # fmt: skip
+        assert run.status.startswith("completed")
+        iterations.append(run.balance["newton_iterations"].max())
+    assert iterations[1] <= iterations[0] + 1
+
+
+# ---- bad input
+def number(_):
+    return 0.0
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("make", "kind", "message"),
+    [
+        (lambda a, b, s: nts.Revolute(a, b, point=P, axis=(0, 0, 0)), ValueError,
+         r"axis of 'revolute of a and b'=\(0, 0, 0\): has no direction; pass a vector"),
+        (lambda a, b, s: nts.Planar(a, b, point=P, axis=(0, 0, np.nan)), ValueError,
+         "axis of 'planar of a and b'.*: pass three finite components"),
+        (lambda a, b, s: nts.Spherical(a, b, point=(0, 1)), ValueError,
+         r"point=\(0, 1\): pass three finite components \[m\]"),
+        (lambda a, b, s: nts.Spherical(a, a, point=P), ValueError,
+         "a=b='a': a Spherical joins two bodies; pass another one, or None"),
+        (lambda a, b, s: nts.Fixed(None, None, point=P), ValueError,
+         "a=None, b=None: a Fixed needs a body; only one end may be the ground"),
+        (lambda a, b, s: nts.Fixed(3, None, point=P), TypeError, "a=3: pass a body, or None"),
+        (lambda a, b, s: nts.Fixed(a, s, point=P), ValueError,
+         r"b='s': a flexible body has no directions for 'fixed of a and s'; tie a rigid body"),
+        (lambda a, b, s: nts.Spherical(s, None, point=(9, 0, 0)), ValueError,
+         "point of 'spherical of s and ground': .*9.0, 0.0, 0.0.*: lies in no cell of body 's'"),
+        (lambda a, b, s: nts.Spherical(a, b, point=P, name=" "), ValueError, "name=' ': is empty"),
+        (lambda a, b, s: nts.Spherical(a, b, point=P, axis=N), TypeError,
+         "axis=.*: unknown option of Spherical; choose from a, b, point, displacement, name"),
+        (lambda a, b, s: nts.Universal(a, b, point=P, axes=(N, N)), ValueError,
+         "axes=.* of 'universal of a and b': are not at right angles"),
+        (lambda a, b, s: nts.Universal(a, b, point=P, axes=N), ValueError, "axes=.*pass two vec"),
+        (lambda a, b, s: nts.Distance(a, b, points=(P, P)), ValueError,
+         r"points=.* of 'distance of a and b': coincide; join them by Spherical\(...\)"),
+        (lambda a, b, s: nts.Distance(a, b, points=P), ValueError, "points=.*: pass two points"),
+        (lambda a, b, s: nts.Distance(a, b, points=(P, Q), length=2.0), ValueError,
+         "length=2.0 of 'distance of a and b': the points are 0.80.* m apart at the start; leave"),
+        (lambda a, b, s: nts.Distance(a, b, points=(P, Q), length=-1.0), ValueError,
+         "length of 'distance of a and b'=-1.0: must be positive"),
+        (lambda a, b, s: nts.Distance(a, b, points=(P, Q), length=lambda t: 1.0 + t), ValueError,
+         "length=<function .* of 'distance of a and b': the points are"),
+        (lambda a, b, s: nts.Revolute(a, b, point=P, axis=N, angle=1.0), TypeError,
+         "angle of 'revolute of a and b'=1.0: pass a function of time"),
+        (lambda a, b, s: nts.Prismatic(a, b, point=P, axis=N, displacement=lambda t: "far"),
+         nts.UserFunctionError, "displacement of 'prismatic of a and b' at t=0.0='far': return a"),
+        (lambda a, b, s: nts.Spherical(a, b, point=P, displacement=number),
+         nts.UserFunctionError, "displacement of 'spherical of a and b' at t=0.0=0.0: pass three"),
+        (lambda a, b, s: nts.Tie(s, s.surface(lambda x: x[0] < 1e-9)), TypeError,
+         r"rigid=.*: pass a RigidBody"),
+        (lambda a, b, s: nts.Tie(a, "face"), TypeError, r"surface='face': pass body.surface"),
+        (lambda a, b, s: nts.Tie(a, s.surface(lambda x: x[0] > 9)), ValueError,
+         "selects no exterior facet"),
+        (lambda a, b, s: nts.System([a], joints=[nts.Spherical(a, b, point=P)]), ValueError,
+         "'spherical of a and b' holds body 'b', which is not among bodies"),
+        (lambda a, b, s: nts.System([a, b], joints=2 * [nts.Spherical(a, b, point=P)]), ValueError,
+         "are not unique; pass name= to each joint"),
+    ],
+)  # fmt: skip
+def test_bad_input(make, kind, message):
+    a, b, s = brick("a", (0, 0, 0)), brick("b", (1, 0, 0)), cube((2, 0, 0), "s", 1)
+    with pytest.raises(kind, match=message):
+        make(a, b, s)
+
+
+@pytest.mark.mpi
+def test_contradicting_drives_stop_a_run():
+    """Its status names the joints."""
+    body = brick("body", (0.4, 0.1, 0.2))
+    joints = [
+        nts.Prismatic(
+            body, None, point=P, axis=N, displacement=lambda t, v=v: v * t, name=f"drive {v}"
+        )
+        for v in (1.0, 2.0)
+    ]
+    run = nts.simulate(nts.System([body], joints=joints), nts.EnergyMomentum(), dt=1e-2, t_end=0.1)
+    assert "not solved" in run.status and "drive" in run.status
+
+
+@pytest.mark.mpi
+def test_a_drive_that_raises_ends_a_run():
+    def angle(t):
+        return t if t < 0.045 else 1 / 0
+
+    body = brick("body", (0.4, 0.1, 0.2))
+    joint = nts.Revolute(body, None, point=P, axis=N, angle=angle)
+    run = nts.simulate(nts.System([body], joints=[joint]), nts.EnergyMomentum(), dt=1e-2, t_end=1.0)
+    assert "angle of 'revolute of body and ground' at t=0.05" in run.status
+    assert "ZeroDivisionError" in run.status
