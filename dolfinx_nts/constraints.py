@@ -27,11 +27,13 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies,
-#: beside their gap times their curvature. Equations that repeat others agree at the solution; before
-#: it they miss each other by the square of the gap, and multipliers change by that over the
+#: beside their gap times their curvature. Equations that repeat others agree at the solution;
+#: before it they miss each other by the square of the gap, and multipliers change by that over the
 #: compliance: a fixed one makes them huge. One that vanishes with the gap leaves Newton's method
 #: its order (Levenberg-Marquardt: Yamashita and Fukushima 2001).
 SHIFT = 1e-7
+#: Part of the velocities by which a start may violate a constraint.
+_OFF = 1e-9
 
 
 def rank_of(name: str, comm: Any) -> int:
@@ -214,25 +216,31 @@ class Constraints(EveryStep):
             dt: Time in which prescribed values are told [s].
 
         Returns:
-            [m/s] and [m/s^2], both (n, m), and the speed of the coordinates in it [m/s].
+            [m/s] and [m/s^2], both (n, m), and what the first may err by [m/s]: by rounding, and
+            by what prescribed values leave open within `dt`.
         """
         u, v = ([values[k] for k in self.bodies[0]] for values in (state.u, state.v))
         y = [s.reference + s.nodal(w) for s, w in zip(self._sides, u, strict=True)]
         speed = np.concatenate(
             [s.nodal(w) for s, w in zip(self._sides, v, strict=True)], axis=1
         )
-        (weights, constants, _), (c0, c1, c2) = self._at(
-            *(state.time + part * dt for part in (0.0, 0.5, 1.0))
-        )
+        times = (state.time + part * dt for part in (0.0, 0.25, 0.5, 1.0))
+        (weights, constants, _), (c0, c_in, c1, c2) = self._at(*times)
+        rate = (4.0 * (c1 - c0) - (c2 - c0)) / dt
+        finer = 2.0 * (4.0 * (c_in - c0) - (c1 - c0)) / dt
         vectors = kernel.factors(weights, constants, np.concatenate(y, axis=1))
         rates = kernel.factors(weights, np.zeros_like(constants), speed)
         gradient = kernel.gradient(weights, vectors)
-        first = np.einsum("nmai,nai->nm", gradient, speed) - (4.0 * (c1 - c0) - (c2 - c0)) / dt
+        first = np.einsum("nmai,nai->nm", gradient, speed) - rate
         second = 2.0 * kernel.value(rates) - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
         if state.a:
             a = [s.nodal(state.a[k]) for s, k in zip(self._sides, self.bodies[0], strict=True)]
             second += np.einsum("nmai,nai->nm", gradient, np.concatenate(a, axis=1))
-        return first, second, float(np.abs(speed).max(initial=0.0))
+        size = max(float(np.abs(a).max(initial=0.0)) for a in (speed, rate))
+        # Both formulas are at least of second order, so the coarse one errs by 4/3 of what they
+        # differ by.
+        doubt = 2.0 * float(np.abs(finer - rate).max(initial=0.0))
+        return first, second, _OFF * size + doubt
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the last step."""

@@ -310,7 +310,7 @@ def test_a_double_pendulum_in_space():
 
 # ---- closed loops
 def corner(b, d, to_b, to_d):
-    """The point at these distances from b and d, left of the way from b to d, in the plane z = 0."""
+    """The point of the plane z = 0 at these distances from b and d, left of the way between."""
     way = np.linalg.norm(d - b)
     x = (way**2 + to_b**2 - to_d**2) / (2.0 * way)
     e = (d - b) / way
@@ -549,7 +549,8 @@ def test_points_of_a_flexible_body():
         nts.Spherical(soft, None, point=(0.2, 0.2, 0.1), displacement=lambda t: (0.0, 0.0, t)),
         nts.Distance(soft, body, points=ends),
     ]
-    stepper = nts.Stepper(nts.System([soft, body], joints=joints), nts.EnergyMomentum())
+    system = nts.System([soft, body], joints=joints)
+    stepper = nts.Stepper(system, nts.EnergyMomentum(), project_start=True)
     follow = Follow(body)
     for _ in range(20):
         t = stepper.advance(1e-2).time
@@ -567,7 +568,7 @@ def test_a_tie():
     """A cube tied to a rigid body by a face; both fly and turn, and the face stays as it was."""
     turning = np.array([1.0, 2.0, -1.0])
     soft = cube((0, 0, 0), "soft", velocity=lambda x: np.cross(turning, x.T).T)
-    body = brick("rigid", (1.3, 0.5, 0.5), turning=turning)
+    body = brick("rigid", (1.3, 0.5, 0.5), np.zeros(3), turning)
     face = soft.surface(lambda x: x[0] > 1 - 1e-9)
     system = nts.System([soft, body], joints=[nts.Tie(body, face)])
     stepper, follow = nts.Stepper(system, nts.EnergyMomentum()), Follow(body)
@@ -579,7 +580,7 @@ def test_a_tie():
     table = stepper.solution.balance
     energy = table["energy"]
     assert np.abs(energy - energy[0]).max() < 1e-11 * energy[0]
-    assert table["potential"].max() > 1e-4 * energy[0]
+    assert table["potential"].max() > 1e-6 * energy[0]
     for name in ("linear_momentum", "angular_momentum"):
         size = np.abs(table[name]).max()
         assert np.abs(table[name] - table[name][0]).max() < 1e-12 * size
@@ -591,7 +592,7 @@ def test_a_distance_far_from_the_origin():
     iterations = []
     for shift in (0.0, 1e4):
         off = np.array([shift, -shift, shift])
-        a, b = brick("a", off), brick("b", off + Q, moving=0.5 * np.cross(N, Q))
+        a, b = brick("a", off), brick("b", off + Q, moving=0.5 * np.cross(N, Q - 0.1 * M1))
         joint = nts.Distance(a, b, points=(off + 0.1 * M1, off + Q))
         run = nts.simulate(
             nts.System([a, b], joints=[joint], gravity=(0, 0, -1.0)), nts.EnergyMomentum(),
@@ -670,7 +671,7 @@ def test_contradicting_drives_stop_a_run():
     body = brick("body", (0.4, 0.1, 0.2))
     joints = [
         nts.Prismatic(
-            body, None, point=P, axis=N, displacement=lambda t, v=v: v * t, name=f"drive {v}"
+            body, None, point=P, axis=N, displacement=lambda t, v=v: v * t**2, name=f"drive {v}"
         )
         for v in (1.0, 2.0)
     ]
@@ -681,7 +682,7 @@ def test_contradicting_drives_stop_a_run():
 @pytest.mark.mpi
 def test_a_drive_that_raises_ends_a_run():
     def angle(t):
-        return t if t < 0.045 else 1 / 0
+        return t**2 if t < 0.045 else 1 / 0
 
     body = brick("body", (0.4, 0.1, 0.2))
     joint = nts.Revolute(body, None, point=P, axis=N, angle=angle)

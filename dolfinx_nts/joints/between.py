@@ -22,6 +22,7 @@ from dolfinx_nts.validation import (
 )
 
 FloatArray = npt.NDArray[np.float64]
+Times = tuple[float, ...]
 
 #: Part of a joint's size by which what is given may miss what the start prescribes.
 ROUNDED = 1e-9
@@ -55,22 +56,23 @@ class Product(NamedTuple):
     Attributes:
         first: v.
         second: w; v . w is a length.
-        ends: c at two times [m].
+        value: c at each of the times that were asked for [m]; empty: 0.
     """
 
     first: Vector
     second: Vector
-    ends: tuple[float, float] = (0.0, 0.0)
+    value: Sequence[float] = ()
 
 
-def assemble(products: Sequence[Product]) -> tuple[Equations, FloatArray]:
-    """Constraints of one element, and c at both times [m], shape (2, 1, m)."""
+def assemble(products: Sequence[Product], times: int) -> tuple[Equations, FloatArray]:
+    """Constraints of one element, and c at so many times [m], shape (times, 1, m)."""
     both = [(p.first, p.second) for p in products]
     weights, constants = (
         np.array([[[getattr(v, name) for v in pair] for pair in both]])
         for name in ("weights", "constant")
     )
-    prescribed = np.array([p.ends for p in products]).T[:, None]
+    values = [p.value or (0.0,) * times for p in products]
+    prescribed = np.array(values).T[:, None]
     return Equations(weights, constants, prescribed[0]), prescribed
 
 
@@ -170,22 +172,22 @@ class Between(ABC):
         self.motion = Motion(self.comm, f"{argument} of {self.name!r}", function, unit, read)
 
     @abstractmethod
-    def products(self, times: tuple[float, float]) -> Iterable[Product]:
-        """Its constraints in a step between two times, the same on all ranks. Collective."""
+    def products(self, times: Times) -> Iterable[Product]:
+        """Its constraints at times within a step, the same on all ranks. Collective."""
 
-    def meet(self, *ends: FloatArray) -> Iterator[Product]:
-        """p_A - p_B = c, which is given at both times, (3,) each, or 0."""
-        values = zip(*ends, strict=True) if ends else ((0.0, 0.0),) * 3
-        for e, (c0, c1) in zip(np.eye(3), values, strict=True):
-            yield Product(self.p_a - self.p_b, Vector(np.zeros(self._nodes), e), (c0, c1))
+    def meet(self, *values: FloatArray) -> Iterator[Product]:
+        """p_A - p_B = c, which is given at each of the times, (3,), or 0."""
+        each = zip(*values, strict=True) if values else ((),) * 3
+        for e, value in zip(np.eye(3), each, strict=True):
+            yield Product(self.p_a - self.p_b, Vector(np.zeros(self._nodes), e), value)
 
     def square(self, first: Vector, second: Vector) -> Product:
         """Two directions that stay at right angles."""
         return Product(self.length * first, second)
 
-    def _in_step(self, start: float, end: float) -> tuple[Equations, FloatArray]:
-        """Equations of this rank's element, if it is here, and c at both times."""
-        found, prescribed = assemble(list(self.products((start, end))))
+    def _in_step(self, times: Times) -> tuple[Equations, FloatArray]:
+        """Equations of this rank's element, if it is here, and c at each of the times."""
+        found, prescribed = assemble(list(self.products(times)), len(times))
         n = self._here
         return Equations(*(a[:n] for a in found)), prescribed[:, :n]
 
@@ -205,7 +207,7 @@ class Between(ABC):
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run. Collective."""
         sides = [side.part(slice(self._here)) for side in self._sides]
-        equations, _ = self._in_step(0.0, 0.0)
+        equations, _ = self._in_step((0.0,))
         return Constraints(
             self.name, bodies, sides, equations, self._in_step if self.motion else None
         )

@@ -13,12 +13,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.joints.between import ROUNDED, Between, Product, direction, number_at, triad
+from dolfinx_nts.joints.between import (
+    ROUNDED,
+    Between,
+    Product,
+    Times,
+    direction,
+    number_at,
+    triad,
+)
 from dolfinx_nts.validation import at_time, known_options, require_positive
 
 FloatArray = npt.NDArray[np.float64]
 Number = Callable[[float], float]
-Times = tuple[float, float]
 
 
 @known_options
@@ -53,8 +60,7 @@ class Spherical(Between):
     def products(self, times: Times) -> Iterator[Product]:
         """p_A - p_B = c."""
         motion = self.motion
-        ends = [np.zeros(3) if motion is None else motion.since_start(t) for t in times]
-        yield from self.meet(*ends)
+        yield from self.meet(*(motion.since_start(t) for t in times if motion))
 
 
 class _WithAxis(Between):
@@ -123,17 +129,17 @@ class Revolute(_WithAxis):
     def products(self, times: Times) -> Iterator[Product]:
         """Spherical, parallel axes, and the angle.
 
-        With the angles t0 and t1 at the ends of the step, t their mean, and
-        b = cos t m2_B - sin t m1_B: m1_A . b = sin(t1 - t), which is as good at any angle.
+        With the mean t of the angles t_k at the times and b = cos t m2_B - sin t m1_B:
+        m1_A . b = sin(t_k - t), which is as good at any angle.
         """
         yield from self.meet()
         yield from self.parallel()
         if self.motion is not None:
-            ends = np.array([self.motion.since_start(t) for t in times])
-            middle = ends.mean()
+            angles = np.array([self.motion.since_start(t) for t in times])
+            middle = angles.mean()
             b = np.cos(middle) * self.m2_b - np.sin(middle) * self.m1_b
-            c0, c1 = (self.length * np.sin(ends - middle)).tolist()
-            yield Product(self.length * self.m1_a, b, (c0, c1))
+            value = self.length * np.sin(angles - middle)
+            yield Product(self.length * self.m1_a, b, value.tolist())
 
 
 @known_options
@@ -183,8 +189,8 @@ class Prismatic(_WithAxis):
         yield from self.parallel()
         yield self.square(self.m1_a, self.m2_b)
         if self.motion is not None:
-            c0, c1 = (self.motion.since_start(t) for t in times)
-            yield Product(self.n_a, self.p_a - self.p_b, (c0, c1))
+            value = [self.motion.since_start(t) for t in times]
+            yield Product(self.n_a, self.p_a - self.p_b, value)
 
 
 @known_options
@@ -307,7 +313,5 @@ class Distance(Between):
     def products(self, times: Times) -> Iterator[Product]:
         """With r = p_A - p_B: r . r/(2 L_0) = L^2/(2 L_0)."""
         r, rest = self.p_a - self.p_b, self.rest
-        c0, c1 = (
-            (rest if self.motion is None else self.motion.at(t)) ** 2 / (2.0 * rest) for t in times
-        )
-        yield Product(0.5 / rest * r, r, (c0, c1))
+        lengths = (rest if self.motion is None else self.motion.at(t) for t in times)
+        yield Product(0.5 / rest * r, r, [length**2 / (2.0 * rest) for length in lengths])
