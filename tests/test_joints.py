@@ -205,7 +205,6 @@ def test_a_heavy_top_precesses(dt, known):
     assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][0]
 
 
-@pytest.mark.mpi
 def test_a_heavy_top_in_other_units():
     """As many iterations, the same motion."""
     runs = [heavy_top(4e-3, nts.EnergyMomentum(), unit) for unit in (1.0, 1e3, 1e6)]
@@ -325,8 +324,7 @@ def tip(angle):
     return CRANK * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
-@pytest.mark.mpi
-@pytest.mark.parametrize("thick", [0.0, 0.1])
+@pytest.mark.parametrize("thick", [0.0, pytest.param(0.1, marks=pytest.mark.mpi)])
 def test_a_planar_four_bar_with_four_revolutes(thick):
     """Three equations repeat others: solved, on the closed kinematics, of order 2."""
     angles = []
