@@ -26,10 +26,14 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies:
-#: it leaves them the multipliers of least norm, and costs the rest some 1e-7 of Newton's
-#: contraction.
+#: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies,
+#: beside their gap times their curvature. Equations that repeat others agree at the solution;
+#: before it they miss each other by the square of the gap, and multipliers change by that over the
+#: compliance: a fixed one makes them huge. One that vanishes with the gap leaves Newton's method
+#: its order (Levenberg-Marquardt: Yamashita and Fukushima 2001).
 SHIFT = 1e-7
+#: Part of the velocities by which a start may violate a constraint.
+_OFF = 1e-9
 
 
 def rank_of(name: str, comm: Any) -> int:
@@ -38,16 +42,16 @@ def rank_of(name: str, comm: Any) -> int:
 
 
 class Equations(NamedTuple):
-    """Constraints 1/2 Q_ab y_a . y_b + L_a . y_a = c [m]; axis 0 = element.
+    """Constraints v . w = c [m], v = V_a y_a + v_0 and w alike; axis 0 = element.
 
     Attributes:
-        quadratic: Q [1/m], symmetric, shape (n, m, k, k).
-        linear: L [-], shape (n, m, k, 3).
+        weights: V and W, whose products are [1/m] or, with a constant, [-], shape (n, m, 2, k).
+        constants: v_0 and w_0, shape (n, m, 2, 3).
         value: c where nothing prescribes it otherwise [m], shape (n, m).
     """
 
-    quadratic: FloatArray
-    linear: FloatArray
+    weights: FloatArray
+    constants: FloatArray
     value: FloatArray
 
 
@@ -104,23 +108,31 @@ class ConstraintElements(PointElements):
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> ConstraintPart:
         """Residual and tangent; the multipliers' unknowns are lengths, factor lambda / scale."""
-        q, b, _ = self.equations
-        n, m, k = b.shape[:3]
+        weights, constants, _ = self.equations
+        n, m, _, k = weights.shape
         scale = self.scale
         multiplier = scale * own["constraints"]
-        force = kernel.gradient(q, b, self.y0 + self.theta * (x - self.y0)).reshape(n, m, 3 * k)
-        end = kernel.gradient(q, b, x).reshape(n, m, 3 * k)
-        gap = kernel.value(q, b, x) - self.prescribed[1]
+        middle, end = (
+            kernel.factors(weights, constants, y)
+            for y in (self.y0 + self.theta * (x - self.y0), x)
+        )
+        force, slope = (
+            kernel.gradient(weights, vectors).reshape(n, m, 3 * k) for vectors in (middle, end)
+        )
+        gap = kernel.value(end) - self.prescribed[1]
         size = 3 * k + m
         residual, tangent = np.zeros((n, size)), np.zeros((n, size, size))
         residual[:, : 3 * k] = np.einsum("nm,nmz->nz", multiplier, force)
         residual[:, 3 * k :] = scale * gap
-        stiffness = self.theta * np.einsum("nm,nmab->nab", multiplier, q)
+        bent = kernel.curvature(weights)
+        stiffness = self.theta * np.einsum("nm,nmab->nab", multiplier, bent)
         blocks = stiffness[:, :, None, :, None] * np.eye(3)[:, None]
         tangent[:, : 3 * k, : 3 * k] = blocks.reshape(n, 3 * k, 3 * k)
         tangent[:, : 3 * k, 3 * k :] = (scale * force).transpose(0, 2, 1)
-        tangent[:, 3 * k :, : 3 * k] = scale * end
-        tangent[:, 3 * k :, 3 * k :] = -self.lent * scale * np.eye(m)
+        tangent[:, 3 * k :, : 3 * k] = scale * slope
+        if self.lent:
+            lent = self.lent + np.abs(gap) * np.abs(bent).max(axis=(2, 3), initial=0.0)
+            tangent[:, 3 * k :, 3 * k :] = -scale * lent[:, :, None] * np.eye(m)
         return ConstraintPart(residual, tangent, multiplier, gap)
 
     def largest(self, part: ConstraintPart) -> list[float]:
@@ -147,7 +159,8 @@ class Constraints(EveryStep):
         bodies: Numbers of their bodies in the system.
         sides: Of each body, the nodes of the elements, here those of this rank.
         equations: Of this rank's elements.
-        value: c at a time [m], shape (n, m); None: that of the equations. Collective.
+        driven: Equations for some times, and c at each of them [m], shape (times, n, m); None:
+            nothing is prescribed. Collective.
         redundant: Whether they may repeat others.
     """
 
@@ -157,14 +170,14 @@ class Constraints(EveryStep):
         bodies: tuple[int, ...],
         sides: Sequence[Points],
         equations: Equations,
-        value: Callable[[float], FloatArray] | None = None,
+        driven: Callable[[tuple[float, ...]], tuple[Equations, FloatArray]] | None = None,
         *,
         redundant: bool = True,
     ) -> None:
         super().__init__(bodies, self._elements, lambda part: part.multiplier / self._factor)
         self._name, self._sides, self._equations = name, tuple(sides), equations
         self._lent = SHIFT if redundant else 0.0
-        self._value, self._force = value, np.zeros_like(equations.value)
+        self._driven, self._force = driven, np.zeros_like(equations.value)
 
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
         self._factor = step.factor
@@ -172,19 +185,23 @@ class Constraints(EveryStep):
             self._force = history
         u = [step.state.u[b] for b in self.bodies[0]]
         y0 = [s.reference + s.nodal(v) for s, v in zip(self._sides, u, strict=True)]
+        equations, prescribed = self._at(step.state.time, step.state.time + step.dt)
         return ConstraintElements(
             name=self._name,
             sides=self._sides,
-            equations=self._equations,
-            prescribed=np.array([self._at(step.state.time), self._at(step.state.time + step.dt)]),
+            equations=equations,
+            prescribed=prescribed,
             y0=np.concatenate(y0, axis=1),
             scale=min(step.mean_scale(side.body) for side in self._sides),
             theta=step.integrator.theta,
             lent=self._lent,
         )
 
-    def _at(self, time: float) -> FloatArray:
-        return self._equations.value if self._value is None else self._value(time)
+    def _at(self, *times: float) -> tuple[Equations, FloatArray]:
+        """Equations that hold at these times, and c at each of them."""
+        if self._driven is not None:
+            return self._driven(times)
+        return self._equations, np.array([self._equations.value] * len(times))
 
     @property
     def no_forces(self) -> FloatArray:
@@ -199,22 +216,31 @@ class Constraints(EveryStep):
             dt: Time in which prescribed values are told [s].
 
         Returns:
-            [m/s] and [m/s^2], both (n, m), and the speed of the coordinates in it [m/s].
+            [m/s] and [m/s^2], both (n, m), and what the first may err by [m/s]: by rounding, and
+            by what prescribed values leave open within `dt`.
         """
-        q, b, _ = self._equations
         u, v = ([values[k] for k in self.bodies[0]] for values in (state.u, state.v))
         y = [s.reference + s.nodal(w) for s, w in zip(self._sides, u, strict=True)]
         speed = np.concatenate(
             [s.nodal(w) for s, w in zip(self._sides, v, strict=True)], axis=1
         )
-        c0, c1, c2 = (self._at(state.time + part * dt) for part in (0.0, 0.5, 1.0))
-        gradient = kernel.gradient(q, b, np.concatenate(y, axis=1))
-        first = np.einsum("nmai,nai->nm", gradient, speed) - (4.0 * (c1 - c0) - (c2 - c0)) / dt
-        second = np.einsum("nmab,nai,nbi->nm", q, speed, speed) - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
+        times = (state.time + part * dt for part in (0.0, 0.25, 0.5, 1.0))
+        (weights, constants, _), (c0, c_in, c1, c2) = self._at(*times)
+        rate = (4.0 * (c1 - c0) - (c2 - c0)) / dt
+        finer = 2.0 * (4.0 * (c_in - c0) - (c1 - c0)) / dt
+        vectors = kernel.factors(weights, constants, np.concatenate(y, axis=1))
+        rates = kernel.factors(weights, np.zeros_like(constants), speed)
+        gradient = kernel.gradient(weights, vectors)
+        first = np.einsum("nmai,nai->nm", gradient, speed) - rate
+        second = 2.0 * kernel.value(rates) - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
         if state.a:
             a = [s.nodal(state.a[k]) for s, k in zip(self._sides, self.bodies[0], strict=True)]
             second += np.einsum("nmai,nai->nm", gradient, np.concatenate(a, axis=1))
-        return first, second, float(np.abs(speed).max(initial=0.0))
+        size = max(float(np.abs(a).max(initial=0.0)) for a in (speed, rate))
+        # Both formulas are at least of second order, so the coarse one errs by 4/3 of what they
+        # differ by.
+        doubt = 2.0 * float(np.abs(finer - rate).max(initial=0.0))
+        return first, second, _OFF * size + doubt
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the last step."""

@@ -232,4 +232,4 @@ def test_equilibrium_names_a_rigid_body_that_may_slide():
     body = rigid((0, 0, 0), (0.2, 0.1, 0.05), (2, 2, 1), name="brick")
     pair = nts.ContactPair(slave=below(body), master=FLOOR)
     found = nts.equilibrium(nts.System([body], contacts=[pair], gravity=(0, 0, -G)))
-    assert "nothing resists body 'brick' moving along" in found.status
+    assert "nothing resists body 'brick'" in found.status

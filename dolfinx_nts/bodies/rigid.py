@@ -43,7 +43,7 @@ VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
 _ROUNDED = 1e-9
 #: Part of the mass that the matrix lends to directors without mass where a rotation has no
 #: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
-_LENT = 1e-3
+_LENT = 1e-8
 
 
 @known_options
@@ -462,12 +462,12 @@ class _Triad:
         self.name, self.bodies = f"{body.name} directors", (body,)
         n, length = int(body.comm.rank == body.owner), body.length
         self._side = body.points(body.centre).part(slice(0, n))
-        q, target = np.zeros((n, 6, 4, 4)), np.zeros((n, 6))
+        weights, target = np.zeros((n, 6, 2, 4)), np.zeros((n, 6))
         for m, (i, j) in enumerate([(1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (3, 1)]):
-            q[:, m, i, j] += 0.5 / length
-            q[:, m, j, i] += 0.5 / length
+            weights[:, m, 0, i] = 0.5 / length
+            weights[:, m, 1, j] = 1.0
             target[:, m] = 0.5 * length * (i == j)
-        self._equations = Equations(q, np.zeros((n, 6, 4, 3)), target)
+        self._equations = Equations(weights, np.zeros((n, 6, 2, 3)), target)
 
     def start(self) -> None:
         """Nothing to remember."""

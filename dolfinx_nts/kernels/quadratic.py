@@ -1,4 +1,8 @@
-"""Constraints at most quadratic in nodal vectors: values and gradients (theory section 11)."""
+"""Constraints at most quadratic in nodal vectors: values and gradients (theory section 11).
+
+Each is a product v . w of two vectors that are linear in the nodal vectors, v = V_a y_a + v_0. They
+are formed before they are multiplied: a difference of points far from the origin keeps its digits.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +12,34 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 
 
-def value(quadratic: FloatArray, linear: FloatArray, y: FloatArray) -> FloatArray:
-    """1/2 Q_ab y_a . y_b + L_a . y_a of each constraint.
+def factors(weights: FloatArray, constants: FloatArray, y: FloatArray) -> FloatArray:
+    """Both factors of each constraint.
 
     Args:
-        quadratic: Q, symmetric, shape (n, m, k, k).
-        linear: L, shape (n, m, k, 3).
+        weights: V and W, shape (n, m, 2, k).
+        constants: v_0 and w_0, shape (n, m, 2, 3).
         y: Nodal vectors [m], shape (n, k, 3).
 
     Returns:
-        Shape (n, m).
+        v and w, shape (n, m, 2, 3).
     """
-    products = np.matmul(y, y.transpose(0, 2, 1))
-    found: FloatArray = 0.5 * np.einsum("nmab,nab->nm", quadratic, products)
-    found += np.einsum("nmai,nai->nm", linear, y)
+    found: FloatArray = np.matmul(weights, y[:, None]) + constants
     return found
 
 
-def gradient(quadratic: FloatArray, linear: FloatArray, y: FloatArray) -> FloatArray:
-    """Q_ab y_b + L_a, the derivative of `value` by y_a, shape (n, m, k, 3)."""
-    found: FloatArray = np.matmul(quadratic, y[:, None]) + linear
+def value(vectors: FloatArray) -> FloatArray:
+    """Their products v . w, shape (n, m)."""
+    found: FloatArray = np.einsum("nmi,nmi->nm", vectors[:, :, 0], vectors[:, :, 1])
     return found
+
+
+def gradient(weights: FloatArray, vectors: FloatArray) -> FloatArray:
+    """V_a w + W_a v, the derivative of `value` by y_a, shape (n, m, k, 3)."""
+    found: FloatArray = np.einsum("nmpa,nmpi->nmai", weights, vectors[:, :, ::-1])
+    return found
+
+
+def curvature(weights: FloatArray) -> FloatArray:
+    """V_a W_b + W_a V_b, the derivative of `gradient` by y_b times the identity, (n, m, k, k)."""
+    one_way: FloatArray = weights[:, :, 0, :, None] * weights[:, :, 1, None, :]
+    return one_way + one_way.transpose(0, 1, 3, 2)

@@ -17,9 +17,6 @@ from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Part of the velocities by which a start may violate a constraint.
-_OFF = 1e-9
-
 
 def violation(problem: StepProblem, state: State, dt: float) -> tuple[float, str] | None:
     """The worst violation of a constraint by the velocities, and its joint's name. Collective.
@@ -36,10 +33,10 @@ def violation(problem: StepProblem, state: State, dt: float) -> tuple[float, str
     for joint, coupling in zip(problem.system.joints, problem.couplings[1:], strict=True):
         if not hasattr(coupling, "kinematics"):
             continue
-        rate, _, size = coupling.kinematics(state, dt)
-        local = np.array([np.abs(rate).max(initial=0.0), size])
-        off, size = global_max(problem.system.comm, local).tolist()
-        if off > _OFF * size and off > worst:
+        rate, _, limit = coupling.kinematics(state, dt)
+        local = np.array([np.abs(rate).max(initial=0.0), limit])
+        off, limit = global_max(problem.system.comm, local).tolist()
+        if off > limit and off > worst:
             worst, name = off, joint.name
     return (worst, name) if name else None
 

@@ -1,0 +1,300 @@
+"""What joints between two bodies share: their ends, and constraints made of products of vectors."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.constraints import Constraints, Equations, rank_of
+from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.validation import (
+    UserFunctionError,
+    call_together,
+    floats,
+    is_finite,
+    require_name,
+    vector,
+)
+
+FloatArray = npt.NDArray[np.float64]
+Times = tuple[float, ...]
+
+#: Part of a joint's size by which what is given may miss what the start prescribes.
+ROUNDED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Vector:
+    """w_a y_a + constant of a joint's nodes: a material point or direction, or a fixed one.
+
+    Attributes:
+        weights: w_a, shape (k,).
+        constant: Shape (3,).
+    """
+
+    weights: FloatArray
+    constant: FloatArray
+
+    def __add__(self, other: Vector) -> Vector:
+        return Vector(self.weights + other.weights, self.constant + other.constant)
+
+    def __sub__(self, other: Vector) -> Vector:
+        return self + -1.0 * other
+
+    def __rmul__(self, factor: float) -> Vector:
+        return Vector(factor * self.weights, factor * self.constant)
+
+
+class Product(NamedTuple):
+    """A constraint v . w = c.
+
+    Attributes:
+        first: v.
+        second: w; v . w is a length.
+        value: c at each of the times that were asked for [m]; empty: 0.
+    """
+
+    first: Vector
+    second: Vector
+    value: Sequence[float] = ()
+
+
+def assemble(products: Sequence[Product], times: int) -> tuple[Equations, FloatArray]:
+    """Constraints of one element, and c at so many times [m], shape (times, 1, m)."""
+    both = [(p.first, p.second) for p in products]
+    weights, constants = (
+        np.array([[[getattr(v, name) for v in pair] for pair in both]])
+        for name in ("weights", "constant")
+    )
+    values = [p.value or (0.0,) * times for p in products]
+    prescribed = np.array(values).T[:, None]
+    return Equations(weights, constants, prescribed[0]), prescribed
+
+
+class Between(ABC):
+    """A joint between two bodies, or a body and the ground; one element on one rank.
+
+    Args:
+        a: A body.
+        b: Another one. None, of either, is the ground.
+        points: Where it holds them at the start [m], two of shape (3,), and the argument's name.
+        name: In messages and files; None: made of its kind and the bodies' names.
+
+    Attributes:
+        name: As given or made.
+        ends: A and B, None for the ground.
+        bodies: Its bodies without the ground.
+        p_a: Its point of A, or of the ground; p_b alike.
+        length: What makes a length of a product of two directions [m].
+        motion: What is prescribed, see `drive`.
+    """
+
+    losses: tuple[str, ...] = ()
+    motion: Motion | None = None
+
+    def __init__(
+        self,
+        a: Any,
+        b: Any,
+        points: tuple[str, Any, Any],
+        name: str | None,
+    ) -> None:
+        self.ends = a, b
+        self.name = named(type(self).__name__, a, b, name)
+        self.bodies = tuple(body for body in (a, b) if body is not None)
+        self.comm = self.bodies[0].comm
+        argument, *given = points
+        places = [vector(argument, x, "m") for x in given]
+        held = [
+            None if body is None else self._at(argument, body, x)
+            for body, x in zip((a, b), places, strict=True)
+        ]
+        self._sides = [side for side in held if side is not None]
+        widths = [0 if side is None else side.nodes.shape[1] for side in held]
+        self._slots = slice(0, widths[0]), slice(widths[0], None)
+        self._nodes = sum(widths)
+        self.p_a, self.p_b = (
+            self._vector(end, side, x)
+            for end, side, x in zip((0, 1), held, places, strict=True)
+        )
+        lengths = [body.length for body in self.bodies if hasattr(body, "length")]
+        self.length = float(np.exp(np.mean(np.log(lengths)))) if lengths else 1.0
+
+    def _at(self, argument: str, body: Any, x: FloatArray) -> Any:
+        try:
+            return body.points(x)
+        except ValueError as error:
+            raise ValueError(f"{argument} of {self.name!r}: {error}") from error
+
+    def _vector(self, end: int, side: Any, fixed: FloatArray) -> Vector:
+        """A vector at an end, from its `Points`, or of the ground."""
+        weights = np.zeros(self._nodes)
+        if side is None:
+            return Vector(weights, fixed)
+        weights[self._slots[end]] = side.weights[0]
+        return Vector(weights, np.zeros(3))
+
+    def directions(self, axes: FloatArray) -> tuple[list[Vector], list[Vector]]:
+        """Directions at both ends that coincide at the start.
+
+        Args:
+            axes: Shape (n, 3).
+
+        Raises:
+            ValueError: A body has none.
+        """
+        for role, body in zip("ab", self.ends, strict=True):
+            if body is not None and not hasattr(body, "directions"):
+                raise ValueError(
+                    f"{role}={body.name!r}: a flexible body has no directions for {self.name!r}; "
+                    "tie a rigid body to a patch of its nodes, Tie(rigid, body.surface(...)), and "
+                    "join that one"
+                )
+        of_a, of_b = (
+            [self._vector(end, body and body.directions(d), d) for d in axes]
+            for end, body in enumerate(self.ends)
+        )
+        return of_a, of_b
+
+    def drive(self, argument: str, function: Any, unit: str, read: Callable[..., Any]) -> None:
+        """Prescribe what a function of time says. Collective.
+
+        Args:
+            argument: Its name.
+            function: The user's.
+            unit: Of its values.
+            read: `number_at`, or `at_time` for vectors.
+        """
+        self.motion = Motion(self.comm, f"{argument} of {self.name!r}", function, unit, read)
+
+    @abstractmethod
+    def products(self, times: Times) -> Iterable[Product]:
+        """Its constraints at times within a step, the same on all ranks. Collective."""
+
+    def meet(self, *values: FloatArray) -> Iterator[Product]:
+        """p_A - p_B = c, which is given at each of the times, (3,), or 0."""
+        each = zip(*values, strict=True) if values else ((),) * 3
+        for e, value in zip(np.eye(3), each, strict=True):
+            yield Product(self.p_a - self.p_b, Vector(np.zeros(self._nodes), e), value)
+
+    def square(self, first: Vector, second: Vector) -> Product:
+        """Two directions that stay at right angles."""
+        return Product(self.length * first, second)
+
+    def _in_step(self, times: Times) -> tuple[Equations, FloatArray]:
+        """Equations of this rank's element, if it is here, and c at each of the times."""
+        found, prescribed = assemble(list(self.products(times)), len(times))
+        n = self._here
+        return Equations(*(a[:n] for a in found)), prescribed[:, :n]
+
+    @property
+    def _here(self) -> int:
+        """Its elements on this rank."""
+        return int(self.comm.rank == rank_of(self.name, self.comm))
+
+    def start(self) -> None:
+        """Nothing to remember."""
+        return None
+
+    def potential(self, u: Sequence[FloatArray], history: Any) -> float:
+        """None [J]."""
+        return 0.0
+
+    def coupling(self, bodies: tuple[int, ...]) -> Constraints:
+        """Its constraints in a run. Collective."""
+        sides = [side.part(slice(self._here)) for side in self._sides]
+        equations, _ = self._in_step((0.0,))
+        return Constraints(
+            self.name, bodies, sides, equations, self._in_step if self.motion else None
+        )
+
+
+def named(kind: str, a: Any, b: Any, name: str | None) -> str:
+    """Name of a joint between these bodies, which are checked."""
+    if name is not None:
+        require_name("name", name)
+    if a is None and b is None:
+        raise ValueError(f"a=None, b=None: a {kind} needs a body; only one end may be the ground")
+    for role, body in (("a", a), ("b", b)):
+        if body is not None and not hasattr(body, "points"):
+            raise TypeError(f"{role}={body!r}: pass a body, or None for the ground")
+    if a is b:
+        raise ValueError(
+            f"a=b={a.name!r}: a {kind} joins two bodies; pass another one, or None for the ground"
+        )
+    ends = ("ground" if body is None else body.name for body in (a, b))
+    return name or f"{kind.lower()} of {' and '.join(ends)}"
+
+
+def direction(name: str, value: Any) -> FloatArray:
+    """A unit vector (3,) along a given one of any length."""
+    given = vector(name, value, "-")
+    size = np.linalg.norm(given)
+    if size == 0.0:
+        raise ValueError(f"{name}={value!r}: has no direction; pass a vector that is not zero")
+    unit: FloatArray = given / size
+    return unit
+
+
+def triad(axis: FloatArray) -> FloatArray:
+    """Right-handed orthonormal m1, m2, n as rows, n along the axis."""
+    least = np.eye(3)[np.abs(axis).argmin()]
+    m1 = np.cross(least, axis)
+    m1 /= np.linalg.norm(m1)
+    return np.array([m1, np.cross(axis, m1), axis])
+
+
+class Motion:
+    """A number or a vector that a function of the user's prescribes; it raises on all ranks alike.
+
+    Args:
+        comm: MPI communicator.
+        name: Of the argument.
+        function: Callable time [s] -> value.
+        unit: Of its values.
+        read: `number_at`, or `at_time` for vectors.
+
+    Attributes:
+        first: Value at t = 0.
+    """
+
+    def __init__(
+        self, comm: Any, name: str, function: Any, unit: str, read: Callable[..., Any]
+    ) -> None:
+        if not callable(function):
+            raise TypeError(f"{name}={function!r}: pass a function of time, or leave it out")
+        self._given = comm, name, function, unit
+        self._read = read
+        self.first = self.at(0.0)
+
+    def at(self, time: float) -> Any:
+        """Value at a time. Collective."""
+        comm, name, function, unit = self._given
+        return self._read(comm, name, function, time, unit)
+
+    def since_start(self, time: float) -> Any:
+        """Its change since t = 0. Collective."""
+        return self.at(time) - self.first
+
+
+def number_at(comm: Any, name: str, function: Callable[[float], Any], t: float, unit: str) -> float:
+    """The user's number at a time; what fails on one rank raises on all.
+
+    Raises:
+        UserFunctionError: It raised, or returned anything but a finite number.
+    """
+    name = f"{name} at t={float(t)!r}"
+    value = floats(given := call_together(comm, name, function, t))
+    fits = value.size == 1 and is_finite(value.item())
+    raise_together(
+        comm,
+        None if fits else f"{name}={given!r}: return a finite number [{unit}]",
+        UserFunctionError,
+    )
+    return float(value.item())
+

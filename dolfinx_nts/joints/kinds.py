@@ -1,0 +1,318 @@
+"""The joints of theory section 13, each a few products of vectors.
+
+`a` is the first body A and `b` the second one B; None, of either, is the ground. Points and axes
+are those of the start. What is prescribed is the motion of A relative to B; of a displacement or an
+angle only the change since t = 0 counts. Its work is external work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.joints.between import (
+    ROUNDED,
+    Between,
+    Product,
+    Times,
+    direction,
+    number_at,
+    triad,
+)
+from dolfinx_nts.validation import at_time, known_options, require_positive
+
+FloatArray = npt.NDArray[np.float64]
+Number = Callable[[float], float]
+
+
+@known_options
+class Spherical(Between):
+    """A ball joint: p_A - p_B = 0.
+
+    Args:
+        a: A body, or None.
+        b: A body, or None.
+        point: Of both at the start [m].
+        displacement: Function of time that p_A - p_B [m] follows in place of 0.
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or the point lies outside a flexible body.
+    """
+
+    def __init__(
+        self,
+        a: Any,
+        b: Any,
+        *,
+        point: Any,
+        displacement: Callable[[float], Any] | None = None,
+        name: str | None = None,
+    ) -> None:
+        super().__init__(a, b, ("point", point, point), name)
+        if displacement is not None:
+            self.drive("displacement", displacement, "m", at_time)
+
+    def products(self, times: Times) -> Iterator[Product]:
+        """p_A - p_B = c."""
+        motion = self.motion
+        yield from self.meet(*(motion.since_start(t) for t in times if motion))
+
+
+class _WithAxis(Between):
+    """A joint with an axis n, and directions m1 and m2 at right angles, at both ends.
+
+    Args:
+        a: A body, or None.
+        b: A body, or None.
+        point: Of both at the start [m].
+        axis: n at the start, of any length.
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+    """
+
+    def __init__(self, a: Any, b: Any, *, point: Any, axis: Any, name: str | None = None) -> None:
+        super().__init__(a, b, ("point", point, point), name)
+        self.axis = direction(f"axis of {self.name!r}", axis)
+        axes = triad(self.axis)
+        (self.m1_a, self.m2_a, self.n_a), (self.m1_b, self.m2_b, self.n_b) = self.directions(axes)
+
+    def parallel(self) -> Iterator[Product]:
+        """The axes of A and B: n_A . m1_B = 0, n_A . m2_B = 0."""
+        yield self.square(self.n_a, self.m1_b)
+        yield self.square(self.n_a, self.m2_b)
+
+    def on_axis(self) -> Iterator[Product]:
+        """B's point on A's axis: m1_A . (p_B - p_A) = 0, m2_A . (p_B - p_A) = 0."""
+        yield Product(self.m1_a, self.p_b - self.p_a)
+        yield Product(self.m2_a, self.p_b - self.p_a)
+
+
+@known_options
+class Revolute(_WithAxis):
+    """A hinge: the points stay together, and the axes parallel.
+
+    Args:
+        a: A rigid body, or None.
+        b: A rigid body, or None.
+        point: On the axis at the start [m].
+        axis: n at the start, of any length.
+        angle: Function of time, the angle about n by which A turns relative to B [rad], less than
+            half a turn in a step; None: free.
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+    """
+
+    def __init__(
+        self,
+        a: Any,
+        b: Any,
+        *,
+        point: Any,
+        axis: Any,
+        angle: Number | None = None,
+        name: str | None = None,
+    ) -> None:
+        super().__init__(a, b, point=point, axis=axis, name=name)
+        if angle is not None:
+            self.drive("angle", angle, "rad", number_at)
+
+    def products(self, times: Times) -> Iterator[Product]:
+        """Spherical, parallel axes, and the angle.
+
+        With the mean t of the angles t_k at the times and b = cos t m2_B - sin t m1_B:
+        m1_A . b = sin(t_k - t), which is as good at any angle.
+        """
+        yield from self.meet()
+        yield from self.parallel()
+        if self.motion is not None:
+            angles = np.array([self.motion.since_start(t) for t in times])
+            middle = angles.mean()
+            b = np.cos(middle) * self.m2_b - np.sin(middle) * self.m1_b
+            value = self.length * np.sin(angles - middle)
+            yield Product(self.length * self.m1_a, b, value.tolist())
+
+
+@known_options
+class Cylindrical(_WithAxis):
+    """B slides along A's axis and turns about it."""
+
+    def products(self, times: Times) -> Iterator[Product]:
+        """Point on the axis, parallel axes."""
+        yield from self.on_axis()
+        yield from self.parallel()
+
+
+@known_options
+class Prismatic(_WithAxis):
+    """B slides along A's axis without turning.
+
+    Args:
+        a: A rigid body, or None.
+        b: A rigid body, or None.
+        point: On the axis at the start [m].
+        axis: n at the start, of any length.
+        displacement: Function of time, that of A relative to B along n [m]; None: free.
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+    """
+
+    def __init__(
+        self,
+        a: Any,
+        b: Any,
+        *,
+        point: Any,
+        axis: Any,
+        displacement: Number | None = None,
+        name: str | None = None,
+    ) -> None:
+        super().__init__(a, b, point=point, axis=axis, name=name)
+        if displacement is not None:
+            self.drive("displacement", displacement, "m", number_at)
+
+    def products(self, times: Times) -> Iterator[Product]:
+        """Cylindrical, m1_A . m2_B = 0, and n_A . (p_A - p_B) = c where it is prescribed."""
+        yield from self.on_axis()
+        yield from self.parallel()
+        yield self.square(self.m1_a, self.m2_b)
+        if self.motion is not None:
+            value = [self.motion.since_start(t) for t in times]
+            yield Product(self.n_a, self.p_a - self.p_b, value)
+
+
+@known_options
+class Planar(_WithAxis):
+    """B's point stays in A's plane through `point` with normal `axis`; the normals are parallel."""
+
+    def products(self, times: Times) -> Iterator[Product]:
+        """n_A . (p_B - p_A) = 0, parallel normals."""
+        yield Product(self.n_a, self.p_b - self.p_a)
+        yield from self.parallel()
+
+
+@known_options
+class Universal(Between):
+    """A cross between two shafts, whose arms stay at right angles: spherical, n_A . n_B = 0.
+
+    Args:
+        a: A rigid body, or None.
+        b: A rigid body, or None.
+        point: Centre of the cross at the start [m].
+        axes: Its arms at the start, that in A and that in B, at right angles, of any length.
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+    """
+
+    def __init__(self, a: Any, b: Any, *, point: Any, axes: Any, name: str | None = None) -> None:
+        super().__init__(a, b, ("point", point, point), name)
+        if np.shape(axes) != (2, 3):
+            raise ValueError(f"axes={axes!r} of {self.name!r}: pass two vectors")
+        arms = np.array([direction(f"axes[{k}] of {self.name!r}", n) for k, n in enumerate(axes)])
+        if abs(arms[0] @ arms[1]) > ROUNDED:
+            raise ValueError(
+                f"axes={axes!r} of {self.name!r}: are not at right angles; the arms of a cross are"
+            )
+        (self.n_a, _), (_, self.n_b) = self.directions(arms)
+
+    def products(self, times: Times) -> Iterator[Product]:
+        """Spherical, n_A . n_B = 0."""
+        yield from self.meet()
+        yield self.square(self.n_a, self.n_b)
+
+
+@known_options
+class Fixed(Between):
+    """A weld: the points stay together, and the axes parallel.
+
+    Args:
+        a: A rigid body, or None.
+        b: A rigid body, or None.
+        point: Of both at the start [m].
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+    """
+
+    def __init__(self, a: Any, b: Any, *, point: Any, name: str | None = None) -> None:
+        super().__init__(a, b, ("point", point, point), name)
+        self.m_a, self.m_b = self.directions(np.eye(3))
+
+    def products(self, times: Times) -> Iterator[Product]:
+        """Spherical; of x, y and z in A and B, three pairs at right angles."""
+        yield from self.meet()
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            yield self.square(self.m_a[i], self.m_b[j])
+
+
+@known_options
+class Distance(Between):
+    """A rod without mass between two points: (|p_A - p_B|^2 - L^2)/(2 L_0) = 0.
+
+    Args:
+        a: A body, or None.
+        b: A body, or None.
+        points: That of A and that of B at the start [m].
+        length: L [m]: None is the points' distance at the start; or a function of time that begins
+            with it.
+        name: In messages and files; default: kind and bodies.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, a point lies outside a flexible body, the points
+            coincide, or they have another distance.
+    """
+
+    def __init__(
+        self,
+        a: Any,
+        b: Any,
+        *,
+        points: Any,
+        length: float | Number | None = None,
+        name: str | None = None,
+    ) -> None:
+        if np.shape(points) != (2, 3):
+            raise ValueError(f"points={points!r}: pass two points [m], that of a and that of b")
+        super().__init__(a, b, ("points", *points), name)
+        p, q = np.asarray(points, dtype=float)
+        self.rest = float(np.linalg.norm(p - q))
+        if self.rest <= ROUNDED * max(np.linalg.norm(p), np.linalg.norm(q)):
+            raise ValueError(
+                f"points={points!r} of {self.name!r}: coincide; join them by Spherical(...)"
+            )
+        begins: Any = length
+        if callable(length):
+            self.drive("length", length, "m", number_at)
+            begins = self.motion and self.motion.first
+        if begins is not None:
+            require_positive(f"length of {self.name!r}", begins, "m")
+            if abs(begins - self.rest) > ROUNDED * self.rest:
+                raise ValueError(
+                    f"length={length!r} of {self.name!r}: the points are {self.rest!r} m apart at "
+                    "the start; leave length out, or move them"
+                )
+
+    def products(self, times: Times) -> Iterator[Product]:
+        """With r = p_A - p_B: r . r/(2 L_0) = L^2/(2 L_0)."""
+        r, rest = self.p_a - self.p_b, self.rest
+        lengths = (rest if self.motion is None else self.motion.at(t) for t in times)
+        yield Product(0.5 / rest * r, r, [length**2 / (2.0 * rest) for length in lengths])
