@@ -82,6 +82,8 @@ class ConstraintElements(PointElements):
 
     Attributes:
         equations: Their coefficients.
+        curvature: Second derivative of the constraints, see `kernels.quadratic`, (n, m, k, k).
+        rest: Reference values of the nodes [m], shape (n, k, 3).
         prescribed: c at t_n and t_{n+1} [m], shape (2, n, m).
         y0: Nodal vectors at t_n [m], shape (n, k, 3).
         scale: Force per motion in the units of the step: a mass in dynamics.
@@ -90,6 +92,8 @@ class ConstraintElements(PointElements):
     """
 
     equations: Equations
+    curvature: FloatArray
+    rest: FloatArray
     prescribed: FloatArray
     y0: FloatArray
     scale: float
@@ -100,6 +104,10 @@ class ConstraintElements(PointElements):
     def widths(self) -> Mapping[str, int]:
         """One multiplier per constraint."""
         return {"augmented": 0, "constraints": self.equations.value.shape[1]}
+
+    def reference(self) -> FloatArray:
+        """Reference values of the nodes [m], shape (n, k, 3)."""
+        return self.rest
 
     @cached_property
     def pattern(self) -> BoolArray:
@@ -122,17 +130,17 @@ class ConstraintElements(PointElements):
         gap = kernel.value(end) - self.prescribed[1]
         size = 3 * k + m
         residual, tangent = np.zeros((n, size)), np.zeros((n, size, size))
-        residual[:, : 3 * k] = np.einsum("nm,nmz->nz", multiplier, force)
+        residual[:, : 3 * k] = np.matmul(multiplier[:, None], force)[:, 0]
         residual[:, 3 * k :] = scale * gap
-        bent = kernel.curvature(weights)
-        stiffness = self.theta * np.einsum("nm,nmab->nab", multiplier, bent)
-        blocks = stiffness[:, :, None, :, None] * np.eye(3)[:, None]
-        tangent[:, : 3 * k, : 3 * k] = blocks.reshape(n, 3 * k, 3 * k)
+        stiffness = self.theta * np.einsum("nm,nmab->nab", multiplier, self.curvature)
+        for i in range(3):
+            tangent[:, i : 3 * k : 3, i : 3 * k : 3] = stiffness
         tangent[:, : 3 * k, 3 * k :] = (scale * force).transpose(0, 2, 1)
         tangent[:, 3 * k :, : 3 * k] = scale * slope
         if self.lent:
-            lent = self.lent + np.abs(gap) * np.abs(bent).max(axis=(2, 3), initial=0.0)
-            tangent[:, 3 * k :, 3 * k :] = -scale * lent[:, :, None] * np.eye(m)
+            bent = np.abs(self.curvature).max(axis=(2, 3), initial=0.0)
+            rows = np.arange(3 * k, size)
+            tangent[:, rows, rows] = -scale * (self.lent + np.abs(gap) * bent)
         return ConstraintPart(residual, tangent, multiplier, gap)
 
     def largest(self, part: ConstraintPart) -> list[float]:
@@ -177,6 +185,9 @@ class Constraints(EveryStep):
         super().__init__(bodies, self._elements, lambda part: part.multiplier / self._factor)
         self._name, self._sides, self._equations = name, tuple(sides), equations
         self._lent = SHIFT if redundant else 0.0
+        self._scale: float | None = None
+        self._rest = np.concatenate([s.reference for s in self._sides], axis=1)
+        self._curvature = kernel.curvature(equations.weights)
         self._driven, self._force = driven, np.zeros_like(equations.value)
 
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
@@ -184,15 +195,20 @@ class Constraints(EveryStep):
         if history is not None:
             self._force = history
         u = [step.state.u[b] for b in self.bodies[0]]
-        y0 = [s.reference + s.nodal(v) for s, v in zip(self._sides, u, strict=True)]
+        moved = [s.nodal(v) for s, v in zip(self._sides, u, strict=True)]
         equations, prescribed = self._at(step.state.time, step.state.time + step.dt)
+        driven = equations is not self._equations
+        if self._scale is None or not step.integrator.inertia:
+            self._scale = min(step.mean_scale(side.body) for side in self._sides)
         return ConstraintElements(
             name=self._name,
             sides=self._sides,
             equations=equations,
+            curvature=kernel.curvature(equations.weights) if driven else self._curvature,
+            rest=self._rest,
             prescribed=prescribed,
-            y0=np.concatenate(y0, axis=1),
-            scale=min(step.mean_scale(side.body) for side in self._sides),
+            y0=self._rest + np.concatenate(moved, axis=1),
+            scale=self._scale,
             theta=step.integrator.theta,
             lent=self._lent,
         )

@@ -29,13 +29,13 @@ def factors(weights: FloatArray, constants: FloatArray, y: FloatArray) -> FloatA
 
 def value(vectors: FloatArray) -> FloatArray:
     """Their products v . w, shape (n, m)."""
-    found: FloatArray = np.einsum("nmi,nmi->nm", vectors[:, :, 0], vectors[:, :, 1])
+    found: FloatArray = (vectors[:, :, 0] * vectors[:, :, 1]).sum(axis=2)
     return found
 
 
 def gradient(weights: FloatArray, vectors: FloatArray) -> FloatArray:
     """V_a w + W_a v, the derivative of `value` by y_a, shape (n, m, k, 3)."""
-    found: FloatArray = np.einsum("nmpa,nmpi->nmai", weights, vectors[:, :, ::-1])
+    found: FloatArray = np.matmul(weights.transpose(0, 1, 3, 2), vectors[:, :, ::-1])
     return found
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     found = {name: value / problem.factor for name, value in zip(names, split, strict=False)}
     for k, (force, moment, places, count) in zip(joints, split[len(names) :], strict=True):
         point = places / max(count[0], 1.0)
-        both = np.array([force, moment - np.cross(point, force)])
+        both = np.array([force, moment - cross(point, force)])
         found[reactions_of(problem.system.joints[k])] = both / problem.factor
     return found
 
@@ -87,7 +88,7 @@ def _of_joint(
     y = side.reference + side.nodal(u)
     force = -parts[0].residual[:, : y[0].size if len(y) else 0].reshape(y.shape)
     out[0] = force[side.places].sum(axis=0)
-    out[1] = np.cross(y, force).sum(axis=(0, 1))
+    out[1] = cross(y, force).sum(axis=(0, 1))
     out[2], out[3] = side.combine(y).sum(axis=0), len(y)
     return out
 
