@@ -117,6 +117,23 @@ class ContactHistory(NamedTuple):
         )
 
 
+class Together(NamedTuple):
+    """What all pairs of a contact have in common where they share nodes, as of rigid bodies.
+
+    The compliances are those that the matrix lends to what holds a pair, over that of the bodies;
+    they vanish with what is missed, see `constraints.SHIFT`, and are 0 where pairs share nothing.
+
+    Attributes:
+        force: Mean normal force [kg m].
+        normal: Compliance lent to gaps [-].
+        tangential: Compliance lent to sticking [-].
+    """
+
+    force: float
+    normal: float
+    tangential: float
+
+
 class Slip(NamedTuple):
     """Slip and metric in facet sizes with their derivatives by the unknowns of the element."""
 
@@ -374,29 +391,36 @@ class ContactElements:
     def _tangential_scale(self) -> float:
         return TANGENTIAL_SCALE if self.pair.yields else _OF_SHARED
 
-    @cached_property
-    def _lent(self) -> FloatArray:
-        """Compliance that the matrix lends to what holds a pair [1/kg], shape (n,), see `SHIFT`."""
-        return SHIFT / self.scale if self.pair.redundant else np.zeros(self.num_elements)
+    def _together(
+        self, gap: FloatArray, slip: Slip | None, multiplier: FloatArray
+    ) -> Together:
+        """What pairs that share nodes need to know of each other. Collective."""
+        if not self.pair.redundant:
+            return Together(0.0, 0.0, 0.0)
+        force = multiplier[:, 0]
+        on = (force < 0.0) | (gap < 0.0)
+        local = np.array([
+            -force[on].clip(max=0.0).sum(), np.count_nonzero(force[on] < 0.0),
+            np.abs(gap[on]).max(initial=0.0),
+            0.0 if slip is None else np.abs(slip.value[on]).max(initial=0.0),
+        ])  # fmt: skip
+        ranks = np.array(self.pair.slave.body.comm.allgather(local))
+        total, number = ranks[:, :2].sum(axis=0)
+        extent = self.pair.extent
+        return Together(total / max(number, 1.0), *(SHIFT + ranks[:, 2:].max(axis=0) / extent))
 
-    def _lent_to_stick(self, mean: float, force: FloatArray, stick: BoolArray) -> FloatArray:
-        """`_lent` of those that stick, so that friction divides as normal forces of this mean do.
+    def _lent_to_stick(
+        self, together: Together, force: FloatArray, stick: BoolArray
+    ) -> FloatArray:
+        """Compliance lent to pairs that stick, so that friction divides as normal forces do.
 
         A brick at rest on a slope just below the limit needs that of all its nodes.
         """
         part = np.full(np.count_nonzero(stick), _UNEVEN)
-        np.divide(mean, -force[stick], out=part, where=force[stick] < 0.0)
-        lent: FloatArray = self._lent[stick] * np.clip(part, 1.0 / _UNEVEN, _UNEVEN)
+        np.divide(together.force, -force[stick], out=part, where=force[stick] < 0.0)
+        part = np.clip(part, 1.0 / _UNEVEN, _UNEVEN)
+        lent: FloatArray = together.tangential * part / self.scale[stick]
         return lent
-
-    def _mean_force(self, own: Mapping[str, FloatArray]) -> float:
-        """Mean normal force of a rigid body's nodes on all ranks [kg m]. Collective."""
-        if not (self.pair.redundant and self.num_tangential):
-            return 0.0
-        pressed = np.maximum(-self.scale * own["constraints"][:, 0], 0.0)
-        local = np.array([pressed.sum(), np.count_nonzero(pressed)])
-        total = self.pair.slave.body.comm.allreduce(local)
-        return float(total[0] / max(total[1], 1.0))
 
     @property
     def strong(self) -> bool:
@@ -523,14 +547,15 @@ class ContactElements:
                 h^2/2 lambda of the scaled constraints, and of lambda_T over the facet size, over
                 `scale` [m], shape (n, constraints).
         """
-        mean = self._mean_force(own)
         if not self.num_elements:
+            self._together(np.empty(0), None, np.empty((0, 1)))
             return self._nothing()
         scale = self.scale[:, None]
         multiplier = scale * own["constraints"]
         x = self._control(x)
         residual, tangent, gap, slip = self._element(x, own["augmented"], multiplier)
-        part = self._laws(x, residual, tangent, gap, slip, multiplier, mean)
+        together = self._together(gap, slip, multiplier)
+        part = self._laws(x, residual, tangent, gap, slip, multiplier, together)
         if slip is not None:
             normal = self._normal(x)
             along = np.einsum("ni,ni->n", part.force, normal)
@@ -561,7 +586,7 @@ class ContactElements:
         gap: FloatArray,
         slip: Slip | None,
         multiplier: FloatArray,
-        mean: float,
+        together: Together,
     ) -> Contribution:
         """Semi-smooth laws of contact (theory section 9) and friction (section 6).
 
@@ -574,7 +599,7 @@ class ContactElements:
         residual[off, row] = force[off] / scale[off]
         tangent[off, row] = 0.0
         tangent[off, row, row] = 1.0 / scale[off]
-        tangent[active, row, row] -= self._lent[active]
+        tangent[active, row, row] -= together.normal / scale[active]
         part = Contribution(
             residual,
             tangent,
@@ -588,7 +613,7 @@ class ContactElements:
             tangential=np.zeros((self.num_elements, 3)),
         )
         if slip is not None:
-            part.stick[:] = self._coulomb(x, residual, tangent, slip, multiplier, active, mean)
+            part.stick[:] = self._coulomb(x, residual, tangent, slip, multiplier, active, together)
             square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
             part.distance[active] = np.sqrt(square[active])
         return part
@@ -622,7 +647,7 @@ class ContactElements:
         slip: Slip,
         multiplier: FloatArray,
         active: BoolArray,
-        mean: float,
+        together: Together,
     ) -> BoolArray:
         """Write the rows of lambda_T [m]; returns which pairs stick.
 
@@ -657,7 +682,9 @@ class ContactElements:
         unsaid = np.where(stick[:, None, None], self.blocked, held) / scale
         value += np.einsum("nab,nb->na", unsaid, t)
         rows[:, :, -2:] += unsaid
-        rows[stick, :, -2:] -= np.eye(2) * self._lent_to_stick(mean, force, stick)[:, None, None]
+        if together.tangential:
+            lent = self._lent_to_stick(together, force, stick)
+            rows[stick, :, -2:] -= np.eye(2) * lent[:, None, None]
         value[~active], rows[~active] = t[~active] / scale[~active, 0], 0.0
         rows[~active, :, -2:] = np.eye(2) / scale[~active]
         residual[:, -2:], tangent[:, -2:] = value, rows
