@@ -151,6 +151,28 @@ def test_touching_blocks_of_tags(kind, cells, facets):
 
 
 @pytest.mark.mpi
+def test_a_volume_may_be_rigid():
+    """One volume of a mesh flexible, the other rigid, in contact at their interface."""
+    mesh, cell_tags, facet_tags = tagged_bar()
+    parts = bodies_from_tags(
+        mesh, cell_tags, facet_tags, names={"soft": 7, "hard": 9}, surfaces={"middle": 3}
+    )
+    hard = parts["hard"].rigid(density=2e3, velocity=(-1, 0, 0))
+    soft = parts["soft"].continuum(nts.NeoHookean(1e6, 0.3), density=1e3)
+    pair = nts.ContactPair(
+        slave=hard.surface(*parts["hard"].where("middle")),
+        master=soft.surface(*parts["soft"].where("middle")),
+    )
+    run = nts.simulate(
+        nts.System([soft, hard], contacts=[pair]), nts.EnergyMomentum(), dt=1e-3, t_end=5e-3
+    )
+    assert hard.name == "hard" and hard.mass == pytest.approx(2e3)
+    assert hard.centre == pytest.approx([1.5, 0.5, 0.5])
+    assert run.balance["active"][-1] > 0
+    assert np.ptp(run.balance["linear_momentum"], axis=0).max() < 1e-12 * 2e3
+
+
+@pytest.mark.mpi
 def test_bodies_of_a_submesh_without_facet_tags():
     """Its cells may leave ranks empty, and 0.5.2 does not number them."""
     mesh, cell_tags, _ = tagged_bar()

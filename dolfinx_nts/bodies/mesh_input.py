@@ -27,6 +27,7 @@ from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.continuum import Continuum
+from dolfinx_nts.bodies.rigid import RigidBody
 from dolfinx_nts.parallel import on_root
 from dolfinx_nts.validation import is_whole
 
@@ -91,6 +92,15 @@ class Part:
             **options: Further arguments of `Continuum`.
         """
         return Continuum(self.mesh, material, density=density, **{"name": self.name, **options})
+
+    def rigid(self, *, density: float, **options: Any) -> RigidBody:
+        """The rigid body on this mesh, under this name.
+
+        Args:
+            density: [kg/m^3].
+            **options: Further arguments of `RigidBody`.
+        """
+        return RigidBody(self.mesh, density=density, **{"name": self.name, **options})
 
 
 class Parts(dict[str, Part]):
