@@ -17,6 +17,9 @@ from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Linear solves of a start.
+_TIMES = 3
+
 
 def violation(problem: StepProblem, state: State, dt: float) -> tuple[float, str] | None:
     """The worst violation of a constraint by the velocities, and its joint's name. Collective.
@@ -73,11 +76,6 @@ def _solve(
     elements = [batch for c in chosen for batch in c.elements]
     of = [bodies for c in chosen for bodies in c.bodies]
     laid = Unknowns(system.comm, {k: len(u) for k, u in enumerate(state.u)}, elements, of)
-    right = np.zeros(laid.layout.num_owned)
-    for k, force in enumerate(forces):
-        right[laid.of_body(k)] = force
-    rows = [c.elements[0].scale * c.kinematics(state, dt)[order].ravel() for c in chosen]
-    right[laid.of_elements("constraints")] = -np.concatenate(rows)
     tangents = []
     for c in chosen:
         batch = c.elements[0]
@@ -85,11 +83,24 @@ def _solve(
         tangents.append(batch.evaluate(batch.y0, own).tangent)
     matrix = StepMatrix(laid.layout, masses, laid.blocks)
     matrix.assemble(tangents)
-    solution = solve_saddle(matrix.operator, right)
-    out = tuple(solution[laid.of_body(k)].copy() for k in range(len(forces)))
-    for k, body in enumerate(system.bodies):
-        out[k][body.fixed] = 0.0
+    total = [np.zeros_like(force) for force in forces]
+    # What the matrix lends to constraints (`SHIFT`) is gone after the second and third time.
+    for _ in range(_TIMES):
+        known = state.a if order else state.v
+        changed = tuple(x + dx for x, dx in zip(known, total, strict=True))
+        now = replace(state, a=changed) if order else replace(state, v=changed)
+        right = np.zeros(laid.layout.num_owned)
+        for k, force in enumerate(forces):
+            right[laid.of_body(k)] = force
+        rows = [c.elements[0].scale * c.kinematics(now, dt)[order].ravel() for c in chosen]
+        right[laid.of_elements("constraints")] = -np.concatenate(rows)
+        solution = solve_saddle(matrix.operator, right)
+        for k, body in enumerate(system.bodies):
+            change = solution[laid.of_body(k)].copy()
+            change[body.fixed] = 0.0
+            total[k] = total[k] + change
+        forces = [np.zeros_like(force) for force in forces]
     matrix.withdraw()
     matrix.destroy()
     laid.destroy()
-    return out
+    return tuple(total)
