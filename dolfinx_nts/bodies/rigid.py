@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -16,9 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.bodies.inertia import ROUNDED, check_axes, measure, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.constraints import Constraints, Equations, rank_of
+from dolfinx_nts.bodies.triad import Triad
+from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
@@ -40,8 +41,6 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
 
-#: Part of the largest moment by which given moments and axes may miss what they must satisfy.
-_ROUNDED = 1e-9
 #: Part of the mass that the matrix lends to directors without mass where a rotation has no
 #: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
 _LENT = 1e-8
@@ -103,7 +102,7 @@ class RigidBody:
         self.space = compat.vector_space(mesh, 1)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
-        mass, centre, euler = _measure(self.space, density)
+        mass, centre, euler = measure(self.space, density)
         moments, axes = np.linalg.eigh(euler)
         axes[:, 2] *= np.linalg.det(axes)
         self._set_up(
@@ -155,7 +154,7 @@ class RigidBody:
         require_name("name", name)
         require_positive("mass", mass, "kg")
         where = vector("centre", centre, "m")
-        moments, columns = _principal(inertia, axes)
+        moments, columns = principal(inertia, axes)
         body = cls.__new__(cls)
         euler = 0.5 * moments.sum() - moments
         body._set_up(
@@ -188,7 +187,7 @@ class RigidBody:
         for what, value, unit in self._given:
             self._vector(what, value, 0.0, unit)
         # Rounding of a disc's or a rod's moments is no mass.
-        euler = np.where(euler > _ROUNDED * euler.max(), euler, 0.0)
+        euler = np.where(euler > ROUNDED * euler.max(), euler, 0.0)
         self.moments = euler.sum() - euler
         self.length = float(np.sqrt(euler.sum() / mass)) or 1.0
         self._axes, self.centre, self._euler = axes, centre, euler
@@ -209,7 +208,7 @@ class RigidBody:
         self.fixed = np.flatnonzero(fixed[: self.num_owned])
         self._fixed = fixed
         self.prescribed(0.0)
-        self.joints: tuple[Any, ...] = () if rotation is not None else (_Triad(self),)
+        self.joints: tuple[Any, ...] = () if rotation is not None else (Triad(self),)
         self._matrix: Any = None
         self._reach = np.ones(4)
         if hasattr(self, "mesh"):
@@ -359,7 +358,7 @@ class RigidBody:
             )
         if array.shape == (3,):
             return np.asarray(Rotation.from_rotvec(array).as_matrix())
-        _check_axes(name, array, kind)
+        check_axes(name, array, kind)
         return array
 
     # ---- Body protocol
@@ -448,106 +447,6 @@ class RigidBody:
         """Free the PETSc objects; the body is of no use then."""
         if self._matrix is not None:
             self._matrix.destroy()
-
-
-class _Triad:
-    """Keeps the directors of a rigid body orthonormal: (D_i . D_j - l^2 delta_ij)/(2 l) = 0.
-
-    Args:
-        body: The body.
-    """
-
-    losses: tuple[str, ...] = ()
-
-    def __init__(self, body: RigidBody) -> None:
-        self.name, self.bodies = f"{body.name} directors", (body,)
-        n, length = int(body.comm.rank == body.owner), body.length
-        self._side = body.points(body.centre).part(slice(0, n))
-        weights, target = np.zeros((n, 6, 2, 4)), np.zeros((n, 6))
-        for m, (i, j) in enumerate([(1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (3, 1)]):
-            weights[:, m, 0, i] = 0.5 / length
-            weights[:, m, 1, j] = 1.0
-            target[:, m] = 0.5 * length * (i == j)
-        self._equations = Equations(weights, np.zeros((n, 6, 2, 3)), target)
-
-    def start(self) -> None:
-        """Nothing to remember."""
-        return None
-
-    def potential(self, u: Sequence[FloatArray], history: Any) -> float:
-        """None [J]."""
-        return 0.0
-
-    def coupling(self, bodies: tuple[int, ...]) -> Constraints:
-        """Its constraints in a run."""
-        return Constraints(self.name, bodies, [self._side], self._equations, redundant=False)
-
-
-def _measure(space: Any, density: float) -> tuple[float, FloatArray, FloatArray]:
-    """Mass [kg], centre [m] and Euler tensor about it [kg m^2] of a mesh. Collective."""
-    mesh = space.mesh
-    rho = fem.Constant(mesh, float(density))
-    v, w = ufl.TrialFunction(space), ufl.TestFunction(space)
-    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
-    (form,) = compat.compile_forms([rho * ufl.inner(v, w) * dx])
-    matrix = compat.create_matrix(form)
-    compat.assemble_matrix(matrix, form, (), 0.0)
-    owned = 3 * space.dofmap.index_map.size_local
-    x = space.tabulate_dof_coordinates()[: owned // 3]
-    right, left = matrix.createVecs()
-
-    def weighted(values: FloatArray) -> FloatArray:
-        right.array_w[:] = np.repeat(values, 3)
-        matrix.mult(right, left)
-        return left.array_r[::3].copy()
-
-    total = mesh.comm.allreduce(np.concatenate([[weighted(np.ones(len(x))).sum()],
-                                                x.T @ weighted(np.ones(len(x)))]))  # fmt: skip
-    mass, centre = float(total[0]), total[1:] / total[0]
-    # About the centre: far from the origin a difference of moments would lose digits.
-    off = x - centre
-    euler = mesh.comm.allreduce(np.array([off.T @ weighted(off[:, k]) for k in range(3)]))
-    for a in (matrix, right, left):
-        a.destroy()
-    return mass, centre, 0.5 * (euler + euler.T)
-
-
-def _principal(inertia: Any, axes: Any) -> tuple[FloatArray, FloatArray]:
-    """Principal moments [kg m^2] (3,) and axes (3, 3) of what a user gives."""
-    given = floats(inertia)
-    if given.shape not in ((3,), (3, 3)) or not np.isfinite(given).all():
-        raise ValueError(
-            f"inertia={inertia!r}: pass three principal moments or a tensor (3, 3) [kg m^2]"
-        )
-    columns = np.eye(3)
-    if given.shape == (3, 3):
-        if axes is not None:
-            raise ValueError(f"axes={axes!r}: a tensor has axes of its own; leave axes out")
-        if np.abs(given - given.T).max() > _ROUNDED * np.abs(given).max():
-            raise ValueError(f"inertia={inertia!r}: is not symmetric; pass a symmetric tensor")
-        given, columns = np.linalg.eigh(0.5 * (given + given.T))
-        columns[:, 2] *= np.linalg.det(columns)
-    elif axes is not None:
-        columns = floats(axes)
-        _check_axes(f"axes={axes!r}", columns, ValueError)
-    size = np.abs(given).max()
-    if (given < -_ROUNDED * size).any():
-        raise ValueError(f"inertia={inertia!r}: a principal moment is negative; pass moments >= 0")
-    if (given.sum() - 2.0 * given < -_ROUNDED * size).any():
-        raise ValueError(
-            f"inertia={inertia!r}: one principal moment exceeds the sum of the others, which no "
-            "body has; check the moments"
-        )
-    return np.maximum(given, 0.0), columns
-
-
-def _check_axes(name: str, axes: FloatArray, kind: type[Exception]) -> None:
-    """Raise unless axes are the columns of a right-handed orthonormal matrix."""
-    fits = axes.shape == (3, 3) and np.isfinite(axes).all()
-    if not fits or np.abs(axes.T @ axes - np.eye(3)).max() > _ROUNDED:
-        raise kind(f"{name}: pass a matrix (3, 3) with orthonormal columns")
-    if np.linalg.det(axes) < 0.0:
-        raise kind(f"{name}: the columns are left-handed; turn the sign of one")
 
 
 def _rows(name: str, x: Any, what: str) -> FloatArray:

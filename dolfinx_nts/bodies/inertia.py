@@ -1,0 +1,85 @@
+"""Mass, centre and principal moments of rigid bodies: of a mesh, or as a user gives them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.validation import floats
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Part of the largest moment by which given moments and axes may miss what they must satisfy.
+ROUNDED = 1e-9
+
+
+def measure(space: Any, density: float) -> tuple[float, FloatArray, FloatArray]:
+    """Mass [kg], centre [m] and Euler tensor about it [kg m^2] of a mesh. Collective."""
+    mesh = space.mesh
+    rho = fem.Constant(mesh, float(density))
+    v, w = ufl.TrialFunction(space), ufl.TestFunction(space)
+    dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
+    (form,) = compat.compile_forms([rho * ufl.inner(v, w) * dx])
+    matrix = compat.create_matrix(form)
+    compat.assemble_matrix(matrix, form, (), 0.0)
+    owned = 3 * space.dofmap.index_map.size_local
+    x = space.tabulate_dof_coordinates()[: owned // 3]
+    right, left = matrix.createVecs()
+
+    def weighted(values: FloatArray) -> FloatArray:
+        right.array_w[:] = np.repeat(values, 3)
+        matrix.mult(right, left)
+        return left.array_r[::3].copy()
+
+    total = mesh.comm.allreduce(np.concatenate([[weighted(np.ones(len(x))).sum()],
+                                                x.T @ weighted(np.ones(len(x)))]))  # fmt: skip
+    mass, centre = float(total[0]), total[1:] / total[0]
+    # About the centre: far from the origin a difference of moments would lose digits.
+    off = x - centre
+    euler = mesh.comm.allreduce(np.array([off.T @ weighted(off[:, k]) for k in range(3)]))
+    for a in (matrix, right, left):
+        a.destroy()
+    return mass, centre, 0.5 * (euler + euler.T)
+
+
+def principal(inertia: Any, axes: Any) -> tuple[FloatArray, FloatArray]:
+    """Principal moments [kg m^2] (3,) and axes (3, 3) of what a user gives."""
+    given = floats(inertia)
+    if given.shape not in ((3,), (3, 3)) or not np.isfinite(given).all():
+        raise ValueError(
+            f"inertia={inertia!r}: pass three principal moments or a tensor (3, 3) [kg m^2]"
+        )
+    columns = np.eye(3)
+    if given.shape == (3, 3):
+        if axes is not None:
+            raise ValueError(f"axes={axes!r}: a tensor has axes of its own; leave axes out")
+        if np.abs(given - given.T).max() > ROUNDED * np.abs(given).max():
+            raise ValueError(f"inertia={inertia!r}: is not symmetric; pass a symmetric tensor")
+        given, columns = np.linalg.eigh(0.5 * (given + given.T))
+        columns[:, 2] *= np.linalg.det(columns)
+    elif axes is not None:
+        columns = floats(axes)
+        check_axes(f"axes={axes!r}", columns, ValueError)
+    size = np.abs(given).max()
+    if (given < -ROUNDED * size).any():
+        raise ValueError(f"inertia={inertia!r}: a principal moment is negative; pass moments >= 0")
+    if (given.sum() - 2.0 * given < -ROUNDED * size).any():
+        raise ValueError(
+            f"inertia={inertia!r}: one principal moment exceeds the sum of the others, which no "
+            "body has; check the moments"
+        )
+    return np.maximum(given, 0.0), columns
+
+
+def check_axes(name: str, axes: FloatArray, kind: type[Exception]) -> None:
+    """Raise unless axes are the columns of a right-handed orthonormal matrix."""
+    fits = axes.shape == (3, 3) and np.isfinite(axes).all()
+    if not fits or np.abs(axes.T @ axes - np.eye(3)).max() > ROUNDED:
+        raise kind(f"{name}: pass a matrix (3, 3) with orthonormal columns")
+    if np.linalg.det(axes) < 0.0:
+        raise kind(f"{name}: the columns are left-handed; turn the sign of one")
