@@ -8,6 +8,7 @@ import pytest
 SMALL = {
     "bar_impact": {"elements": 4, "t_end": 0.1},
     "flying_l_block": {"t_end": 2.0},
+    "heavy_top": {"steps": (4e-3,), "t_end": 0.02, "size": 0.05},
     "own_problem": {"cells": 2, "steps": 4},
     "hertz": {"problems": ("cylinders",), "scales": (0.01,), "refinement": 0.5},
     "ironing": {"block": (16, 2), "die": (4, 2), "steps": (10, 50), "end": 0.2},
