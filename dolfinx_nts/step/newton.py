@@ -27,7 +27,14 @@ from dolfinx_nts.step.linear_solver import (
 from dolfinx_nts.step.problem import EQUAL, BodyTerms, Evaluation, StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.system import System
-from dolfinx_nts.validation import StepFailedError, is_finite, is_whole, known_options, require_bool
+from dolfinx_nts.validation import (
+    StepFailedError,
+    UserFunctionError,
+    is_finite,
+    is_whole,
+    known_options,
+    require_bool,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -171,6 +178,7 @@ class StepSolver:
         self._last: Evaluation | None = None
         self._passed: Evaluation | None = None
         self._careful, self._shortened = False, 0
+        self._raised: UserFunctionError | None = None
         self._dets: dict[int, tuple[FloatArray, float]] = {}
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
@@ -231,6 +239,9 @@ class StepSolver:
                 self._matrices_due = True
                 iterations += self.snes.getIterationNumber()
                 self.destroy()
+                if self._raised is not None:
+                    # Newer versions of petsc4py put an error of their own in its place.
+                    raise self._raised from error
                 if self._chosen < len(self._presets) - 1:
                     return self._attempt_otherwise(iterations)
                 state = self.problem.state
@@ -365,7 +376,11 @@ class StepSolver:
         return self._last
 
     def _function(self, _snes: Any, x: Any, f: Any) -> None:
-        f.array_w[:] = self.problem.residual(self._at(x))
+        try:
+            f.array_w[:] = self.problem.residual(self._at(x))
+        except UserFunctionError as error:
+            self._raised = error
+            raise
 
     def _jacobian(self, _snes: Any, x: Any, _j: Any, _p: Any) -> None:
         e = self._at(x)
