@@ -224,6 +224,15 @@ class Constraints(EveryStep):
         """Multipliers that are zero, shape (n, m)."""
         return np.zeros_like(self._equations.value)
 
+    def gap(self, state: State) -> tuple[FloatArray, float]:
+        """G - c at a state [m], shape (n, m), and what it may be by rounding [m]. Collective."""
+        u = [state.u[k] for k in self.bodies[0]]
+        y = [s.reference + s.nodal(w) for s, w in zip(self._sides, u, strict=True)]
+        (weights, constants, _), (c, *_) = self._at(state.time, state.time)
+        both = np.concatenate(y, axis=1)
+        found = kernel.value(kernel.factors(weights, constants, both)) - c
+        return found, _OFF * float(np.abs(both).max(initial=0.0))
+
     def kinematics(self, state: State, dt: float) -> tuple[FloatArray, FloatArray, float]:
         """First and second derivative in time of g - c at a state. Collective.
 

@@ -66,7 +66,7 @@ class Step:
     force_rounding: Callable[[Sequence[int]], float]
 
     def mean_scale(self, body: Any) -> float:
-        """The same in the mean over a body's places. Collective."""
+        """Force per motion in the mean over a body's places, in the step's units. Collective."""
         inertia = self.integrator.inertia
         values = body.nodal_mass if inertia else self.stiffness(body)
         chosen = values[::3][places_of(body)]

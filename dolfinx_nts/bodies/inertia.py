@@ -16,6 +16,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Part of the largest moment by which given moments and axes may miss what they must satisfy.
 ROUNDED = 1e-9
+#: Part of the largest moment by which equal ones may differ by the rounding of a mesh.
+_EQUAL = 1e-9
 
 
 def measure(space: Any, density: float) -> tuple[float, FloatArray, FloatArray]:
@@ -60,11 +62,12 @@ def principal(inertia: Any, axes: Any) -> tuple[FloatArray, FloatArray]:
             raise ValueError(f"axes={axes!r}: a tensor has axes of its own; leave axes out")
         if np.abs(given - given.T).max() > ROUNDED * np.abs(given).max():
             raise ValueError(f"inertia={inertia!r}: is not symmetric; pass a symmetric tensor")
-        given, columns = np.linalg.eigh(0.5 * (given + given.T))
-        columns[:, 2] *= np.linalg.det(columns)
+        given, columns = axes_of(given)
     elif axes is not None:
         columns = floats(axes)
-        check_axes(f"axes={axes!r}", columns, ValueError)
+        problem = misfit_of_axes(columns)
+        if problem:
+            raise ValueError(f"axes={axes!r}: {problem}")
     size = np.abs(given).max()
     if (given < -ROUNDED * size).any():
         raise ValueError(f"inertia={inertia!r}: a principal moment is negative; pass moments >= 0")
@@ -76,10 +79,33 @@ def principal(inertia: Any, axes: Any) -> tuple[FloatArray, FloatArray]:
     return np.maximum(given, 0.0), columns
 
 
-def check_axes(name: str, axes: FloatArray, kind: type[Exception]) -> None:
-    """Raise unless axes are the columns of a right-handed orthonormal matrix."""
+def misfit_of_axes(axes: FloatArray) -> str | None:
+    """What is wrong with axes that should be columns of a right-handed orthonormal matrix."""
     fits = axes.shape == (3, 3) and np.isfinite(axes).all()
     if not fits or np.abs(axes.T @ axes - np.eye(3)).max() > ROUNDED:
-        raise kind(f"{name}: pass a matrix (3, 3) with orthonormal columns")
+        return "pass a matrix (3, 3) with orthonormal columns"
     if np.linalg.det(axes) < 0.0:
-        raise kind(f"{name}: the columns are left-handed; turn the sign of one")
+        return "the columns are left-handed; turn the sign of one"
+    return None
+
+
+def axes_of(tensor: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues and right-handed axes (3, 3) of a symmetric tensor, whatever its rounding.
+
+    Where eigenvalues are equal, the axes are those nearest to x, y and z; the largest component of
+    the others is positive.
+    """
+    values, axes = np.linalg.eigh(0.5 * (tensor + tensor.T))
+    size, start = np.abs(values).max(), 0
+    while start < 3:
+        same = np.abs(values - values[start]) <= _EQUAL * size
+        space = axes[:, same]
+        if space.shape[1] > 1:
+            # Of the coordinate axes those that lie most in the space, made orthonormal in it.
+            chosen = np.sort(np.argsort(-np.linalg.norm(space, axis=1))[: space.shape[1]])
+            one, _, two = np.linalg.svd(space @ space[chosen].T, full_matrices=False)
+            space = one @ two
+        axes[:, same] = space * np.sign(space[np.abs(space).argmax(axis=0), range(space.shape[1])])
+        start = int(np.flatnonzero(same).max()) + 1
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return values, axes

@@ -58,10 +58,6 @@ class Points:
         arrays = (self.nodes, self.weights, self.reference, self.fixed, self.places)
         return Points(self.body, *(a[chosen] for a in arrays))
 
-    def with_weights(self, weights: FloatArray) -> Points:
-        """The same nodes with other weights, shape (n, k)."""
-        return replace(self, weights=weights)
-
     @cached_property
     def _table(self) -> tuple[IntArray, IntArray]:
         """Rows of this rank's nodes among its owned ones, and where each node is. Collective."""

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Moment
-from dolfinx_nts.bodies.inertia import ROUNDED, check_axes, measure, principal
+from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.triad import Triad
@@ -23,7 +23,7 @@ from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
-from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.parallel import gather_rows, raise_together
 from dolfinx_nts.validation import (
     UserFunctionError,
     at_time,
@@ -44,6 +44,8 @@ VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
 #: Part of the mass that the matrix lends to directors without mass where a rotation has no
 #: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
 _LENT = 1e-8
+#: Part of a torque along an axis without inertia that counts as none.
+_ALONG = 1e-6
 
 
 @known_options
@@ -62,10 +64,11 @@ class RigidBody:
         angular_velocity: At the start [rad/s].
         force: Dead force on the centre of mass [N]: a vector, or a function of time.
         torque: Dead torque [N m]: a vector, or a function of time.
-        motion: Displacement of the centre of mass since the start [m], as a vector, or a function
-            of time; its work is external work. None: the centre is free.
-        rotation: Rotation since the start, as a rotation vector [rad], a matrix (3, 3), or a
-            function of time to one of them. None: the body is free to turn.
+        motion: Displacement of the centre of mass from its reference [m], as a vector, or a
+            function of time, where the body starts, too; its work is external work. None: the
+            centre is free.
+        rotation: Rotation from the reference, as a rotation vector [rad], a matrix (3, 3), or a
+            function of time to one of them, likewise. None: the body is free to turn.
         name: Name in messages and files.
 
     Attributes:
@@ -103,8 +106,7 @@ class RigidBody:
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
         mass, centre, euler = measure(self.space, density)
-        moments, axes = np.linalg.eigh(euler)
-        axes[:, 2] *= np.linalg.det(axes)
+        moments, axes = axes_of(euler)
         self._set_up(
             mesh.comm, name, mass, centre, moments, axes, velocity, angular_velocity, force,
             torque, motion, rotation,
@@ -217,6 +219,7 @@ class RigidBody:
             local = np.abs(self._mesh_weights).max(axis=0, initial=0.0)
             comm.Allreduce(local, self._reach, op=MPI.MAX)
         self.accept(np.zeros(self.num_owned), self.initial_velocity)
+        self._check_torque(self._vector("torque", torque, 0.0, "N m"))
 
     # ---- the last accepted state
     @property
@@ -347,19 +350,33 @@ class RigidBody:
     def _rotation_at(self, time: float) -> FloatArray:
         """The prescribed rotation since the start, shape (3, 3). Collective."""
         given, name = self._turn, f"rotation of {self.name!r}"
+        kind: type[Exception] = ValueError
         if callable(given):
-            name = f"{name} at t={time!r}"
+            name, kind = f"{name} at t={time!r}", UserFunctionError
             given = call_together(self.comm, name, given, time)
-        kind = UserFunctionError if callable(self._turn) else ValueError
+        problem, turned = None, np.eye(3)
         array = floats(given)
         if array.shape not in ((3,), (3, 3)) or not np.isfinite(array).all():
-            raise kind(
-                f"{name}={given!r}: pass a rotation vector (3,) [rad] or a rotation matrix (3, 3)"
+            problem = "pass a rotation vector (3,) [rad] or a rotation matrix (3, 3)"
+        elif array.shape == (3,):
+            turned = Rotation.from_rotvec(array).as_matrix()
+        else:
+            problem, turned = misfit_of_axes(array), array
+        text = f"{name}={given!r}: {problem}"
+        raise_together(self.comm, text if problem else None, kind)
+        return turned
+
+    def _check_torque(self, torque: FloatArray) -> None:
+        """Refuse a torque [N m] about the axis of a rod, or on a point: nothing resists it."""
+        if np.count_nonzero(self._euler) > 1:
+            return
+        axes = self.rotation[:, self._euler > 0.0].T if self._euler.any() else np.eye(3)
+        if np.abs(axes @ torque).max() > _ALONG * np.linalg.norm(torque):
+            raise UserFunctionError(
+                f"torque of {self.name!r}={torque.tolist()!r}: the body has no inertia about "
+                f"{'its axis' if len(axes) == 1 else 'any axis'}; give it some, or leave the "
+                "torque out"
             )
-        if array.shape == (3,):
-            return np.asarray(Rotation.from_rotvec(array).as_matrix())
-        check_axes(name, array, kind)
-        return array
 
     # ---- Body protocol
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
@@ -370,6 +387,7 @@ class RigidBody:
             part = 1.0 if callable(value) else moment.ramp
             now.append(part * self._vector(what, value, moment.time, unit))
         self._load, self._couple = now
+        self._check_torque(self._couple)
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]."""

@@ -176,7 +176,9 @@ class ContactSearch:
             return closes | (force > c.no_pull(self._old[k].tangential[node]))
         # What goes to and fro at the limit would change the layout in every step.
         had = np.isin(node, self.elements[k].candidates.node) if self.elements else False
-        awake: BoolArray = had | (c.candidates.gap < reach) | (force > 0.0)
+        # Of nodes that rest all or none: whether rounding closes their gaps must not divide forces.
+        near = reach + c.rounding if c.pair.redundant else reach
+        awake: BoolArray = had | (c.candidates.gap < near) | (force > 0.0)
         return awake
 
     # ---- a solution

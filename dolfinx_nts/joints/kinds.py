@@ -22,7 +22,13 @@ from dolfinx_nts.joints.between import (
     number_at,
     triad,
 )
-from dolfinx_nts.validation import at_time, known_options, require_positive
+from dolfinx_nts.validation import (
+    UserFunctionError,
+    at_time,
+    floats,
+    known_options,
+    require_positive,
+)
 
 FloatArray = npt.NDArray[np.float64]
 Number = Callable[[float], float]
@@ -36,7 +42,7 @@ class Spherical(Between):
         a: A body, or None.
         b: A body, or None.
         point: Of both at the start [m].
-        displacement: Function of time that p_A - p_B [m] follows in place of 0.
+        displacement: Function of time whose change since t = 0 p_A - p_B [m] follows.
         name: In messages and files; default: kind and bodies.
 
     Raises:
@@ -222,7 +228,7 @@ class Universal(Between):
 
     def __init__(self, a: Any, b: Any, *, point: Any, axes: Any, name: str | None = None) -> None:
         super().__init__(a, b, ("point", point, point), name)
-        if np.shape(axes) != (2, 3):
+        if floats(axes).shape != (2, 3):
             raise ValueError(f"axes={axes!r} of {self.name!r}: pass two vectors")
         arms = np.array([direction(f"axes[{k}] of {self.name!r}", n) for k, n in enumerate(axes)])
         if abs(arms[0] @ arms[1]) > ROUNDED:
@@ -290,7 +296,7 @@ class Distance(Between):
         length: float | Number | None = None,
         name: str | None = None,
     ) -> None:
-        if np.shape(points) != (2, 3):
+        if floats(points).shape != (2, 3):
             raise ValueError(f"points={points!r}: pass two points [m], that of a and that of b")
         super().__init__(a, b, ("points", *points), name)
         p, q = np.asarray(points, dtype=float)
@@ -314,5 +320,10 @@ class Distance(Between):
     def products(self, times: Times) -> Iterator[Product]:
         """With r = p_A - p_B: r . r/(2 L_0) = L^2/(2 L_0)."""
         r, rest = self.p_a - self.p_b, self.rest
-        lengths = (rest if self.motion is None else self.motion.at(t) for t in times)
+        lengths = [rest if self.motion is None else self.motion.at(t) for t in times]
+        if min(lengths) <= 0.0:
+            raise UserFunctionError(
+                f"length of {self.name!r} at t={times[int(np.argmin(lengths))]!r}: is "
+                f"{min(lengths)!r}; return a positive length [m]"
+            )
         yield Product(0.5 / rest * r, r, [length**2 / (2.0 * rest) for length in lengths])

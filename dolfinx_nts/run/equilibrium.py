@@ -120,7 +120,9 @@ class _LoadStepper(Stepper):
         row = balance.next_row(rows[0], rows[-1], measured, terms)
         rows.append(row | forces_now)
         missing, size = abs(row["ledger_residual"]), abs(row["potential"])
+        loads = sum(float(np.abs(t.external).sum()) for t in step.bodies)
         pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
+        pressed += self.system.comm.allreduce(loads)
         rounding = _ROUNDING * self.problem.rounded_length * pressed
         if missing > _OPEN * max(size, abs(row["external_work"])) + rounding:
             self.solution.warn(
@@ -148,7 +150,8 @@ class _LoadStepper(Stepper):
         if found:
             self.solution.warn(
                 "free motion", self.state.time, 1.0,
-                f"{found}: how far it has moved so is chance; add a Dirichlet condition, or pass "
+                f"{found}: how far it has moved so is chance; hold it by a Dirichlet condition, "
+                "a joint or prescribed motion, or pass "
                 "stabilization=0.1, which leaves it where it is",
                 grave=True,
             )  # fmt: skip

@@ -273,6 +273,7 @@ class Stepper:
             state = replace(state, a=())
         self._accept(state)
         self._started, self._goes_on = False, start is not None and start.moving
+        self._start = start
         self.solution.rows = Table([self._first_row()])
         self._promises = Promises(self.solution, integrator, self.newton.rtol)
         self._materials, self._material_change = MaterialWatch(system), 0.0
@@ -413,24 +414,50 @@ class Stepper:
         self.look()
 
     def _consistent(self, state: State, dt: float) -> State:
-        """A start whose velocities fit the joints.
+        """A start that fits the joints.
+
+        Velocities at the end of another run's step need not: they only do in the mean of two steps.
 
         Raises:
-            ValueError: They do not, and are not to be projected.
+            ValueError: It does not, and its velocities are not to be projected, or cannot be.
         """
-        if not self.system.joints or self._goes_on:
+        if not self.system.joints:
             return state
         still = tuple(np.zeros_like(v) for v in state.v)
         self.problem.begin(replace(state, a=state.a or still), dt)
-        found = consistent.violation(self.problem, state, dt)
-        if found is None:
+        found = consistent.violation(self.problem, state, dt, rates=False)
+        if found is not None:
+            raise ValueError(
+                f"joints: at the start {found[1]!r} is off by {found[0]:.3g} m; let the bodies' "
+                "displacements and prescribed motion, and what the joint prescribes, begin where "
+                "it holds"
+            )
+        if self._continues:
             return state
-        if not self._project_start:
+        found = consistent.violation(self.problem, state, dt, rates=True)
+        if found is not None and not self._project_start:
             raise ValueError(
                 f"velocity: at the start joint {found[1]!r} is violated at {found[0]:.3g} m/s; "
-                "give its bodies velocities that fit, or pass project_start=True"
+                "give its bodies velocities, and what is prescribed rates, that fit, or pass "
+                "project_start=True"
             )
-        return replace(state, v=consistent.projection(self.problem, state, dt))
+        if found is not None:
+            state = replace(state, v=consistent.projection(self.problem, state, dt))
+            found = consistent.violation(self.problem, state, dt, rates=True)
+        if found is not None:
+            raise ValueError(
+                f"project_start=True: no velocities fit joint {found[1]!r}, which stays violated "
+                f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it"
+            )
+        return state
+
+    @property
+    def _continues(self) -> bool:
+        """Whether the run goes on from another one with the same joints."""
+        if not self._goes_on or self._start is None:
+            return False
+        known = {joint.name for joint in self._start.system.joints}
+        return all(joint.name in known for joint in self.system.joints)
 
     def look(self, *, last: bool = False) -> None:
         """Warn if what is in contact is inside each other; only as often as it has moved.

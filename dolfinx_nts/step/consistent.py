@@ -21,23 +21,30 @@ FloatArray = npt.NDArray[np.float64]
 _TIMES = 3
 
 
-def violation(problem: StepProblem, state: State, dt: float) -> tuple[float, str] | None:
-    """The worst violation of a constraint by the velocities, and its joint's name. Collective.
+def violation(
+    problem: StepProblem, state: State, dt: float, *, rates: bool
+) -> tuple[float, str] | None:
+    """The worst violation of a constraint at a start, and its joint's name. Collective.
 
     Args:
         problem: Equations of the first step, after `begin`.
         state: At the start.
         dt: First step [s].
+        rates: That of velocities; else of positions.
 
     Returns:
-        [m/s], or None where all constraints hold.
+        [m/s] or [m], or None where all constraints hold.
     """
     worst, name = 0.0, ""
-    for joint, coupling in zip(problem.system.joints, problem.couplings[1:], strict=True):
+    couplings: list[Any] = problem.couplings[1:]
+    for joint, coupling in zip(problem.system.joints, couplings, strict=True):
         if not hasattr(coupling, "kinematics"):
             continue
-        rate, _, limit = coupling.kinematics(state, dt)
-        local = np.array([np.abs(rate).max(initial=0.0), limit])
+        if rates:
+            missed, _, limit = coupling.kinematics(state, dt)
+        else:
+            missed, limit = coupling.gap(state)
+        local = np.array([np.abs(missed).max(initial=0.0), limit])
         off, limit = global_max(problem.system.comm, local).tolist()
         if off > limit and off > worst:
             worst, name = off, joint.name
