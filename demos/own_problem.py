@@ -104,9 +104,12 @@ class Contact:
         """Solve the load step that ends at a pseudo time."""
         (u,), zero = self.state.u, np.zeros(1)
         size = self.comm.allreduce(np.abs(u).max(initial=0.0), op=MPI.MAX)
+        rule = Static()
         step = nts.Step(
-            self.state, time - self.state.time, 1.0, Static(), True, [u], [0 * u],
-            zero + 0.1 * HEIGHT, zero + size, lambda bodies: 0.0,
+            state=self.state, dt=time - self.state.time, factor=1.0, integrator=rule,
+            condense=True, first=[u], ahead=[0 * u], motion=zero + 0.1 * HEIGHT,
+            length=zero + size, stiffness=lambda body: body.nodal_stiffness(rule), moments=[],
+            force_rounding=lambda bodies: 0.0,
         )  # fmt: skip
         self.search.begin(step, self.state.contacts, None, search=True)
         elements = self.search.elements
