@@ -7,6 +7,7 @@ from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
 
 COMM = MPI.COMM_WORLD
 FLOOR = nts.Plane((0, 0, 0), (0, 0, 1))
@@ -235,3 +236,35 @@ def test_equilibrium_names_a_rigid_body_that_may_slide():
     pair = nts.ContactPair(slave=below(body), master=FLOOR)
     found = nts.equilibrium(nts.System([body], contacts=[pair], gravity=(0, 0, -G)))
     assert "nothing resists body 'brick'" in found.status
+
+
+def disc(facets, radius=0.1, width=0.02):
+    """A ring of hexahedra about the y axis, which stands on z = 0."""
+    angle = np.linspace(0, 2 * np.pi, facets, endpoint=False)
+    rims = [(y, r) for y in (0.0, width) for r in (0.6 * radius, radius)]
+    points = [(r * np.cos(a), y, r * np.sin(a) + radius) for y, r in rims for a in angle]
+    k = np.arange(facets)
+    both = [n * facets + (k + step) % facets for n in range(4) for step in (0, 1)]
+    # Corners in DOLFINx's order: radius, angle, width.
+    cells = np.array([both[i] for i in (0, 2, 1, 3, 4, 6, 5, 7)]).T
+    return compat.create_mesh(COMM, cells.astype(np.int64), np.array(points), "hexahedron")
+
+
+@pytest.mark.slow
+def test_a_disc_slides_until_it_rolls():
+    """192 facets; v = v0 R^2/(R^2 + k^2) when it rolls, and friction takes the rest."""
+    radius, mu = 0.1, 0.2
+    body = nts.RigidBody(disc(192), density=1e3, velocity=(1, 0, 0), name="disc")
+    slave = body.surface(lambda x: np.hypot(x[0], x[2] - radius) > 0.999 * radius)
+    pair = nts.ContactPair(slave=slave, master=FLOOR, friction=mu)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
+    rolls = 1.0 / (1.0 + body.moments.max() / (body.mass * radius**2))
+    time = (1.0 - rolls) / (mu * G)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=1.05 * time)
+    table = run.balance
+    assert run.status.startswith("completed")
+    assert body.velocity[0] == pytest.approx(rolls, rel=0.01)
+    assert body.angular_velocity[1] * radius == pytest.approx(rolls, rel=0.01)
+    taken = 0.5 * body.mass * (1.0 - rolls)
+    assert table["friction_dissipation"][-1] == pytest.approx(taken, rel=0.01)
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
