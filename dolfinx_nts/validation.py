@@ -38,7 +38,7 @@ def known_options(target: T) -> T:
     wrapped: Any = target
     is_class = isinstance(target, type)
     function = wrapped.__init__ if is_class else wrapped
-    known = [p for p in inspect.signature(function).parameters if p != "self"]
+    known = [p for p in inspect.signature(function).parameters if p not in ("self", "cls")]
 
     @functools.wraps(function)
     def checked(*args: Any, **options: Any) -> Any:

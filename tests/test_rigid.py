@@ -144,10 +144,55 @@ def test_a_torque_turns_and_its_work_is_in_the_ledger(rule):
     for dt in (0.1, 0.05):
         body = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), torque=(0, 0, 1.5), force=(1, 0, 0))
         run = nts.simulate(nts.System([body]), RULES[rule], dt=dt, t_end=2.0)
-        errors.append(abs(body.angular_velocity[2] - 1.5 * 2 / 2.5))
+        turned = Rotation.from_rotvec([0, 0, 0.5 * 1.5 / 2.5 * 2.0**2]).as_matrix()
+        errors.append(np.abs(body.rotation - turned).max())
+        assert body.angular_velocity == pytest.approx([0, 0, 1.5 * 2 / 2.5], abs=1e-9)
         assert np.abs(run.balance["ledger_residual"]).max() < 1e-12 * run.balance["energy"][-1]
         assert body.velocity == pytest.approx([1, 0, 0], abs=1e-12)
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("rule", ["energy-momentum", "midpoint"])
+@pytest.mark.parametrize(("spin", "torque"), [(5.0, 0.06), (20.0, 60.0)])
+def test_the_impulse_of_a_torque_is_exact_at_any_turn(rule, spin, torque):
+    """Half a radian and two radians a step."""
+    body = nts.RigidBody.from_inertia(
+        2.0, (1, 2, 3), angular_velocity=(0, 0, spin), torque=(0, 0, torque)
+    )
+    run = nts.simulate(nts.System([body]), RULES[rule], dt=0.1, t_end=1.0)
+    change = run.balance["angular_momentum"][-1] - run.balance["angular_momentum"][0]
+    assert change == pytest.approx([0, 0, torque], rel=1e-9, abs=1e-9)
+    assert run.balance["newton_iterations"].max() <= 8
+
+
+def test_tangent_of_a_torque_is_its_derivative():
+    body = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), torque=(0.3, -0.5, 1.5), motion=(0, 0, 0))
+    rng = np.random.default_rng(1)
+    u0, u1, du = 0.3 * rng.standard_normal((3, 12))
+    body.begin_step(nts.EnergyMomentum(), nts.Moment(u0, 0.0))
+    step, none = 1e-6, np.zeros(3)
+    change = body.external(u1 + step * du, none) - body.external(u1 - step * du, none)
+    rows, _, values = body.tangent(u1, 0.0, 1.0).getValuesCSR()
+    tangent = values.reshape(12, 12)
+    expected = -change / (2.0 * step)
+    assert (np.diff(rows) == 12).all()
+    du[:3] = 0.0
+    assert (tangent @ du)[3:] == pytest.approx(expected[3:], rel=1e-7, abs=1e-9)
+
+
+def test_reactions_of_prescribed_motion_are_force_and_moment():
+    """A clamp carries weight and torque; a turn at constant rate of spin needs J alpha."""
+    clamped = nts.RigidBody.from_inertia(
+        2.0, (1, 1, 2), motion=(0, 0, 0), rotation=(0, 0, 0), torque=(0, 3, 0), name="clamped"
+    )
+    turned = nts.RigidBody.from_inertia(
+        1.0, (1, 1, 2), rotation=lambda t: (0, 0, t * t), name="turned"
+    )
+    run = nts.simulate(
+        nts.System([clamped, turned], gravity=(0, 0, -10)), nts.EnergyMomentum(), dt=0.02, t_end=0.4
+    )
+    assert run.reactions["clamped"][-1] == pytest.approx(np.array([[0, 0, 20], [0, -3, 0]]))
+    assert run.reactions["turned"][-1, 0] == pytest.approx([0, 0, 4], rel=1e-3, abs=1e-9)
 
 
 @pytest.mark.mpi

@@ -201,6 +201,7 @@ class RigidBody:
         masses = np.array([mass, *(euler / self.length**2)])
         self.reference: FloatArray = y.ravel()[: self.num_owned]
         self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
+        self._held_at = y[1:]
         self._lent = np.zeros(self.num_owned)
         if np.count_nonzero(euler) < 2:
             self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * mass
@@ -398,15 +399,43 @@ class RigidBody:
         return np.zeros(self.num_owned)
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
-        """Gravity, force, and torque as tau x D_i / (2 l^2) on each director [N]."""
+        """Gravity, force, and the torque's forces on the directors [N]."""
         f = np.zeros((self.num_owned // 3, 3))
         if self.num_owned:
             f[0] = self.mass * gravity + self._load
+            self._held_at = directors = self._directors(u1)
             if self._couple.any():
-                u = self._u0 + self._theta * (u1 - self._u0)
-                directors = (self.reference + u).reshape(4, 3)[1:]
-                f[1:] = cross(np.tile(self._couple, (3, 1)), directors) / (2.0 * self.length**2)
+                f[1:] = cross(np.tile(self._turning(directors), (3, 1)), directors)
         return f.ravel()
+
+    def _directors(self, u1: FloatArray) -> FloatArray:
+        """Where the forces of the step act [m], shape (3, 3)."""
+        u = self._u0 + self._theta * (u1 - self._u0)
+        return (self.reference + u).reshape(4, 3)[1:]
+
+    def _turning(self, directors: FloatArray) -> FloatArray:
+        """The vector t with sum D_i x (t x D_i) = torque, so that its impulse is exact at any turn [N/m].
+
+        On orthonormal directors it is torque / (2 l^2); in the middle of a step they are shorter.
+        """
+        squares = directors.T @ directors
+        whole = np.trace(squares) * np.eye(3) - squares
+        turning: FloatArray = np.linalg.solve(whole, self._couple)
+        return turning
+
+    def _torque_gradient(self, directors: FloatArray) -> FloatArray:
+        """Derivative of the torque's forces t x D_i by the directors, shape (9, 9)."""
+        squares = directors.T @ directors
+        t = self._turning(directors)
+        # (trace - squares) dt = - (change of both) t
+        change = np.concatenate(
+            [2.0 * np.outer(t, d) - (d @ t) * np.eye(3) - np.outer(d, t) for d in directors], axis=1
+        )
+        dt = -np.linalg.solve(np.trace(squares) * np.eye(3) - squares, change)
+        gradient = np.kron(np.eye(3), _spin(t))
+        for i, d in enumerate(directors):
+            gradient[3 * i : 3 * i + 3] -= _spin(d) @ dt
+        return gradient
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """Return mass M less stiffness times the derivative of the torque's forces."""
@@ -415,9 +444,8 @@ class RigidBody:
         if self.num_owned:
             whole = np.diag(mass * (self.nodal_mass + self._lent))
             if self._couple.any():
-                x, y, z = stiffness * self._theta * self._couple / (2.0 * self.length**2)
-                for k in (3, 6, 9):
-                    whole[k : k + 3, k : k + 3] += [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+                by_directors = self._torque_gradient(self._directors(u1))
+                whole[3:, 3:] -= stiffness * self._theta * by_directors
             if self.fixed.size:
                 whole[self.fixed] = whole[:, self.fixed] = 0.0
                 whole[self.fixed, self.fixed] = mass * self.mass or 1.0
@@ -445,10 +473,15 @@ class RigidBody:
         return 0.0
 
     def reactions(self, residual: FloatArray) -> FloatArray:
-        """Force on the prescribed centre on this rank [N], shape (1, 3), or (0, 3)."""
-        if self._motion is None:
-            return np.zeros((0, 3))
-        return residual[:3].reshape(1, 3) if self.num_owned else np.zeros((1, 3))
+        """What prescribed motion needs on this rank: force [N], then moment of rotation [N m].
+
+        Shape (2, 3), (1, 3) if only one of them is prescribed, (0, 3) if none is.
+        """
+        rows = np.zeros((2, 3))
+        if self.num_owned:
+            forces = residual.reshape(4, 3)
+            rows[0], rows[1] = forces[0], cross(self._held_at, forces[1:]).sum(axis=0)
+        return rows[[self._motion is not None, self._turn is not None]]
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""
@@ -465,6 +498,12 @@ class RigidBody:
         """Free the PETSc objects; the body is of no use then."""
         if self._matrix is not None:
             self._matrix.destroy()
+
+
+def _spin(a: FloatArray) -> FloatArray:
+    """Matrix of a x."""
+    x, y, z = a
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _rows(name: str, x: Any, what: str) -> FloatArray:
