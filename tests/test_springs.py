@@ -529,4 +529,4 @@ def test_forces_of_joints_supports_and_contacts_are_written(mpi_tmp_path):
         assert len(rows) == 6 and values["time [s]"] == pytest.approx(0.05)
         assert values["pull_force_z [N]"] == pytest.approx(2 * 9.81)
         assert values["pull_moment_x [N m]"] == 0.0
-        assert values["held_0_z [N]"] == pytest.approx(3 * 9.81)
+        assert values["held_force_z [N]"] == pytest.approx(3 * 9.81)

@@ -483,6 +483,12 @@ class RigidBody:
             rows[0], rows[1] = forces[0], cross(self._held_at, forces[1:]).sum(axis=0)
         return rows[[self._motion is not None, self._turn is not None]]
 
+    @property
+    def reaction_labels(self) -> list[tuple[str, str]]:
+        """Name and unit of each row of `reactions`."""
+        motion = [("force", "N")] if self._motion is not None else []
+        return motion + ([("moment", "N m")] if self._turn is not None else [])
+
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""
         self.accepted = u, v

@@ -343,11 +343,11 @@ class ForcesCSV(BalanceCSV):
         system, header = stepper.system, ["time [s]"]
         joints = [system.joints[k] for k in resultants.declared_joints(system)]
         columns = [resultants.reactions_of(item) for item in (*system.bodies, *joints)]
-        labels = [
-            f"{body.name}_{k}_{{}} [N]"
-            for body, column in zip(system.bodies, columns, strict=False)
-            for k in range(len(stepper.solution.rows[0][column]))
-        ]
+        labels = []
+        for body, column in zip(system.bodies, columns, strict=False):
+            rows = [(str(k), "N") for k in range(len(stepper.solution.rows[0][column]))]
+            rows = getattr(body, "reaction_labels", rows)
+            labels += [f"{body.name}_{row}_{{}} [{unit}]" for row, unit in rows]
         for joint in joints:
             labels += [f"{joint.name}_force_{{}} [N]", f"{joint.name}_moment_{{}} [N m]"]
         labels += [f"contact_{pair.name}_{{}} [N]" for pair in system.contacts]

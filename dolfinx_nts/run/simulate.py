@@ -104,6 +104,8 @@ class Solution:
     def reactions(self) -> dict[str, FloatArray]:
         """Of each body, force of each `Dirichlet` condition on it [N], shape (rows, conditions, 3).
 
+        Of a rigid body those of its prescribed motion: force, then moment of rotation [N m].
+
         Of each joint, by its name, force [N] and moment about its point [N m] on the first of its
         bodies, shape (rows, 2, 3).
 
