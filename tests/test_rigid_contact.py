@@ -114,8 +114,8 @@ def test_a_brick_on_a_slope_slides_below_the_limit_alone(part):
     assert body.position[0] - body.centre[0] == pytest.approx(exact, rel=1e-6, abs=1e-13)
 
 
-@pytest.mark.mpi
-def test_a_tower_of_five_stands():
+def tower():
+    """Five bricks on one another and on the floor, with friction."""
     bodies = [
         rigid((0, 0, k), (1, 1, 1), (1 + k % 2, 1 + k % 2, 1), name=f"b{k}") for k in range(5)
     ]
@@ -126,29 +126,24 @@ def test_a_tower_of_five_stands():
         )
         for k in range(4)
     ]
-    system = nts.System(bodies, contacts=pairs, gravity=(0, 0, -G))
+    return nts.System(bodies, contacts=pairs, gravity=(0, 0, -G))
+
+
+@pytest.mark.mpi
+def test_a_tower_of_five_stands():
+    system = tower()
     run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-2, t_end=0.4)
-    carried = run.contact_forces[-1, :, 2] / (bodies[0].mass * G)
+    carried = run.contact_forces[-1, :, 2] / (system.bodies[0].mass * G)
     assert run.status == "completed" and carried == pytest.approx([5, 4, 3, 2, 1], rel=1e-9)
-    assert max(np.abs(b.position - b.centre).max() for b in bodies) < 1e-12
+    assert max(np.abs(b.position - b.centre).max() for b in system.bodies) < 1e-12
 
 
 @pytest.mark.slow
 def test_a_tower_of_five_stands_for_ten_seconds():
-    bodies = [
-        rigid((0, 0, k), (1, 1, 1), (1 + k % 2, 1 + k % 2, 1), name=f"b{k}") for k in range(5)
-    ]
-    pairs = [nts.ContactPair(slave=below(bodies[0]), master=FLOOR, friction=0.5)]
-    pairs += [
-        nts.ContactPair(
-            slave=below(bodies[k + 1], k + 1), master=above(bodies[k], k + 1), friction=0.5
-        )
-        for k in range(4)
-    ]
-    system = nts.System(bodies, contacts=pairs, gravity=(0, 0, -G))
+    system = tower()
     run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=10.0)
     assert run.status == "completed"
-    assert max(np.abs(b.position - b.centre).max() for b in bodies) < 1e-10
+    assert max(np.abs(b.position - b.centre).max() for b in system.bodies) < 1e-10
 
 
 @pytest.mark.mpi
