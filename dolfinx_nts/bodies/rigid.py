@@ -414,7 +414,7 @@ class RigidBody:
         return (self.reference + u).reshape(4, 3)[1:]
 
     def _turning(self, directors: FloatArray) -> FloatArray:
-        """The vector t with sum D_i x (t x D_i) = torque, so that its impulse is exact at any turn [N/m].
+        """The vector t [N/m] with sum D_i x (t x D_i) = torque, whose impulse is exact then.
 
         On orthonormal directors it is torque / (2 l^2); in the middle of a step they are shorter.
         """
