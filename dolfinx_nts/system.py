@@ -60,6 +60,8 @@ class System:
 
     Attributes:
         size: Coordinates of all bodies.
+        declared_joints: As given.
+        joints: These, then those that bodies bring, such as what keeps a rigid body rigid.
 
     Raises:
         TypeError: An item is no body or no contact.
@@ -102,8 +104,9 @@ class System:
                         f"contacts: the {role} body {body.name!r} is not among "
                         f"bodies={names}; add it"
                     )
+        self.declared_joints = self.joints
         own = (joint for body in self.bodies for joint in getattr(body, "joints", ()))
-        self.joints = (*self.joints, *own)
+        self.joints = (*self.declared_joints, *own)
         labels = [joint.name for joint in self.joints]
         if len(set(labels)) < len(labels):
             raise ValueError(f"joints: names {labels} are not unique; pass name= to each joint")

@@ -213,17 +213,22 @@ def test_prescribed_motion_does_external_work():
     assert run.reactions["rigid"][-1, 0, 0] == pytest.approx(2.0, rel=1e-8)
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6], ids=["m", "mm", "um"])
-def test_units_do_not_matter(unit):
-    """Lengths in m, mm and um, masses in kg: the same iterations and motion."""
+def iterations_in(unit):
+    """Of a free body with lengths in this unit, which flies as it must."""
     body = nts.RigidBody.from_inertia(
         2.0, np.array([1.0, 2.0, 2.5]) * unit**2, velocity=np.array([1.0, 2.0, 0.5]) * unit,
         angular_velocity=(1, 2, 3),
     )  # fmt: skip
     gravity = np.array([0, 0, -9.81]) * unit
     run = nts.simulate(nts.System([body], gravity=gravity), nts.EnergyMomentum(), dt=0.05, t_end=1)
-    assert run.balance["newton_iterations"][1:].tolist() == [3.0] * 20
     assert body.position / unit == pytest.approx([1, 2, 0.5 - 4.905], abs=1e-12)
+    return run.balance["newton_iterations"].tolist()
+
+
+def test_units_do_not_matter():
+    """Lengths in m, mm and um, masses in kg: the same iterations and motion."""
+    in_m, in_mm, in_um = (iterations_in(unit) for unit in (1.0, 1e3, 1e6))
+    assert in_m == in_mm == in_um
 
 
 @pytest.mark.mpi

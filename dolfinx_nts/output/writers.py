@@ -341,7 +341,7 @@ class ForcesCSV(BalanceCSV):
 
     def _of(self, stepper: Stepper) -> tuple[tuple[str, ...], list[str]]:
         system, header = stepper.system, ["time [s]"]
-        joints = [system.joints[k] for k in resultants.declared_joints(system)]
+        joints = system.declared_joints
         columns = [resultants.reactions_of(item) for item in (*system.bodies, *joints)]
         labels = []
         for body, column in zip(system.bodies, columns, strict=False):

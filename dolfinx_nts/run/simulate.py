@@ -112,10 +112,9 @@ class Solution:
         In dynamics that of each step, with inertia, where the integrator takes its forces. A
         coordinate that two conditions prescribe counts with the later one.
         """
-        joints = [self.system.joints[k] for k in resultants.declared_joints(self.system)]
         return {
             item.name: self.rows.column(resultants.reactions_of(item))
-            for item in (*self.system.bodies, *joints)
+            for item in (*self.system.bodies, *self.system.declared_joints)
         }
 
     @property

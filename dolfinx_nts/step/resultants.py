@@ -25,18 +25,11 @@ def reactions_of(item: Any) -> str:
     return f"reactions of {item.name}"
 
 
-def declared_joints(system: System) -> list[int]:
-    """Numbers of the joints that are no body's own."""
-    own = {id(joint) for body in system.bodies for joint in getattr(body, "joints", ())}
-    return [k for k, joint in enumerate(system.joints) if id(joint) not in own]
-
-
 def at_start(system: System) -> dict[str, FloatArray]:
     """Zeros of the right shapes, for the row of the start."""
     row = {reactions_of(b): np.zeros_like(_reactions(b, np.zeros(b.num_owned)))
            for b in system.bodies}  # fmt: skip
-    joints = (system.joints[k] for k in declared_joints(system))
-    row |= {reactions_of(joint): np.zeros((2, 3)) for joint in joints}
+    row |= {reactions_of(joint): np.zeros((2, 3)) for joint in system.declared_joints}
     return row | {CONTACT_FORCES: np.zeros((len(system.contacts), 3))}
 
 
@@ -53,21 +46,21 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
         its slave body, shape (contacts, 3).
     """
     bodies, contacts = problem.system.bodies, problem.contact_parts(step)
-    joints = declared_joints(problem.system)
+    joints = problem.system.declared_joints
     parts = [_reactions(b, t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
     forces = [part.force.sum(axis=0) for part in contacts]
     parts.append(np.reshape(forces, (len(contacts), 3)))
-    held = list(problem.each(step))[1:]
-    parts += [_of_joint(problem, step, *held[k]) for k in joints]
+    held = list(problem.each(step))[1 : 1 + len(joints)]
+    parts += [_of_joint(problem, step, *each) for each in held]
     total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     split = np.split(total, np.cumsum([len(part) for part in parts])[:-1])
     names = [*map(reactions_of, bodies), CONTACT_FORCES]
     found = {name: value / problem.factor for name, value in zip(names, split, strict=False)}
-    for k, (force, moment, places, count) in zip(joints, split[len(names) :], strict=True):
+    for joint, (force, moment, places, count) in zip(joints, split[len(names) :], strict=True):
         point = places / max(count[0], 1.0)
         both = np.array([force, moment - cross(point, force)])
-        found[reactions_of(problem.system.joints[k])] = both / problem.factor
+        found[reactions_of(joint)] = both / problem.factor
     return found
 
 
