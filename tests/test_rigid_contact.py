@@ -263,3 +263,24 @@ def test_a_disc_slides_until_it_rolls():
     taken = 0.5 * body.mass * (1.0 - rolls)
     assert table["friction_dissipation"][-1] == pytest.approx(taken, rel=0.01)
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+
+
+def test_a_smooth_rigid_master_keeps_momenta_and_the_ledger():
+    """A soft column under a turning rigid plate whose surface is smooth."""
+    plate = rigid(
+        (0, 0, 1.01), (1, 1, 0.5), (3, 3, 2), velocity=(1, 0, -3), angular_velocity=(0, 1, 0),
+        name="plate",
+    )  # fmt: skip
+    column = nts.Continuum(
+        grid((0.2, 0.2, 0), (0.6, 0.6, 1), (2, 2, 2)), nts.NeoHookean(1e6, 0.3), density=1e3,
+        name="column",
+    )  # fmt: skip
+    master = plate.surface(lambda x: x[2] < 1.01 + 1e-9, smoothing=True)
+    pair = nts.ContactPair(slave=above(column, 1.0), master=master, friction=0.3)
+    system = nts.System([plate, column], contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.02)
+    table = run.balance
+    assert run.status.startswith("completed") and table["active"].max() > 0
+    for name in ("linear_momentum", "angular_momentum"):
+        assert np.ptp(table[name], axis=0).max() < 1e-11 * np.abs(table[name]).max()
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
