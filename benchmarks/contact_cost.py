@@ -18,8 +18,9 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
+from dolfinx_nts.step.accuracy import ACCURACY
 from dolfinx_nts.step.assembly import StepMatrix
-from dolfinx_nts.step.newton import ACCURACY, StepSolver
+from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 
 

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from step_time import PARTS, cubes
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.newton import ACCURACY
+from dolfinx_nts.step.accuracy import ACCURACY
 
 #: Of `PARTS`, what contact costs beside the linear solver; the bodies' matrices are stored in
 #: blocks in the last two of them.

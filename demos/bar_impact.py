@@ -48,7 +48,7 @@ SHOWN = (
 )  # fmt: skip
 
 
-def scene(comm, elements, gravity):
+def scene(comm, elements, gravity, mass="consistent"):
     """Bar along x in front of a wall whose face is x = 0."""
     box = [[GAP, 0, 0], [GAP + LENGTH, 1, 1]]
     mesh = create_box(
@@ -57,7 +57,7 @@ def scene(comm, elements, gravity):
     material = nts.StVenantKirchhoff(young=YOUNG, poisson=0.0)
     velocity = (0.0, 0.0, 0.0) if gravity else (-SPEED, 0.0, 0.0)
     bar = nts.Continuum(mesh, material, density=DENSITY, velocity=velocity, name="bar")
-    end = bar.surface(lambda x: x[0] < GAP + 1e-6)
+    end = bar.surface(lambda x: x[0] < GAP + 1e-6, mass=mass)
     pair = nts.ContactPair(slave=end, master=nts.Plane(point=(0, 0, 0), normal=(1, 0, 0)))
     acceleration = (-GRAVITY if gravity else 0.0, 0.0, 0.0)
     return nts.System([bar], contacts=[pair], gravity=acceleration)
@@ -220,6 +220,7 @@ def main(
     courant=1.0,
     t_end=None,
     integrators=tuple(INTEGRATORS),
+    mass="consistent",
     progress=False,
 ):
     """Run the impact with each integrator.
@@ -232,6 +233,7 @@ def main(
         courant: Step over the time a wave needs for one element.
         t_end: End of the run [s]; default just after the last contact.
         integrators: Which of "energy-momentum", "midpoint".
+        mass: Of the nodes that touch, "consistent" or "redistributed".
         progress: Show a progress line.
 
     Returns:
@@ -242,7 +244,7 @@ def main(
     results, balances = {}, {}
     for name in integrators:
         recorder, clock = Recorder(), time.perf_counter()
-        system = scene(comm, elements, gravity)
+        system = scene(comm, elements, gravity, mass)
         folder = output and Path(output) / name
         writers = [recorder, *([Fields(folder, every=5)] if folder else [])]
         run = nts.simulate(

@@ -91,7 +91,7 @@ def wheel_mesh(comm, facets, rings):
     return create_mesh(comm, cells, points, "hexahedron")
 
 
-def scene(comm, facets, *, settle):
+def scene(comm, facets, *, settle, smoothing=False):
     """Wheel above the layer; while it settles, its hub may not move sideways."""
     mesh = wheel_mesh(comm, facets, max(2, facets // 16))
     centre = RADIUS * np.cos(np.pi / facets)
@@ -120,7 +120,9 @@ def scene(comm, facets, *, settle):
     )
     rim = wheel.surface(lambda x: np.hypot(x[0], x[2] - centre) > RADIUS - 1e-6)
     pair = nts.ContactPair(
-        slave=rim, master=layer.surface(lambda x: x[2] > -1e-9), friction=FRICTION
+        slave=rim,
+        master=layer.surface(lambda x: x[2] > -1e-9, smoothing=smoothing),
+        friction=FRICTION,
     )
     return nts.System([wheel, layer], contacts=[pair], gravity=(0, 0, -GRAVITY))
 
@@ -173,6 +175,8 @@ def figures(run, wheel):
         "kappa": float(kappa),
         "ledger": float(np.abs(b["ledger_residual"]).max() / energy),
         "contact_defect": float(b["contact_defect"][-1] / energy),
+        "facet_changes": len(run.switches),
+        "facet_change_energy": sum(abs(s.defect) for s in run.switches) / float(energy),
         "off_ground": float((b["active"][1:] == 0).mean()),
         "newton_iterations": float(b["newton_iterations"][1:].mean()),
         "retries": run.retries,
@@ -219,7 +223,8 @@ def report(results, facets):
         print(
             f"{name}: {r['status']}, {r['retries']} retries, {r['newton_iterations']:.2f} "
             f"iterations a step, off the ground {100 * r['off_ground']:.0f} % of the steps, "
-            f"{r['seconds']:.0f} s"
+            f"{r['facet_changes']} changes of facet with {r['facet_change_energy']:.2g} of the "
+            f"energy, {r['seconds']:.0f} s"
         )
 
 
@@ -228,6 +233,7 @@ def main(
     comm=MPI.COMM_WORLD,
     output=None,
     facets=48,
+    smoothing=False,
     dt=4e-3,
     duration=0.7,
     integrators=tuple(INTEGRATORS),
@@ -239,6 +245,7 @@ def main(
         comm: MPI communicator.
         output: Folder for pictures and fields, or None.
         facets: Facets around the rim, a multiple of 8.
+        smoothing: Whether the layer is a smooth surface through its nodes.
         dt: Step [s].
         duration: From the throw to the end of the run [s].
         integrators: Which of "energy-momentum", "midpoint".
@@ -247,10 +254,13 @@ def main(
     Returns:
         {integrator: figures}; see `figures`.
     """
-    settled = nts.equilibrium(scene(comm, facets, settle=True), load_steps=4, progress=progress)
+    settled = nts.equilibrium(
+        scene(comm, facets, settle=True, smoothing=smoothing), load_steps=4, progress=progress
+    )
     results, balances = {}, {}
     for name in integrators:
-        wheel, clock, system = Recorder(), time.perf_counter(), scene(comm, facets, settle=False)
+        wheel, clock = Recorder(), time.perf_counter()
+        system = scene(comm, facets, settle=False, smoothing=smoothing)
         folder = output and Path(output) / name
         run = nts.simulate(
             system,
@@ -278,5 +288,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", default="out/rolling", help="pictures and fields")
     parser.add_argument("--facets", type=int, default=48)
+    parser.add_argument("--smoothing", action="store_true", help="of the layer")
     parser.add_argument("--dt", type=float, default=4e-3)
     main(progress=True, **vars(parser.parse_args()))

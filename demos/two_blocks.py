@@ -44,6 +44,8 @@ def scene(
     density: float = 1e3,
     metre: float = 1.0,
     speed: float | None = None,
+    mass: str = "consistent",
+    friction: float = 0.0,
 ) -> nts.System:
     """Two cubes, the first about to hit the second.
 
@@ -55,6 +57,8 @@ def scene(
         density: Reference density [kg/m^3] in the units of the scene.
         metre: Length of a metre in the units of the scene, e.g. 1e3 for a scene in mm.
         speed: Speed of the first cube, 2 m/s if not given; the spin scales with it.
+        mass: Of the first cube's nodes that touch, "consistent" or "redistributed".
+        friction: Coefficient of friction.
     """
 
     def box(corner: list[float], size: float, shift: float, n: int) -> Any:
@@ -77,8 +81,9 @@ def scene(
     )
     tolerance = 1e-9 * metre
     pair = nts.ContactPair(
-        slave=left.surface(lambda x: x[0] > metre - tolerance),
+        slave=left.surface(lambda x: x[0] > metre - tolerance, mass=mass),
         master=right.surface(lambda x: x[0] < 1.05 * metre + tolerance),
+        friction=friction,
     )
     return nts.System([left, right], contacts=[pair])
 

@@ -2,13 +2,17 @@
 
 from importlib.metadata import version
 
+from dolfinx_nts.bodies.beam import Beam
 from dolfinx_nts.bodies.body import Body, Moment
-from dolfinx_nts.bodies.continuum import Continuum, Dirichlet, Traction
+from dolfinx_nts.bodies.conditions import Dirichlet, Traction
+from dolfinx_nts.bodies.continuum import Continuum
+from dolfinx_nts.bodies.form_body import FormBody
 from dolfinx_nts.bodies.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.rigid import RigidBody
+from dolfinx_nts.bodies.section import Clamp, PointForce, Section
 from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.contact.facet_pair import FacetPair
@@ -21,6 +25,7 @@ from dolfinx_nts.elements import (
     Elements,
     EveryStep,
     Joint,
+    JointCoupling,
     PointElements,
     PointPart,
     Step,
@@ -46,19 +51,26 @@ from dolfinx_nts.joints import (
 from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.strain_energy import Isotropic
+from dolfinx_nts.run.checkpoint import Checkpoint, restart
 from dolfinx_nts.run.equilibrium import Equilibrium, equilibrium
-from dolfinx_nts.run.simulate import Solution, Stepper, simulate
+from dolfinx_nts.run.intercept import intercept
+from dolfinx_nts.run.simulate import simulate
+from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.step_size import Adapt
+from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
-from dolfinx_nts.step.newton import Newton
+from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 __version__ = version("dolfinx_nts")
 __all__ = [
     "Adapt",
+    "Beam",
     "Body",
     "BodyMotion",
+    "Checkpoint",
+    "Clamp",
     "ContactHistory",
     "ContactPair",
     "Continuum",
@@ -74,11 +86,13 @@ __all__ = [
     "EveryStep",
     "FacetPair",
     "Fixed",
+    "FormBody",
     "Gap",
     "GeneralizedAlpha",
     "Integrator",
     "Isotropic",
     "Joint",
+    "JointCoupling",
     "Midpoint",
     "Moment",
     "MooneyRivlin",
@@ -89,11 +103,14 @@ __all__ = [
     "Planar",
     "Plane",
     "PointElements",
+    "PointForce",
     "PointPart",
     "Points",
     "Prismatic",
     "Revolute",
+    "Restart",
     "RigidBody",
+    "Section",
     "Solution",
     "Sphere",
     "Spherical",
@@ -116,7 +133,9 @@ __all__ = [
     "bodies_from_tags",
     "cauchy_stress",
     "equilibrium",
+    "intercept",
     "motion_of",
+    "restart",
     "simulate",
     "von_mises",
 ]

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import EveryStep, PointElements, Step
 from dolfinx_nts.kernels import quadratic as kernel
+from dolfinx_nts.kinematics import OFF, Kinematics
 
 if TYPE_CHECKING:
     from dolfinx_nts.system import State
@@ -32,8 +33,6 @@ BoolArray = npt.NDArray[np.bool_]
 #: compliance: a fixed one makes them huge. One that vanishes with the gap leaves Newton's method
 #: its order (Levenberg-Marquardt: Yamashita and Fukushima 2001).
 SHIFT = 1e-7
-#: Part of the velocities by which a start may violate a constraint.
-_OFF = 1e-9
 
 
 def rank_of(name: str, comm: Any) -> int:
@@ -105,6 +104,11 @@ class ConstraintElements(PointElements):
         """One multiplier per constraint."""
         return {"augmented": 0, "constraints": self.equations.value.shape[1]}
 
+    @property
+    def force_scale(self) -> float:
+        """Unknowns are lengths, forces over `scale`."""
+        return self.scale
+
     def reference(self) -> FloatArray:
         """Reference values of the nodes [m], shape (n, k, 3)."""
         return self.rest
@@ -114,33 +118,48 @@ class ConstraintElements(PointElements):
         """Which constraints stand in the rows of which: each in its own."""
         return np.eye(self.widths["constraints"], dtype=bool)
 
+    @cached_property
+    def extent(self) -> float:
+        """Length whose rounding enters its constraints on this rank [m].
+
+        That of what each vector is made of, times the other vector: nothing of nodes with weight 0,
+        such as the directors of a point, whose length is no length of the scene.
+        """
+        weights, constants, _ = self.equations
+        made_of = np.abs(weights) @ np.abs(self.rest)[:, None] + np.abs(constants)
+        vectors = np.linalg.norm(kernel.factors(weights, constants, self.rest), axis=3)
+        both = made_of.max(axis=3) * vectors[:, :, ::-1]
+        return float(both.sum(axis=2).max(initial=0.0))
+
+    @cached_property
+    def _bent(self) -> FloatArray:
+        """Largest curvature of each constraint [1/m], shape (n, m)."""
+        bent: FloatArray = np.abs(self.curvature).max(axis=(2, 3), initial=0.0)
+        return bent
+
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> ConstraintPart:
         """Residual and tangent; the multipliers' unknowns are lengths, factor lambda / scale."""
         weights, constants, _ = self.equations
         n, m, _, k = weights.shape
-        scale = self.scale
+        scale, last = self.scale, 3 * k
         multiplier = scale * own["constraints"]
-        middle, end = (
-            kernel.factors(weights, constants, y)
-            for y in (self.y0 + self.theta * (x - self.y0), x)
-        )
-        force, slope = (
-            kernel.gradient(weights, vectors).reshape(n, m, 3 * k) for vectors in (middle, end)
-        )
+        middle = kernel.factors(weights, constants, self.y0 + self.theta * (x - self.y0))
+        end = kernel.factors(weights, constants, x)
+        force = kernel.gradient(weights, middle).reshape(n, m, last)
         gap = kernel.value(end) - self.prescribed[1]
-        size = 3 * k + m
-        residual, tangent = np.zeros((n, size)), np.zeros((n, size, size))
-        residual[:, : 3 * k] = np.matmul(multiplier[:, None], force)[:, 0]
-        residual[:, 3 * k :] = scale * gap
-        stiffness = self.theta * np.einsum("nm,nmab->nab", multiplier, self.curvature)
+        residual = np.empty((n, last + m))
+        residual[:, :last] = np.matmul(multiplier[:, None], force)[:, 0]
+        residual[:, last:] = scale * gap
+        tangent = np.zeros((n, last + m, last + m))
+        bend = np.matmul(self.theta * multiplier[:, None], self.curvature.reshape(n, m, k * k))
+        stiffness = bend.reshape(n, k, k)
         for i in range(3):
-            tangent[:, i : 3 * k : 3, i : 3 * k : 3] = stiffness
-        tangent[:, : 3 * k, 3 * k :] = (scale * force).transpose(0, 2, 1)
-        tangent[:, 3 * k :, : 3 * k] = scale * slope
+            tangent[:, i:last:3, i:last:3] = stiffness
+        tangent[:, :last, last:] = (scale * force).transpose(0, 2, 1)
+        tangent[:, last:, :last] = scale * kernel.gradient(weights, end).reshape(n, m, last)
         if self.lent:
-            bent = np.abs(self.curvature).max(axis=(2, 3), initial=0.0)
-            rows = np.arange(3 * k, size)
-            tangent[:, rows, rows] = -scale * (self.lent + np.abs(gap) * bent)
+            rows = np.arange(last, last + m)
+            tangent[:, rows, rows] = -scale * (self.lent + np.abs(gap) * self._bent)
         return ConstraintPart(residual, tangent, multiplier, gap)
 
     def largest(self, part: ConstraintPart) -> list[float]:
@@ -192,7 +211,8 @@ class Constraints(EveryStep):
 
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
         self._factor = step.factor
-        if history is not None:
+        # A guess alone: a run may go on from one whose joint of this name had other equations.
+        if history is not None and history.shape == self._force.shape:
             self._force = history
         u = [step.state.u[b] for b in self.bodies[0]]
         moved = [s.nodal(v) for s, v in zip(self._sides, u, strict=True)]
@@ -219,21 +239,31 @@ class Constraints(EveryStep):
             return self._driven(times)
         return self._equations, np.array([self._equations.value] * len(times))
 
-    @property
-    def no_forces(self) -> FloatArray:
-        """Multipliers that are zero, shape (n, m)."""
-        return np.zeros_like(self._equations.value)
+    def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
+        """As of `JointCoupling`, in closed form but for what is prescribed."""
+        (batch,) = self.elements
+        gap, off = self._gap(state)
+        first, second, doubt = self._rates(state, dt)
+        own = {"constraints": np.zeros_like(self._equations.value)}
+        return [
+            Kinematics(
+                batch.scale * np.array([gap, first, second]),
+                np.array([np.abs(values).max(initial=0.0) for values in (gap, first)]),
+                np.array([off, doubt]),
+                batch.evaluate(batch.y0, own).tangent,
+            )
+        ]
 
-    def gap(self, state: State) -> tuple[FloatArray, float]:
+    def _gap(self, state: State) -> tuple[FloatArray, float]:
         """G - c at a state [m], shape (n, m), and what it may be by rounding [m]. Collective."""
         u = [state.u[k] for k in self.bodies[0]]
         y = [s.reference + s.nodal(w) for s, w in zip(self._sides, u, strict=True)]
         (weights, constants, _), (c, *_) = self._at(state.time, state.time)
         both = np.concatenate(y, axis=1)
         found = kernel.value(kernel.factors(weights, constants, both)) - c
-        return found, _OFF * float(np.abs(both).max(initial=0.0))
+        return found, OFF * float(np.abs(both).max(initial=0.0))
 
-    def kinematics(self, state: State, dt: float) -> tuple[FloatArray, FloatArray, float]:
+    def _rates(self, state: State, dt: float) -> tuple[FloatArray, FloatArray, float]:
         """First and second derivative in time of g - c at a state. Collective.
 
         Args:
@@ -265,7 +295,16 @@ class Constraints(EveryStep):
         # Both formulas are at least of second order, so the coarse one errs by 4/3 of what they
         # differ by.
         doubt = 2.0 * float(np.abs(finer - rate).max(initial=0.0))
-        return first, second, _OFF * size + doubt
+        return first, second, OFF * size + doubt
+
+    def load_step_work(
+        self, before: Any, after: FloatArray, start: float, end: float
+    ) -> float:
+        """Work of prescribed values, -lambda . (c_1 - c_0) with the mean of both lambda [J]."""
+        _, (c0, c1) = self._at(start, end)
+        # Nothing acts before the first load step.
+        force = after if before is None else before + after
+        return -0.5 * float((force * (c1 - c0)).sum())
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the last step."""

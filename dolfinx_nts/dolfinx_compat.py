@@ -151,6 +151,20 @@ def vector_space(msh: Any, degree: int) -> Any:
     return fem.functionspace(msh, ("Lagrange", degree, (3,)))
 
 
+def lagrange_degree(space: Any) -> int | None:
+    """Degree of a continuous Lagrange space of 3-vectors, None of any other."""
+    element = space.ufl_element()
+    if _OLD:
+        family, degree, broken = element.family(), element.degree(), False
+    elif not hasattr(element, "basix_element"):
+        return None
+    else:
+        family, degree, broken = element.family_name, element.degree, element.discontinuous
+    vectors = space.dofmap.index_map_bs == 3 and space.num_sub_spaces == 3
+    known = str(family) in {"Lagrange", "Q", "CG", "P"} and not broken
+    return int(degree) if vectors and known else None
+
+
 def scalar_space(msh: Any, family: str, degree: int) -> Any:
     """Scalar space of the family ("Lagrange" or "DG")."""
     if _OLD:
@@ -167,13 +181,6 @@ def tensor_space(msh: Any, family: str, degree: int) -> Any:
     return fem.functionspace(msh, (family, degree, (3, 3)))
 
 
-def interpolation_points(space: Any) -> FloatArray:
-    """Reference interpolation points of a space, shape (n, 3)."""
-    p = space.element.interpolation_points
-    points: FloatArray = p() if callable(p) else p
-    return points
-
-
 def node_blocks(mesh: Any, space: Any) -> IntArray:
     """Block of coordinates of each geometry node of this rank, ghosts included, shape (nodes,)."""
     nodes = geometry_dofmap(mesh)
@@ -184,11 +191,12 @@ def node_blocks(mesh: Any, space: Any) -> IntArray:
 
 def cells_at(msh: Any, x: FloatArray) -> IntArray:
     """One of this rank's own cells that holds each point (n, 3), or -1, shape (n,)."""
-    tree = geometry.BoundingBoxTree(msh, 3) if _OLD else geometry.bb_tree(msh, 3)
+    dim = msh.topology.dim
+    tree = geometry.BoundingBoxTree(msh, dim) if _OLD else geometry.bb_tree(msh, dim)
     collide = geometry.compute_collisions if _OLD else geometry.compute_collisions_points
     x = np.ascontiguousarray(x, dtype=np.float64)
     found = geometry.compute_colliding_cells(msh, collide(tree, x), x)
-    owned, cells = msh.topology.index_map(3).size_local, np.full(len(x), -1)
+    owned, cells = msh.topology.index_map(dim).size_local, np.full(len(x), -1)
     for i in range(len(x)):
         own = [c for c in found.links(i) if c < owned]
         cells[i] = own[0] if own else -1
@@ -262,12 +270,41 @@ def dense_matrix(comm: Any, size: int) -> Any:
     return PETSc.Mat().createAIJ(((size, None), (size, None)), nnz=(size, 0), bsize=3, comm=comm)
 
 
+def coo_matrix(comm: Any, size: int, rows: npt.ArrayLike, cols: npt.ArrayLike) -> Any:
+    """New PETSc AIJ matrix of nodes, 3 x 3 blocks, for `set_values_coo`.
+
+    Args:
+        comm: MPI communicator.
+        size: Rows and columns on this rank.
+        rows: Global numbers of the triplets that this rank sets, whoever owns them.
+        cols: Likewise.
+    """
+    a = PETSc.Mat().create(comm)
+    a.setSizes(((size, None), (size, None)))
+    a.setBlockSize(3)
+    a.setType("aij")
+    set_preallocation_coo(a, rows, cols)
+    return a
+
+
 def without_zeros(a: Any) -> Any:
     """Copy of an assembled matrix without the zeros stored in it; MatFilter only since 3.20."""
     rows, cols, values = a.getValuesCSR()
     kept = values != 0.0
-    start = np.concatenate([[0], np.cumsum(kept)])[rows].astype(PETSc.IntType)
-    csr = (start, cols[kept], values[kept])
+    start = np.concatenate([[0], np.cumsum(kept)])[rows]
+    return with_entries(a, start, cols[kept], values[kept])
+
+
+def with_entries(a: Any, start: IntArray, cols: IntArray, values: FloatArray) -> Any:
+    """PETSc AIJ matrix of the sizes of another with other entries of this rank's rows.
+
+    Args:
+        a: The other one.
+        start: Where each row starts among the entries, and their number, shape (rows + 1,).
+        cols: Global columns.
+        values: Values.
+    """
+    csr = (start.astype(PETSc.IntType), cols.astype(PETSc.IntType), values)
     return PETSc.Mat().createAIJ(a.getSizes(), csr=csr, comm=a.comm)
 
 

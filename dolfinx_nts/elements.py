@@ -1,9 +1,10 @@
-"""What a step asks of whatever couples coordinates: contacts now, joints and springs to come."""
+"""What a step asks of whatever couples coordinates: contacts, joints, springs and ties."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -12,10 +13,12 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Moment, places_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.kinematics import Kinematics, differenced, has_constraints, unknown
 
 if TYPE_CHECKING:
     from dolfinx_nts.contact.surfaces import Surface
-    from dolfinx_nts.step.problem import Evaluation
+    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]
@@ -46,7 +49,7 @@ class Step:
         first: Displacement of each body after flight without forces [m].
         ahead: Motion of each body along which contact is sought [m].
         motion: Largest component of each body's motion [m], shape (bodies,).
-        length: Of each body, the displacement whose rounding its forces have [m], shape (bodies,).
+        length: Displacement of each body that sets the rounding of its forces [m], shape (bodies,).
         stiffness: Of a body, that of each of its coordinates' neighbourhood [N/m]; for statics.
         moments: Of each body, when its forces are taken and how fast it moves there.
         force_rounding: Of some bodies, the norm of forces that is rounding [kg m]. Collective.
@@ -74,10 +77,16 @@ class Step:
         return float(total[0] / total[1])
 
     def scale(self, surface: Surface) -> FloatArray:
-        """Force per motion of a surface's points in the units of the step, (p,). Collective."""
-        if self.integrator.inertia:
+        """Force per motion of a surface's points in the units of the step, (p,). Collective.
+
+        Massless nodes have their stiffness for it: with more, Newton's method would go to and fro
+        between contact and none, and stick and slip, in small steps.
+        """
+        massless = surface.massless
+        if self.integrator.inertia and not massless.any():
             return surface.mass
-        return surface.material.divided(self.stiffness(surface.body))
+        stiff = self.factor * surface.material.divided(self.stiffness(surface.body))
+        return np.where(massless, stiff, surface.mass) if self.integrator.inertia else stiff
 
 
 class Part(Protocol):
@@ -120,6 +129,14 @@ class Elements(Protocol):
     def pattern(self) -> BoolArray:
         """Which constraints stand in the rows of which, shape (m, m)."""
 
+    @property
+    def bilateral(self) -> bool:
+        """Whether its constraints hold always and in both directions, as those of joints."""
+
+    @property
+    def force_scale(self) -> float:
+        """What a constraint's unknown is multiplied by to be a force, in the step's units."""
+
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates of each body, shape (n, k) each."""
 
@@ -158,6 +175,21 @@ class Elements(Protocol):
             rtol: Tolerance of Newton's method.
         """
 
+    def resultant(self, part: Any, k: int, u: FloatArray) -> FloatArray:
+        """Resultant of its forces on one of its bodies, this rank's part. Collective.
+
+        Elements may leave it out; the `reactions` of a joint that has such are NaN.
+
+        Args:
+            part: Solution of the step.
+            k: Number of the body among those of the elements.
+            u: Owned displacements of that body where the step takes its forces [m].
+
+        Returns:
+            Factor of the step times force and moment about the origin, the sum of the points where
+            the elements hold the body [m], and, in each entry, their number, shape (4, 3).
+        """
+
     def ledger(self, part: Any, factor: float) -> dict[str, float]:
         """Sums of an accepted step on this rank, by columns of the balance table.
 
@@ -181,6 +213,11 @@ class Joint(Protocol):
         bodies: Bodies of the system that it couples.
         losses: Columns of the balance table for energy that leaves through it, of its own names;
             its elements' `ledger` says how much.
+        numbers: Of each element on this rank, one that does not depend on the ranks; may be missing
+            where it remembers nothing that a checkpoint must hold.
+        settings: Numbers and texts by name, for JSON and the same on all ranks, that it was made
+            with; a checkpoint goes on only with equal ones. It may be missing: then name and kind
+            alone are compared.
     """
 
     name: str
@@ -198,7 +235,7 @@ class Joint(Protocol):
             history: What it remembers there, such as the turns of an angle.
         """
 
-    def coupling(self, bodies: tuple[int, ...]) -> Coupling:
+    def coupling(self, bodies: tuple[int, ...]) -> JointCoupling:
         """What makes its elements in a run.
 
         Args:
@@ -241,6 +278,16 @@ class PointElements:
         """Which constraints stand in the rows of which: all."""
         return np.ones((self.widths["constraints"],) * 2, dtype=bool)
 
+    @property
+    def bilateral(self) -> bool:
+        """Its constraints hold always."""
+        return True
+
+    @property
+    def force_scale(self) -> float:
+        """Unknowns are forces."""
+        return 1.0
+
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates of each body's nodes."""
         return tuple(side.flat() for side in self.sides)
@@ -263,7 +310,7 @@ class PointElements:
         ]
         return np.stack(rows, axis=1)
 
-    @property
+    @cached_property
     def extent(self) -> float:
         """Length beside the displacements whose rounding enters on this rank [m]."""
         return float(np.abs(self.reference()).max(initial=0.0))
@@ -292,6 +339,17 @@ class PointElements:
         limit = rtol * motion + 8 * _EPS * (rounded + float(largest[3]))
         return {f"{self.name} constraints": over(float(largest[1]), limit)}
 
+    def resultant(self, part: Any, k: int, u: FloatArray) -> FloatArray:
+        """Sums over the nodes of side k."""
+        side, out = self.sides[k], np.zeros((4, 3))
+        y = side.reference + side.nodal(u)
+        start = sum(3 * other.nodes.shape[1] for other in self.sides[:k])
+        force = -part.residual[:, start : start + 3 * side.nodes.shape[1]].reshape(y.shape)
+        out[0] = force[side.places].sum(axis=0)
+        out[1] = cross(y, force).sum(axis=(0, 1))
+        out[2], out[3] = side.combine(y).sum(axis=0), len(y)
+        return out
+
     def ledger(self, part: Any, factor: float) -> dict[str, float]:
         """Nothing lost."""
         return {}
@@ -315,7 +373,7 @@ class PointPart(NamedTuple):
 
 
 class EveryStep:
-    """A `Coupling` with the same kind of elements in every step, and nothing to look for.
+    """A `JointCoupling` with the same kind of elements in every step, and nothing to look for.
 
     Args:
         bodies: Numbers of their bodies in the system.
@@ -333,9 +391,11 @@ class EveryStep:
     ) -> None:
         self.bodies, self._make, self._remember = [bodies], make, remember
         self.elements: list[Any] = []
+        self._begun: tuple[Step, Any] | None = None
 
     def begin(self, step: Step, history: Any, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step."""
+        self._begun = step, history
         self.elements = [self._make(step, history)]
 
     def touched(self) -> set[int]:
@@ -365,6 +425,29 @@ class EveryStep:
     def history(self, parts: Sequence[Any]) -> Any:
         """What is remembered of an accepted step."""
         return self._remember(parts[0]) if self._remember else None
+
+    def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
+        """What the elements' ledgers say."""
+        return None
+
+    def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
+        """From the residuals of the elements of steps up to this one.
+
+        Raises:
+            TypeError: These cannot say it: elements other than `PointElements`, or with unknowns
+                beside multipliers, or a `begin` of one's own.
+        """
+        if self._begun is None:
+            held = [batch for batch in self.elements if has_constraints(batch)]
+            if held:
+                raise unknown(held[0])
+            return [None] * len(self.elements)
+        step, history = self._begun
+
+        def make(length: float) -> Any:
+            return self._make(replace(step, dt=length), history)
+
+        return [differenced(make, self.bodies[0], state, dt)]
 
 
 class Coupling(Protocol):
@@ -426,4 +509,34 @@ class Coupling(Protocol):
 
         Args:
             parts: Solution, of each of `elements`.
+        """
+
+
+class JointCoupling(Coupling, Protocol):
+    """What a `Joint` makes: a `Coupling` that also says what its forces do."""
+
+    def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
+        """External work in a load step of `equilibrium` on this rank [J]. Collective.
+
+        It is that of the mean of the forces at both ends, as the work of loads is.
+
+        Args:
+            before: What it remembers at the start of the load step.
+            after: At its end.
+            start: Pseudo time where the load step starts.
+            end: Where it ends.
+
+        Returns:
+            None: the work is what `Elements.ledger` says, in which forces are those of the end.
+        """
+
+    def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
+        """How the constraints change in time at a state, of each of `elements`. Collective.
+
+        A start has to fit them, and first accelerations keep them. None, on all ranks alike, for
+        elements without constraints, or with such as a start need not fit.
+
+        Args:
+            state: The state; without accelerations they count as zero.
+            dt: Time in which prescribed values are told [s].
         """

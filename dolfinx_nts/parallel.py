@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from dolfinx_nts.kernels import compiled
+
 FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
 
@@ -89,3 +91,13 @@ def write_on_root(comm: Any, what: str, action: Callable[[], Any]) -> Any:
         f"{what}: cannot be written ({problem[1]}); pass a place that exists or can be made, with "
         "space and write permission"
     ) from cause
+
+
+def same_kernels(comm: Any) -> None:
+    """Take compiled kernels on all ranks or on none: what ranks decide must not differ by rounding.
+
+    Rank 0 compiles them for all that share its cache.
+    """
+    on_root(comm, compiled.is_there)
+    if not all(comm.allgather(compiled.is_there())):
+        compiled.leave_out()

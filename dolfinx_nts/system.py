@@ -14,7 +14,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.elements import Joint
-from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.parallel import raise_together, same_kernels
 from dolfinx_nts.validation import items, known_options, vector
 
 FloatArray = npt.NDArray[np.float64]
@@ -46,6 +46,15 @@ class State:
         """What each contact remembers of its slave nodes."""
         history: tuple[ContactHistory, ...] = self.histories[0]
         return history
+
+
+def is_like(one: Joint, other: Joint) -> bool:
+    """Whether two joints are of one kind and name and join bodies of the same names.
+
+    What the one remembers at the end of a run then fits the other.
+    """
+    names = [[body.name for body in joint.bodies] for joint in (one, other)]
+    return type(one) is type(other) and one.name == other.name and names[0] == names[1]
 
 
 @known_options
@@ -107,6 +116,9 @@ class System:
         self.declared_joints = self.joints
         own = (joint for body in self.bodies for joint in getattr(body, "joints", ()))
         self.joints = (*self.declared_joints, *own)
+        for k, joint in enumerate(self.declared_joints):
+            if any(joint is other for other in self.declared_joints[:k]):
+                raise ValueError(f"joints[{k}]: {joint.name!r} is given twice; drop one")
         labels = [joint.name for joint in self.joints]
         if len(set(labels)) < len(labels):
             raise ValueError(f"joints: names {labels} are not unique; pass name= to each joint")
@@ -124,6 +136,8 @@ class System:
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
         self._check_overlap()
+        if self.contacts:
+            same_kernels(self.comm)
         start = self.initial_state()
         depths = self.penetration(start)
         for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
@@ -172,11 +186,11 @@ class System:
             for j, known in enumerate(other.contacts):
                 if pair.is_like(known):
                     contacts[k] = state.contacts[j]
-        known_joints = {j.name: h for j, h in zip(other.joints, state.histories[1:], strict=True)}
-        joints = (
-            known_joints.get(j.name, h)
-            for j, h in zip(self.joints, found.histories[1:], strict=True)
-        )
+        joints = list(found.histories[1:])
+        for k, joint in enumerate(self.joints):
+            for known, history in zip(other.joints, state.histories[1:], strict=True):
+                if is_like(joint, known):
+                    joints[k] = history
         start = replace(found, time=state.time, u=u, histories=(tuple(contacts), *joints))
         if moving:
             v = tuple(state.v[index[b.name]].copy() for b in self.bodies)
@@ -191,12 +205,15 @@ class System:
         """Raise on every rank unless u fits the body's mesh and conditions."""
         problem, there = None, body.prescribed(time)
         if not np.array_equal(body.reference, old.reference):
-            problem = f"start: body {body.name!r} has another mesh there; use the same mesh object"
+            other = "mesh there; use the same mesh object" if hasattr(body, "mesh") else (
+                "reference there; give it the mass, centre, inertia and axes that it has there"
+            )
+            problem = f"start: body {body.name!r} has another {other}"
         else:
             off = np.abs(there - u[body.fixed]).max(initial=0.0)
             if off > _ON_SUPPORT * np.abs(body.reference).max(initial=0.0):
                 problem = (
-                    f"start: the Dirichlet values of body {body.name!r} at t={time:.6g} are "
+                    f"start: the prescribed values of body {body.name!r} at t={time:.6g} are "
                     f"{off:.3g} m off its displacement; let them go on from there"
                 )
         raise_together(body.comm, problem)

@@ -107,18 +107,54 @@ def vector(name: str, value: Any, unit: str, *, or_else: str = "") -> FloatArray
     return array
 
 
+def vectors(name: str, value: Any, what: str) -> FloatArray:
+    """The value as rows of three finite components, shape (n, 3); a single one may be (3,)."""
+    array = np.atleast_2d(floats(value))
+    if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
+        raise ValueError(f"{name}={value!r}: pass {what} of shape (3,) or (n, 3)")
+    return array
+
+
+def require_same(comm: Any, **given: Any) -> None:
+    """Raise a ValueError on all ranks unless arguments have the same values there. Collective.
+
+    Of functions only that they are some is compared.
+    """
+    shown = {name: "a function" if callable(v) else _plain(v) for name, v in given.items()}
+    problem = None
+    for name, first in comm.bcast(shown).items():
+        if shown[name] != first and problem is None:
+            problem = (
+                f"{name}: is {shown[name]} on rank {comm.rank} and {first} on rank 0; pass the "
+                "same on all ranks"
+            )
+    raise_together(comm, problem)
+
+
+def _plain(value: Any) -> str:
+    array = floats(value)
+    return repr(array.tolist() if array.size else value)
+
+
 def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tuple[Any, ...]:
     """The items of a sequence argument, all of the wanted kind."""
     if not isinstance(value, Iterable):
         raise TypeError(f"{name}={value!r}: pass a sequence of {wanted}")
     found = tuple(value)
     for k, item in enumerate(found):
+        if isinstance(item, type):
+            raise TypeError(
+                f"{name}[{k}]={item!r}: is a class; pass objects made from it, "
+                f"{item.__name__}(...)"
+            )
         if not fits(item):
             raise TypeError(f"{name}[{k}]={item!r}: pass a sequence of {wanted}")
     return found
 
 
-def call_together(comm: Any, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def call_together(
+    comm: Any, name: str, function: Callable[..., Any], *arguments: Any, shown: Any = None
+) -> Any:
     """What the user's function returns; what it raises on one rank raises on all.
 
     Args:
@@ -126,6 +162,7 @@ def call_together(comm: Any, name: str, function: Callable[..., Any], *arguments
         name: Name of the argument, and when it is called.
         function: What every rank calls.
         *arguments: Its arguments.
+        shown: What the user has given, where `function` is made from it.
 
     Raises:
         UserFunctionError: It raised on some rank.
@@ -134,7 +171,8 @@ def call_together(comm: Any, name: str, function: Callable[..., Any], *arguments
     try:
         value = function(*arguments)
     except Exception as error:  # any: a rank that raises alone would leave the others waiting
-        cause, problem = error, f"{name}: {function!r} raised {error!r}; correct it"
+        what = function if shown is None else shown
+        cause, problem = error, f"{name}: {what!r} raised {error!r}; correct it"
     raise_together(comm, problem, UserFunctionError, cause)
     return value
 
@@ -167,6 +205,11 @@ def at_time(
             problem = str(error)
     raise_together(comm, problem, UserFunctionError, cause)
     return value
+
+
+def vector_in_time(comm: Any, name: str, value: Any, time: float, unit: str) -> FloatArray:
+    """A vector, or a function of time at a time, for which every rank must call this."""
+    return at_time(comm, name, value, time, unit) if callable(value) else vector(name, value, unit)
 
 
 def at_points(

@@ -528,11 +528,6 @@ def test_surface_of_a_quadratic_body():
 
 
 def test_smoothing():
-    body = continuum(box(cell_type="tetrahedron"))
-    pattern = (
-        r"^smoothing=True: the surface of 'body' has triangles; .* mesh the body with hexahedra"
-    )
-    raises(ValueError, pattern, lambda: body.surface(top, smoothing=True))
     pattern = r"^smoothing='yes': pass True or False"
     raises(TypeError, pattern, lambda: continuum().surface(top, smoothing="yes"))
 

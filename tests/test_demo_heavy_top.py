@@ -35,6 +35,7 @@ def test_exact_motion():
 
 
 @pytest.mark.parametrize("dt", KNOWN)
+@pytest.mark.slow
 def test_errors_of_steady_precession(results, dt):
     r = results["steady"][dt]
     assert r["status"] == "completed"

@@ -99,6 +99,7 @@ def test_what_the_prescribed_load_misses_is_strain():
     assert abs(half - none) < 0.65 * abs(whole - none)
 
 
+@pytest.mark.slow
 def test_profiles_and_picture_are_written(tmp_path):
     demo.main(problems=("cylinders", "friction"), scales=(1.0,), refinement=0.5, output=tmp_path)
     assert (tmp_path / "hertz.png").stat().st_size > 10_000

@@ -7,8 +7,12 @@ import pytest
 
 SMALL = {
     "bar_impact": {"elements": 4, "t_end": 0.1},
+    "domino": {"dominoes": 3, "duration": 0.02},
     "flying_l_block": {"t_end": 2.0},
     "heavy_top": {"steps": (4e-3,), "t_end": 0.02, "size": 0.05},
+    "newtons_cradle": {
+        "kinds": ("rigid, touching",), "parts": (0.5,), "cells": 2, "duration": 2e-3,
+    },
     "own_problem": {"cells": 2, "steps": 4},
     "hertz": {"problems": ("cylinders",), "scales": (0.01,), "refinement": 0.5},
     "ironing": {"block": (16, 2), "die": (4, 2), "steps": (10, 50), "end": 0.2},
@@ -18,6 +22,7 @@ SMALL = {
     "sliding_block": {"floors": ("plane",), "parts": ("verge",), "cells": (2, 2, 1)},
     "two_blocks": {"t_end": 0.01, "cells": (1, 1)},
     "two_tori": {"t_end": 0.1},
+    "wheel": {"facets": 16, "dt": 4e-3, "duration": 0.012},
 }
 DEMOS = Path(__file__).resolve().parents[1] / "demos"
 

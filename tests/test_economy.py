@@ -23,15 +23,15 @@ FEATURE = {f.name: f for f in economy.FEATURES}
 INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
 
 
-def stepper(scene, name="energy-momentum", **newton):
+def stepper(scene, name="energy-momentum", *, ledger=True, **newton):
     # One solver for all features, so that their rounding is the same.
     newton = {"linear_solver": "direct", **newton}
-    return nts.Stepper(scene, INTEGRATORS[name], newton=nts.Newton(**newton))
+    return nts.Stepper(scene, INTEGRATORS[name], newton=nts.Newton(**newton), ledger=ledger)
 
 
 def all_awake(monkeypatch):
     """Give every candidate unknowns, as if each could touch in every step."""
-    everyone = lambda self, index, c: np.ones(c.num_elements, dtype=bool)  # noqa: E731
+    everyone = lambda self, index, c, had: np.ones(c.num_elements, dtype=bool)  # noqa: E731
     monkeypatch.setattr(ContactSearch, "_may_touch", everyone)
 
 
@@ -49,6 +49,7 @@ def factor_entries(s):
 
 
 # ---- the table
+@pytest.mark.slow
 def test_table(tmp_path, capsys):
     arguments = ["economy", "--set", "cells=2", "steps=1", "rounds=2"]
     rows = tradeoff.main([*arguments, "--output", str(tmp_path)])
@@ -90,14 +91,26 @@ def test_without_its_ledger_a_run_is_the_same():
     scenes = economy.Economy(COMM, 2)
     final = []
     for on in (True, False):
-        with economy._ledger(on):
-            s = stepper(scenes.system(FEATURE["active"]))
-            for _ in range(4):
-                s.advance(scenes.dt)
-            s.close()
-        assert (s.solution.rows[-1]["energy"] > 0) == on
+        s = stepper(scenes.system(FEATURE["active"]), ledger=on)
+        for _ in range(4):
+            s.advance(scenes.dt)
+        s.close()
+        assert np.isfinite(s.solution.balance["energy"][1:]).all() == on
+        assert np.isfinite(s.solution.contact_forces).all()
         final.append(displacements(s))
     assert np.array_equal(*final)
+
+
+def test_a_progress_line_and_a_table_without_a_ledger(capsys):
+    scenes = economy.Economy(COMM, 2)
+    run = nts.simulate(
+        scenes.system(FEATURE["active"]), nts.Midpoint(), dt=scenes.dt, t_end=3 * scenes.dt,
+        ledger=False, progress=True,
+    )  # fmt: skip
+    assert run.status == "completed" and "no ledger was kept" in run.summary
+    assert np.isnan(run.balance["linear_momentum"][1:]).all()
+    with pytest.raises(TypeError, match="ledger=0: pass True or False"):
+        nts.Stepper(run.system, nts.Midpoint(), ledger=0)
 
 
 # ---- far

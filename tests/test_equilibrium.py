@@ -1,5 +1,7 @@
 """Equilibrium: closed forms, the patch test B7, load stepping, start of a dynamic run."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import ufl
@@ -525,7 +527,7 @@ def test_supports_are_where_they_say_at_the_time_it_is_given():
     rule = nts.EnergyMomentum()
     run = nts.simulate(going_on, rule, dt=1e-3, t_end=2e-3, start=held, start_time=0.0)
     assert run.status == "completed"
-    with pytest.raises(ValueError, match=r"^start: the Dirichlet values of body 'cube' at t=0 "):
+    with pytest.raises(ValueError, match=r"^start: the prescribed values of body 'cube' at t=0 "):
         nts.simulate(held.system, rule, dt=1e-3, t_end=2e-3, start=held, start_time=0.0)
     with pytest.raises(ValueError, match=r"^t_end=0.5: must lie after the start's time 0.7"):
         nts.simulate(
@@ -553,7 +555,7 @@ def test_start_is_checked():
     held = nts.equilibrium(held_cube(lambda t: (0, 0, 0.1 * t)))
     rule, times = nts.EnergyMomentum(), {"dt": 0.1, "t_end": 2.0}
     with pytest.raises(
-        ValueError, match=r"^start: the Dirichlet values of body 'cube' at t=1 .*0.1 m off"
+        ValueError, match=r"^start: the prescribed values of body 'cube' at t=1 .*0.1 m off"
     ):  # noqa: E501
         nts.simulate(held_cube((0, 0, 0)), rule, start=held, **times)
     with pytest.raises(ValueError, match=r"^start: has bodies \['cube'\], not \['other'\]"):
@@ -593,3 +595,102 @@ def test_other_arguments_are_checked():
         nts.equilibrium(nts.System([body]))
     with pytest.raises(TypeError, match=r"^output=3: pass a sequence of writers"):
         nts.equilibrium(held_cube((0, 0, 0)), output=3)
+
+
+# ---- joints that prescribe motion
+def pulled():
+    """A block drawn by a point."""
+    body = cube([nts.Dirichlet(at(2, 0.0))])
+    joint = nts.Spherical(
+        body, None, point=(0.5, 0.5, 1.0), displacement=lambda t: (0.02 * t, 0, 0.05 * t)
+    )
+    return nts.System([body], joints=[joint])
+
+
+def hauled():
+    """A block drawn by a rod that gets shorter."""
+    body = cube([nts.Dirichlet(at(2, 0.0))])
+    joint = nts.Distance(
+        body, None, points=((0.5, 0.5, 1.0), (0.5, 0.7, 2.0)),
+        length=lambda t: np.sqrt(1.04) - 0.05 * t,
+    )  # fmt: skip
+    return nts.System([body], joints=[joint])
+
+
+def wound():
+    """A torsion spring that a driven hinge winds up, under a body that rests on the hinge."""
+    body = nts.RigidBody.from_inertia(1.0, (0.1, 0.1, 0.1), centre=(0.5, 0.5, 1.0), comm=COMM)
+    hinge = nts.Revolute(
+        body, None, point=(0.5, 0.5, 1.0), axis=(0, 0, 1), angle=lambda t: 1.5 * t
+    )
+    spring = nts.TorsionSpring.about(hinge, stiffness=40.0)
+    return nts.System([body], joints=[hinge, spring], gravity=(0, 0, -100.0))
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("stabilization", [None, 0.1])
+@pytest.mark.parametrize("make", [pulled, hauled, wound])
+def test_what_a_joint_prescribes_does_work(make, stabilization):
+    """As loads do: what the ledger misses falls as the square of the load steps."""
+    missing = []
+    for steps in (2, 4):
+        run = nts.equilibrium(make(), load_steps=steps, stabilization=stabilization)
+        assert run.status == "completed" and not run.warnings
+        table = run.balance
+        missing.append(abs(table["ledger_residual"][-1]))
+    assert missing[-1] < 0.02 * table["energy"][-1]
+    assert np.log2(missing[0] / missing[1]) == pytest.approx(2.0, abs=0.1)
+    if make is wound:
+        assert table["energy"][-1] == pytest.approx(0.5 * 40.0 * 1.5**2, rel=1e-9)
+
+
+class Ratchet:
+    """A joint of one's own whose elements' ledger names work and a loss: 3 J and 1 J a unit."""
+
+    losses = ("ratchet_loss",)
+    name = "ratchet"
+
+    def __init__(self, body):
+        side = body.points((0.5, 0.5, 1.0))
+        self.bodies = (body,)
+        self.side = side if COMM.rank == 0 else side.part(slice(0))
+
+    def start(self):
+        return None
+
+    def potential(self, u, history):
+        return 0.0
+
+    def coupling(self, bodies):
+        def make(step, history):
+            return RatchetElements(name=self.name, sides=(self.side,), dt=step.dt)
+
+        return nts.EveryStep(bodies, make)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RatchetElements(nts.PointElements):
+    dt: float
+
+    def evaluate(self, x, own):
+        n, size = len(x), self.num_coordinates
+        return nts.PointPart(np.zeros((n, size)), np.zeros((n, size, size)))
+
+    def ledger(self, part, factor):
+        n = self.num_elements
+        return {"external_work": 3.0 * self.dt * n, "ratchet_loss": 1.0 * self.dt * n}
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("stabilization", [None, 0.1])
+def test_elements_of_ones_own_say_what_work_they_do(stabilization):
+    """Also in the relaxations before the last one of a load step."""
+    body = cube([nts.Dirichlet(at(2, 0.0))])
+    system = nts.System([body], joints=[Ratchet(body)], gravity=(0, 0, -1.0))
+    run = nts.equilibrium(system, load_steps=2, stabilization=stabilization)
+    bare = nts.equilibrium(
+        nts.System([body], gravity=(0, 0, -1.0)), load_steps=2, stabilization=stabilization
+    )
+    work = run.balance["external_work"] - bare.balance["external_work"]
+    assert work == pytest.approx([0.0, 1.5, 3.0], abs=1e-9)
+    assert run.balance["ratchet_loss"] == pytest.approx([0.0, 0.5, 1.0], abs=1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import two_blocks
 from mpi4py import MPI
-from test_single_mass import STEP, mass_on_wall
+from test_single_mass import STEP, PointMass, mass_on_wall
 from test_two_blocks import fung
 
 import dolfinx_nts as nts
@@ -51,6 +51,23 @@ def test_a_step_without_an_impulse_keeps_its_momentum():
     with pytest.raises(nts.StepFailedError, match="angular momentum changes by 1 more than"):
         check_momentum(stepper.problem, step, good, before, turned)
     stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ledger", [True, False])
+def test_the_guard_is_on_in_every_run(ledger, monkeypatch):
+    """Velocities that an integrator turns round at the end of a step end the run."""
+    rule = nts.EnergyMomentum()
+    good = type(rule).advance
+    system = nts.System([PointMass(COMM, 1.0, (0.0, 0.0, 1.0), velocity=(1.0, 0.0, 0.0))])
+
+    def turned(self, du, v, a, dt):
+        v1, a1 = good(self, du, v, a, dt)
+        return -v1, a1
+
+    monkeypatch.setattr(type(rule), "advance", turned)
+    run = nts.simulate(system, rule, dt=STEP, t_end=3 * STEP, ledger=ledger)
+    assert "linear momentum changes by" in run.status
 
 
 @pytest.mark.mpi

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from test_form_body import energy, green
 from test_single_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.inversion import smallest_dets
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.step.newton import ACCURACY
+from dolfinx_nts.step.accuracy import ACCURACY
 from dolfinx_nts.step.problem import StepProblem
 
 COMM = MPI.COMM_WORLD
@@ -21,6 +22,16 @@ SENTENCE = "inside out, which W(C) cannot see: det F = "
 def cube(n=2, size=(1.0, 1.0, 1.0), comm=COMM, cell=CellType.hexahedron, **options):
     mesh = create_box(comm, [[0, 0, 0], size], [n] * 3, cell, ghost_mode=GhostMode.shared_facet)
     return nts.Continuum(mesh, RUBBER, density=1e3, **({"name": "cube"} | options))
+
+
+def form_cube(n=2, **options):
+    """A cube of forms of a user's own."""
+    mesh = create_box(
+        COMM, [[0, 0, 0], [1, 1, 1]], [n] * 3, CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    space = compat.vector_space(mesh, 1)
+    return nts.FormBody(space, energy, strain=green, density=1e3, name="cube", **options)
 
 
 def displace(body, motion):
@@ -142,11 +153,11 @@ def test_bodies_without_cells_have_none():
 
 
 # ---- steps
-def squeezed(speed, n=2, **options):
+def squeezed(speed, n=2, make=cube, **options):
     """A cube between two faces, the upper of which goes down at a speed."""
     below = nts.Dirichlet(lambda x: x[2] < 1e-9)
     above = nts.Dirichlet(lambda x: x[2] > 1 - 1e-9, value=lambda t: (0, 0, -speed * t))
-    return nts.System([cube(n, bcs=[below, above], **options)])
+    return nts.System([make(n, bcs=[below, above], **options)])
 
 
 def spinning(rate):
@@ -180,7 +191,7 @@ def test_no_step_ends_inside_out(name, accuracy, evaluations):
     run = nts.simulate(
         system, integrator, dt=dt, t_end=t_end, newton=ACCURACY[accuracy], output=[watch]
     )
-    assert SENTENCE in run.status and "allow_inversion=True" in run.status
+    assert SENTENCE in run.status and "Continuum(..., allow_inversion=True)" in run.status
     assert min(watch.dets) > 0.0 and run.balance["min_det"].min() > 0.0
     tried = len(run.rows) - 1 + run.retries
     assert run.retries >= 8 and len(evaluations) < 15 * tried
@@ -232,6 +243,48 @@ def test_statics(allowed):
     else:
         assert SENTENCE in run.status
         assert run.balance["min_det"].min() > 0.0
+
+
+# ---- bodies of a user's own forms
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    "integrator", [nts.EnergyMomentum(), nts.Midpoint()], ids=lambda i: type(i).__name__
+)
+def test_no_step_of_own_forms_ends_inside_out(integrator):
+    watch = Watch()
+    run = nts.simulate(
+        squeezed(12.0, 2, form_cube), integrator, dt=0.02, t_end=0.1, output=[watch]
+    )
+    assert SENTENCE in run.status and "FormBody(..., allow_inversion=True)" in run.status
+    assert min(watch.dets) > 0.0 and run.balance["min_det"].min() > 0.0
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("allowed", [False, True])
+def test_own_forms_in_statics(allowed):
+    """At faces that do not widen, det F is the height, as the middle of the cube halves it."""
+    system = squeezed(1.5, 2, form_cube, allow_inversion=allowed)
+    run = nts.equilibrium(system, load_steps=5, newton=nts.Newton(max_retries=1))
+    dets = run.balance["min_det"]
+    assert dets[:4] == pytest.approx([1.0, 0.7, 0.4, 0.1], abs=1e-9)
+    if allowed:
+        assert run.status.startswith("completed, but ") and f"{SENTENCE}-" in run.status
+        assert dets[-1] < corner_dets(system.bodies[0]) + 1e-12 and dets[-1] < 0.0
+    else:
+        assert SENTENCE in run.status and dets.min() > 0.0
+
+
+def test_own_forms_refuse_a_start_inside_out():
+    def push(x):
+        return np.array([-1.5 * x[0], 0 * x[1], 0 * x[2]])
+
+    if COMM.size == 1:
+        with pytest.raises(ValueError, match="inside out, det F = -0.5"):
+            form_cube(displacement=push)
+        with pytest.raises(TypeError, match="allow_inversion=1"):
+            form_cube(allow_inversion=1)
+    body = form_cube(displacement=push, allow_inversion=True)
+    assert body.smallest_det(body.initial_displacement)[0] == pytest.approx(-0.5, abs=1e-13)
 
 
 # ---- line search

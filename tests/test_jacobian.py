@@ -12,7 +12,12 @@ import dolfinx_nts as nts
 from dolfinx_nts.integrators import Static
 
 COMM = MPI.COMM_WORLD
-CELLS = {"hex": CellType.hexahedron, "tet": CellType.tetrahedron, "smooth": CellType.hexahedron}
+CELLS = {
+    **{"hex": CellType.hexahedron, "tet": CellType.tetrahedron},
+    **{"smooth": CellType.hexahedron, "curved": CellType.tetrahedron},
+}
+#: Those whose master is smooth.
+SMOOTH = "smooth", "curved"
 RULES = {
     "midpoint": nts.Midpoint(),
     "energy-momentum": nts.EnergyMomentum(),
@@ -54,7 +59,7 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
     )
     pair = nts.ContactPair(
         slave=upper.surface(lambda x: x[2] < 1 + gap + 1e-9),
-        master=lower.surface(lambda x: x[2] > 1 - 1e-9, smoothing=cell == "smooth"),
+        master=lower.surface(lambda x: x[2] > 1 - 1e-9, smoothing=cell in SMOOTH),
         friction=friction,
     )
     return nts.System([upper, lower], contacts=[pair])
@@ -276,6 +281,7 @@ def test_contact_changes_beside_matrices_that_are_kept(rule, solver):
     "hex-none-midpoint", "hex-mixed-energy-momentum", "hex-mixed-mean-value stress",
     "hex-mixed-gonzalez contact", "hex-none-static", "tet-mixed-energy-momentum",
     "smooth-none-energy-momentum", "smooth-mixed-condensed", "smooth-mixed-midpoint",
+    "curved-mixed-energy-momentum", "curved-mixed-condensed", "curved-none-midpoint",
 )  # fmt: skip
 def test_jacobian_along_directions(cell, friction, rule):
     """As above on any number of ranks: matrix times direction, through AIJ and nest."""
@@ -338,7 +344,7 @@ def last_change(sets):
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.fast(
     "hex-midpoint-False", "hex-mean-value stress-False", "hex-energy-momentum-True",
-    "smooth-gonzalez contact-True", "smooth-condensed-True",
+    "smooth-gonzalez contact-True", "smooth-condensed-True", "curved-condensed-False",
 )  # fmt: skip
 def test_newton_converges_quadratically(cell, rule, turned):
     """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""

@@ -19,7 +19,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 LEVELS = [
     {"parallel", "validation", "dolfinx_compat", "kernels"},
     {"integrators"},
-    {"bodies", "constraints", "contact", "elements", "joints", "system"},
+    {"bodies", "constraints", "contact", "elements", "joints", "kinematics", "system"},
     {"step"},
     {"output"},
     {"run"},

@@ -151,7 +151,12 @@ def test_contact_fields(mpi_tmp_path):
     assert not last["force"][~surface].any() and not last["pressure"][~surface].any()
     assert np.isnan(last["gap"][~surface]).all() and (last["status"][~surface] == -1).all()
     assert np.isnan(first["gap"]).all() and (first["status"][surface] == 0).all()
-    assert set(read(mpi_tmp_path / "the_right_one.xdmf").fields[0]) == {"displacement", "velocity"}
+    load = "contact_load_left-the_right_one"
+    master = read(mpi_tmp_path / "the_right_one.xdmf").fields[-1]
+    assert set(master) == {"displacement", "velocity", load}
+    total = file.fields[-1][load].sum(axis=0)
+    assert np.abs(total - run.solution.contact_forces[-1, 0]).max() < 1e-12 * np.abs(total).max()
+    assert np.abs(total + master[load].sum(axis=0)).max() < 1e-12 * np.abs(total).max()
     run.close()
 
 

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.contact import intrusion, overlap
+from dolfinx_nts.contact import crossings, intrusion, obstacle_crossings, overlap
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.kernels import facets
 
@@ -399,7 +399,7 @@ def test_looks_are_as_rare_as_the_motion_allows(monkeypatch):
     """Not while nothing moves relatively or boxes are apart; else 4 a facet (of 1/3 m)."""
     system, looks = blocks(0.1), []
     true = intrusion.intrusions
-    monkeypatch.setattr(overlap, "intrusions", lambda *a: looks.append(len(looks)) or true(*a))
+    monkeypatch.setattr(crossings, "intrusions", lambda *a: looks.append(len(looks)) or true(*a))
     watch = overlap.OverlapWatch(system)
 
     def look(x, z, **options):
@@ -724,8 +724,8 @@ def test_obstacles_are_looked_at_as_rarely_as_the_motion_allows(monkeypatch):
     """Not far away; else after a quarter of the radius and four steps, or the radius."""
     ball, looks = nts.Sphere((0.5, 0.5, -0.45), 0.4), []
     system = above(ball)
-    watch, true = overlap.OverlapWatch(system), overlap.sunk
-    monkeypatch.setattr(overlap, "sunk", lambda *a: looks.append(1) or true(*a))
+    watch, true = overlap.OverlapWatch(system), intrusion.sunk
+    monkeypatch.setattr(obstacle_crossings, "sunk", lambda *a: looks.append(1) or true(*a))
 
     def look(z, **options):
         watch.look(moved(system, (0, 0, z)), **options)

@@ -192,10 +192,9 @@ def test_a_joint_of_a_stranger_is_refused():
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DriveElements(nts.PointElements):
-    """A point that is drawn along x with a speed: a constraint whose multiplier is its force."""
+    """A point that is drawn along x by a way: a constraint whose multiplier is its force."""
 
-    speed: float
-    end: float
+    way: float
 
     @property
     def widths(self):
@@ -215,7 +214,7 @@ class DriveElements(nts.PointElements):
         start = np.einsum("nk,nk->n", along, self.reference().reshape(n, 3 * k))
         residual, tangent = np.zeros((n, 3 * k + 1)), np.zeros((n, 3 * k + 1, 3 * k + 1))
         residual[:, :-1] = MASS * own["constraints"] * along
-        residual[:, -1] = MASS * (place - start - self.speed * self.end)
+        residual[:, -1] = MASS * (place - start - self.way)
         tangent[:, :-1, -1], tangent[:, -1, :-1] = MASS * along, MASS * along
         return nts.PointPart(residual, tangent)
 
@@ -228,12 +227,13 @@ MASS = 1e3
 
 
 class Drive:
-    """A joint with the ground whose constraint depends on time."""
+    """A joint with the ground whose constraint depends on time: a way at an acceleration."""
 
     losses = ()
 
-    def __init__(self, body, x, speed, name="drive"):
-        self.name, self.bodies, self.speed = name, (body,), speed
+    def __init__(self, body, x, speed, acceleration=0.0, name="drive"):
+        self.name, self.bodies = name, (body,)
+        self.motion = (speed, acceleration)
         side = body.points(x)
         self.side = side if COMM.rank == 0 else side.part(slice(0))
 
@@ -245,10 +245,10 @@ class Drive:
 
     def coupling(self, bodies):
         def make(step, history):
+            (speed, acceleration), t = self.motion, step.state.time + step.dt
             return DriveElements(
-                name=self.name, sides=(self.side,), speed=self.speed,
-                end=step.state.time + step.dt,
-            )  # fmt: skip
+                name=self.name, sides=(self.side,), way=speed * t + 0.5 * acceleration * t**2
+            )
 
         return nts.EveryStep(bodies, make)
 
@@ -260,8 +260,9 @@ def test_a_drive_moves_what_it_holds(newton):
     body, x = cube((0, 0, 0), "a"), np.array([0.3, 0.4, 0.6])
     system = nts.System([body], joints=[Drive(body, x, 0.1)])
     run = nts.simulate(
-        system, nts.EnergyMomentum(), dt=5e-3, t_end=0.05, newton=nts.Newton(**newton)
-    )
+        system, nts.EnergyMomentum(), dt=5e-3, t_end=0.05, newton=nts.Newton(**newton),
+        project_start=True,
+    )  # fmt: skip
     found = body.points(x)
     u = np.concatenate(COMM.allgather(run.state.u[0])).reshape(-1, 3)
     moved = found.weights[0] @ u[found.nodes[0]]
@@ -278,3 +279,224 @@ def test_a_step_with_a_joint_that_fails_is_cut():
         newton=nts.Newton(max_iterations=1, max_retries=2),
     )  # fmt: skip
     assert run.retries == 2 and "not solved after" in run.status
+
+
+# ---- starts
+def at_point(body, x, values):
+    """Nodal values at a material point, from all ranks."""
+    found = body.points(x)
+    return found.weights[0] @ np.concatenate(COMM.allgather(values)).reshape(-1, 3)[found.nodes[0]]
+
+
+@pytest.mark.mpi
+def test_a_start_that_violates_a_joint_of_ones_own_is_refused():
+    """As that of the built-in twin, and projected alike."""
+    x, twin = np.array([0.3, 0.4, 0.6]), {}
+    body = cube((0, 0, 0), "a")
+    system = nts.System([body], joints=[Drive(body, x, 0.1)])
+    with pytest.raises(ValueError, match=r"joint 'drive' is violated at 0\.1 m/s.*project_start"):
+        nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.05)
+    ball = nts.Spherical(body, None, point=x, displacement=lambda t: (0.1 * t, 0, 0))
+    for name, joint in (("own", Drive(body, x, 0.1)), ("built-in", ball)):
+        stepper = nts.Stepper(
+            nts.System([body], joints=[joint]), nts.EnergyMomentum(), project_start=True
+        )
+        stepper.start(5e-3)
+        twin[name] = stepper.state.v[0]
+        assert at_point(body, x, twin[name])[0] == pytest.approx(0.1, abs=1e-12)
+        stepper.close()
+    # An impulse along x at the same point; the twin's others do little to the mass's coupling.
+    assert twin["own"].reshape(-1, 3)[:, 0] == pytest.approx(
+        twin["built-in"].reshape(-1, 3)[:, 0], abs=1e-12
+    )
+    off = cube((0, 0, 0), "b", displacement=(0.02, 0, 0), velocity=(0.1, 0, 0))
+    with pytest.raises(ValueError, match=r"at the start 'drive' is off by 0\.02 m"):
+        nts.simulate(
+            nts.System([off], joints=[Drive(off, x, 0.1)]), nts.EnergyMomentum(), dt=5e-3,
+            t_end=0.05,
+        )  # fmt: skip
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    "rule", [nts.Newmark(), nts.GeneralizedAlpha()], ids=lambda rule: type(rule).__name__
+)
+def test_first_accelerations_keep_a_joint_of_ones_own(rule):
+    """A point that is drawn at 0.1 m/s and 3 m/s^2 out of a cube that flies at 0.1 m/s."""
+    x = np.array([0.3, 0.4, 0.6])
+    body = cube((0, 0, 0), "a", velocity=(0.1, 0.0, 0.0))
+    stepper = nts.Stepper(nts.System([body], joints=[Drive(body, x, 0.1, 3.0)]), rule)
+    stepper.start(5e-3)
+    assert at_point(body, x, stepper.state.a[0]) == pytest.approx([3.0, 0, 0], abs=1e-9)
+    stepper.close()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RodElements(nts.PointElements):
+    """A rod of fixed length from a point to the origin: (x . x - L^2)/2 = 0, in units of its own.
+
+    Its `largest` says lengths, as the rows are those of an area.
+    """
+
+    square: float
+
+    @property
+    def widths(self):
+        return {"augmented": 0, "constraints": 1}
+
+    def evaluate(self, x, own):
+        (side,) = self.sides
+        n, k = side.weights.shape
+        place = np.einsum("na,nai->ni", side.weights, x)
+        along = (side.weights[:, :, None] * place[:, None]).reshape(n, 3 * k)
+        residual, tangent = np.zeros((n, 3 * k + 1)), np.zeros((n, 3 * k + 1, 3 * k + 1))
+        multiplier = MASS * own["constraints"]
+        residual[:, :-1] = multiplier * along
+        residual[:, -1] = 0.5 * MASS * (np.einsum("ni,ni->n", place, place) - self.square)
+        both = np.einsum("na,nb,ij->naibj", side.weights, side.weights, np.eye(3))
+        tangent[:, :-1, :-1] = multiplier[:, :, None] * both.reshape(n, 3 * k, 3 * k)
+        tangent[:, :-1, -1] = tangent[:, -1, :-1] = MASS * along
+        return nts.PointPart(residual, tangent)
+
+    def largest(self, part):
+        rows = np.abs(part.residual[:, -1]) / (MASS * np.sqrt(self.square))
+        return [0.0, float(rows.max(initial=0.0)), 0.0, self.extent]
+
+
+class Rod(Drive):
+    """A joint with the ground."""
+
+    def __init__(self, body, x):
+        super().__init__(body, x, 0.0, name="rod")
+        self.x = np.array(x)
+
+    def coupling(self, bodies):
+        def make(step, history):
+            return RodElements(name=self.name, sides=(self.side,), square=float(self.x @ self.x))
+
+        return nts.EveryStep(bodies, make)
+
+
+@pytest.mark.mpi
+def test_a_rod_of_ones_own_turns_as_the_built_in_one():
+    """Its centripetal acceleration v^2/L, by the second derivative of a curved constraint."""
+    length, speed, g = 0.7, 1.3, 9.81
+    body = nts.RigidBody.from_inertia(
+        2.0, (0.2, 0.5, 0.4), centre=(length, 0, 0), velocity=(0, 0, speed), name="bob", comm=COMM
+    )
+    system = nts.System([body], joints=[Rod(body, (length, 0, 0))], gravity=(0, 0, -g))
+    stepper = nts.Stepper(system, nts.GeneralizedAlpha())
+    stepper.start(1e-3)
+    a = np.concatenate(COMM.allgather(stepper.state.a[0]))[:3]
+    assert a == pytest.approx([-(speed**2) / length, 0.0, -g], abs=1e-8)
+    stepper.close()
+    body = nts.RigidBody.from_inertia(
+        2.0, (0.2, 0.5, 0.4), centre=(length, 0, 0), velocity=(0.3, 0, 1), name="bob", comm=COMM
+    )
+    system = nts.System([body], joints=[Rod(body, (length, 0, 0))])
+    with pytest.raises(ValueError, match=r"joint 'rod' is violated at 0\.3 m/s"):
+        nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.1)
+
+
+@pytest.mark.mpi
+def test_constraints_that_nobody_can_follow_are_refused():
+    """The coupling of a user says None where a start need not fit."""
+    body, x = cube((0, 0, 0), "a"), np.array([0.3, 0.4, 0.6])
+
+    class Own(nts.EveryStep):
+        def begin(self, step, history, again, search):
+            self.elements = [self._make(step, history)]
+
+    class Loose(Own):
+        def kinematics(self, state, dt):
+            return [None]
+
+    class Other(Drive):
+        def coupling(self, bodies):
+            return self.kind(bodies, super().coupling(bodies)._make)
+
+    drive = Other(body, x, 0.1)
+    drive.kind = Own
+    system = nts.System([body], joints=[drive])
+    with pytest.raises(TypeError, match="joint 'drive': its elements have constraints, but"):
+        nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=5e-3)
+    drive.kind = Loose
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=5e-3)
+    assert run.status.startswith("completed") and len(run.rows) == 2
+
+
+# ---- resultants
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PushElements(nts.PointElements):
+    """Points that are pushed by constant forces, shape (n, 3)."""
+
+    push: np.ndarray
+    factor: float
+
+    def evaluate(self, x, own):
+        (side,) = self.sides
+        n, size = len(x), self.num_coordinates
+        residual = -self.factor * side.weights[:, :, None] * self.push[:, None]
+        return nts.PointPart(residual.reshape(n, size), np.zeros((n, size, size)))
+
+
+class Unspoken:
+    """Elements that are no PointElements and do not say their resultant."""
+
+    def __init__(self, batch):
+        self._batch = batch
+
+    def __getattr__(self, name):
+        if name in ("resultant", "sides"):
+            raise AttributeError(name)
+        return getattr(self._batch, name)
+
+
+class TwoBatches(nts.EveryStep):
+    def begin(self, step, history, again, search):
+        self.elements = list(self._make(step, history))
+        self.bodies = [self.bodies[0]] * len(self.elements)
+
+
+class Pushes:
+    """A joint whose coupling has two batches of elements, each of two points."""
+
+    losses = ()
+
+    def __init__(self, body, x, push, name="pushes", wrap=lambda batch: batch):
+        self.name, self.bodies, self.push, self._wrap = name, (body,), push, wrap
+        self._here = slice(None) if COMM.rank == 0 else slice(0)
+        self._sides = [body.points(both).part(self._here) for both in x]
+
+    def start(self):
+        return None
+
+    def potential(self, u, history):
+        return 0.0
+
+    def coupling(self, bodies):
+        def make(step, history):
+            for side, push in zip(self._sides, self.push, strict=True):
+                yield self._wrap(PushElements(
+                    name=self.name, sides=(side,), push=push[self._here], factor=step.factor
+                ))  # fmt: skip
+
+        return TwoBatches(bodies, make)
+
+
+@pytest.mark.mpi
+def test_reactions_of_ones_own_joint():
+    """Of all its batches, about the middle of its points; NaN where elements do not say them."""
+    body = cube((0, 0, 0), "a", bcs=[nts.Dirichlet(lambda x: np.isfinite(x[0]))])
+    x = np.array([[[0.2, 0.3, 0.0], [1.0, 1.0, 1.0]], [[0.0, 1.0, 0.5], [0.7, 0.0, 0.9]]])
+    push = np.array([[[1.0, 2.0, 3.0], [0.5, 0.0, -4.0]], [[0.0, 7.0, 0.0], [-1.0, 1.0, 6.0]]])
+    joints = [Pushes(body, x, push), Pushes(body, x, push, "unspoken", Unspoken)]
+    system = nts.System([body], joints=joints)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=2e-3)
+    middle = x.reshape(-1, 3).mean(axis=0)
+    moment = np.cross(x - middle, push).sum(axis=(0, 1))
+    wanted = np.array([push.sum(axis=(0, 1)), moment])
+    assert run.reactions["pushes"][1:] == pytest.approx(np.array([wanted] * 2), abs=1e-9)
+    assert np.isnan(run.reactions["unspoken"][1:]).all()
+    # What holds the body bears both joints.
+    assert run.reactions["a"][1:, 0] == pytest.approx(np.array([-2 * wanted[0]] * 2), abs=1e-9)

@@ -36,7 +36,7 @@ def test_a_material_that_is_not_defined_is_named():
     run = nts.simulate(
         system, nts.EnergyMomentum(), dt=2e-3, t_end=0.05, newton=nts.Newton(max_retries=1)
     )
-    assert "the stresses of 'fibres' are not finite: its W(C) may not be defined" in run.status
+    assert "the internal forces of 'fibres' are not finite: the energy of its" in run.status
 
 
 def test_energy_that_contact_brings_in_small_parts_is_told():
@@ -105,6 +105,14 @@ def test_a_closed_ledger_says_nothing(integrator, accuracy):
         nts.System([Sprung(1.0)]), integrator, dt=0.05, t_end=1.5, accuracy=accuracy
     )
     assert run.status == "completed" and not run.warnings
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Newmark()])
+def test_an_energy_that_is_no_number_is_grave(integrator):
+    run = nts.simulate(nts.System([Sprung(np.nan)]), integrator, dt=0.05, t_end=0.2)
+    assert run.status != "completed" and run.warnings["ledger"].grave
+    assert "the energy is not finite" in run.warnings["ledger"].text
 
 
 def vibrating(stiffness):

@@ -7,7 +7,7 @@ from mpi4py import MPI
 from test_friction import difference, rubbing_blocks
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.newton import ACCURACY
+from dolfinx_nts.step.accuracy import ACCURACY
 
 COMM = MPI.COMM_WORLD
 INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
@@ -257,3 +257,16 @@ def test_what_iterations_leave_does_not_add_up(system, steps, contact):
     stepper.close()
     assert table["active"].any() == contact
     assert np.abs(table["ledger_residual"]).max() < 1e-10 * table["energy"][0]
+
+
+def test_the_step_is_the_same_number_in_all_steps():
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)
+    body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3, name="cube")
+    lengths, system = [], nts.System([body])
+    for start in (None, nts.simulate(system, nts.Midpoint(), dt=1e-3, t_end=0.03)):
+        nts.simulate(
+            system, nts.Midpoint(), dt=1.1e-3, t_end=0.1, start=start,
+            before_step=lambda time, dt: lengths.append(dt),
+        )  # fmt: skip
+        assert len(set(lengths)) == 1
+        lengths.clear()

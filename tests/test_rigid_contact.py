@@ -5,6 +5,7 @@ import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from scipy.spatial.transform import Rotation
+from scipy.special import ellipk
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -78,23 +79,28 @@ def test_a_box_rests_for_a_thousand_steps(nodes, friction):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("friction", "accuracy", "promise"),
+    [(0.0, "exact", 1e-11), (0.3, "exact", 1e-11), (0.3, "balanced", 1e-8)],
+    ids=["frictionless", "friction", "balanced"],
+)
 @pytest.mark.parametrize(
     "turn", [(0, 0, 0), (0, 0.6, 0), (0.6, 0.5, 0.2)], ids=["flat", "edge", "corner"]
 )
-def test_a_box_dropped_closes_the_ledger(turn, friction):
+@pytest.mark.fast("corner-friction", "edge-frictionless", "flat-balanced")
+def test_a_box_dropped_closes_the_ledger(turn, friction, accuracy, promise):
     mesh = grid((-0.5, -0.5, -0.5), (1, 1, 1), (2, 2, 2), turn)
     low = COMM.allreduce(mesh.geometry.x[:, 2].min(), op=MPI.MIN)
     mesh.geometry.x[:, 2] += 0.02 - low
     body = nts.RigidBody(mesh, density=1e3)
     pair = nts.ContactPair(slave=body.surface(everywhere), master=FLOOR, friction=friction)
     system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.2)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.2, accuracy=accuracy)
     table = run.balance
     assert run.status == "completed" and table["active"].max() > 0
-    assert np.abs(table["ledger_residual"]).max() < 1e-11 * energies(table)
-    assert table["min_gap"].min() > -1e-14
-    assert np.abs(body.rotation.T @ body.rotation - np.eye(3)).max() < 1e-12
+    assert np.abs(table["ledger_residual"]).max() < promise * energies(table)
+    assert table["min_gap"].min() > -1e-3 * promise
+    assert np.abs(body.rotation.T @ body.rotation - np.eye(3)).max() < 0.1 * promise
 
 
 @pytest.mark.mpi
@@ -151,6 +157,7 @@ def test_a_tower_of_five_stands_for_ten_seconds():
     "rule", [nts.EnergyMomentum(), nts.Midpoint()], ids=["energy-momentum", "midpoint"]
 )
 @pytest.mark.parametrize("slave", ["rigid", "soft"])
+@pytest.mark.fast("rigid-energy-momentum", "soft-midpoint")
 def test_momenta_with_a_flexible_body(slave, rule):
     """A turning rigid box on a soft cube with friction, as slave and as master."""
     one = rigid(
@@ -174,17 +181,45 @@ def test_momenta_with_a_flexible_body(slave, rule):
         assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
 
 
+def floor_of(kind, acceleration):
+    """What a brick on z = 0 stands on, its bodies, and gravity [m/s^2] for a base acceleration."""
+    if kind == "inclined gravity":
+        return FLOOR, [], (-acceleration, 0, -G)
+
+    def motion(t):
+        return (0.5 * acceleration * t**2, 0, 0)
+
+    if kind == "plane":
+        return nts.Plane((0, 0, 0), (0, 0, 1), motion=motion), [], (0, 0, -G)
+    table = rigid((-0.5, -0.5, -0.1), (1, 1, 0.1), name="table", motion=motion, rotation=(0, 0, 0))
+    return above(table, 0.0), [table], (0, 0, -G)
+
+
 @pytest.mark.parametrize("push", [0.99, 1.01])
-def test_a_brick_tips_at_b_over_h_times_g(push):
-    """Pushed by a base acceleration, here as inclined gravity: it tips above b/h g alone."""
+@pytest.mark.parametrize("kind", ["inclined gravity", "plane", "table"])
+def test_a_brick_tips_at_b_over_h_times_g(kind, push):
+    """Its base accelerates, or gravity is inclined: it tips above b/h g alone."""
     b, h = 0.1, 0.4
     body = rigid((0, 0, 0), (b, 0.1, h), (2, 1, 2))
-    pair = nts.ContactPair(slave=below(body), master=FLOOR, friction=2.0)
-    system = nts.System([body], contacts=[pair], gravity=(push * b / h * G, 0, -G))
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=1.0)
-    turned = np.abs(body.rotation - nts.RigidBody(body.mesh, density=1e3).rotation).max()
+    floor, others, gravity = floor_of(kind, -push * b / h * G)
+    pair = nts.ContactPair(slave=below(body), master=floor, friction=2.0)
+    system = nts.System([body, *others], contacts=[pair], gravity=gravity)
+    start = body.rotation
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.6)
+    angle = np.arcsin(np.abs((body.rotation @ start.T)[0, 2]))
+    table = run.balance
     assert run.status.startswith("completed")
-    assert (turned > 1e-2) if push > 1 else (turned < 1e-12)
+    assert kind == "inclined gravity" or (
+        np.abs(table["ledger_residual"]).max() < 1e-11 * energies(table)
+    )
+    if push < 1.0:
+        assert angle < 1e-12
+        return
+    # About its edge: (b^2 + h^2)/3 angle'' = (a h - g b)/2 + (a b + g h)/2 angle, small angles.
+    a = push * b / h * G
+    fast = np.sqrt(1.5 * (a * b + G * h) / (b**2 + h**2))
+    grown = (a * h - G * b) / (a * b + G * h) * (np.cosh(fast * run.state.time) - 1.0)
+    assert angle == pytest.approx(grown, rel=0.01)
 
 
 def iterations_and_place(unit):
@@ -263,6 +298,71 @@ def test_a_disc_slides_until_it_rolls():
     taken = 0.5 * body.mass * (1.0 - rolls)
     assert table["friction_dissipation"][-1] == pytest.approx(taken, rel=0.01)
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+
+
+def ball(facets, radius=0.1):
+    """A hollow ball of hexahedra, which stands on z = 0, with this many facets around its middle.
+
+    Six faces of a cube, divided evenly by angle, so that nodes lie on the circle y = 0.
+    """
+    n = facets // 4
+    slope = np.tan(np.linspace(-0.25 * np.pi, 0.25 * np.pi, n + 1))
+    u, v = (a.ravel() for a in np.meshgrid(slope, slope, indexing="ij"))
+    number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    quads = np.stack([number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]], axis=-1)
+    faces = [
+        np.roll(np.column_stack([np.full_like(u, side), side * u, v]), axis, axis=1)
+        for axis in range(3)
+        for side in (-1.0, 1.0)
+    ]
+    points = np.concatenate(faces)
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    cells = np.concatenate([quads.reshape(-1, 4) + k * (n + 1) ** 2 for k in range(6)])
+    _, first, same = np.unique(
+        points.round(9) + 0.0, axis=0, return_index=True, return_inverse=True
+    )
+    cells, points = same[cells], points[first]
+    both = np.concatenate([0.6 * radius * points, radius * points]) + (0, 0, radius)
+    hexahedra = np.concatenate([cells, cells + len(points)], axis=1)
+    return compat.create_mesh(COMM, hexahedra.astype(np.int64), both, "hexahedron")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("make", "gyration"),
+    # Radius of gyration over the radius, squared, of a round body whose hollow is 0.6 as wide.
+    [(disc, 0.5 * (1 + 0.6**2)), (ball, 0.4 * (1 - 0.6**5) / (1 - 0.6**3))],
+    ids=["roller", "ball"],
+)
+def test_rolling_in_a_bore_swings_as_rolling_says(make, gyration):
+    """192 facets, from rest at 0.3 rad: a quarter of its period, elliptic integral and all."""
+    radius, bore, tilt = 0.1, 0.5, 0.3
+    mesh, turn = make(192), Rotation.from_rotvec((0, -tilt, 0)).as_matrix()
+    place = (bore - radius) * np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    mesh.geometry.x[:] = (mesh.geometry.x - (0, 0, radius)) @ turn.T + place
+    body = nts.RigidBody(mesh, density=1e3, name="roller")
+
+    def rolls_on(x):
+        y = x - place[:, None]
+        far = np.hypot(y[0], y[2]) if make is disc else np.linalg.norm(y, axis=0)
+        return (far > 0.999 * radius) & (np.abs(y[1]) < 0.3 * radius)
+
+    hollow = nts.Cylinder((0, 0, 0), (0, 1, 0), bore, inside=True)
+    pair = nts.ContactPair(slave=body.surface(rolls_on), master=hollow, friction=2.0)
+    inertia = 1.0 + gyration
+    quarter = ellipk(np.sin(0.5 * tilt) ** 2) * np.sqrt((bore - radius) * inertia / G)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    before = [0.0, body.position[0]]
+    while body.position[0] > 0.0:
+        before = [stepper.state.time, body.position[0]]
+        stepper.advance(1e-3)
+    after = [stepper.state.time, body.position[0]]
+    passes = np.interp(0.0, [after[1], before[1]], [after[0], before[0]])
+    table = stepper.solution.balance
+    stepper.close()
+    assert passes == pytest.approx(quarter, rel=0.01)
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["kinetic"].max()
 
 
 def test_a_smooth_rigid_master_keeps_momenta_and_the_ledger():

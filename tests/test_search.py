@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from dolfinx_nts.contact.search import ROUNDING, closest_facets
+from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
+
+
+@pytest.fixture(autouse=True, params=["all pairs", "trees"])
+def way(request, monkeypatch):
+    """Few points and facets are compared by all pairs, many by trees."""
+    if request.param == "trees":
+        monkeypatch.setattr(compiled, "_MOST_PAIRS", 0)
 
 
 def brute_force(points, corners, reach, current=None, preference=1e-6):
@@ -14,7 +22,7 @@ def brute_force(points, corners, reach, current=None, preference=1e-6):
     sizes = fc.size(corners)
     facet = np.full(len(points), -1)
     xi, distance = np.full((len(points), 2), np.nan), np.full(len(points), np.inf)
-    pairs_xi, pairs_distance = fc.closest_point(
+    pairs_xi, pairs_distance = compiled.closest_point(
         np.repeat(points, m, axis=0), np.tile(corners, (len(points), 1, 1))
     )
     for i, x in enumerate(points):

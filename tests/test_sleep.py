@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from test_single_mass import PointMass
@@ -358,3 +359,29 @@ def test_sleep_is_a_bool(wrong):
     ):
         with pytest.raises(TypeError, match=f"sleep={wrong!r}: pass True or False"):
             make()
+
+
+@pytest.mark.mpi
+def test_a_material_that_changes_wakes():
+    """A body at rest that swells as soon as a parameter of its energy says so."""
+
+    def moved(sleep):
+        mesh = create_box(
+            COMM, [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], [2, 2, 2], CellType.hexahedron,
+            ghost_mode=GhostMode.shared_facet,
+        )  # fmt: skip
+        swells, base = fem.Constant(mesh, 0.0), nts.StVenantKirchhoff(young=1e4, poisson=0.3)
+        body = nts.Continuum(mesh, lambda c: base(c) - swells * ufl.tr(c), density=1e2)
+        # The first of bodies that all rest stays awake.
+        other = cube((5, 0, 0), "other")
+        s = nts.Stepper(nts.System([other, body]), nts.EnergyMomentum(), sleep=sleep)
+        speeds = []
+        for k in range(5):
+            swells.value = 0.0 if k < 3 else 100.0
+            s.advance(DT)
+            speeds.append(largest(s.state.v[1]))
+        s.close()
+        return speeds
+
+    right, found = moved(False), moved(True)
+    assert found == pytest.approx(right, rel=1e-9, abs=1e-12) and right[-1] > 1e-3 > right[2]

@@ -14,7 +14,7 @@ FACETS, RADIUS, SPEED, WEIGHT = 16, 1.0, 1.0, 1e3
 #: Half the length of the way and of the surface.
 WAY, END = 0.33, 0.48
 VARIANTS = ("start", "middle", "smooth")
-BENT = {"convex": 1.0, "concave": -1.0, "flat": 0.0}
+BENT = {"convex": 1.0, "concave": -1.0, "flat": 0.0, "dome": 1.0}
 
 
 class Sledge(PointMass):
@@ -28,10 +28,14 @@ class Sledge(PointMass):
         return np.array([SPEED * time, 0.0])[: len(self.fixed)]
 
 
-def plate(shape, facets, uneven):
-    """Fixed facets in a row along x, bent to a cylinder."""
+def plate(shape, facets, uneven, triangles=False):
+    """Fixed facets along x, bent to a cylinder or a sphere.
+
+    Quadrilaterals in a row, or triangles in three rows.
+    """
+    cells, kind = (3, CellType.tetrahedron) if triangles else (1, CellType.hexahedron)
     mesh = create_box(
-        COMM, [[-END, -0.1, -0.1], [END, 0.1, 0.0]], [facets, 1, 1], CellType.hexahedron,
+        COMM, [[-END, -0.1, -0.1], [END, 0.1, 0.0]], [facets, cells, 1], kind,
         ghost_mode=GhostMode.shared_facet,
     )  # fmt: skip
     top = locate_facets(mesh, lambda x: x[2] > -1e-9, None, "top")
@@ -42,7 +46,14 @@ def plate(shape, facets, uneven):
     even = np.linspace(-END, END, facets + 1)
     shift = uneven * np.random.default_rng(1).uniform(-1, 1, facets - 1) * (even[1] - even[0])
     x = np.interp(x, even, even + np.concatenate([[0], shift, [0]]))
-    if BENT[shape]:
+    if triangles:
+        # Rows shifted against each other, so that valences' sectors differ, too.
+        y = y + uneven * 0.06 * np.sin(40 * x) * (1 - (y / 0.1) ** 2)
+    if shape == "dome":
+        to = np.column_stack([x, y, np.full(len(x), RADIUS)])
+        to *= ((RADIUS + z) / np.linalg.norm(to, axis=1))[:, None]
+        x, y, z = (to - [0, 0, RADIUS]).T
+    elif BENT[shape]:
         r = RADIUS + BENT[shape] * z
         x, z = r * np.sin(x / RADIUS), BENT[shape] * (r * np.cos(x / RADIUS) - RADIUS)
     mesh.geometry.x[:] = np.column_stack([x, y, z])
@@ -56,7 +67,9 @@ def plate(shape, facets, uneven):
     return body, tags
 
 
-def slide(shape, variant, part, integrator=None, facets=FACETS, uneven=0.0):
+def slide(
+    shape, variant, part, integrator=None, facets=FACETS, uneven=0.0, triangles=False
+):
     """Draw the sledge over the plate.
 
     Args:
@@ -66,18 +79,20 @@ def slide(shape, variant, part, integrator=None, facets=FACETS, uneven=0.0):
         integrator: Energy-momentum scheme if None.
         facets: Facets of the plate along its length.
         uneven: Random shift of the edges between facets in their width.
+        triangles: Whether the plate has tetrahedra.
 
     Returns:
         Losses of the steps that begin on another facet than the last one [J], losses of all other
         steps, and the balance table.
     """
-    body, tags = plate(shape, facets, uneven)
+    body, tags = plate(shape, facets, uneven, triangles)
     master = body.surface(tags, 1, smoothing=variant == "smooth")
     # A node is on facets and patches; a little lower, the weight has no way to fall in the first
     # step.
     x, _, z = np.unique(np.round(master.reference, 12), axis=0).T
     begin = np.flatnonzero(x >= -WAY)[0]
-    start = np.array([x[begin], 0.01, z[begin] - 1e-9])
+    height = z[begin] if shape != "dome" else np.sqrt(RADIUS**2 - x[begin] ** 2 - 1e-4) - RADIUS
+    start = np.array([x[begin], 0.01, height - 1e-9])
     mass = Sledge(start)
     pair = nts.ContactPair(PointSurface(mass, start), master)
     pair.slave.fixed[:, :2] = True
@@ -159,32 +174,60 @@ def test_smoothing_of_uneven_facets(shape):
     assert mean["smooth"] < 0.05 * mean["middle"]
 
 
-def bumpy(comm, smoothing):
+@pytest.mark.parametrize(
+    ("shape", "part", "uneven"),
+    [
+        *[("convex", 0.2137, 0.0), ("concave", 0.1137, 0.0), ("convex", 0.1137, 0.25)],
+        *[("dome", 0.2137, 0.0), ("dome", 0.2137, 0.25)],
+    ],
+)
+@pytest.mark.fast("dome-0.2137-0.25")
+def test_smoothing_of_triangles(shape, part, uneven):
+    """Changes of facet cost a thousandth, and so do those of the pieces of a facet."""
+    changes, others, table = slide(shape, "middle", part, uneven=uneven, triangles=True)
+    assert_closed(table, changes, 15)
+    assert np.abs(others).max() <= 1e-12 * WEIGHT
+    faceted = np.abs(changes).mean()
+    changes, others, table = slide(shape, "smooth", part, uneven=uneven, triangles=True)
+    assert_closed(table, changes, 15)
+    assert np.abs(changes).mean() < 1e-3 * faceted
+    assert np.abs(others).max() < 1e-3 * faceted
+
+
+def bumpy(comm, smoothing, kind=CellType.hexahedron, metre=1.0):
     """A block that slides over the waves of a plate; both are free."""
-    cells = {"cell_type": CellType.hexahedron, "ghost_mode": GhostMode.shared_facet}
+    cells = {"cell_type": kind, "ghost_mode": GhostMode.shared_facet}
     mesh = create_box(comm, [[0, 0, 0], [1.2, 1, 0.3]], [6, 5, 1], **cells)
     top = locate_facets(mesh, lambda x: x[2] > 0.3 - 1e-9, None, "top")
     one = np.full(len(top), 1, np.int32)
     tags = meshtags(mesh, 2, np.sort(top), one)
     x, y, z = mesh.geometry.x.T
     mesh.geometry.x[:, 2] += 0.03 * np.sin(6 * x) * np.cos(4 * y) * z / 0.3
-    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
-    plate = nts.Continuum(mesh, rubber, density=1e4, name="plate")
+    mesh.geometry.x[:] *= metre
+    # Of a scene in mm and tonnes, say: mass and time keep their units.
+    rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
+    plate = nts.Continuum(mesh, rubber, density=1e4 / metre**3, name="plate")
     low = 0.335
     mesh = create_box(comm, [[0.21, 0.23, low], [0.61, 0.63, low + 0.3]], [2, 2, 1], **cells)
-    block = nts.Continuum(mesh, rubber, density=1e4, velocity=(2.0, 0.7, -1.0), name="block")
-    slave = block.surface(lambda x: x[2] < low + 1e-9)
+    mesh.geometry.x[:] *= metre
+    velocity = metre * np.array([2.0, 0.7, -1.0])
+    block = nts.Continuum(
+        mesh, rubber, density=1e4 / metre**3, velocity=tuple(velocity), name="block"
+    )
+    slave = block.surface(lambda x: x[2] < (low + 1e-9) * metre)
     pair = nts.ContactPair(slave, plate.surface(tags, 1, smoothing=smoothing))
     return nts.System([block, plate], contacts=[pair])
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("smoothing", [False, True])
-@pytest.mark.fast("True")
-def test_momentum_and_energy_on_any_number_of_ranks(smoothing):
+@pytest.mark.fast("True-hexahedron", "True-tetrahedron")
+def test_momentum_and_energy_on_any_number_of_ranks(smoothing, kind):
     tables = []
     for comm in (COMM, MPI.COMM_SELF):
-        run = nts.simulate(bumpy(comm, smoothing), nts.EnergyMomentum(), dt=4e-3, t_end=0.08)
+        scene = bumpy(comm, smoothing, getattr(CellType, kind))
+        run = nts.simulate(scene, nts.EnergyMomentum(), dt=4e-3, t_end=0.08)
         assert run.status == "completed" and run.retries == 0
         tables.append(run.balance)
     table, alone = tables
@@ -196,3 +239,37 @@ def test_momentum_and_energy_on_any_number_of_ranks(smoothing):
     for name in ("energy", "contact_defect", "linear_momentum", "angular_momentum", "active"):
         scale = max(np.abs(alone[name]).max(), alone["energy"][0])
         assert np.abs(table[name] - alone[name]).max() <= 1e-9 * scale
+
+
+@pytest.mark.slow
+def test_smooth_triangles_in_other_units():
+    tables = []
+    for metre in (1.0, 1e3, 1e6):
+        scene = bumpy(COMM, True, CellType.tetrahedron, metre)
+        run = nts.simulate(scene, nts.EnergyMomentum(), dt=4e-3, t_end=0.08)
+        assert run.status == "completed"
+        tables.append(run.balance)
+    for table, metre in zip(tables[1:], (1e3, 1e6), strict=True):
+        assert np.array_equal(table["newton_iterations"], tables[0]["newton_iterations"])
+        assert np.array_equal(table["active"], tables[0]["active"])
+        energy = table["energy"] / metre**2
+        assert np.abs(energy / tables[0]["energy"] - 1).max() <= 1e-9
+
+
+@pytest.mark.slow
+def test_friction_on_smooth_triangles_of_a_rigid_body():
+    block, plate = bumpy(COMM, True, CellType.tetrahedron).bodies
+    rigid = nts.RigidBody(plate.mesh, density=1e4, name="rigid")
+    top = locate_facets(plate.mesh, lambda x: x[2] > 0.2, None, "top")
+    tags = meshtags(plate.mesh, 2, np.sort(top), np.full(len(top), 1, np.int32))
+    slave = block.surface(lambda x: x[2] < 0.335 + 1e-9)
+    pair = nts.ContactPair(slave, rigid.surface(tags, 1, smoothing=True), friction=0.3)
+    system = nts.System([block, rigid], contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=4e-3, t_end=0.08)
+    table = run.balance
+    assert run.status == "completed" and table["active"].max() >= 5
+    assert table["friction_dissipation"][-1] > 0.1 * table["energy"][0]
+    assert np.abs(table["ledger_residual"]).max() <= 1e-11 * table["energy"][0]
+    for name in ("linear_momentum", "angular_momentum"):
+        change = np.abs(table[name] - table[name][0]).max()
+        assert change <= 1e-12 * np.abs(table[name]).max()

@@ -102,6 +102,7 @@ def test_tangents_are_derivatives(item, rule, ground):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("law", LAWS)
+@pytest.mark.fast("linear")
 def test_tumbling_bodies_keep_energy_and_momenta(law):
     a, b = tumbling()
     spring = nts.Spring(a, b, POINTS, **LAWS[law])
@@ -173,6 +174,7 @@ def test_oscillator(rule, damping):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_damped_tumbling_closes_the_ledger():
     a, b = tumbling()
     joints = [nts.Spring(a, b, POINTS, **LAWS["Lennard-Jones"]),
@@ -204,6 +206,7 @@ def test_a_spring_of_no_length_passes_through_it():
 
 
 @pytest.mark.parametrize("rule", ["energy-momentum", "midpoint", "generalised alpha"])
+@pytest.mark.fast("energy-momentum")
 def test_torsion_pendulum_over_several_turns(rule):
     """V = k/2 phi^2 + c (1 - cos phi), not periodic: turns count."""
     inertia, k, c, damping, spin, end = 0.5, 0.02, 0.3, 0.02, 8.0, 2.5
@@ -405,7 +408,7 @@ def test_an_energy_that_raises_ends_the_run_on_all_ranks():
     spring = nts.Spring(body, None, [(1, 0, 0), (0, 0, 0)], energy=energy)
     run = nts.simulate(nts.System([body], joints=[spring]), RULES["energy-momentum"],
                        dt=0.01, t_end=1.0)  # fmt: skip
-    assert "energy of 'Spring of mass and ground'" in run.status and "too long" in run.status
+    assert "energy of 'spring of mass and ground'" in run.status and "too long" in run.status
     assert 0.1 < run.balance["time"][-1] < 0.25
 
 
@@ -453,18 +456,21 @@ APART = [(0, 0, 0), (1, 0, 0)]
         (lambda a: nts.Spring(a, None, APART, energy=np.exp, force=3.0), TypeError,
          r"force=3.0: pass a function of an array"),
         (lambda a: nts.Spring(a, None, APART, energy=lambda x: np.abs(x) ** 2), ValueError,
-         r"energy of 'Spring of mass and ground': changes by 0.0201 J .* pass force=dV/dl"),
+         r"energy of 'spring of mass and ground': changes by 0.0201 J .* pass force=dV/dl"),
         (lambda a: nts.Spring(a, None, APART, energy=lambda x: x**2, force=lambda x: -2 * x),
          ValueError, r"its derivative says -0.0201 J"),
         (lambda a: nts.Spring(a, None, APART, energy=lambda x: x + np.nan), ValueError,
-         r"energy of 'Spring of mass and ground': it or its derivative is not finite at 1"),
+         r"energy of 'spring of mass and ground': it or its derivative is not finite at 1"),
         (lambda a: nts.Spring(a, None, APART, energy=lambda x: np.full(3, x)),
-         nts.UserFunctionError, r"energy of 'Spring of mass and ground': .* raised ValueError"),
+         nts.UserFunctionError,
+         r"energy of 'spring of mass and ground': <function <lambda>.* at .*> raised ValueError"),
         (lambda a: nts.Spring(None, None, APART, stiffness=1.0), ValueError,
          r"a=None, b=None: a Spring needs a body"),
         (lambda a: nts.Spring(a, a, APART, stiffness=1.0), ValueError,
          r"a=b='mass': a rigid body does not change its size"),
         (lambda a: nts.Spring(a, 7, APART, stiffness=1.0), TypeError, r"b=7: pass a body, or None"),
+        (lambda a: nts.Spring(a, nts.RigidBody, APART, stiffness=1.0), TypeError,
+         r"b=<class .*RigidBody'>: is a class; pass a body made from it, RigidBody\(...\)"),
         (lambda a: nts.Spring(a, None, (0, 0, 0), stiffness=1.0), ValueError,
          r"points=\(0, 0, 0\): pass two points"),
         (lambda a: nts.Spring(a, None, [(0, 0, 0), (1, 0)], stiffness=1.0), ValueError,
@@ -474,14 +480,14 @@ APART = [(0, 0, 0), (1, 0, 0)]
         (lambda a: nts.Spring(a, None, [(1, 0, 0)] * 2, energy=np.exp), ValueError,
          r"they coincide, and a force of one's own has no direction there"),
         (lambda a: nts.Damper(a, None, [(1, 0, 0)] * 2, damping=1.0), ValueError,
-         r"points of 'Damper of mass and ground': they coincide"),
+         r"points of 'damper of mass and ground': they coincide"),
         (lambda a: nts.Damper(a, None, APART, damping=-1.0), ValueError, r"damping=-1.0: must be"),
         (lambda a: nts.Damper(a, None, APART, damping=1.0, name=""), ValueError,
          r"name='': is empty"),
         (lambda a: nts.Damper(a, None, APART, damping=1.0, friction=2), TypeError,
          r"friction=2: unknown option of Damper; choose from a, b, points, damping, name"),
         (lambda a: nts.TorsionSpring(a, None, axis=(0, 0, 0), stiffness=1.0), ValueError,
-         r"axis=\(0, 0, 0\): has no direction"),
+         r"axis of 'torsionspring of mass and ground'=\(0, 0, 0\): has no direction"),
         (lambda a: nts.TorsionSpring(a, None, axis=Z, stiffness=1.0, angle=np.inf), ValueError,
          r"angle=inf: must be finite"),
         (lambda a: nts.TorsionSpring(a, None, axis=Z, stiffness=-1.0), ValueError,
@@ -500,7 +506,7 @@ def test_bad_input_of_flexible_bodies():
     body = cube()
     with pytest.raises(ValueError, match=r"b='cube': a flexible body has no directions for"):
         nts.TorsionSpring(None, body, axis=Z, stiffness=1.0)
-    with pytest.raises(ValueError, match=r"points of 'Spring of cube and ground': .*lies in no"):
+    with pytest.raises(ValueError, match=r"points of 'spring of cube and ground': .*lies in no"):
         nts.Spring(body, None, [(3, 0, 0), (0, 0, 0)], stiffness=1.0)
 
 
@@ -530,3 +536,19 @@ def test_forces_of_joints_supports_and_contacts_are_written(mpi_tmp_path):
         assert values["pull_force_z [N]"] == pytest.approx(2 * 9.81)
         assert values["pull_moment_x [N m]"] == 0.0
         assert values["held_force_z [N]"] == pytest.approx(3 * 9.81)
+
+
+@pytest.mark.mpi
+def test_a_start_remembers_of_a_spring_only_what_is_its_own():
+    """A torsion spring of the name of a linear one does not begin with that one's length."""
+    rod = mass((10, 0, 0), "rod")
+    spring = nts.Spring(rod, None, points=((10, 0, 0), (0, 0, 0)), stiffness=1.0, name="s")
+    first = nts.System([rod], joints=[spring])
+    ended = nts.simulate(first, nts.EnergyMomentum(), dt=0.01, t_end=0.02)
+    other = mass((10, 0, 0), "rod")
+    twist = nts.TorsionSpring(other, None, axis=(0, 0, 1), stiffness=1.0, name="s")
+    run = nts.simulate(
+        nts.System([other], joints=[twist]), nts.EnergyMomentum(), dt=0.01, t_end=0.04,
+        start=ended,
+    )  # fmt: skip
+    assert abs(run.balance["potential"]).max() < 1e-12

@@ -13,8 +13,8 @@ from test_single_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.run.simulate import Stepper
 from dolfinx_nts.run.step_size import Pace, factor
+from dolfinx_nts.run.stepper import Stepper
 
 COMM = MPI.COMM_WORLD
 RATE = 3.0

@@ -10,7 +10,7 @@ from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.run.simulate import Solution
+from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.step.balance import COLUMNS, Switch, Switches
 
@@ -75,6 +75,7 @@ def test_summary_says_what_changes_of_facet_cost():
     assert line in run.summary
 
 
+@pytest.mark.slow
 def test_memory_of_a_long_run():
     """Twenty columns of 8 B each, with a quarter more room, and nothing else."""
     mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)

@@ -6,8 +6,10 @@ import sys
 import numpy as np
 import pytest
 from mpi4py import MPI
+from scipy.spatial.transform import Rotation
 
-from dolfinx_nts.step.newton import ACCURACY
+import dolfinx_nts as nts
+from dolfinx_nts.step.accuracy import ACCURACY
 from dolfinx_nts.study import tradeoff
 
 COMM = MPI.COMM_WORLD
@@ -36,6 +38,29 @@ def script(tmp_path):
 
 
 @pytest.mark.mpi
+def test_means_of_a_rigid_body_are_those_of_its_points():
+    """Of u, and of u times X over the radius of gyration: (R - 1) int rho X X^T."""
+    axes = Rotation.from_rotvec((0.3, -0.5, 0.2)).as_matrix()
+    moments = np.array([1.0, 2.0, 2.5])
+    body = nts.RigidBody.from_inertia(
+        4.0, moments, (1, 2, 3), axes, velocity=(3, 0, 1), angular_velocity=(1, 2, 3), name="brick"
+    )
+    way, stepper = tradeoff.Motion(), nts.Stepper(nts.System([body]), nts.EnergyMomentum())
+    way.start(stepper)
+    stepper.advance(0.1)
+    way.write(stepper)
+    stepper.close()
+    turned = body.rotation @ axes.T
+    euler = axes @ np.diag(0.5 * moments.sum() - moments) @ axes.T
+    size = np.sqrt(np.trace(euler) / 4.0)
+    mean = (turned - np.eye(3)) @ euler / (4.0 * size)
+    moved = way.motion[1] - way.motion[0]
+    assert moved[:3] == pytest.approx(0.1 * np.array([3, 0, 1]), abs=1e-12)
+    assert moved[3:].reshape(3, 3).T == pytest.approx(mean, abs=1e-12)
+
+
+@pytest.mark.mpi
+@pytest.mark.slow
 def test_error_of_the_trajectory_is_of_second_order(script):
     """Against a much finer step of the same run the errors of h and h/2 are as 4 to 1."""
     reference = {"accuracy": "exact", "dt_factor": 1 / 16}
@@ -170,7 +195,7 @@ def test_levels_of_accuracy_are_ordered():
 
 
 def test_a_script_with_a_module_beside_it(tmp_path):
-    """As `python scene.py` finds it, and anew for each run."""
+    """As `python scene.py` finds it."""
     scene, beside = tmp_path / "scene.py", tmp_path / "spacing_of_scene.py"
     scene.write_text(
         "from __future__ import annotations\n"
@@ -182,7 +207,17 @@ def test_a_script_with_a_module_beside_it(tmp_path):
         "def main():\n"
         "    return Size().cells\n"
     )
-    for cells in (3, 10):
-        beside.write_text(f"CELLS = {cells}\n")
-        assert tradeoff.load(str(scene)).main() == cells
-    assert str(tmp_path) not in sys.path and "spacing_of_scene" not in sys.modules
+    beside.write_text("CELLS = 3\n")
+    for _ in range(2):
+        assert tradeoff.load(str(scene)).main() == 3
+    assert str(tmp_path) not in sys.path
+
+
+@pytest.mark.parametrize("call", ["nts.simulate", "simulate"])
+def test_a_script_may_import_simulate_as_it_likes(tmp_path, call):
+    scene, imports = tmp_path / "scene.py", "import dolfinx_nts as nts"
+    text = SCRIPT.replace("nts.simulate", call)
+    scene.write_text(text.replace(imports, f"{imports}\nfrom dolfinx_nts import simulate"))
+    run = tradeoff.measure(str(scene), {"dt_factor": 2.0}, COMM)
+    assert run.status == "completed" and run.dt == 0.04
+    assert run.solution.balance["time"][1] == pytest.approx(0.04)

@@ -116,6 +116,7 @@ def test_ledger_closes_when_the_step_changes():
     stepper.close()
 
 
+@pytest.mark.slow
 def test_bodies_of_a_micrometre():
     """The same physics at any size: lengths and times scaled together, speeds kept."""
     runs = []

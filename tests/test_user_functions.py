@@ -11,7 +11,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.bodies import continuum
+from dolfinx_nts import validation
 from dolfinx_nts.output import writers as output
 
 COMM = MPI.COMM_WORLD
@@ -202,7 +202,7 @@ def test_an_interrupt_goes_through():
 
 
 def test_constants_are_not_agreed_on(monkeypatch):
-    monkeypatch.setattr(continuum, "at_time", raises)
+    monkeypatch.setattr(validation, "at_time", raises)
     run = nts.simulate(scene("Traction", (0, 0, 1.0)), nts.Midpoint(), dt=DT, t_end=2 * DT)
     assert run.status == "completed"
 

@@ -70,6 +70,12 @@ class Body(Protocol):
         places: Which of this rank's nodes are places that move with a translation, t_a = 1, shape
             (num_owned / 3,); the others are directors, which only turn. May be missing: all are.
         joints: Constraints among its own coordinates, see `Joint`; may be missing.
+        file_order: Callable without arguments, collective: on rank 0, which of the nodes of all
+            ranks, rank after rank, comes first in files, which second: an order that does not
+            depend on the ranks. May be missing: rank after rank.
+        driven: Whether prescribed coordinates follow functions of time; may be missing: no.
+        turn: Callable (u0, u1): largest turn of its directors between two displacements [rad], on
+            this rank, of which a run warns if it is far in a step. May be missing.
         rounded: Length [m], the same on all ranks, whose rounding the forces hold beside that of u;
             may be missing, and is that of the positions then.
     """
@@ -125,7 +131,7 @@ class Body(Protocol):
         """Stored energy on this rank [J]."""
 
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
-        """Smallest det F on this rank, inf without cells, and X of its cell [m], shape (3,).
+        """Smallest det F on this rank, inf without cells in 3D, and X of its cell [m], shape (3,).
 
         A body may leave it out; else a step that ends with det F <= 0 is not accepted unless the
         body's `allow_inversion` is True.

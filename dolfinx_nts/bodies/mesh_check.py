@@ -15,6 +15,8 @@ from dolfinx_nts.parallel import raise_together
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Corners of the cells of each kind.
+_CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
 #: Corner -> its three edge neighbours in DOLFINx vertex order.
 _NEIGHBOURS = np.array([[c ^ 1, c ^ 2, c ^ 4] for c in range(8)])
 #: The triple product flips sign at every second corner.
@@ -43,8 +45,34 @@ def check_mesh(mesh: Any, name: str) -> None:
         raise ValueError(
             f"mesh of {name!r}: {kind} in {mesh.geometry.dim}D; pass 3D hexahedra or tetrahedra"
         )
-    corners = {"hexahedron": 8, "tetrahedron": 4}[kind]
+    _check_nodes(mesh, name)
     cells = compat.geometry_dofmap(mesh)
+    owned = mesh.topology.index_map(3).size_local
+    _check_cells(mesh, name, mesh.geometry.x[cells[:owned].reshape(owned, _CORNERS[kind])])
+
+
+def check_any_mesh(mesh: Any, name: str) -> None:
+    """Raise on every rank unless the mesh is valid and of degree 1, of any dimension.
+
+    Args:
+        mesh: DOLFINx mesh.
+        name: Of its body, for messages.
+
+    Raises:
+        ValueError: Cells of another kind, not finite; in 3D inverted or overlapping.
+    """
+    if mesh.topology.dim == 3:
+        check_mesh(mesh, name)
+    else:
+        _check_nodes(mesh, name)
+
+
+def _check_nodes(mesh: Any, name: str) -> None:
+    """Raise on every rank unless the nodes are corners of known cells, and finite."""
+    kind, cells = compat.cell_name(mesh), compat.geometry_dofmap(mesh)
+    if kind not in _CORNERS:
+        raise ValueError(f"mesh of {name!r}: {kind}; pass a mesh of {', '.join(_CORNERS)}")
+    corners = _CORNERS[kind]
     nodes = mesh.comm.allreduce(cells.shape[1], op=MPI.MAX)
     if nodes != corners:
         raise ValueError(
@@ -53,8 +81,6 @@ def check_mesh(mesh: Any, name: str) -> None:
     nan = np.flatnonzero(~np.isfinite(mesh.geometry.x).all(axis=1))
     text = f"mesh of {name!r}: {len(nan)} nodes are not finite, e.g. {mesh.geometry.x[nan[:1]]}"
     raise_together(mesh.comm, f"{text}; check the coordinates for NaN" if len(nan) else None)
-    owned = mesh.topology.index_map(3).size_local
-    _check_cells(mesh, name, mesh.geometry.x[cells[:owned].reshape(owned, corners)])
 
 
 def _check_cells(mesh: Any, name: str, x: FloatArray) -> None:

@@ -18,7 +18,7 @@ from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.bodies.triad import Triad
+from dolfinx_nts.bodies.triad import Triads, largest_turn
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets
 from dolfinx_nts.integrators import Integrator
@@ -26,14 +26,16 @@ from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import gather_rows, raise_together
 from dolfinx_nts.validation import (
     UserFunctionError,
-    at_time,
     call_together,
     floats,
     known_options,
     require_bool,
     require_name,
     require_positive,
+    require_same,
     vector,
+    vector_in_time,
+    vectors,
 )
 
 FloatArray = npt.NDArray[np.float64]
@@ -60,8 +62,8 @@ class RigidBody:
     Args:
         mesh: 3D hexahedral or tetrahedral mesh.
         density: [kg/m^3], > 0.
-        velocity: Of the centre of mass at the start [m/s].
-        angular_velocity: At the start [rad/s].
+        velocity: Of the centre of mass at the start [m/s]; not beside `motion`.
+        angular_velocity: At the start [rad/s]; not beside `rotation`.
         force: Dead force on the centre of mass [N]: a vector, or a function of time.
         torque: Dead torque [N m]: a vector, or a function of time.
         motion: Displacement of the centre of mass from its reference [m], as a vector, or a
@@ -99,8 +101,12 @@ class RigidBody:
         name: str = "rigid",
     ) -> None:
         require_name("name", name)
-        require_positive("density", density, "kg/m^3")
         check_mesh(mesh, name)
+        require_same(
+            mesh.comm, density=density, velocity=velocity, angular_velocity=angular_velocity,
+            force=force, torque=torque, motion=motion, rotation=rotation, name=name,
+        )  # fmt: skip
+        require_positive("density", density, "kg/m^3")
         self.mesh, self.density, self.degree = mesh, density, 1
         self.space = compat.vector_space(mesh, 1)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
@@ -153,6 +159,11 @@ class RigidBody:
             ValueError: An argument is out of range: moments that no body has, axes that are not
                 right-handed or not orthonormal.
         """
+        require_same(
+            comm, mass=mass, inertia=inertia, centre=centre, axes=axes, velocity=velocity,
+            angular_velocity=angular_velocity, force=force, torque=torque, motion=motion,
+            rotation=rotation, name=name,
+        )  # fmt: skip
         require_name("name", name)
         require_positive("mass", mass, "kg")
         where = vector("centre", centre, "m")
@@ -184,6 +195,15 @@ class RigidBody:
         self.name, self.comm, self.mass = name, comm, mass
         linear = vector("velocity", velocity, "m/s")
         turning = vector("angular_velocity", angular_velocity, "rad/s")
+        for what, speed, drive, prescribed in (
+            ("velocity", linear, "motion", motion),
+            ("angular_velocity", turning, "rotation", rotation),
+        ):
+            if speed.any() and prescribed is not None:
+                raise ValueError(
+                    f"{what} of {name!r}={speed.tolist()!r}: {drive}= prescribes it; leave {what} "
+                    f"out, or {drive}="
+                )
         self._force, self._torque, self._motion, self._turn = force, torque, motion, rotation
         self._given = [("force", force, "N"), ("torque", torque, "N m")]
         for what, value, unit in self._given:
@@ -191,6 +211,7 @@ class RigidBody:
         # Rounding of a disc's or a rod's moments is no mass.
         euler = np.where(euler > ROUNDED * euler.max(), euler, 0.0)
         self.moments = euler.sum() - euler
+        # A point has none, and nothing depends on what its directors are given.
         self.length = float(np.sqrt(euler.sum() / mass)) or 1.0
         self._axes, self.centre, self._euler = axes, centre, euler
         self.owner = rank_of(name, comm)
@@ -211,7 +232,10 @@ class RigidBody:
         self.fixed = np.flatnonzero(fixed[: self.num_owned])
         self._fixed = fixed
         self.prescribed(0.0)
-        self.joints: tuple[Any, ...] = () if rotation is not None else (Triad(self),)
+        held = self.points(centre).part(slice(0, int(here)))
+        self.joints: tuple[Any, ...] = () if rotation is not None else (
+            Triads(self, held, self.length, np.arange(len(held))),
+        )  # fmt: skip
         self._matrix: Any = None
         self._reach = np.ones(4)
         if hasattr(self, "mesh"):
@@ -268,7 +292,7 @@ class RigidBody:
         Raises:
             ValueError: x is no array of points.
         """
-        return self._points(self._weights(_rows("x", x, "points")))
+        return self._points(self._weights(vectors("x", x, "points [m]")))
 
     def directions(self, x: Any) -> Points:
         """Directions that turn with the body, for joints.
@@ -279,7 +303,7 @@ class RigidBody:
         Raises:
             ValueError: x is no array of vectors.
         """
-        local = _rows("x", x, "vectors") @ self._axes / self.length
+        local = vectors("x", x, "vectors") @ self._axes / self.length
         return self._points(np.column_stack([np.zeros(len(local)), local]))
 
     def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
@@ -304,7 +328,14 @@ class RigidBody:
         """Nodal vectors (4, 3) on all ranks. Collective."""
         return gather_rows(self.comm, values.reshape(-1, 3))
 
-    def surface(self, marker: Any, tag: int | None = None, *, smoothing: bool = False) -> Surface:
+    def surface(
+        self,
+        marker: Any,
+        tag: int | None = None,
+        *,
+        smoothing: bool = False,
+        mass: str = "consistent",
+    ) -> Surface:
         """A part of the boundary for contact, as of `Continuum.surface`.
 
         Args:
@@ -312,12 +343,18 @@ class RigidBody:
                 meshtags.
             tag: Value in the meshtags.
             smoothing: Whether slaves touch a smooth surface when this one is the master.
+            mass: "consistent"; no node of a rigid body can lose its mass.
 
         Raises:
             TypeError: smoothing is no bool.
-            ValueError: The body has no mesh; no facet, or interior facets; smoothing of triangles.
+            ValueError: The body has no mesh; no facet, or interior facets; mass is another one.
         """
         require_bool("smoothing", smoothing)
+        if mass != "consistent":
+            raise ValueError(
+                f"mass={mass!r} of a surface of {self.name!r}: a rigid body has no nodes that "
+                "could do without mass; leave mass out, or let a Continuum be the slave"
+            )
         if not hasattr(self, "mesh"):
             raise ValueError(
                 f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
@@ -333,10 +370,12 @@ class RigidBody:
 
     # ---- loads and prescribed motion
     def _vector(self, name: str, value: VectorInTime, time: float, unit: str) -> FloatArray:
-        name = f"{name} of {self.name!r}"
-        if callable(value):
-            return at_time(self.comm, name, value, time, unit)
-        return vector(name, value, unit)
+        return vector_in_time(self.comm, f"{name} of {self.name!r}", value, time, unit)
+
+    @property
+    def driven(self) -> bool:
+        """Whether its position or its rotation follows a function of time."""
+        return callable(self._motion) or callable(self._turn)
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
@@ -489,6 +528,10 @@ class RigidBody:
         motion = [("force", "N")] if self._motion is not None else []
         return motion + ([("moment", "N m")] if self._turn is not None else [])
 
+    def turn(self, u0: FloatArray, u1: FloatArray) -> float:
+        """Largest turn between two displacements on this rank [rad]."""
+        return largest_turn(self.reference + u0, self.reference + u1)
+
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""
         self.accepted = u, v
@@ -510,10 +553,3 @@ def _spin(a: FloatArray) -> FloatArray:
     """Matrix of a x."""
     x, y, z = a
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def _rows(name: str, x: Any, what: str) -> FloatArray:
-    given = np.atleast_2d(floats(x))
-    if given.ndim != 2 or given.shape[1] != 3 or not np.isfinite(given).all():
-        raise ValueError(f"{name}={x!r}: pass {what} of shape (3,) or (n, 3)")
-    return given

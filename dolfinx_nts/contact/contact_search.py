@@ -11,14 +11,15 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory, Contribution
+from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
+from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.elements import Step
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.validation import StepFailedError
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step.problem import Evaluation
+    from dolfinx_nts.step.evaluation import Evaluation
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -65,6 +66,20 @@ class ContactSearch:
         self.beside = [(0.0, -1)] * len(contacts)
         self._cover = [0.0] * len(contacts)
         self._known: dict[int, tuple[list[FloatArray], ContactElements]] = {}
+        self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
+        self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
+
+    @property
+    def had_unknowns(self) -> list[BoolArray]:
+        """Of each contact, which of this rank's slave nodes have unknowns in the last step."""
+        if not self.elements:
+            return self._had
+        both = zip(self._had, self.elements, strict=True)
+        return [np.isin(np.arange(len(had)), c.candidates.node) for had, c in both]
+
+    def resume(self, had: Sequence[BoolArray]) -> None:
+        """Go on from another run's `had_unknowns`, before the first step."""
+        self._had = list(had)
 
     # ---- elements of a step
     def begin(
@@ -84,7 +99,8 @@ class ContactSearch:
             self._followed = [old.followed for old in self._old]
             self._found = [self._search(k) for k in range(len(self._pairs))]
             self._drop_doubles()
-            self._with_unknowns = [self._may_touch(k, c) for k, c in enumerate(self._found)]
+            had = self.had_unknowns
+            self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in enumerate(self._found)]
         self._choose()
 
     def _choose(self) -> None:
@@ -137,7 +153,17 @@ class ContactSearch:
             gap += _EPS * pair.given
         # A force that is rounding of the bodies' own would stick or slip by its sign.
         force = step.force_rounding(bodies) if pair.friction else 0.0
-        return replace(elements, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
+        elements = replace(elements, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
+        massless = self._massless[k][found.node]
+        if not (step.integrator.inertia and massless.any()):
+            return elements
+        old, before = self._old[k], np.zeros((len(massless), 3))
+        carried = elements.multipliers(old.force[found.node], old.tangential[found.node])
+        before[:, 0] = step.factor * carried[:, 0]
+        if pair.friction:
+            before[:, 1:] = step.factor * carried[:, -2:]
+        before[~massless] = np.nan
+        return replace(elements, before=before)
 
     def _drop_doubles(self) -> None:
         """Of two pairs that keep a node out of the same fixed surface, leave one.
@@ -160,7 +186,7 @@ class ContactSearch:
                 if len(there):
                     self._found[k] = c.part(~np.isin(np.arange(c.num_elements), there))
 
-    def _may_touch(self, k: int, c: ContactElements) -> BoolArray:
+    def _may_touch(self, k: int, c: ContactElements, had: BoolArray) -> BoolArray:
         """Which candidates need unknowns: all within reach, and who had them in the last step.
 
         In statics, where no motion bounds the next one, all do. Strong friction may hold nodes that
@@ -175,10 +201,9 @@ class ContactSearch:
             closes = self._gap(k, c, self._step.first) < -_SURELY * reach
             return closes | (force > c.no_pull(self._old[k].tangential[node]))
         # What goes to and fro at the limit would change the layout in every step.
-        had = np.isin(node, self.elements[k].candidates.node) if self.elements else False
         # Of nodes that rest all or none: whether rounding closes their gaps must not divide forces.
         near = reach + c.rounding if c.pair.redundant else reach
-        awake: BoolArray = had | (c.candidates.gap < near) | (force > 0.0)
+        awake: BoolArray = had[node] | (c.candidates.gap < near) | (force > 0.0)
         return awake
 
     # ---- a solution

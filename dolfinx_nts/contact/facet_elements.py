@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.contact.contact_elements import ContactElements, Slip
-from dolfinx_nts.kernels import facets, nts_element
+from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.contact.contact_laws import Slip
+from dolfinx_nts.kernels import compiled, facets, nts_element
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -39,13 +40,14 @@ class FacetElements(ContactElements):
             candidates=self.candidates.part(chosen),
             x0=self.x0[chosen],
             scale=self.scale[chosen],
+            before=self._before_of(chosen),
             master_scale=self.master_scale[chosen],
         )
 
     @property
     def num_control(self) -> int:
         """Corners of a facet, or control points of its patch."""
-        return self.pair.master.patches.shape[1]
+        return self.x0.shape[1] - 1
 
     @property
     def _only_normal(self) -> bool:
@@ -64,14 +66,14 @@ class FacetElements(ContactElements):
     @cached_property
     def master_nodes(self) -> Points:
         """Nodes that the facets depend on."""
-        nodes: Points = self.pair.master.facet_nodes.part(self.candidates.facet)
+        nodes: Points = self.pair.master.facet_nodes.part(self.candidates.patch)
         return nodes
 
     @cached_property
     def _master_fixed(self) -> BoolArray:
         """Which coordinates of the facets' points are prescribed, shape (n, points, 3)."""
         master = self.pair.master
-        fixed: BoolArray = master.fixed[master.patches[self.candidates.facet]]
+        fixed: BoolArray = master.fixed[master.patches[self.candidates.patch]]
         return fixed
 
     @property
@@ -98,7 +100,7 @@ class FacetElements(ContactElements):
         weights = self.pair.master.weights
         if weights is None:
             return self.foot
-        foot: FloatArray = np.einsum("nk,nkp->np", self.foot, weights[self.candidates.facet])
+        foot: FloatArray = np.einsum("nk,nkp->np", self.foot, weights[self.candidates.patch])
         return foot
 
     def gap(self, x: FloatArray) -> FloatArray:
@@ -115,7 +117,7 @@ class FacetElements(ContactElements):
     def _control_weights(self) -> FloatArray | None:
         """Weights of the nodes in the control points, (n, nc, k), if they differ."""
         weights = self.pair.master.facet_weights
-        return None if weights is None else weights[self.candidates.facet]
+        return None if weights is None else weights[self.candidates.patch]
 
     @cached_property
     def _tangents(self) -> FloatArray:
@@ -145,7 +147,8 @@ class FacetElements(ContactElements):
         if self.rule == "direct":
             return self._direct(x, multiplier)
         if self.condense:
-            return self._condensed(x, multiplier)
+            found = self._compiled(x, multiplier) if self.rule == "mean-value" else None
+            return found or self._condensed(x, multiplier)
         return self._invariants(x, augmented, multiplier)
 
     def _direct(
@@ -199,7 +202,7 @@ class FacetElements(ContactElements):
 
     def _projection(self, x: FloatArray) -> FloatArray:
         """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
-        xi, converged = facets.project(x[:, 0], x[:, 1:], self.candidates.xi)
+        xi, converged = compiled.project(x[:, 0], x[:, 1:], self.candidates.xi)
         xi[~converged] = np.nan
         return xi
 
@@ -259,6 +262,20 @@ class FacetElements(ContactElements):
         metric_gradient[..., :size] = by_z.reshape(n, 2, 2, size) * scale_z[:, None, None]
         slip = self._slip(augmented[:, 3:] - length * c.xi, gradient, metric, metric_gradient)
         return residual, tangent, e.constraint[:, 0], slip
+
+    def _compiled(
+        self, x: FloatArray, multiplier: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None] | None:
+        """`_condensed` of the mean value where it is compiled."""
+        c, xi = self.candidates, self._projection(x)
+        k = compiled.condensed(self.x0, x, c.normal, c.xi, xi, c.length, multiplier)
+        if k is None:
+            return None
+        slip = None
+        if self.num_tangential:
+            value = c.length[:, None] * (xi - c.xi)
+            slip = Slip(value, k.slip_gradient, k.metric, k.metric_gradient)
+        return k.residual, k.tangent, k.gap, slip
 
     def _condensed(
         self, x: FloatArray, multiplier: FloatArray

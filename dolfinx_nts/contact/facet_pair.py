@@ -21,7 +21,7 @@ from dolfinx_nts.contact.pair import (
 )
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.elements import Step
-from dolfinx_nts.kernels import facets, nts_element, patches
+from dolfinx_nts.kernels import compiled, facets, nts_element, patches
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -33,6 +33,9 @@ _OVERHANG = 0.05
 #: ... and this far beyond an edge shared with another facet, between the normal cones of a convex
 #: edge, and further by what the node may be away.
 _WEDGE = 0.5
+#: A foot is followed from piece to piece of the surface over a facet so often; then the last will
+#: do, as neighbours go on alike beyond their border.
+_MOST_PATCHES = 3
 #: A node this part of a facet behind it, or less, is outside.
 _OUTSIDE = 1e-6
 
@@ -100,7 +103,7 @@ class FacetPair(ContactPair, master=Surface):
 
     def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
         """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
-        control = self.master.control_points(positions[1], found.facet)
+        control = self.master.control_points(positions[1], found.patch)
         return np.concatenate([super().points(positions, found), control], axis=1)
 
     def find(
@@ -154,7 +157,7 @@ class FacetPair(ContactPair, master=Surface):
             x0=self.points(positions, found),
             scale=step.scale(self.slave)[self.slave.share[found.node]],
             theta=rule.theta,
-            master_scale=step.scale(master)[master.patches[found.facet]],
+            master_scale=step.scale(master)[master.patches[found.patch]],
         )
 
     def _along_paths(
@@ -172,7 +175,7 @@ class FacetPair(ContactPair, master=Surface):
         change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
         corners, node = master[self.master.facets], found.node[change]
         if len(node):
-            start, _ = facets.closest_point(x[node], corners[facet])
+            start, _ = compiled.closest_point(x[node], corners[facet])
             other, _ = self._measure(x, master, node, facet, start, motion.reach)
             found = _replace(found, other)
         aimed = motion.aimed
@@ -183,7 +186,7 @@ class FacetPair(ContactPair, master=Surface):
             aimed = np.where(hit >= 0, hit, aimed)
         node = np.flatnonzero(aimed >= 0)
         if len(node):
-            start, _ = facets.closest_point(x[node], corners[aimed[node]])
+            start, _ = compiled.closest_point(x[node], corners[aimed[node]])
             other, _ = self._measure(x, master, node, aimed[node], start, None)
             found = _replace(found, other)
         return found
@@ -218,11 +221,12 @@ class FacetPair(ContactPair, master=Surface):
         slave_path, master_path = self._gather_paths(motions)
         hit, _ = search.first_hits(x, slave_path, corners, master_path[self.master.facets])
         node = np.flatnonzero((hit >= 0) & (hit != held))
-        control = self.master.control_points(master + master_path, hit[node])
-        end = (x + slave_path)[node]
-        xi, converged = facets.project(end, control, np.zeros((len(node), 2)))
+        end, moved = (x + slave_path)[node], master + master_path
+        start = np.zeros((len(node), 2))
+        _, control, xi, converged = self._projected(end, moved, hit[node], start)
         foot, _, normal = facets.frame(control, xi)
-        depth = np.einsum("ni,ni->n", normal, foot - end) / facets.size(control)
+        length = facets.size(moved[self.master.facets[hit[node]]])
+        depth = np.einsum("ni,ni->n", normal, foot - end) / length
         # A node that is held at another facet may end a little behind this one.
         deep = depth > np.where(held[node] >= 0, MARGIN, _OUTSIDE)
         hit[np.setdiff1d(np.arange(len(hit)), node[deep | ~converged])] = -1
@@ -241,20 +245,40 @@ class FacetPair(ContactPair, master=Surface):
 
         Projected from `start`; with reach None all may touch whose projection is found.
         """
-        pair = self.master.control_points(master, facet)
-        xi, converged = facets.project(x[node], pair, start)
-        foot, _, normal = facets.frame(pair, xi)
+        patch, control, xi, converged = self._projected(x[node], master, facet, start)
+        foot, _, normal = facets.frame(control, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
-        length = facets.size(pair)
-        legal = converged & self._movable(node, facet)
+        length = facets.size(master[self.master.facets[facet]])
+        legal = converged & self._movable(node, patch)
         beyond = np.zeros_like(legal)
         if reach is not None:
             over, beyond = self._over_facet(facet, xi, reach / length)
             legal &= over & (gap > -MARGIN * length) & (gap < reach + MARGIN * length)
-        found = Candidates(
-            node[legal], facet[legal], xi[legal], normal[legal], gap[legal], length[legal]
-        )
+        found = Candidates(node, facet, patch, xi, normal, gap, length).part(legal)
         return found, node[beyond]
+
+    def _projected(
+        self, points: FloatArray, master: FloatArray, facet: IntArray, start: FloatArray
+    ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+        """Projection of points (n, 3) onto what lies over their facets (n,), from `start` (n, 2).
+
+        Returns:
+            Patches, shape (n,), their control points [m], coordinates and which converged.
+        """
+        patch = self.master.patch_at(facet, start)
+        control = self.master.control_points(master, patch)
+        xi, converged = compiled.project(points, control, start)
+        for _ in range(_MOST_PATCHES):
+            other = self.master.patch_at(facet, xi)
+            change = np.flatnonzero(converged & (other != patch))
+            if not change.size:
+                break
+            patch[change] = other[change]
+            control[change] = self.master.control_points(master, patch[change])
+            xi[change], converged[change] = compiled.project(
+                points[change], control[change], xi[change]
+            )
+        return patch, control, xi, converged
 
     def _crossings(
         self, c: Candidates, master: FloatArray, slave_motion: FloatArray, master_motion: FloatArray
@@ -265,11 +289,11 @@ class FacetPair(ContactPair, master=Surface):
         that what changes of facet cost and bring cancels in the long run.
         """
         nc = self.master.facets.shape[1]
-        pair = self.master.control_points(master, c.facet)
+        pair = self.master.control_points(master, c.patch)
         shape, _, _ = facets.shape(c.xi, pair.shape[1])
         _, tangents, _ = facets.frame(pair, c.xi)
         motion = slave_motion[c.node]
-        carried = self.master.control_points(master_motion, c.facet)
+        carried = self.master.control_points(master_motion, c.patch)
         motion = motion - np.einsum("ni,nij->nj", shape, carried)
         metric = np.einsum("naj,nbj->nab", tangents, tangents)
         along = np.einsum("naj,nj->na", tangents, motion)
@@ -295,10 +319,10 @@ class FacetPair(ContactPair, master=Surface):
         inside: BoolArray = (free | (excess <= wedge[:, None])).all(axis=1) & ~beyond
         return inside, beyond
 
-    def _movable(self, node: IntArray, facet: IntArray) -> BoolArray:
+    def _movable(self, node: IntArray, patch: IntArray) -> BoolArray:
         """Whether any coordinate of a pair is free; without one there is nothing to solve for."""
         slave = self.slave.fixed[self.slave.share[node]].all(axis=1)
-        master = self.master.fixed[self.master.patches[facet]].all(axis=(1, 2))
+        master = self.master.fixed[self.master.patches[patch]].all(axis=(1, 2))
         return ~(slave & master)
 
 

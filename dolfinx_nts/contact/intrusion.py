@@ -165,10 +165,14 @@ class Placed:
         largest: FloatArray = self.sizes[self.boundary.beside[edge]].max(axis=1)
         return largest
 
+    @cached_property
+    def facet_boxes(self) -> tuple[FloatArray, FloatArray]:
+        """Smallest and largest coordinates of each facet [m], shape (m, 3) each."""
+        return self.corners.min(axis=1), self.corners.max(axis=1)
+
     def facets_near(self, box: FloatArray) -> IntArray:
         """Facets whose boxes meet a box (2, 3)."""
-        c = self.corners
-        return np.flatnonzero(_meet(c.min(axis=1), c.max(axis=1), box))
+        return np.flatnonzero(_meet(*self.facet_boxes, box))
 
     def depth(
         self, points: FloatArray, reach: FloatArray | float, chosen: IntArray | None = None

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.contact_elements import ContactElements, Contribution, Slip
+from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.contact.contact_laws import Contribution, Slip
 from dolfinx_nts.contact.obstacles import inverse
 from dolfinx_nts.kernels.nts_element import Gap
 

@@ -63,7 +63,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
         node = np.flatnonzero(movable & (gap.value < reach + MARGIN * length))
         only, xi = np.zeros(len(node), dtype=np.int64), np.zeros((len(node), 2))
         normal = gap.gradient[node, 0]
-        found = Candidates(node, only, xi, normal, gap.value[node], length[node])
+        found = Candidates(node, only, only, xi, normal, gap.value[node], length[node])
         cover = reach + MARGIN * float(np.sqrt(slave.area.min()))
         return Found(found, np.ones(len(slave.share), dtype=bool), cover)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,14 @@ class Obstacle:
 
     name: str
     motion: Motion | None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a restart compares: the fields of a dataclass, of a motion whether there is one."""
+        given: dict[str, Any] = {}
+        if is_dataclass(self):
+            given = {f.name: getattr(self, f.name) for f in fields(self)}
+        return given | {"name": self.name, "motion": self.motion is not None}
 
     def displacement(self, time: float, comm: Any) -> FloatArray:
         """Displacement at a time [m], shape (3,). Collective if there is a motion.

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.validation import known_options
 
@@ -35,6 +36,7 @@ class Candidates(NamedTuple):
     Attributes:
         node: Positions in the slave surface's `share`, shape (n,).
         facet: Facets of the master surface, shape (n,).
+        patch: What lies over them there, as of `Surface.patch_at`, shape (n,).
         xi: Orthogonal projection at t_n, shape (n, 2).
         normal: Outward unit normal of the master there, shape (n, 3).
         gap: g_0 [m], shape (n,).
@@ -43,6 +45,7 @@ class Candidates(NamedTuple):
 
     node: IntArray
     facet: IntArray
+    patch: IntArray
     xi: FloatArray
     normal: FloatArray
     gap: FloatArray
@@ -54,7 +57,7 @@ class Candidates(NamedTuple):
 
 
 NO_CANDIDATES = Candidates(
-    np.empty(0, np.int64), np.empty(0, np.int64),
+    np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64),
     np.empty((0, 2)), np.empty((0, 3)), np.empty(0), np.empty(0),
 )  # fmt: skip
 
@@ -140,6 +143,28 @@ class ContactPair:
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
         self._set_up()
+
+    @classmethod
+    def between(cls, a: Any, b: Any, **options: Any) -> ContactPair:
+        """A pair whose slave is the surface that is finer where both are near. Collective.
+
+        Master nodes may enter the slave between its nodes, the farther the fewer these are. Of
+        surfaces whose node spacings are within 10 % the softer one is the slave, of those that are
+        as stiff, too, the first one. An obstacle is always the master, and a rigid body that of
+        one that is not. All is measured in the reference, on all ranks alike; where contact moves
+        to parts that are meshed differently, choose yourself.
+
+        Args:
+            a: A surface, or a `Plane`, `Sphere` or `Cylinder`.
+            b: The other one.
+            options: As of `ContactPair`, e.g. friction.
+
+        Raises:
+            TypeError: `a` or `b` is of no known kind, both are obstacles, or an unknown option.
+            ValueError: As of `ContactPair`.
+        """
+        slave, master = slave_and_master(a, b)
+        return cls(slave, master, **options)
 
     # ---- what a kind of master has of its own
     def _set_up(self) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
 
 FloatArray = npt.NDArray[np.float64]
@@ -77,7 +78,7 @@ class _Scene(NamedTuple):
 
     def closest(self, point: IntArray, facet: IntArray) -> tuple[FloatArray, FloatArray]:
         """Closest points of pairs: coordinates [-], shape (p, 2), and distances [m], shape (p,)."""
-        return fc.closest_point(self.points[point], self.corners[facet])
+        return compiled.closest_point(self.points[point], self.corners[facet])
 
     def rounding(self, point: IntArray, facet: IntArray, distance: FloatArray) -> FloatArray:
         """Difference of distances that means nothing [m], shape (p,)."""
@@ -118,15 +119,22 @@ def closest_facets(
     if n == 0 or len(corners) == 0:
         return result
     scene = _Scene(points, corners, fc.size(corners))
-    kept, near = _current(scene, limit, current), _near_box(scene, limit)
-    classes = _size_classes(corners)
+    kept = _current(scene, limit, current)
+    if not compiled.closest_facets(points, corners, scene.sizes, limit, ROUNDING, result):
+        _by_trees(scene, limit, kept, result)
+    _prefer(scene, kept, preference, result)
+    return result
+
+
+def _by_trees(scene: _Scene, limit: FloatArray, kept: Closest, result: Closest) -> None:
+    """Enter the closest facets of all points into the result."""
+    near = _near_box(scene, limit)
+    classes = _size_classes(scene.corners)
     new = near[kept.facet[near] < 0]
     bound = kept.distance.copy()
     bound[new] = _upper_bounds(scene, new, classes, limit[new])
     for point, facet in _candidates(scene, near, classes, bound[near]):
         _choose(scene, limit, point, facet, result)
-    _prefer(scene, kept, preference, result)
-    return result
 
 
 def first_hits(

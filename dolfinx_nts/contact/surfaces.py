@@ -8,7 +8,6 @@ positions are gathered when a search needs them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -21,7 +20,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.points import Points, at_mesh, at_nodes
 from dolfinx_nts.contact import search
 from dolfinx_nts.kernels import facets as facet_math
-from dolfinx_nts.kernels import patches
+from dolfinx_nts.kernels import patches, triangle_patches
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.validation import at_points, is_whole
 
@@ -29,7 +28,6 @@ logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
-Marker = Callable[[FloatArray], npt.NDArray[np.bool_]]
 
 _CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
 
@@ -49,13 +47,13 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
         ValueError: The marker raises or returns no truth values, the tags are not facet tags, or
             no exterior facet is selected, or an interior facet is.
     """
-    exterior = compat.exterior_facets(mesh)
+    exterior, dim = compat.exterior_facets(mesh), mesh.topology.dim - 1
     if tag is None:
         if not callable(marker):
             raise TypeError(
                 f"{what}={marker!r}: pass a function of x with shape (3, n), or meshtags and a tag"
             )
-        nodes = compat.entities_to_geometry(mesh, 2, exterior)
+        nodes = compat.entities_to_geometry(mesh, dim, exterior)
         used, chosen = np.unique(nodes), np.zeros(len(mesh.geometry.x), dtype=bool)
         chosen[used] = at_points(mesh.comm, what, marker, mesh.geometry.x[used].T, (), "b")
         found = exterior[chosen[nodes].all(axis=1)]
@@ -63,15 +61,15 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
     else:
         if callable(marker):
             raise TypeError(f"{what}: a function of x takes no tag, but {tag!r} is given")
-        if not hasattr(marker, "find") or marker.dim != 2:
+        if not hasattr(marker, "find") or marker.dim != dim:
             raise ValueError(
-                f"{what}={marker!r}: pass facet meshtags (dimension 2), not cell or edge tags"
+                f"{what}={marker!r}: pass facet meshtags (dimension {dim}), not cell or edge tags"
             )
         if not is_whole(tag):
             raise TypeError(f"{what} (tag {tag!r}): pass a whole number as the tag")
         tagged = marker.find(tag)
         found = np.intersect1d(tagged, exterior).astype(np.int32)
-        owned = tagged < mesh.topology.index_map(2).size_local
+        owned = tagged < mesh.topology.index_map(dim).size_local
         wrong = int(np.count_nonzero(owned) - len(found))
     total, wrong = (int(n) for n in np.sum(mesh.comm.allgather((len(found), wrong)), axis=0))
     name = what if tag is None else f"{what} (tag {tag})"
@@ -99,10 +97,11 @@ class Surface:
         points: Global node numbers of the corner points, sorted, shape (p,).
         facets: Corner points of the facets as positions in `points`, cyclic and counter-clockwise
             seen from outside, shape (m, nc); the order does not depend on the partition.
-        patches: Points that the surface over each facet depends on, the corners first: (m, nc), or
-            (m, 16) with smoothing.
-        weights: With smoothing, the patches' control points from these points, shape (m, 16, 16);
-            else None, as corners and control points are the same.
+        patches: Points that each patch depends on, the corners of its facet first: one patch a
+            facet, (m, nc), or with smoothing (m, 16) over quadrilaterals, and three over each
+            triangle, one after another, (3 m, q).
+        weights: With smoothing, the patches' control points from these points, shape (m, 16, 16) or
+            (3 m, 15, q); else None, as corners and control points are the same.
         original: Input numbers of the points, the same for every number of ranks, shape (p,).
         reference: Reference positions [m], shape (p, 3).
         area: Tributary area of each point [m^2], shape (p,).
@@ -151,40 +150,46 @@ class Surface:
         self.fixed = ~free.any(axis=1)
 
     def _smooth(self, corners: FloatArray) -> None:
-        """Lay patches over the facets with reference corners (m, 4, 3)."""
-        nc = self.facets.shape[1]
-        if nc != 4:
-            raise ValueError(
-                f"smoothing=True: the surface of {self.body.name!r} has triangles; smoothing needs "
-                "quadrilaterals: mesh the body with hexahedra, or leave smoothing out"
-            )
-        self.patches, self.weights, irregular = patches.control_net(self.facets, corners)
+        """Lay patches over the facets with reference corners (m, nc, 3)."""
+        if self.facets.shape[1] == 4:
+            self.patches, self.weights, irregular = patches.control_net(self.facets, corners)
+            where = "where other than four facets meet"
+        else:
+            points, weights, irregular = triangle_patches.control_net(self.facets, self.reference)
+            self.patches = np.repeat(points, triangle_patches.PIECES, axis=0)
+            self.weights = weights.reshape(-1, *weights.shape[2:])
+            where = "around which facets have no tangent plane in common"
         if irregular.any() and self.body.comm.rank == 0:
             logger.warning(
-                "surface of %r: %d of %d facets have a corner where other than four facets meet; "
-                "there smoothing leaves edges",
-                self.body.name, irregular.sum(), len(irregular),
+                "surface of %r: %d of %d facets have a corner %s; there smoothing leaves edges",
+                self.body.name, irregular.sum(), len(irregular), where,
             )  # fmt: skip
 
-    def control_points(self, x: FloatArray, facet: IntArray) -> FloatArray:
-        """What the surface over given facets is interpolated from [m], shape (n, nc or 16, 3).
+    def patch_at(self, facet: IntArray, xi: FloatArray) -> IntArray:
+        """Number in `patches` of what lies over facets (n,) at xi (n, 2), shape (n,)."""
+        if len(self.patches) == len(self.facets):
+            return facet.copy()
+        return triangle_patches.PIECES * facet + triangle_patches.piece(xi)
+
+    def control_points(self, x: FloatArray, patch: IntArray) -> FloatArray:
+        """What the surface in given patches is interpolated from [m], shape (n, nc, 3).
 
         Args:
             x: Positions of all points [m], shape (p, 3).
-            facet: Facets, shape (n,).
+            patch: Patches, shape (n,).
         """
-        return self.combine(x[self.patches[facet]], facet)
+        return self.combine(x[self.patches[patch]], patch)
 
-    def combine(self, x: FloatArray, facet: IntArray) -> FloatArray:
-        """Control points from the points of the facets' patches [m], both (n, nc or 16, 3)."""
+    def combine(self, x: FloatArray, patch: IntArray) -> FloatArray:
+        """Control points (n, nc, 3) from the patches' points (n, q, 3) [m]."""
         if self.weights is None:
             return x
-        result: FloatArray = np.matmul(self.weights[facet], x)
+        result: FloatArray = np.matmul(self.weights[patch], x)
         return result
 
     @cached_property
     def facet_nodes(self) -> Points:
-        """Nodes of the body that the surface over each facet depends on; their weights are 0."""
+        """Nodes of the body that each patch depends on; their weights are 0."""
         m = self.material
         used, at = np.unique(m.nodes, return_index=True)
         nodes = m.nodes[self.patches]
@@ -198,9 +203,9 @@ class Surface:
 
     @cached_property
     def facet_weights(self) -> FloatArray | None:
-        """Weights of `facet_nodes` in the control points, (m, nc or 16, k); None if they are one.
+        """Weights of `facet_nodes` in the control points, (patches, nc, k); None if they are one.
 
-        Of a node that stands twice the first one counts.
+        If a node occurs twice, its first entry counts.
         """
         m = self.material
         if m.are_nodes:
@@ -230,6 +235,14 @@ class Surface:
         """Mass of the points' nodes [kg], shape (p,). Collective."""
         return self.material.divided(self.body.nodal_mass)
 
+    @property
+    def massless(self) -> npt.NDArray[np.bool_]:
+        """Whether the points are nodes without mass, shape (p,). Collective."""
+        if not getattr(self.body, "has_massless", False):
+            return np.zeros(len(self.points), dtype=bool)
+        found: npt.NDArray[np.bool_] = self.material.nodal(self.body.massless).all(axis=(1, 2))
+        return found
+
     @cached_property
     def _dealt(self) -> IntArray:
         """Shares of all ranks one after another. Collective."""
@@ -240,7 +253,11 @@ class Surface:
         comm = self.body.comm
         table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
         table[self._dealt] = gather_rows(comm, values)
-        start = comm.exscan(len(self.rows)) or 0
+        return self.owned(table)
+
+    def owned(self, table: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values at the points of `rows` from those at all points. Collective."""
+        start = self.body.comm.exscan(len(self.rows)) or 0
         return table[start : start + len(self.rows)]
 
     def depth(self, x: FloatArray, u: FloatArray) -> FloatArray:
@@ -307,8 +324,8 @@ def _distinct(rows: IntArray) -> IntArray:
 def _rank_of(nodes: IntArray, size: int) -> IntArray:
     """Rank that computes the contact of each node (input number), shape (n,).
 
-    As good as by lot, so that every part of a surface is divided, and alike in all surfaces of a
-    body. The mixing is that of Steele, Lea and Flood's SplitMix64.
+    A hash of the number spreads each part of a surface over the ranks, alike for all surfaces of a
+    body. Its mixing is that of Steele, Lea and Flood's SplitMix64.
     """
     x = np.asarray(nodes).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):

@@ -9,6 +9,7 @@ import ufl
 
 from dolfinx_nts.integrators.rule import MiddleOfStep, choose
 from dolfinx_nts.kernels.discrete_gradient import gonzalez_stress, mean_value_stress
+from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy, green_strain
 from dolfinx_nts.validation import is_whole, known_options
 
@@ -24,7 +25,8 @@ class EnergyMomentum(MiddleOfStep):
             error otherwise).
         contact_gradient: Discrete gradient of the contact constraints, "mean-value" (exact, unit
             independent) or "gonzalez" (the paper's (67), for comparison).
-        quadrature_points: Gauss points in time of the mean-value stress, 1 to 7.
+        quadrature_points: Gauss points in time, 1 to 7, of the mean-value stress and, whatever
+            `stress` is, of the forces of a `FormBody`.
 
     Raises:
         ValueError: Unknown rule or number of points.
@@ -57,3 +59,7 @@ class EnergyMomentum(MiddleOfStep):
         else:
             stress = mean_value_stress(energy, e0, e1, self.quadrature_points)
         return (ufl.Identity(3) + 0.5 * (h0 + h1)) * stress
+
+    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+        """Virtual work of a potential's forces in the mean over the step in UFL [J]."""
+        return potential.mean_virtual_work(u0, u1, w, self.quadrature_points)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from dolfinx_nts.integrators.rule import WithAccelerations, stress_of
+from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
 from dolfinx_nts.validation import is_finite, known_options
 
@@ -52,3 +53,7 @@ class GeneralizedAlpha(WithAccelerations):
     def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
         """First Piola-Kirchhoff stress P = F S(E(F)) of F at t_n + theta h in UFL [Pa]."""
         return stress_of(energy, h0 + self.theta * (h1 - h0))
+
+    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+        """Virtual work of a potential's forces at t_n + theta h in UFL [J]."""
+        return potential.virtual_work(u0 + self.theta * (u1 - u0), w)

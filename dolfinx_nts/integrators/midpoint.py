@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from dolfinx_nts.integrators.rule import MiddleOfStep, stress_of
+from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
 from dolfinx_nts.validation import known_options
 
@@ -24,3 +25,7 @@ class Midpoint(MiddleOfStep):
     def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
         """First Piola-Kirchhoff stress P = F_m S(E(F_m)) in UFL [Pa] of F = 1 + H."""
         return stress_of(energy, 0.5 * (h0 + h1))
+
+    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+        """Virtual work of a potential's forces in the middle in UFL [J]."""
+        return potential.virtual_work(0.5 * (u0 + u1), w)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from dolfinx_nts.integrators.rule import WithAccelerations, stress_of
+from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
 from dolfinx_nts.validation import is_finite, known_options
 
@@ -57,3 +58,7 @@ class Newmark(WithAccelerations):
     def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
         """First Piola-Kirchhoff stress P = F_1 S(E_1) in UFL [Pa] of F = 1 + H."""
         return stress_of(energy, h1)
+
+    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+        """Virtual work of a potential's forces at t_{n+1} in UFL [J]."""
+        return potential.virtual_work(u1, w)

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 
+from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy, green_strain
 
 FloatArray = npt.NDArray[np.float64]
@@ -60,6 +61,9 @@ class Integrator(Protocol):
 
     def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
         """First Piola-Kirchhoff stress in UFL [Pa] from displacement gradients at both ends."""
+
+    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+        """Virtual work of a potential's forces in UFL [J] from displacements at both ends."""
 
 
 class InTime:

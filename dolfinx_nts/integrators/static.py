@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.integrators.rule import stress_of
+from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,3 +53,7 @@ class Static:
     def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
         """First Piola-Kirchhoff stress P = F_1 S(E_1) in UFL [Pa] of F = 1 + H."""
         return stress_of(energy, h1)
+
+    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+        """Virtual work of a potential's forces at t_{n+1} in UFL [J]."""
+        return potential.virtual_work(u1, w)

@@ -18,6 +18,7 @@ from dolfinx_nts.validation import (
     floats,
     is_finite,
     require_name,
+    require_same,
     vector,
 )
 
@@ -105,13 +106,21 @@ class Between(ABC):
         name: str | None,
     ) -> None:
         self.ends = a, b
-        self.name = named(type(self).__name__, a, b, name)
+        kind = type(self).__name__
+        self.name = named(kind, self.ends, name)
+        if a is b:
+            raise ValueError(
+                f"a=b={a.name!r}: a {kind} joins two bodies; pass another one, or None for the "
+                "ground"
+            )
         self.bodies = tuple(body for body in (a, b) if body is not None)
         self.comm = self.bodies[0].comm
         argument, *given = points
+        require_same(self.comm, **{argument: given, "name": name})
         places = [vector(argument, x, "m") for x in given]
+        self._places = places
         held = [
-            None if body is None else self._at(argument, body, x)
+            None if body is None else points_of(f"{argument} of {self.name!r}", body, x)
             for body, x in zip((a, b), places, strict=True)
         ]
         self._sides = [side for side in held if side is not None]
@@ -124,12 +133,6 @@ class Between(ABC):
         )
         lengths = [body.length for body in self.bodies if hasattr(body, "length")]
         self.length = float(np.exp(np.mean(np.log(lengths)))) if lengths else 1.0
-
-    def _at(self, argument: str, body: Any, x: FloatArray) -> Any:
-        try:
-            return body.points(x)
-        except ValueError as error:
-            raise ValueError(f"{argument} of {self.name!r}: {error}") from error
 
     def _vector(self, end: int, side: Any, fixed: FloatArray) -> Vector:
         """A vector at an end, from its `Points`, or of the ground."""
@@ -148,18 +151,19 @@ class Between(ABC):
         Raises:
             ValueError: A body has none.
         """
-        for role, body in zip("ab", self.ends, strict=True):
-            if body is not None and not hasattr(body, "directions"):
-                raise ValueError(
-                    f"{role}={body.name!r}: a flexible body has no directions for {self.name!r}; "
-                    "tie a rigid body to a patch of its nodes, Tie(rigid, body.surface(...)), and "
-                    "join that one"
-                )
+        require_directions(self.ends, self.name, at_nodes=True)
         of_a, of_b = (
-            [self._vector(end, body and body.directions(d), d) for d in axes]
-            for end, body in enumerate(self.ends)
+            [self._vector(end, self._direction(body, d, x), d) for d in axes]
+            for end, (body, x) in enumerate(zip(self.ends, self._places, strict=True))
         )
         return of_a, of_b
+
+    @staticmethod
+    def _direction(body: Any, along: FloatArray, x: FloatArray) -> Any:
+        """`Points` of a direction that turns with a body where a joint holds it; None: ground."""
+        if body is None or hasattr(body, "directions"):
+            return body and body.directions(along)
+        return body.directions_at(along, x)
 
     def drive(self, argument: str, function: Any, unit: str, read: Callable[..., Any]) -> None:
         """Prescribe what a function of time says. Collective.
@@ -197,6 +201,20 @@ class Between(ABC):
         """Its elements on this rank."""
         return int(self.comm.rank == rank_of(self.name, self.comm))
 
+    @property
+    def numbers(self) -> npt.NDArray[np.int64]:
+        """Of its elements on this rank."""
+        return np.arange(self._here)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a restart compares; of a motion only whether there is one."""
+        return {
+            "bodies": ["ground" if body is None else body.name for body in self.ends],
+            "points": [place.tolist() for place in self._places],
+            "driven": self.motion is not None,
+        }
+
     def start(self) -> None:
         """Nothing to remember."""
         return None
@@ -214,21 +232,53 @@ class Between(ABC):
         )
 
 
-def named(kind: str, a: Any, b: Any, name: str | None) -> str:
-    """Name of a joint between these bodies, which are checked."""
+def named(kind: str, ends: Sequence[Any], name: str | None) -> str:
+    """Name of what is between two bodies, or a body and the ground, which are checked.
+
+    Args:
+        kind: Of joint, spring or damper.
+        ends: Its bodies; None is the ground.
+        name: As given; None: one is made.
+    """
     if name is not None:
         require_name("name", name)
-    if a is None and b is None:
-        raise ValueError(f"a=None, b=None: a {kind} needs a body; only one end may be the ground")
-    for role, body in (("a", a), ("b", b)):
+    for role, body in zip("ab", ends, strict=True):
+        if isinstance(body, type):
+            raise TypeError(
+                f"{role}={body!r}: is a class; pass a body made from it, {body.__name__}(...)"
+            )
         if body is not None and not hasattr(body, "points"):
             raise TypeError(f"{role}={body!r}: pass a body, or None for the ground")
-    if a is b:
-        raise ValueError(
-            f"a=b={a.name!r}: a {kind} joins two bodies; pass another one, or None for the ground"
-        )
-    ends = ("ground" if body is None else body.name for body in (a, b))
-    return name or f"{kind.lower()} of {' and '.join(ends)}"
+    if all(body is None for body in ends):
+        raise ValueError(f"a=None, b=None: a {kind} needs a body; only one end may be the ground")
+    both = ("ground" if body is None else body.name for body in ends)
+    return name or f"{kind.lower()} of {' and '.join(both)}"
+
+
+def require_directions(ends: Sequence[Any], name: str, *, at_nodes: bool) -> None:
+    """Raise a ValueError where a body has no directions.
+
+    Args:
+        ends: Bodies; None is the ground.
+        name: Of what needs them.
+        at_nodes: Whether directions that each node has of its own will do.
+    """
+    for role, body in zip("ab", ends, strict=True):
+        turns = hasattr(body, "directions") or (at_nodes and hasattr(body, "directions_at"))
+        if not (body is None or turns):
+            raise ValueError(
+                f"{role}={body.name!r}: a flexible body has no directions for {name!r}; tie a "
+                "rigid body to a patch of its nodes, Tie(rigid, body.surface(...)), or fix one to "
+                "a node of a beam, Fixed(rigid, beam, point=...), and take that one"
+            )
+
+
+def points_of(argument: str, body: Any, x: FloatArray) -> Any:
+    """A body's material points for a joint or spring, whose argument an error names."""
+    try:
+        return body.points(x)
+    except ValueError as error:
+        raise ValueError(f"{argument}: {error}") from error
 
 
 def direction(name: str, value: Any) -> FloatArray:

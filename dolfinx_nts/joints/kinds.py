@@ -90,6 +90,11 @@ class _WithAxis(Between):
         axes = triad(self.axis)
         (self.m1_a, self.m2_a, self.n_a), (self.m1_b, self.m2_b, self.n_b) = self.directions(axes)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Its axis, too."""
+        return super().settings | {"axis": self.axis.tolist()}
+
     def parallel(self) -> Iterator[Product]:
         """The axes of A and B: n_A . m1_B = 0, n_A . m2_B = 0."""
         yield self.square(self.n_a, self.m1_b)
@@ -236,6 +241,12 @@ class Universal(Between):
                 f"axes={axes!r} of {self.name!r}: are not at right angles; the arms of a cross are"
             )
         (self.n_a, _), (_, self.n_b) = self.directions(arms)
+        self.arms = arms
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Its arms, too."""
+        return super().settings | {"axes": self.arms.tolist()}
 
     def products(self, times: Times) -> Iterator[Product]:
         """Spherical, n_A . n_B = 0."""

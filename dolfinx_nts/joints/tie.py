@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -42,9 +43,17 @@ class Tie:
                 f"surface: its body {flexible.name!r} is rigid; hold it by Fixed(...), or tie a "
                 "surface of a flexible body"
             )
-        self.name, self.bodies = named("Tie", rigid, flexible, name), (rigid, flexible)
+        self.name, self.bodies = named("Tie", (rigid, flexible), name), (rigid, flexible)
         mine = surface.share
+        self.numbers = surface.original[mine]
         at = surface.reference[mine]
+        nodes = np.sort(surface.original).astype(np.int64)
+        #: What a restart compares.
+        self.settings = {
+            "bodies": [rigid.name, flexible.name],
+            "nodes": len(nodes),
+            "which nodes": zlib.crc32(nodes.tobytes()),
+        }
         self._sides: tuple[Points, ...] = (rigid.at_nodes(mine, at), surface.material.part(mine))
 
     def start(self) -> None:

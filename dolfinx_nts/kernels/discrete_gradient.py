@@ -49,10 +49,16 @@ _RESOLVED = {n: {k: _EPS ** (k / (2 * n)) for k in last} for n, last in _LAST.it
 _SMALL_STRAIN = 1e-7
 
 
+def gauss(points: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss points and weights on [0, 1]."""
+    tau, weight = _GAUSS[points]
+    return tau, weight
+
+
 def mean_value_stress(energy: StrainEnergy, e0: Any, e1: Any, points: int) -> Any:
     """S = int_0^1 dW/dE(E_0 + tau (E_1 - E_0)) dtau by Gauss points (UFL)."""
     tau, weight = _GAUSS[points]
-    return _combine(weight, [energy.stress(e0 + t * (e1 - e0)) for t in tau.tolist()])
+    return combine(weight, [energy.stress(e0 + t * (e1 - e0)) for t in tau.tolist()])
 
 
 def gonzalez_stress(energy: StrainEnergy, e0: Any, e1: Any) -> Any:
@@ -70,11 +76,11 @@ def gonzalez_stress(energy: StrainEnergy, e0: Any, e1: Any) -> Any:
     middle = samples[_POINTS // 2]
     size, argument = ufl.inner(de, de), energy.argument(em)
     scale = ufl.inner(argument, argument)
-    left = -_combine(weight, [f**2 for f in samples])
+    left = -combine(weight, [f**2 for f in samples])
     for k, last in _LAST[_POINTS].items():
-        left += (_combine(last, samples) / _RESOLVED[_POINTS][k]) ** 2
+        left += (combine(last, samples) / _RESOLVED[_POINTS][k]) ** 2
     left *= ufl.conditional(ufl.lt(size, _SMALL_STRAIN**2 * scale), 0.0, 1.0)
-    by_quadrature = _combine(weight, samples) - middle
+    by_quadrature = combine(weight, samples) - middle
     bracket = ufl.conditional(ufl.le(left, 0.0), by_quadrature, path.difference - middle)
     # Next to rest the term is below rounding, but its derivative would be rounding noise over DE.
     bracket = ufl.conditional(ufl.lt(size**2, _EPS**2 * scale), 0.0, bracket)
@@ -82,8 +88,8 @@ def gonzalez_stress(energy: StrainEnergy, e0: Any, e1: Any) -> Any:
     return path.middle + bracket / (size + 1e-200) * de
 
 
-def _combine(weights: FloatArray, values: list[Any]) -> Any:
-    """Weighted sum of UFL expressions."""
+def combine(weights: FloatArray, values: list[Any]) -> Any:
+    """Weighted sum of UFL expressions or forms."""
     first, *rest = (w * v for w, v in zip(weights.tolist(), values, strict=True))
     return sum(rest, start=first)
 

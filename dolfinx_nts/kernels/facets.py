@@ -7,8 +7,8 @@ from the number of corners `nc`:
   [-1, 1]^2, reference corners (-1, -1), (1, -1), (1, 1), (-1, 1);
 - `nc = 3`: linear, N = (1 - xi_1 - xi_2, xi_1, xi_2), `xi` in the unit triangle.
 
-`shape`, `frame`, `size` and `project` take the control points of a smooth patch as well (`nc = 16`,
-see `patches`), whose first four are the corners of its facet.
+`shape`, `third`, `frame` and `project` take the control points of a smooth patch as well: `nc = 16`
+over a quadrilateral, see `patches`, and `nc = 15` over a triangle, see `triangle_patches`.
 
 Lengths may come in any unit: every test in this module is relative.
 """
@@ -20,7 +20,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.kernels import patches
+from dolfinx_nts.kernels import patches, triangle_patches
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
@@ -29,10 +29,10 @@ BoolArray = npt.NDArray[np.bool_]
 EPS = float(np.finfo(np.float64).eps)
 
 # Newton converges quadratically, so the step after one of this size is at round-off.
-_LAST_STEP = 1e-10
+LAST_STEP = 1e-10
 _MAX_NEWTON = 60
 # Squared sine of an angle between two edges that is rounding only.
-_COLLINEAR = 1e-14
+COLLINEAR = 1e-14
 _MAX_HALVINGS = 40
 _MAX_BISECTIONS = 120
 
@@ -40,6 +40,8 @@ _REFERENCE = {
     3: np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
     4: np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]),
 }
+#: Modules of smooth patches by the number of control points.
+_SMOOTH = {p.NUM_POINTS: p for p in (patches, triangle_patches)}
 # Exact for what the facets need: integrals of N_I over a flat triangle, and over a parallelogram.
 _QUADRATURE = {
     3: (np.array([[1.0, 1.0]]) / 3.0, np.array([0.5])),
@@ -59,14 +61,14 @@ def shape(xi: FloatArray, nc: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 
     Args:
         xi: Convective coordinates [-], shape (n, 2).
-        nc: Number of corners, 3 or 4, or of control points, 16.
+        nc: Number of corners, 3 or 4, or of control points, 15 or 16.
 
     Returns:
         N [-], shape (n, nc); dN/dxi^a [-], shape (n, nc, 2); d2N/dxi^a dxi^b [-],
         shape (n, nc, 2, 2).
     """
-    if nc == patches.NUM_POINTS:
-        return patches.shape(xi)
+    if nc in _SMOOTH:
+        return _SMOOTH[nc].shape(xi)
     corner = _reference(nc)
     n = len(xi)
     if nc == 3:
@@ -79,6 +81,16 @@ def shape(xi: FloatArray, nc: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     second = np.zeros((n, 4, 2, 2))
     second[..., 0, 1] = second[..., 1, 0] = 0.25 * corner[:, 0] * corner[:, 1]
     return values, first, second
+
+
+def third(xi: FloatArray, nc: int) -> FloatArray | None:
+    """Third derivatives of the shape functions, shape (n, nc, 2, 2, 2); None where they are 0.
+
+    Args:
+        xi: Convective coordinates [-], shape (n, 2).
+        nc: Number of corners or control points.
+    """
+    return _SMOOTH[nc].third(xi) if nc in _SMOOTH else None
 
 
 def frame(corners: FloatArray, xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -107,7 +119,6 @@ def size(corners: FloatArray) -> FloatArray:
     Args:
         corners: Facet corners [m], shape (n, nc, 3).
     """
-    corners = corners[:, :4]
     edges = np.roll(corners, -1, axis=1) - corners
     return np.linalg.norm(edges, axis=2).mean(axis=1)
 
@@ -222,12 +233,12 @@ def _bilinear(c: FloatArray, xi: FloatArray) -> _Expansion:
     return g[:2, 3], metric, hessian, change
 
 
-def _bicubic(start: FloatArray, spans: FloatArray, xi: FloatArray) -> _Expansion:
+def _curved(start: FloatArray, spans: FloatArray, xi: FloatArray) -> _Expansion:
     """Expansion of the distance from smooth patches.
 
     Args:
         start: First corner relative to the point [m], shape (n, 3).
-        spans: Control points relative to the first corner [m], shape (n, 16, 3).
+        spans: Control points relative to the first corner [m], shape (n, nc, 3).
         xi: Convective coordinates [-], shape (2, n).
     """
     values, first, second = shape(xi.T, spans.shape[1])
@@ -240,7 +251,8 @@ def _bicubic(start: FloatArray, spans: FloatArray, xi: FloatArray) -> _Expansion
     metric, hessian = (np.stack([a[0, 0], a[0, 1], a[1, 1]]) for a in (square, curved))
 
     def change(step: FloatArray) -> list[FloatArray]:
-        powers = np.einsum("nip,nij->pnj", patches.along(xi.T, step.T)[:, :, 1:], spans)
+        along = _SMOOTH[spans.shape[1]].along(xi.T, step.T)
+        powers = np.einsum("nip,nij->pnj", along[:, :, 1:], spans)
         out = np.zeros((2 * len(powers), len(start)))
         out[: len(powers)] = np.einsum("pnj,nj->pn", powers, offset)
         out[0] = np.einsum("an,an->n", gradient, step)
@@ -295,15 +307,14 @@ def _refine(start: FloatArray, spans: FloatArray, xi: FloatArray) -> tuple[Float
     converged = np.zeros(xi.shape[1], dtype=bool)
     # Rounding of `start` limits the step that a far point can reach.
     far = np.abs(start).max(axis=1) / np.abs(spans).max(axis=(1, 2))
-    last_step = _LAST_STEP + 1e3 * EPS * far
-    smooth = spans.shape[1] == patches.NUM_POINTS
-    modes = None if smooth else _modes(start, spans)
+    last_step = LAST_STEP + 1e3 * EPS * far
+    modes = None if spans.shape[1] in _SMOOTH else _modes(start, spans)
     active = np.arange(len(start))
     for _ in range(_MAX_NEWTON):
         if not active.size:
             break
         if modes is None:
-            *terms, change = _bicubic(start[active], spans[active], xi[:, active])
+            *terms, change = _curved(start[active], spans[active], xi[:, active])
         else:
             *terms, change = _bilinear(modes[:, :, active], xi[:, active])
         step = _descent_step(*terms)
@@ -399,7 +410,7 @@ def _closest_triangle(start: FloatArray, spans: FloatArray) -> FloatArray:
     gradient, metric, _, _ = _bilinear(_modes(start, spans), np.zeros((2, len(start))))
     xi = -_solve_2x2(metric, gradient).T
     square = metric[0] * metric[2]
-    flat = square - metric[1] ** 2 <= _COLLINEAR * square
+    flat = square - metric[1] ** 2 <= COLLINEAR * square
     xi[flat] = -1.0
     outside = ~((xi >= 0.0).all(axis=1) & (xi.sum(axis=1) <= 1.0))
     xi[outside] = _closest_edge(start[outside], spans[outside])
@@ -481,7 +492,7 @@ def _closest_convex(g: FloatArray) -> FloatArray:
         new = old - slope / curvature
         newton = (new >= low) & (new <= high)
         t[active] = new = np.where(newton, new, 0.5 * (low + high))
-        last = newton & (np.abs(new - old) <= _LAST_STEP)
+        last = newton & (np.abs(new - old) <= LAST_STEP)
         rest = ~(last | (high - low <= 4.0 * EPS))
         active, low, high = active[rest], low[rest], high[rest]
         g_active = g_active[:, :, rest]

@@ -1,7 +1,7 @@
 """Batched node-to-surface element: gap, invariants, constraints, gradients and exact tangents.
 
 Axis 0 of every array is the pair (one slave node, one master facet with nc corners, or the smooth
-patch over it with nc = 16 control points, which take the place of the corners). Two
+patch over it with nc = 15 or 16 control points, which take the place of the corners). Two
 descriptions of the same element: the direct one (projection and normal eliminated, for the midpoint
 rule, theory section 4) and the one in invariants (normal d and convective coordinates f as
 unknowns, for the energy-momentum scheme, sections 3 and 5). Nothing here knows about MPI, PETSc or
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.kernels import discrete_gradient, facets, patches
+from dolfinx_nts.kernels import discrete_gradient, facets, patches, triangle_patches
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -26,8 +26,8 @@ NUM_CONSTRAINTS = 6
 #: Augmented unknowns per pair: d in R^3 and f in R^2.
 NUM_AUGMENTED = 5
 #: Gauss points that make the mean value exact: the constraints have degree <= 4 in pi over a facet,
-#: 12 over a patch.
-_GAUSS_POINTS = {3: 2, 4: 2, patches.NUM_POINTS: 6}
+#: 12 over a patch on a quadrilateral, 8 on a triangle.
+GAUSS_POINTS = {3: 2, 4: 2, patches.NUM_POINTS: 6, triangle_patches.NUM_POINTS: 4}
 
 
 class Gap(NamedTuple):
@@ -151,9 +151,9 @@ def projection(x: FloatArray, xi: FloatArray, multiplier: FloatArray) -> Project
     mixed = mixed.reshape(n, size, 2)
     bent = np.einsum("na,naci,ndi->ncd", mu, bend, tangents)
     inner = -np.einsum("ncdi,nai,na->ncd", bend, tangents, mu) - bent - bent.transpose(0, 2, 1)
-    if nc == patches.NUM_POINTS:
+    if (third := facets.third(xi, nc)) is not None:
         along_offset = np.einsum("nki,ni->nk", x[:, 1:], offset)
-        inner += np.einsum("na,nkacd,nk->ncd", mu, patches.third(xi), along_offset)
+        inner += np.einsum("na,nkacd,nk->ncd", mu, third, along_offset)
     cross = np.matmul(mixed, gradient)
     hessian += cross + cross.transpose(0, 2, 1)
     hessian += np.matmul(gradient.transpose(0, 2, 1), np.matmul(inner, gradient))
@@ -212,7 +212,7 @@ def invariant_gradient(z: FloatArray, nc: int) -> FloatArray:
 def invariants(z: FloatArray, nc: int, gradient: FloatArray | None = None) -> FloatArray:
     """The invariants pi(z) of theory section 3: 17 of a quadrilateral, 12 of a triangle.
 
-    A patch has 155.
+    A patch has 155 over a quadrilateral and 138 over a triangle.
 
     Args:
         z: (x_s, x_1 .. x_nc, d, f), shape (n, 3 (nc + 2) + 2).
@@ -294,10 +294,10 @@ def constraint_curvature(pi: FloatArray, multiplier: FloatArray, nc: int) -> Flo
     ff = -np.einsum("n,nibc,ni->nbc", normal, ddshape, yd)
     ff -= np.einsum("nibc,ni->nbc", ddshape, np.matmul(yy, slope[:, :, None])[:, :, 0])
     mixed = np.matmul(dshape.transpose(0, 2, 1), np.matmul(yy, bent))
-    if nc == patches.NUM_POINTS:
+    if (third := facets.third(pi[:, -2:], nc)) is not None:
         yn = np.matmul(yy, shape[:, :, None])
         factor = yd[:, :, None] * tangent[:, None] - yn * projection[:, None]
-        ff += np.einsum("niabc,nia->nbc", patches.third(pi[:, -2:]), factor)
+        ff += np.einsum("niabc,nia->nbc", third, factor)
     out[:, -2:] = ff - mixed - mixed.transpose(0, 2, 1)
     return out
 
@@ -343,7 +343,7 @@ def element(
         Forces, constraints and tangents in z.
     """
     nc = (z0.shape[1] - 2) // 3 - 2
-    points, second = _GAUSS_POINTS[nc], _invariant_maps(nc)[0]
+    points, second = GAUSS_POINTS[nc], _invariant_maps(nc)[0]
     d0, d1 = invariant_gradient(z0, nc), invariant_gradient(z1, nc)
     pi0, pi1 = invariants(z0, nc, d0), invariants(z1, nc, d1)
     dm = 0.5 * (d0 + d1)

@@ -24,7 +24,7 @@ BoolArray = npt.NDArray[np.bool_]
 #: Control points of a patch.
 NUM_POINTS = 16
 #: Least cosine between the normals of facets that an edge joins smoothly; sharper ones stay edges.
-_SHARP = 0.5
+SHARP = 0.5
 
 #: Coefficients of 1, s, s^2, s^3 of the cubics of the control points at s = -3, -1, 1, 3.
 _CUBICS = np.array([[-1, 1, 1, -1], [9, -11, -1, 3], [9, 11, -1, -3], [-1, -1, 1, 1]]) / 16.0
@@ -122,7 +122,7 @@ def neighbours(facets: IntArray, corners: FloatArray) -> IntArray:
     first = np.flatnonzero(np.r_[True, (key[1:] != key[:-1]).any(axis=1)])
     count = np.diff(first, append=len(key))
     one, two = order[first[count == 2]], order[first[count == 2] + 1]
-    smooth = np.einsum("ni,ni->n", normal[one // nc], normal[two // nc]) >= _SHARP
+    smooth = np.einsum("ni,ni->n", normal[one // nc], normal[two // nc]) >= SHARP
     smooth &= start[one] == end[two]
     across = np.full(len(start), -1)
     across[one[smooth]], across[two[smooth]] = two[smooth], one[smooth]

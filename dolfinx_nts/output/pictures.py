@@ -44,12 +44,15 @@ def picture(
 
     Raises:
         TypeError: A body without a mesh.
-        ValueError: Unknown colour, no body, or an argument out of range.
+        ValueError: Unknown colour, no body, one whose mesh is not 3D, or an argument out of range.
         OSError: On all ranks: the file cannot be written.
     """
     bodies = items("bodies", bodies, lambda b: hasattr(b, "mesh"), "Continuum bodies")
     _check_picture(bodies, colour, view, limits, width)
     require_bool("labels", labels)
+    for body in bodies:
+        if body.mesh.topology.dim != 3:
+            raise ValueError(f"bodies: {body.name!r} has no volume; leave it out")
     file = as_path("path", path)
     comm = bodies[0].comm
     drawn = []

@@ -41,9 +41,10 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
     else:
         lines = {"total": balance["energy"]} | {n: balance[n] for n in ("kinetic", "potential")}
         energy = _Panel("Energy", "[J]", lines)
+    works = (*ledger.WORKS, *ledger.CHANGES)
     work = {
         name.replace("_", " "): balance[name]
-        for name in ("contact_defect", "external_work", "friction_dissipation", "material_change")
+        for name in ("contact_defect", *(n for n in works if n != "contact_defect"))
         if name == "contact_defect" or balance[name].any()
     }
     nodes = {

@@ -21,16 +21,14 @@ import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.points import at_mesh
-from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
-from dolfinx_nts.parallel import gather_on_root, write_on_root
+from dolfinx_nts.parallel import gather_on_root, raise_together, write_on_root
 from dolfinx_nts.step import balance as ledger
-from dolfinx_nts.step import resultants
-from dolfinx_nts.system import State
+from dolfinx_nts.step import contact_fields, resultants
 from dolfinx_nts.validation import StrPath, as_path, is_whole, require_positive
 
 if TYPE_CHECKING:
-    from dolfinx_nts.run.simulate import Stepper
+    from dolfinx_nts.run.stepper import Stepper
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -47,8 +45,14 @@ _XDMF_HEAD = (
     '<Grid Name="{}" GridType="Collection" CollectionType="Temporal">\n'
 )
 _XDMF_TAIL = "</Grid>\n</Domain></Xdmf>\n"
-#: XDMF's name of a cell and its order of DOLFINx's vertices.
-_CELLS = {8: ("Hexahedron", [0, 1, 3, 2, 4, 5, 7, 6]), 4: ("Tetrahedron", [0, 1, 2, 3])}
+#: XDMF's name of DOLFINx's cells and its order of their vertices.
+_CELLS = {
+    "interval": ('Polyline" NodesPerElement="2', [0, 1]),
+    "triangle": ("Triangle", [0, 1, 2]),
+    "quadrilateral": ("Quadrilateral", [0, 1, 3, 2]),
+    "tetrahedron": ("Tetrahedron", [0, 1, 2, 3]),
+    "hexahedron": ("Hexahedron", [0, 1, 3, 2, 4, 5, 7, 6]),
+}
 
 
 class _Series:
@@ -66,7 +70,7 @@ class _Series:
         everywhere = gather_on_root(body.comm, original[nodes])
         numbers, self._order = np.unique(everywhere, return_index=True)
         self._points = self._nodal(body.space.tabulate_dof_coordinates()[: self._owned])
-        owned = body.mesh.topology.index_map(3).size_local
+        owned = body.mesh.topology.index_map(body.mesh.topology.dim).size_local
         cells = gather_on_root(body.comm, original[compat.geometry_dofmap(body.mesh)[:owned]])
         order = gather_on_root(
             body.comm, np.asarray(body.mesh.topology.original_cell_index[:owned], dtype=np.int64)
@@ -82,7 +86,7 @@ class _Series:
         """Write the mesh; rank 0 only."""
         import h5py
 
-        self._kind, corners = _CELLS[self._cells.shape[1]]
+        self._kind, corners = _CELLS[compat.cell_name(self.body.mesh)]
         image = io.BytesIO()
         with h5py.File(image, "w") as file:
             file["mesh/points"], file["mesh/cells"] = self._points, self._cells[:, corners]
@@ -92,20 +96,19 @@ class _Series:
 
     def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
         """Nodal fields of the last accepted state on rank 0; collective."""
-        state, owned = stepper.state, self._owned
+        state = stepper.state
         u, v = (at_mesh(self.body, w[self.index]) for w in (state.u, state.v))
         fields = {
             "displacement": self._nodal(u.reshape(-1, 3)),
             "velocity": self._nodal(v.reshape(-1, 3)),
         }
+        system, solution = stepper.system, stepper.solution
+        found = contact_fields.at_nodes(system, state, solution.contact_loads, self.body)
         for label, k in self.contacts.items():
-            contact = stepper.system.contacts[k]
-            found = _contact_fields(contact, state, k, stepper.mean_force(k))
-            for name, (elsewhere, values) in found.items():
-                nodal = np.full((owned, *values.shape[1:]), elsewhere)
-                nodal[contact.slave.rows] = contact.slave.at_own(values)
-                fields[f"{name}_{label}"] = self._nodal(nodal)
-        return fields
+            slave, mean = system.contacts[k].slave, stepper.mean_force(k)
+            for name, values in (("force", mean), ("pressure", mean / slave.area[slave.share])):
+                found[f"contact_{name}_mean_{label}"] = contact_fields.spread(slave, 0.0, values)
+        return fields | {name: self._nodal(values) for name, values in found.items()}
 
     def append(self, time: float, fields: Mapping[str, FloatArray]) -> None:
         """Add one time; rank 0 only. Both files are complete and closed afterwards.
@@ -149,35 +152,11 @@ class _Series:
         )
 
 
-def _contact_fields(
-    pair: ContactPair, state: State, k: int, mean: FloatArray
-) -> dict[str, tuple[float, FloatArray]]:
-    """Name -> value elsewhere and values at this rank's slave nodes."""
-    slave, own = pair.slave, state.contacts[k]
-    force, gap = own.force, own.gap
-    near = np.isfinite(gap)
-    fields = {
-        "contact_force": (0.0, force),
-        "contact_pressure": (0.0, force / slave.area[slave.share]),
-        "contact_force_mean": (0.0, mean),
-        "contact_pressure_mean": (0.0, mean / slave.area[slave.share]),
-        "contact_gap": (np.nan, np.where(near, gap, np.nan)),
-        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + own.stick),
-    }
-    if pair.friction:
-        fields["contact_friction"] = (0.0, own.tangential)
-        fields["contact_slip"] = (0.0, own.slip)
-    return fields
-
-
 class Fields:
     """Writes each body as a time series FOLDER/NAME.xdmf with NAME.h5, readable in ParaView.
 
-    Displacement [m] and velocity [m/s] at the mesh's nodes. At the slave body of a contact also,
-    with the contact's name appended, contact_force p_N [N], contact_pressure (force per tributary
-    reference area) [Pa], contact_gap [m] (NaN where unknown) and contact_status (-1 not a slave
-    node, 0 far away, 1 near, 2 in contact, 3 sticking); with friction contact_friction, the
-    tangential force on the node [N], and contact_slip, the distance slipped so far [m].
+    Displacement [m] and velocity [m/s] at the mesh's nodes, and the fields of the body's contacts
+    as of `Solution.contact_fields`.
 
     With a consistent mass the forces of single steps alternate about the right ones, at Courant
     number 1 by a quarter to two fifths of them and more in shorter steps: contact_force_mean and
@@ -186,7 +165,7 @@ class Fields:
     The initial and the last accepted state are always written, and every time is on disk before the
     run goes on; where it cannot be written (disk full, folder gone), the run ends and all times
     before are whole. Bodies without a mesh are left out; existing files of the same names are
-    replaced.
+    replaced, but by a run that goes on from a checkpoint: it has other files for what follows.
 
     Args:
         folder: Where the files go; made if missing.
@@ -197,7 +176,8 @@ class Fields:
     Raises:
         ValueError: The cadence is out of range or given twice; from `start`: no body has a mesh,
             or two bodies' names give one file.
-        OSError: From `start`, before any step and on all ranks: the folder cannot be written.
+        OSError: From `start`, before any step and on all ranks: the folder cannot be written, or a
+            run that goes on from a checkpoint would replace what is there.
     """
 
     def __init__(self, folder: StrPath, *, every: int = 1, interval: float | None = None) -> None:
@@ -213,8 +193,7 @@ class Fields:
     def start(self, stepper: Stepper) -> None:
         """Create the files with the initial state."""
         system, contacts = stepper.system, stepper.system.contacts
-        names = [_file_name(c.name) for c in contacts]
-        label = [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
+        label = contact_fields.labels(system)
         self._series = []
         for i, body in enumerate(system.bodies):
             if hasattr(body, "mesh"):
@@ -225,10 +204,21 @@ class Fields:
         files = [s.path.name for s in self._series]
         if len(set(files)) < len(files):
             raise ValueError(f"name of bodies: file names {files} are not unique; rename a body")
+        if stepper.restart is not None:
+            self._spare(system.comm)
         for series in self._series:
             self._root(stepper, series.create)
         self._steps, self._next = 0, self.interval or 0.0
         self._append(stepper)
+
+    def _spare(self, comm: Any) -> None:
+        """Raise on all ranks rather than replace what an earlier part of the run has written."""
+        there = [s.path.name for s in self._series if Path(f"{s.path}.xdmf").exists()]
+        problem = (
+            f"folder={str(self.folder)!r}: holds {there[0]}.xdmf, which a run from a checkpoint "
+            "would replace; pass another folder for what follows"
+        ) if comm.rank == 0 and there else None  # fmt: skip
+        raise_together(comm, problem, FileExistsError)
 
     def write(self, stepper: Stepper, *, last: bool = False) -> None:
         """Write the accepted state if the cadence asks for it, or if it is the last."""
@@ -329,8 +319,8 @@ class ForcesCSV(BalanceCSV):
     """Writes the forces of supports, joints and contacts: a row for the start and one per step.
 
     Of each body the force of each of its conditions, of each joint force and moment on the first of
-    its bodies, about its point, of each contact the force on its slave; see `Solution.reactions`
-    and `Solution.contact_forces`.
+    its bodies, about its point, of each contact force and moment about the origin on its slave; see
+    `Solution.reactions`, `Solution.contact_forces` and `Solution.contact_moments`.
 
     Args:
         path: File; its folder is made if missing, an existing file is replaced.
@@ -351,5 +341,7 @@ class ForcesCSV(BalanceCSV):
         for joint in joints:
             labels += [f"{joint.name}_force_{{}} [N]", f"{joint.name}_moment_{{}} [N m]"]
         labels += [f"contact_{pair.name}_{{}} [N]" for pair in system.contacts]
+        labels += [f"contact_{pair.name}_moment_{{}} [N m]" for pair in system.contacts]
         header += [label.format(axis) for label in labels for axis in "xyz"]
-        return ("time", *columns, resultants.CONTACT_FORCES), header
+        contacts = (resultants.CONTACT_FORCES, resultants.CONTACT_MOMENTS)
+        return ("time", *columns, *contacts), header

@@ -10,13 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.integrators import Static
-from dolfinx_nts.run.simulate import Solution, Stepper, run, writers
+from dolfinx_nts.run.simulate import run, writers
+from dolfinx_nts.run.solution import Solution
+from dolfinx_nts.run.step_warnings import tell_inversion, tell_slip
+from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.step import balance, resultants
+from dolfinx_nts.step.accuracy import Newton
+from dolfinx_nts.step.contact_fields import ContactLoads
+from dolfinx_nts.step.evaluation import Evaluation
 from dolfinx_nts.step.free_motion import free_motion
-from dolfinx_nts.step.newton import Newton
-from dolfinx_nts.step.problem import Evaluation
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -30,12 +34,12 @@ from dolfinx_nts.validation import (
 
 FloatArray = npt.NDArray[np.float64]
 
-#: A load step is dropped if it leaves a slave this part of a facet behind one that it was no
-#: candidate of.
+#: A load step is dropped if a slave ends this part of a facet behind one of which it was no
+#: candidate.
 _MISSED = 0.1
 #: Relaxations of one load step before it counts as without equilibrium.
 _RELAXATIONS = 100
-#: From this part of the forces on, the stabilization's moves no node to another facet.
+#: Below this part of the forces the stabilization no longer moves nodes to other facets.
 _NEARLY_AT_REST = 1e-2
 #: A failed relaxation is repeated with a stiffer stabilization, up to this.
 _STIFFEST = 10.0
@@ -68,6 +72,25 @@ class Equilibrium(Solution):
     moving: ClassVar[bool] = False
 
 
+class _Relaxed:
+    """What the relaxations of a load step took.
+
+    Args:
+        system: The scene.
+
+    Attributes:
+        of_joints: Columns of the balance table for energy that leaves through joints.
+        lost: By column, what left in all relaxations but the last one [J].
+        driven: External work that the ledgers of each joint's elements name in all of them, this
+            rank's part [J], shape (joints,).
+    """
+
+    def __init__(self, system: System) -> None:
+        self.of_joints = {name for joint in system.joints for name in joint.losses}
+        self.lost = dict.fromkeys(("friction_dissipation", *self.of_joints), 0.0)
+        self.driven = np.zeros(len(system.joints))
+
+
 class _LoadStepper(Stepper):
     """Stepper in pseudo time; a step is relaxed until nothing of the stabilization is left."""
 
@@ -97,7 +120,7 @@ class _LoadStepper(Stepper):
     def _step(self, dt: float, time: float) -> None:
         self._prepare(dt)
         old = self.state
-        step, state, iterations, lost = self._relax(dt, time)
+        step, state, iterations, relaxed = self._relax(dt, time)
         self._rates = [(a - b) / dt for a, b in zip(state.u, old.u, strict=True)]
         forces = [t.external.copy() for t in step.bodies]
         work = 0.0
@@ -105,10 +128,12 @@ class _LoadStepper(Stepper):
             forces[k][body.fixed] += t.residual[body.fixed]
             work += 0.5 * float((forces[k] + self._forces[k]) @ (state.u[k] - old.u[k]))
         self._forces = forces
+        work += self._joints_work(old, state, relaxed.driven)
         forces_now, before = resultants.of_step(self.problem, step), self.solution.rows[-1]
         terms = balance.step_terms(self.problem, step)
         terms["external_work"] = self.system.comm.allreduce(work)
-        terms["friction_dissipation"] += lost
+        for name, lost in relaxed.lost.items():
+            terms[name] += lost
         for k, pair in enumerate(self.system.contacts):
             mean = 0.5 * (before["contact_forces"][k] + forces_now["contact_forces"][k])
             start, end = pair.path(old.time, time)
@@ -119,6 +144,7 @@ class _LoadStepper(Stepper):
         rows, measured = self.solution.rows, balance.measure(self.system, state)
         row = balance.next_row(rows[0], rows[-1], measured, terms)
         rows.append(row | forces_now)
+        self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
         missing, size = abs(row["ledger_residual"]), abs(row["potential"])
         loads = sum(float(np.abs(t.external).sum()) for t in step.bodies)
         pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
@@ -127,14 +153,29 @@ class _LoadStepper(Stepper):
         if missing > _OPEN * max(size, abs(row["external_work"])) + rounding:
             self.solution.warn(
                 "ledger", time, missing,
-                f"the work misses {missing:.3g} J of the {size:.3g} J stored, as it is that of the "
-                "mean forces of load steps; use more of them",
+                f"work and stored energy differ by {missing:.3g} J of {size:.3g} J: work is that "
+                "of the mean forces of each load step; use more load steps",
             )  # fmt: skip
         self._accept(state)
-        self._tell_inversion(step)
-        self._tell_slip(step)
+        tell_inversion(self.solution, self.problem, step, state)
+        tell_slip(self.solution, self.problem, step, state)
         self._solved = step
         self.look()
+
+    def _joints_work(self, old: State, new: State, told: FloatArray) -> float:
+        """External work of what joints prescribe in a load step on this rank [J]. Collective.
+
+        Args:
+            old: At its start.
+            new: At its end.
+            told: What the ledgers of each joint's elements say, shape (joints,).
+        """
+        couplings: list[Any] = self.problem.couplings[1:]
+        histories, work = zip(old.histories[1:], new.histories[1:], strict=True), 0.0
+        for coupling, both, ledger in zip(couplings, histories, told.tolist(), strict=True):
+            found = coupling.load_step_work(*both, old.time, new.time)
+            work += ledger if found is None else found
+        return work
 
     def look(self, *, last: bool = False) -> None:
         """As of `Stepper`, and at the end for motions that nothing resists."""
@@ -156,14 +197,15 @@ class _LoadStepper(Stepper):
                 grave=True,
             )  # fmt: skip
 
-    def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, float]:
-        """Solution of a load step, its state, Newton iterations, earlier relaxations' dissipation.
+    def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, _Relaxed]:
+        """Solution of a load step, its state, Newton iterations, what the relaxations took.
 
         Each relaxation starts where the last one ended and is held there a little by the
         stabilization: a proximal-point iteration, whose limit knows nothing of it.
         """
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
-        search, lost, since = True, 0.0, 0.0
+        search, since = True, 0.0
+        relaxed = _Relaxed(self.system)
         slipped = [contact.slip for contact in kept.contacts]
         problem.stabilization = self._stabilization
         state = replace(kept, v=tuple(self._rates))
@@ -173,7 +215,8 @@ class _LoadStepper(Stepper):
                     step = self._solve(state, dt, search)
                     reached = self._accepted(step, dt, time)
                     if search:  # else slip still counts from the last search
-                        lost, slipped = lost + since, [contact.slip for contact in state.contacts]
+                        relaxed.lost["friction_dissipation"] += since
+                        slipped = [contact.slip for contact in state.contacts]
                     contacts = tuple(
                         new._replace(slip=start + new.slip - old.slip)
                         for start, old, new in zip(
@@ -191,11 +234,15 @@ class _LoadStepper(Stepper):
                     problem.stabilization /= _RELIEF
                     continue
                 iterations += step.iterations
-                since = balance.step_terms(problem, step)["friction_dissipation"]
+                relaxed.driven += balance.told_by_joints(problem, step)
                 state, dt = reached, 0.0
                 unrest = problem.unrest(step)
                 if unrest <= 1.0:
-                    return step, state, iterations, lost
+                    return step, state, iterations, relaxed
+                terms = balance.step_terms(problem, step)
+                since = terms["friction_dissipation"]
+                for name in relaxed.of_joints:
+                    relaxed.lost[name] += terms[name]
                 if unrest < _RELIEVED * last:
                     problem.stabilization *= _RELIEF
                 last = unrest
@@ -328,5 +375,7 @@ def equilibrium(
         system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options,
         watch_overlap=watch_overlap, before_step=before_step,
     )  # fmt: skip
-    run(stepper, times, output, dt=times[0], progress=progress, remedy=_REMEDY)
+    lengths = np.diff(times, prepend=0.0).tolist()
+    steps = list(zip(lengths, times, strict=True))
+    run(stepper, steps, output, progress=progress, remedy=_REMEDY)
     return stepper.solution

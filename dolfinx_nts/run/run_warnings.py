@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 logger = logging.getLogger(__name__)
@@ -35,10 +35,13 @@ class RunWarnings(Mapping[str, RunWarning]):
     """The warnings of a run by their kind, in the order in which they first came.
 
     Each kind is logged once, when it is first seen; the same on all ranks.
+
+    Args:
+        found: Those of the run that goes on.
     """
 
-    def __init__(self) -> None:
-        self._found: dict[str, RunWarning] = {}
+    def __init__(self, found: Iterable[RunWarning] = ()) -> None:
+        self._found = {w.kind: w for w in found}
 
     def __getitem__(self, kind: str) -> RunWarning:
         return self._found[kind]

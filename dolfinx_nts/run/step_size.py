@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 import numbers
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.step.problem import Evaluation, StepProblem
+from dolfinx_nts.step.evaluation import Evaluation
+from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import known_options
 
@@ -79,6 +80,24 @@ def factor(error: float) -> float:
     return change if error > 1.0 or change >= _WORTHWHILE else 1.0
 
 
+class PaceMemory(NamedTuple):
+    """What the sizes of the next steps depend on.
+
+    Attributes:
+        dt: Size of the next step [s].
+        top: Largest speed so far, in the norm of the mass.
+        error: Of the last step over its tolerance.
+        before: Length of the last step [s]; None: its error says nothing of the next.
+        accelerations: Mean ones of the last step [m/s^2], of each body; empty without `before`.
+    """
+
+    dt: float
+    top: float
+    error: float
+    before: float | None
+    accelerations: tuple[FloatArray, ...]
+
+
 class Pace:
     """Sizes of the steps of a run, the same on all ranks; remembers the last accepted step.
 
@@ -105,6 +124,19 @@ class Pace:
         self._top = _norms(system, state.v)[0]
         self._before: tuple[float, tuple[FloatArray, ...]] | None = None
         self._error, self._meets, self.exceeds = 0.0, False, False
+
+    @property
+    def memory(self) -> PaceMemory:
+        """What `resume` needs to go on as if the run had not ended."""
+        before, accelerations = self._before or (None, ())
+        return PaceMemory(self.dt, self._top, self._error, before, accelerations)
+
+    def resume(self, memory: PaceMemory) -> None:
+        """Go on from another run's memory."""
+        self.dt = min(max(memory.dt, self.shortest), self._longest)
+        self._top, self._error = memory.top, memory.error
+        if memory.before is not None:
+            self._before = memory.before, memory.accelerations
 
     def propose(self, left: float) -> float:
         """The next step [s]; the last two are equal.

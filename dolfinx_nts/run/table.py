@@ -31,6 +31,19 @@ class Table(Sequence[Row]):
         for row in rows:
             self.append(row)
 
+    @classmethod
+    def of(cls, columns: Mapping[str, FloatArray]) -> Table:
+        """A table of whole columns, all with as many rows."""
+        table = cls()
+        table._columns = {name: np.array(column, dtype=float) for name, column in columns.items()}
+        table._room = table._length = len(next(iter(columns.values())))
+        return table
+
+    @property
+    def columns(self) -> dict[str, FloatArray]:
+        """All columns up to now, see `column`."""
+        return {name: self.column(name) for name in self._columns}
+
     def append(self, row: Mapping[str, Any]) -> None:
         """Add a row that has at least the columns of the first."""
         if self._length == self._room:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
-    from dolfinx_nts.run.simulate import Stepper
+    from dolfinx_nts.run.stepper import Stepper
 
 
 class Writer(Protocol):

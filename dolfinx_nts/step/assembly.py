@@ -208,8 +208,7 @@ class StepMatrix:
 
     Args:
         layout: Fields of the problem.
-        bodies: PETSc matrices of the body fields; contact is added to them in place, unless they
-            are stored in blocks.
+        bodies: PETSc matrices of the body fields, which are not changed.
         elements: Unknowns of each batch of contact elements.
         split: Whether solvers see a nest of two fields, "bodies" and "constraints", from which a
             field split takes its blocks without a copy; else one matrix.
@@ -233,7 +232,6 @@ class StepMatrix:
         blocked: bool = False,
     ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
-        self._in_bodies: list[FloatArray] = []
         self._in_operator: list[FloatArray] = []
         fields = range(layout.counts.shape[1])
         self._split = split and len(fields) > len(bodies)
@@ -250,6 +248,12 @@ class StepMatrix:
             for key in self._sources
             if key[0] != key[1] or key[0] >= len(bodies)
         }
+        # Bodies' matrices with room for contact within the body, which may fill more entries.
+        self._copies = {
+            i: self._bodies[i].duplicate(copy=False) for i, j in self._sources
+            if i == j and i < len(bodies)
+        }
+        self._same: dict[int, bool] = {}
         self.nest: Any = None
         if found is None:
             grid = [[self._block(i, j) for j in joined] for i in joined]
@@ -280,7 +284,7 @@ class StepMatrix:
 
     def _block(self, i: int, j: int) -> Any:
         if i == j and i < len(self._bodies):
-            return self._bodies[i]
+            return self._copies.get(i, self._bodies[i])
         block = self._blocks.get((i, j))
         return block.matrix if block else None
 
@@ -334,12 +338,11 @@ class StepMatrix:
             self._by_nodes.fill(self._corner)
             self._add(tangents)
             return
-        self._in_bodies = list(tangents)
         for key, sources in self._sources.items():
             if key in self._blocks:
                 self._blocks[key].set(tangents)
             else:
-                self._add_to_body(self._bodies[key[0]], sources, tangents)
+                self._fill_copy(key[0], sources, tangents)
         self.nest.assemble()
         # Without `out` the nest itself is converted.
         self.nest.convert("aij", out=self._corner)
@@ -353,10 +356,6 @@ class StepMatrix:
             else:
                 _add_block(self._corner, numbers, numbers, values)
         self._corner.assemble()
-
-    def outgrown(self) -> bool:
-        """Whether the bodies' matrices have entries the operator has no room for. Collective."""
-        return self._by_nodes is not None and self._by_nodes.outgrown()
 
     def schur(self) -> SchurApproximation:
         """Approximate Schur complements of the contact unknowns, as the operator is. Collective.
@@ -387,14 +386,6 @@ class StepMatrix:
         cols = PETSc.IS().createStride(stop - start, start, 1, comm=comm)
         return PETSc.IS().createGeneral(touched, comm=comm), cols
 
-    def withdraw(self) -> None:
-        """Take the contact tangents out of the bodies' matrices, but for rounding."""
-        change = [-a for a in self._in_bodies]
-        for key, sources in self._sources.items():
-            if key not in self._blocks and change:
-                self._add_to_body(self._bodies[key[0]], sources, change)
-        self._in_bodies = []
-
     def _numbers(self, fields: Sequence[int], own: Layout) -> list[tuple[IntArray, IntArray]]:
         """Each batch's columns in some fields, and their numbers in the layout of these alone."""
         result = []
@@ -409,15 +400,24 @@ class StepMatrix:
             result.append((np.concatenate(columns), np.concatenate(numbers, axis=1).astype(int)))
         return result
 
-    def _add_to_body(
-        self, a: Any, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]
+    def _fill_copy(
+        self, k: int, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]
     ) -> None:
+        """Bring the copy of a body's matrix up to it and to contact within the body. Collective."""
+        body, a = self._bodies[k], self._copies[k]
+        kinds = PETSc.Mat.Structure
+        same = self._same.get(k, True)
+        structure = kinds.SAME_NONZERO_PATTERN if same else kinds.DIFFERENT_NONZERO_PATTERN
+        body.copy(a, structure=structure)
         a.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         for e, i, j in sources:
             element = self._elements[e]
             values = tangents[e][:, element.columns[i], element.columns[j]]
             _add_block(a, element.numbers[i], element.numbers[j], values)
         a.assemble()
+        if k not in self._same:
+            total = PETSc.Mat.InfoType.GLOBAL_SUM
+            self._same[k] = a.getInfo(total)["nz_used"] == body.getInfo(total)["nz_used"]
 
     def whole_bodies(self) -> list[IntArray] | None:
         """Numbers of the bodies dealt to this rank in their part of the operator, body by body.
@@ -453,7 +453,7 @@ class StepMatrix:
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
-        made = [self._corner, *self._contact, *self._blocks.values()]
+        made = [self._corner, *self._contact, *self._blocks.values(), *self._copies.values()]
         made += [self.operator] if self._split and self.operator else []
         made += [a for a in (self.nest, self._schur) if a]
         for a in made:
@@ -502,40 +502,67 @@ def model_problem(
     return a, (("bodies", bodies), ("constraints", contact))
 
 
-def solve_saddle(matrix: Any, right: FloatArray) -> FloatArray:
-    """Solution of A x = right with MUMPS, without equations that repeat others. Collective.
+class Saddle:
+    """Factors of a matrix by MUMPS, without equations that repeat others. Collective.
 
     Args:
         matrix: PETSc AIJ matrix.
-        right: Owned entries.
     """
-    x, b = matrix.createVecs()
-    b.array_w[:] = right
-    ksp = PETSc.KSP().create(matrix.getComm())
-    ksp.setType("preonly")
-    ksp.setOperators(matrix)
-    pc = ksp.getPC()
-    pc.setType("lu")
-    pc.setFactorSolverType("mumps")
-    pc.setFactorSetUpSolverType()
-    for option, value in ((14, 2000), (24, 1)):
-        pc.getFactorMatrix().setMumpsIcntl(option, value)
-    ksp.solve(b, x)
-    solution: FloatArray = x.array_r.copy()
-    for a in (x, b, ksp):
-        a.destroy()
-    return solution
+
+    def __init__(self, matrix: Any) -> None:
+        self._x, self._b = matrix.createVecs()
+        self._ksp = PETSc.KSP().create(matrix.getComm())
+        self._ksp.setType("preonly")
+        self._ksp.setOperators(matrix)
+        pc = self._ksp.getPC()
+        pc.setType("lu")
+        pc.setFactorSolverType("mumps")
+        pc.setFactorSetUpSolverType()
+        for option, value in ((14, 2000), (24, 1)):
+            pc.getFactorMatrix().setMumpsIcntl(option, value)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solution of A x = right, owned entries. Collective."""
+        self._b.array_w[:] = right
+        self._ksp.solve(self._b, self._x)
+        solution: FloatArray = self._x.array_r.copy()
+        return solution
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, which Python's collector does not."""
+        for a in (self._x, self._b, self._ksp):
+            a.destroy()
 
 
-def solve_mass(mass: Any, right: FloatArray) -> FloatArray:
-    """Solution of M x = right, owned entries. Collective.
+class _Mass:
+    """The mass of a body as a PETSc matrix, with zeros at prescribed coordinates."""
+
+    def __init__(self, body: Any) -> None:
+        self._body = body
+
+    def mult(self, _matrix: Any, x: Any, y: Any) -> None:
+        """M x."""
+        y.array_w[:] = self._body.inertia(x.array_r.copy())
+        y.array_w[self._body.fixed] = 0.0
+
+    def getDiagonal(self, _matrix: Any, diagonal: Any) -> None:  # noqa: N802 (PETSc's name)
+        """What serves as the diagonal for preconditioning."""
+        diagonal.array_w[:] = self._body.nodal_mass
+
+
+def solve_mass(body: Any, right: FloatArray) -> FloatArray:
+    """Solution of M x = right, owned entries, zero at prescribed coordinates. Collective.
 
     Args:
-        mass: PETSc matrix of one body, positive definite.
+        body: Its inertia is positive definite.
         right: Owned entries.
     """
+    size = (body.num_owned, None)
+    mass = PETSc.Mat().createPython((size, size), _Mass(body), comm=body.comm)
+    mass.setUp()
     x, b = mass.createVecs()
     b.array_w[:] = right
+    b.array_w[body.fixed] = 0.0
     ksp = PETSc.KSP().create(mass.getComm())
     ksp.setType("cg")
     ksp.getPC().setType("jacobi")
@@ -543,6 +570,6 @@ def solve_mass(mass: Any, right: FloatArray) -> FloatArray:
     ksp.setOperators(mass)
     ksp.solve(b, x)
     solution: FloatArray = x.array_r.copy()
-    for a in (x, b, ksp):
+    for a in (x, b, ksp, mass):
         a.destroy()
     return solution

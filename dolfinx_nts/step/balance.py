@@ -14,7 +14,8 @@ from dolfinx_nts.bodies.inversion import smallest_dets
 from dolfinx_nts.system import State, System
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step.problem import Evaluation, StepProblem
+    from dolfinx_nts.step.evaluation import Evaluation
+    from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,6 +28,8 @@ COLUMNS = (
     "external_work",
     "friction_dissipation",
     "contact_defect",
+    "massless_defect",
+    "impact_restored",
     "material_change",
     "ledger_residual",
     "linear_momentum",
@@ -47,8 +50,10 @@ def columns(system: System) -> tuple[str, ...]:
 
 
 #: Columns that add up over the steps, and those that count in a step.
-WORKS = ("external_work", "friction_dissipation", "contact_defect")
+WORKS = ("external_work", "friction_dissipation", "contact_defect", "massless_defect")
 COUNTS = ("active", "stick", "slip")
+#: Columns that add up what changes the energy between steps.
+CHANGES = ("impact_restored", "material_change")
 
 
 class Switch(NamedTuple):
@@ -146,12 +151,26 @@ def measure(
     }
 
 
+def momenta(system: System, state: State) -> dict[str, FloatArray]:
+    """Momenta of a state [kg m/s, kg m^2/s], as `measure` has them. Collective."""
+    local = np.zeros(6)
+    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+        local += np.concatenate(_momenta(body, u, body.inertia(v)))
+    total = np.empty_like(local)
+    system.comm.Allreduce(local, total, op=MPI.SUM)
+    return {"linear_momentum": total[:3], "angular_momentum": total[3:]}
+
+
 def _of_body(body: Any, u: FloatArray, v: FloatArray) -> FloatArray:
     """This rank's part of a body's energies and momenta, shape (8,)."""
     momentum = body.inertia(v)
     energies = [0.5 * float(v @ momentum), body.potential(u)]
-    moments = body.linear_momentum(momentum), body.angular_momentum(u, momentum)
-    return np.concatenate([energies, *moments])
+    return np.concatenate([energies, *_momenta(body, u, momentum)])
+
+
+def _momenta(body: Any, u: FloatArray, momentum: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """This rank's part of a body's linear and angular momentum."""
+    return body.linear_momentum(momentum), body.angular_momentum(u, momentum)
 
 
 def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
@@ -184,6 +203,20 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
         **dict(zip(smallest, least.tolist(), strict=True)),
         "min_det": step.min_det,
     }
+
+
+def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
+    """External work of an accepted step by the elements of each joint on this rank [J], (joints,).
+
+    Args:
+        problem: Equations of the step.
+        step: Their solution.
+    """
+    work = np.zeros(len(problem.couplings) - 1)
+    for k, (coupling, parts) in enumerate(list(problem.each(step))[1:]):
+        for batch, part in zip(coupling.elements, parts, strict=True):
+            work[k] += batch.ledger(part, problem.factor).get("external_work", 0.0)
+    return work
 
 
 def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch]:
@@ -240,6 +273,12 @@ def first_row(system: System, state: State) -> dict[str, Any]:
     return row | {"min_det": float(smallest_dets(system, state.u).min())}
 
 
+def unknown_row(system: System) -> dict[str, Any]:
+    """Balance table row of a step without a ledger."""
+    row: dict[str, Any] = dict.fromkeys(columns(system), np.nan)
+    return row | dict.fromkeys(("linear_momentum", "angular_momentum"), np.full(3, np.nan))
+
+
 def next_row(
     first: dict[str, Any], last: dict[str, Any], measured: dict[str, Any], terms: dict[str, float]
 ) -> dict[str, Any]:
@@ -253,16 +292,18 @@ def next_row(
     """
     row = {**last, **measured, **terms}
     losses = [name for name in terms if name not in COLUMNS]
-    for name in (*WORKS, "material_change", *losses):
-        row[name] = last[name] + terms[name]
+    for name in (*WORKS, *CHANGES, *losses):
+        row[name] = last[name] + terms.get(name, 0.0)
     row["energy"] = row["kinetic"] + row["potential"]
     row["ledger_residual"] = (
         row["energy"]
         - first["energy"]
         - row["external_work"]
+        - row["impact_restored"]
         - row["material_change"]
         + row["friction_dissipation"]
         + row["contact_defect"]
+        + row["massless_defect"]
         + sum(row[name] for name in losses)
     )
     return row

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.elements import JointCoupling
+from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.step.assembly import StepMatrix, solve_mass, solve_saddle
+from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.system import State
@@ -36,18 +38,12 @@ def violation(
         [m/s] or [m], or None where all constraints hold.
     """
     worst, name = 0.0, ""
-    couplings: list[Any] = problem.couplings[1:]
-    for joint, coupling in zip(problem.system.joints, couplings, strict=True):
-        if not hasattr(coupling, "kinematics"):
-            continue
-        if rates:
-            missed, _, limit = coupling.kinematics(state, dt)
-        else:
-            missed, limit = coupling.gap(state)
-        local = np.array([np.abs(missed).max(initial=0.0), limit])
-        off, limit = global_max(problem.system.comm, local).tolist()
-        if off > limit and off > worst:
-            worst, name = off, joint.name
+    for joint, coupling in zip(problem.system.joints, _couplings(problem), strict=True):
+        for found in filter(None, coupling.kinematics(state, dt)):
+            local = np.array([found.size[int(rates)], found.limit[int(rates)]])
+            off, limit = global_max(problem.system.comm, local).tolist()
+            if off > limit and off > worst:
+                worst, name = off, joint.name
     return (worst, name) if name else None
 
 
@@ -71,25 +67,40 @@ def projection(problem: StepProblem, state: State, dt: float) -> tuple[FloatArra
     return tuple(v + dv for v, dv in zip(state.v, change, strict=True))
 
 
+def _constraints(
+    problem: StepProblem, state: State, dt: float
+) -> list[tuple[Any, tuple[int, ...], Kinematics]]:
+    """Elements of joints with constraints that a start has to fit, and their bodies' numbers."""
+    return [
+        (batch, bodies, found)
+        for c in _couplings(problem)
+        for batch, bodies, found in zip(
+            c.elements, c.bodies, c.kinematics(state, dt), strict=True
+        )
+        if found is not None
+    ]
+
+
+def _couplings(problem: StepProblem) -> list[JointCoupling]:
+    couplings: list[Any] = problem.couplings[1:]
+    return couplings
+
+
 def _solve(
     problem: StepProblem, state: State, forces: Sequence[FloatArray], order: int, dt: float
 ) -> tuple[FloatArray, ...]:
     """M x + G^T lambda = forces, G x = - the rate (0) or the second derivative (1)."""
     system = problem.system
-    masses = [b.tangent(u, 1.0, 0.0) for b, u in zip(system.bodies, state.u, strict=True)]
-    chosen: list[Any] = [c for c in problem.couplings[1:] if hasattr(c, "kinematics")]
+    chosen = _constraints(problem, state, dt)
     if not chosen:
-        return tuple(solve_mass(m, f) for m, f in zip(masses, forces, strict=True))
-    elements = [batch for c in chosen for batch in c.elements]
-    of = [bodies for c in chosen for bodies in c.bodies]
+        return tuple(solve_mass(b, f) for b, f in zip(system.bodies, forces, strict=True))
+    masses = [b.tangent(u, 1.0, 0.0) for b, u in zip(system.bodies, state.u, strict=True)]
+    elements, of = [batch for batch, _, _ in chosen], [bodies for _, bodies, _ in chosen]
     laid = Unknowns(system.comm, {k: len(u) for k, u in enumerate(state.u)}, elements, of)
-    tangents = []
-    for c in chosen:
-        batch = c.elements[0]
-        own = {"augmented": np.empty((batch.num_elements, 0)), "constraints": c.no_forces}
-        tangents.append(batch.evaluate(batch.y0, own).tangent)
+    tangents = [found.tangent for _, _, found in chosen]
     matrix = StepMatrix(laid.layout, masses, laid.blocks)
     matrix.assemble(tangents)
+    saddle = Saddle(matrix.operator)
     total = [np.zeros_like(force) for force in forces]
     # Each time less is left of what the matrix lends to constraints, see `SHIFT`.
     for _ in range(_TIMES):
@@ -99,15 +110,15 @@ def _solve(
         right = np.zeros(laid.layout.num_owned)
         for k, force in enumerate(forces):
             right[laid.of_body(k)] = force
-        rows = [c.elements[0].scale * c.kinematics(now, dt)[order].ravel() for c in chosen]
+        rows = [found.rows[1 + order].ravel() for _, _, found in _constraints(problem, now, dt)]
         right[laid.of_elements("constraints")] = -np.concatenate(rows)
-        solution = solve_saddle(matrix.operator, right)
+        solution = saddle.solve(right)
         for k, body in enumerate(system.bodies):
             change = solution[laid.of_body(k)].copy()
             change[body.fixed] = 0.0
             total[k] = total[k] + change
         forces = [np.zeros_like(force) for force in forces]
-    matrix.withdraw()
+    saddle.destroy()
     matrix.destroy()
     laid.destroy()
     return tuple(total)

@@ -13,8 +13,9 @@ from dolfinx_nts.bodies.body import places_of
 from dolfinx_nts.parallel import global_max
 
 if TYPE_CHECKING:
+    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.step.newton import StepSolver
-    from dolfinx_nts.step.problem import Evaluation, StepProblem
+    from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

@@ -15,7 +15,7 @@ _BODIES = "fieldsplit_bodies_"
 _CONSTRAINTS = "fieldsplit_constraints_"
 #: What `SchurInverse` factorises with.
 _FACTORS = "factors_"
-#: Name by which its matrix knows the second approximation.
+#: Name under which the first matrix stores the second approximation.
 _SECOND = "dolfinx_nts_second"
 #: What `Newton.linear_solver` may be.
 SOLVERS = ("auto", "direct", "krylov")
@@ -56,8 +56,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         _CONSTRAINTS + "pc_factor_mat_solver_type": "mumps",
     },
 }
-#: In place of the preset's on several ranks: parts of the mesh, which overlap by a node. It halves
-#: the iterations of smooth motion; alone there is none.
+#: On several ranks the preconditioner of bodies is additive Schwarz with an overlap of one node,
+#: which halves the iterations of smooth motion; without overlap it gains nothing.
 _PARTS = {_BODIES + "pc_type": "asm"}
 #: The same where each rank takes whole bodies: as few iterations as on one rank. Their numbering
 #: is that of the parts, which makes incomplete factors poor; of blocks PETSc reorders LU's only.

@@ -1,11 +1,11 @@
-"""PETSc SNES for a step: nested Jacobian, convergence per block, diagnosis."""
+"""PETSc SNES for a step: nested Jacobian, convergence per block."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,101 +14,29 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.inversion import describe, forbidden, smallest_dets
+from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.diagnosis import diagnosis
+from dolfinx_nts.step.evaluation import Evaluation
+from dolfinx_nts.step.least_norm import NullSpace, form_tree
 from dolfinx_nts.step.linear_solver import (
-    SOLVERS,
     SolverOptions,
-    choose,
     keep_bodies,
     most_iterations,
     set_schur,
     take_bodies,
 )
-from dolfinx_nts.step.problem import EQUAL, BodyTerms, Evaluation, StepProblem
+from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
-from dolfinx_nts.system import System
-from dolfinx_nts.validation import (
-    StepFailedError,
-    UserFunctionError,
-    is_finite,
-    is_whole,
-    known_options,
-    require_bool,
-)
+from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
-
-@known_options
-@dataclass(frozen=True, kw_only=True)
-class Newton:
-    """When a step counts as solved and how hard to try.
-
-    Attributes:
-        rtol: Largest residual of a block relative to the forces (or motions) of the step, > 0.
-        max_iterations: Newton iterations before a step is dropped.
-        max_retries: How often a dropped step may be cut (to less than half) before the run stops.
-        condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
-            lambda_N and lambda_T reach the linear solver: the same solution in fewer iterations.
-        linear_solver: "direct" (MUMPS) or "krylov" (FGMRES with incomplete factors of the bodies
-            and a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth.
-            Its incomplete factors weaken as dt grows beyond the time a wave needs through an
-            element.
-            "auto" takes "krylov" while that is the faster one: not below 600 coordinates (100
-            where no contact is declared), nor in statics, nor with `petsc_options` beyond those of
-            SNES, nor for the next steps after a solve that needed more iterations than MUMPS is
-            worth. Where MUMPS fails, it leaves out equations that repeat others for some steps;
-            "krylov" is left alone.
-        reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
-            and steps for as long as Newton contracts well; contact is always linearised anew.
-
-    Raises:
-        TypeError: An argument is of another type.
-        ValueError: An argument is out of range.
-    """
-
-    rtol: float = 1e-12
-    max_iterations: int = 25
-    max_retries: int = 8
-    condense: bool = True
-    linear_solver: str = "auto"
-    reuse: bool = False
-
-    def __post_init__(self) -> None:
-        if not (is_finite(self.rtol) and 0 < self.rtol < 1):
-            raise ValueError(f"rtol={self.rtol!r}: must lie in (0, 1)")
-        for name in ("max_iterations", "max_retries"):
-            value = getattr(self, name)
-            if not is_whole(value):
-                raise TypeError(f"{name}={value!r}: pass a whole number")
-        for name in ("condense", "reuse"):
-            require_bool(name, getattr(self, name))
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
-        if self.max_retries < 0:
-            raise ValueError(f"max_retries={self.max_retries!r}: must not be negative")
-        if self.linear_solver not in SOLVERS:
-            known = ", ".join(map(repr, SOLVERS))
-            raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
-
-    def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
-        """Preset of the linear solver to begin with; arguments as of `choose`."""
-        if self.linear_solver != "auto":
-            return self.linear_solver
-        flexible = [b for b in system.bodies if not getattr(b, "joints", ())]
-        size = int(system.comm.allreduce(sum(b.num_owned for b in flexible)))
-        return choose(size, bool(system.contacts or system.joints), inertia, given)
-
-
-#: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
-ACCURACY: Mapping[str, Newton] = {
-    "exact": Newton(),
-    "balanced": Newton(rtol=1e-9, reuse=True),
-    "fast": Newton(rtol=1e-6, reuse=True),
-}
+#: Relative difference of the factors of two equal steps of a caller whose lengths are rounded.
+_EQUAL = 1e-6
 #: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
 _SLOW = 0.05
 #: A residual that keeps more than this part of itself in an iteration ...
@@ -180,6 +108,8 @@ class StepSolver:
         self._careful, self._shortened = False, 0
         self._raised: UserFunctionError | None = None
         self._dets: dict[int, tuple[FloatArray, float]] = {}
+        joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
+        self._independent: bool | None = True if form_tree(joints) else None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
 
@@ -211,7 +141,7 @@ class StepSolver:
             last = self._attempt()
             iterations += last.iterations
             if not self.problem.wake(last):
-                return replace(last, iterations=iterations)
+                return replace(self._of_least_norm(last), iterations=iterations)
 
     def _attempt(self) -> Evaluation:
         """Solve the step with the candidates that have unknowns."""
@@ -269,6 +199,23 @@ class StepSolver:
             self.destroy()
         raise StepFailedError(message)
 
+    def _of_least_norm(self, solved: Evaluation) -> Evaluation:
+        """The solution with multipliers of least norm, where constraints repeat each other."""
+        problem = self.problem
+        if self._independent:
+            return solved
+        space = NullSpace(problem.system.comm, problem.elements, problem.bodies, solved.parts)
+        if self._independent is None:
+            self._independent = space.is_empty()
+            if self._independent:
+                return solved
+        here = problem.of_constraints
+        with problem.x as x:
+            x[here] = solved.x[here] - space.part(solved.x[here])
+        e = problem.evaluate(problem.x)
+        # An element of the user's own may have a compliance.
+        return replace(e, min_det=solved.min_det) if self._worst(e) <= 1.0 else solved
+
     def _attempt_otherwise(self, iterations: int) -> Evaluation:
         """Solve the step with the next preset, after the linear solver failed or took too long."""
         self._matrices_due, self._patience = True, _PATIENCE
@@ -279,6 +226,10 @@ class StepSolver:
         last = self._attempt()
         return replace(last, iterations=iterations + last.iterations)
 
+    def renew(self) -> None:
+        """Make the bodies' matrices anew, after others have used them."""
+        self._matrices_due = True
+
     def prepare(self) -> None:
         """Make SNES and matrices ready for the current step."""
         self._last = self._passed = None
@@ -286,10 +237,9 @@ class StepSolver:
         self._flips: list[IntArray] = []
         self._before = np.inf
         changed = abs(self.problem.factor / self._factor - 1.0) if self._factor else np.inf
-        self._matrices_due |= not self.newton.reuse or changed > EQUAL
+        self._matrices_due |= not self.newton.reuse or changed > _EQUAL
         self._factor = self.problem.factor
-        outgrown = self.matrix is not None and self.matrix.outgrown()
-        if self._version != self.problem.version or outgrown:
+        if self._version != self.problem.version:
             self.destroy()
             self._version = self.problem.version
             self.assemble(self._at(self.problem.x))
@@ -400,7 +350,8 @@ class StepSolver:
         unchanged = self.problem.system.comm.allreduce(self._rests, op=MPI.LAND)
         stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
         # An active set that still changes stalls by itself, not by rounding.
-        near = worst < _NEAR or (unchanged and not self.problem.knows_rounding)
+        known = self.problem.rounding.is_known(self.problem.awake)
+        near = worst < _NEAR or (unchanged and not known)
         if stalls and near and not self._measured:
             self.problem.measure_rounding(self._last)
             self._measured = self._matrices_due = True
@@ -492,64 +443,27 @@ class StepSolver:
         problem, u = self.problem, self._displacements(e.x)
         dets = forbidden(problem.system, self._smallest_dets(u))
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
+            kind = type(problem.system.bodies[int(dets.argmin())]).__name__
             return (
                 f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
                 f"{iterations} iterations: {describe(problem.system, u, dets)}; "
-                f"{_AGAINST_INVERSION}, Continuum(..., allow_inversion=True) accepts it"
+                f"{_AGAINST_INVERSION}, {kind}(..., allow_inversion=True) accepts it"
             )
-        message = self._diagnosis(e, reason, iterations)
+        message = diagnosis(problem, e, self._flips, self._reason(reason), iterations)
         if not dets.min() <= _KEPT_DET:
             return message
         return f"{message}; {describe(problem.system, u, dets)}; {_AGAINST_INVERSION}"
 
-    def _diagnosis(self, e: Evaluation, reason: int, iterations: int) -> str:
-        """One sentence that names what failed and where; every rank must call it."""
-        problem = self.problem
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = problem.ratios(e)
-        ratio = {k: r if np.isfinite(r) else np.inf for k, r in found.items()}
-        worst = max(ratio, key=lambda name: ratio[name])
-        notes = [
-            (c.name, *c.describe(part, flips))
-            for c, part, flips in zip(problem.elements, e.parts, self._flips, strict=True)
-            if c.num_elements
-        ]
-        notes += [
-            _body_note(body, terms)
-            for body, terms in zip(problem.system.bodies, e.bodies, strict=True)
-            if body.num_owned
-        ]
-        gathered = [n for part in problem.system.comm.allgather(notes) for n in part]
-        # Of each body and contact the rank with the largest residual speaks, the worst one first.
-        best = {name: text for name, _, text in sorted(gathered, key=lambda n: n[1])}
-        trouble = {
-            name: max((r for k, r in ratio.items() if f"{k} ".startswith(f"{name} ")), default=0.0)
-            for name in best
-        }
-        top = [best[name] for name in sorted(best, key=lambda name: -trouble[name])[:4]]
-        why = f"SNES reason {reason}"
-        endless = [
-            body.name
-            for body, terms in zip(problem.system.bodies, e.bodies, strict=True)
-            if not problem.system.comm.allreduce(np.isfinite(terms.internal).all(), op=MPI.LAND)
-        ]
-        if endless:
-            why += (
-                f"; the stresses of {', '.join(map(repr, endless))} are not finite: its W(C) may "
-                "not be defined for this strain"
-            )
-        if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
-            ksp = self.snes.getKSP().getConvergedReason()
-            why = f"the linear solver {self._presets[self._chosen]!r} failed, KSP reason {ksp}"
-            why += self._with_options()
-            if self._presets == ("krylov",):
-                why += "; linear_solver='auto' goes on with MUMPS where that happens"
-        finite = ratio[worst] < np.inf
-        size = f"at {ratio[worst]:.3g} times its tolerance" if finite else "is not finite"
-        return (
-            f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
-            f"{iterations} iterations ({why}); worst block {worst!r} {size}; {'; '.join(top)}"
-        )
+    def _reason(self, reason: int) -> str:
+        """What PETSc gives as the reason of a failure."""
+        if reason != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+            return f"SNES reason {reason}"
+        ksp = self.snes.getKSP().getConvergedReason()
+        why = f"the linear solver {self._presets[self._chosen]!r} failed, KSP reason {ksp}"
+        why += self._with_options()
+        if self._presets == ("krylov",):
+            why += "; linear_solver='auto' goes on with MUMPS where that happens"
+        return why
 
     def _with_options(self) -> str:
         return f", with petsc_options={dict(self._given)!r}" if self._given else ""
@@ -558,8 +472,6 @@ class StepSolver:
         """Free the PETSc objects, which Python's collector does not."""
         self._options.remove()
         if self.matrix is not None:
-            if not self._matrices_due:
-                self.matrix.withdraw()
             self.matrix.destroy()
             self.matrix = None
         if self.snes is not None:
@@ -567,11 +479,3 @@ class StepSolver:
             self._f.destroy()
             self.snes = None
         self._version = -1
-
-
-def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:
-    """Name, weight and text of where the body's equation is worst solved."""
-    r = np.nan_to_num(np.abs(terms.residual), nan=np.inf)
-    r[body.fixed] = 0.0
-    x = ", ".join(f"{c:.4g}" for c in body.reference.reshape(-1, 3)[int(np.argmax(r)) // 3])
-    return body.name, float(r.max()), f"body {body.name!r}: largest residual at X = ({x})"

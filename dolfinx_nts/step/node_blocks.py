@@ -28,9 +28,8 @@ Pattern = list[tuple[IntArray, IntArray]]
 def patterns(bodies: Sequence[Any]) -> list[Pattern] | None:
     """Block rows of the bodies' matrices, None unless all consist of whole blocks. Collective.
 
-    Bodies of the user's own may have any coordinates, and what contact adds to an AIJ matrix within
-    one body leaves out those that are prescribed. Of no rows PETSc has no incomplete factors in
-    blocks.
+    Bodies of the user's own may have any coordinates. PETSc has no incomplete
+    factorisation in blocks of a matrix without rows.
     """
     nodes = all(a.getBlockSize() == 3 and a.getType() in {"seqaij", "mpiaij"} for a in bodies)
     nodes &= any(a.getLocalSize()[0] for a in bodies)
@@ -46,18 +45,10 @@ def _pattern(a: Any) -> Pattern | None:
     The matrix keeps it: contact has a new layout much more often than a body has.
     """
     known: Pattern | None = a.getAttr(_PATTERN)
-    if known is None or _grown(a, known):
+    if known is None:
         known = _find_pattern(a)
         a.setAttr(_PATTERN, known)
     return known
-
-
-def _grown(a: Any, pattern: Pattern) -> bool:
-    """Whether an AIJ matrix has entries on this rank that are not in its pattern."""
-    return any(
-        not np.array_equal(scalar[::3], 9 * pointer)
-        for (pointer, _), (scalar, *_) in zip(pattern, compat.csr_parts(a), strict=True)
-    )
 
 
 def _find_pattern(a: Any) -> Pattern | None:
@@ -145,15 +136,6 @@ class NodeBlocks:
         np.minimum(blocks, (local, first[-1] - local), out=blocks)
         self.size = 3 * local
         self.room = [b.astype(index) for b in np.ascontiguousarray(blocks.T)]
-
-    def outgrown(self) -> bool:
-        """Whether a body's matrix has got entries that are not in its pattern. Collective.
-
-        Two runs of one system that take turns share the bodies' matrices, and one that stores them
-        otherwise adds contact within a body to them.
-        """
-        grown = any(map(_grown, self._bodies, self._patterns))
-        return bool(self._bodies[0].comm.tompi4py().allreduce(grown, op=MPI.LOR))
 
     def fill(self, matrix: Any) -> None:
         """Replace all values by those of the bodies, to which others may be added. Collective."""

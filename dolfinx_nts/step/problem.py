@@ -11,7 +11,7 @@ pure: nothing here changes a State, and history changes only when a step is acce
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -24,6 +24,8 @@ from dolfinx_nts.bodies.body import Moment, motion_of_points, places_of
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.elements import Coupling, Step, over
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.step.evaluation import BodyTerms, Evaluation
+from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.system import State, System
@@ -31,53 +33,6 @@ from dolfinx_nts.system import State, System
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
-
-_EPS = float(np.finfo(float).eps)
-#: Relative difference of the factors of two equal steps, which differ by rounding.
-EQUAL = 1e-6
-#: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
-_ANOTHER_STEP = 4.0
-
-
-@dataclass(frozen=True, eq=False)
-class BodyTerms:
-    """Parts of a body's equation at an iterate, owned coordinates, [kg m] except u1 and du [m].
-
-    Attributes:
-        u1: Displacement at t_{n+1}.
-        du: u_1 - u_0.
-        internal: h^2/2 internal forces.
-        external: h^2/2 external forces.
-        coupling: h^2/2 forces of elements, such as contact forces G^T lambda.
-        residual: Complete equation, also at prescribed coordinates, where it is h^2/2 times the
-            reaction.
-    """
-
-    u1: FloatArray
-    du: FloatArray
-    internal: FloatArray
-    external: FloatArray
-    coupling: FloatArray
-    residual: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """The step equations at an iterate.
-
-    Attributes:
-        x: Iterate it belongs to, this rank's part.
-        bodies: Terms of each body.
-        parts: Contribution of each batch of elements.
-        iterations: Newton iterations it took.
-        min_det: Smallest det F of all bodies, once solved.
-    """
-
-    x: FloatArray
-    bodies: tuple[BodyTerms, ...]
-    parts: tuple[Any, ...]
-    iterations: int = 0
-    min_det: float = np.inf
 
 
 class StepProblem:
@@ -99,6 +54,7 @@ class StepProblem:
         version: Changes whenever `unknowns` does.
         factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
         rtol: As given.
+        rounding: What part of the forces on bodies is rounding.
         centre: Middle of all bodies in the reference [m], shape (3,).
         stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
     """
@@ -120,7 +76,9 @@ class StepProblem:
         self.version = 0
         self.stabilization = 0.0
         self.centre, self._span = _box(system)
-        self._diagonal, self._diagonal_factor = np.zeros((2, len(system.bodies)))
+        self.rounding = Rounding(
+            system.bodies, lambda k: self.body_tangent(k, self.state.u[k])
+        )
 
     # ---- set-up of a step
     def begin(
@@ -176,17 +134,14 @@ class StepProblem:
             self._motion = np.maximum(self._motion, self.motion(again))
             way = [terms.du for terms in again.bodies]
         # Bodies at rest may fall.
-        self._length = self._moved + self._motion + dt**2 * float(np.linalg.norm(self._gravity))
+        length = self._moved + self._motion + dt**2 * float(np.linalg.norm(self._gravity))
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
         for bodies in map(list, (*system.contact_bodies, *system.joint_bodies)):
-            self._length[bodies] = self._length[bodies].max()
-        # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
-        old = self._diagonal_factor
-        other = (self.factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * self.factor)
-        self._diagonal[other] = 0.0
+            length[bodies] = length[bodies].max()
+        self.rounding.begin(self.factor, length, self._moved, self._extent)
         step = Step(
             state, dt, self.factor, self.integrator, self.condense, self.first, way,
-            self._motion, self._length, self._stiffness, moments, self._force_rounding_of,
+            self._motion, length, self._stiffness, moments, self.rounding.of,
         )  # fmt: skip
         for coupling, history in zip(self.couplings, state.histories, strict=True):
             coupling.begin(step, history, again, search)
@@ -197,6 +152,11 @@ class StepProblem:
     def elements(self) -> list[Any]:
         """Batches of elements in the step."""
         return [batch for coupling in self.couplings for batch in coupling.elements]
+
+    @property
+    def bodies(self) -> list[tuple[int, ...]]:
+        """Numbers of the bodies of each batch."""
+        return [of for coupling in self.couplings for of in coupling.bodies]
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """Couplings with their parts of an evaluation."""
@@ -209,6 +169,11 @@ class StepProblem:
     def contact_parts(self, e: Evaluation) -> tuple[Any, ...]:
         """Parts of an evaluation that contacts contribute, one of each."""
         return next(parts for coupling, parts in self.each(e) if coupling is self.contacts)
+
+    def forget_forces(self) -> None:
+        """Take no body's forces from an earlier step: parameters of materials have changed."""
+        if self._sleepers is not None:
+            self._sleepers.forget()
 
     def wake(self, e: Evaluation) -> bool:
         """Whether a solved step asks for more elements, and is to be solved again. Collective.
@@ -249,13 +214,6 @@ class StepProblem:
         """Bodies that elements move, the same on all ranks. Collective."""
         return set().union(*(coupling.touched() for coupling in self.couplings))
 
-    def _force_rounding_of(self, bodies: Sequence[int]) -> float:
-        """Norm of the forces on some bodies that is rounding [kg m]. Collective."""
-        for k in bodies:
-            if not self._diagonal[k]:
-                self._measure_rounding(k)
-        return float(self.rounding[list(bodies)].sum())
-
     def _lay_out(self) -> None:
         """Layout of the unknowns, kept while no rank's elements change, and a first guess."""
         system = self.system
@@ -269,8 +227,7 @@ class StepProblem:
         if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
             self.destroy()
             sizes = {k: system.bodies[k].num_owned for k in self.awake}
-            bodies = [of for coupling in self.couplings for of in coupling.bodies]
-            self.unknowns = Unknowns(system.comm, sizes, elements, bodies)
+            self.unknowns = Unknowns(system.comm, sizes, elements, self.bodies)
             self.version += 1
             self._numbers = numbers
         self.guess(flight=True)
@@ -283,6 +240,11 @@ class StepProblem:
     def of_body(self, k: int) -> slice:
         """Where a body that is awake stands among this rank's unknowns."""
         return self._laid.of_body(k)
+
+    @property
+    def of_constraints(self) -> slice:
+        """Where the elements' multipliers stand among this rank's unknowns."""
+        return self._laid.of_elements("constraints")
 
     @property
     def _laid(self) -> Unknowns:
@@ -346,22 +308,12 @@ class StepProblem:
             return {}
         chosen = sorted(set(np.flatnonzero(rest).tolist()) - self._touched())
         u, f = self.state.u, self.factor
-        found = self._sleepers.find(chosen, u, self._gravity, self._force_rounding)
+        found = self._sleepers.find(chosen, u, self._gravity, self.rounding.at_rest)
         none = {k: np.zeros_like(u[k]) for k in found}
         return {
             k: BodyTerms(u[k], none[k], f * a, f * b, none[k], f * (a - b))
             for k, (a, b) in found.items()
         }
-
-    def _force_rounding(self, k: int) -> float:
-        """Norm of the forces on a body at rest [N] that is rounding, as in `ratios`.
-
-        A diagonal of another step hardly allows more: it grows with the factor, but less than that.
-        """
-        if not self._diagonal[k]:
-            self._measure_rounding(k)
-        rounding = self._rounding_of(self._moved)[k]
-        return float(rounding / max(self.factor, self._diagonal_factor[k]))
 
     def _inertial(self, body: Any, du: FloatArray) -> FloatArray:
         """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
@@ -480,49 +432,16 @@ class StepProblem:
             held.destroy()
         return a
 
-    @property
-    def knows_rounding(self) -> bool:
-        """Whether the rounding of the forces on all bodies in the step has been measured."""
-        return bool((self._diagonal[list(self.awake)] > 0.0).all())
-
     def measure_rounding(self, e: Evaluation) -> None:
-        """Measure the rounding of the forces anew, for bodies that have stiffened. Collective.
-
-        The bodies' matrices are not those of an iterate any more.
+        """Measure the rounding of the forces anew, at an iterate's motion. Collective.
 
         Args:
             e: Iterate whose motion is longer than the one that was predicted, at most the extent.
         """
-        self._length = np.maximum(self._length, self._lengths(e))
-        for k in self.awake:
-            self._measure_rounding(k)
-
-    def _measure_rounding(self, k: int) -> None:
-        """Note the diagonal of a body's matrix in the accepted state, never in an iterate.
-
-        An iterate that runs off may be stiffer by any factor; its rounding excuses no residual.
-        """
-        diagonal = self.body_tangent(k, self.state.u[k]).getDiagonal()
-        self._diagonal[k], self._diagonal_factor[k] = diagonal.norm(), self.factor
-        diagonal.destroy()
+        self.rounding.length = np.maximum(self.rounding.length, self._lengths(e))
+        self.rounding.measure(self.awake)
 
     # ---- convergence
-    @property
-    def rounding(self) -> FloatArray:
-        """Of the forces on each body [kg m]: stiffness times length times machine precision.
-
-        Forces come from displacement gradients, so the length is that of the displacement, wherever
-        the body lies and however large it is.
-        """
-        return self._rounding_of(self._length)
-
-    def _rounding_of(self, length: FloatArray) -> FloatArray:
-        """`rounding` at displacements of these lengths [m], shape (bodies,)."""
-        bodies = zip(self.system.bodies, self._extent, strict=True)
-        beside = np.array([getattr(body, "rounded", extent) for body, extent in bodies])
-        rounding: FloatArray = _EPS * self._diagonal * (length + beside)
-        return rounding
-
     def _lengths(self, e: Evaluation) -> FloatArray:
         """Largest displacement of each body in an evaluation [m]. Collective.
 
@@ -535,7 +454,7 @@ class StepProblem:
     def momentum_rounding(self) -> float:
         """Change of momentum in the step that is rounding [kg m/s]."""
         rate = self.integrator.rate(self.dt)
-        return float(self.rounding.sum() * np.sqrt(self.system.size) * rate)
+        return float(self.rounding.forces.sum() * np.sqrt(self.system.size) * rate)
 
     @property
     def span(self) -> float:
@@ -561,7 +480,7 @@ class StepProblem:
             parts = (self._stabilization(body) * t.du, t.internal, t.external, t.coupling)
             squares.append([float(p @ p) for p in parts])
         norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
-        limits = self.rtol * norms[:, 1:].max(axis=1) + self._rounding_of(self._lengths(e))
+        limits = self.rtol * norms[:, 1:].max(axis=1) + self.rounding.at(self._lengths(e))
         return max(over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
@@ -572,7 +491,7 @@ class StepProblem:
             parts = (free, self._inertia[k], t.internal, t.external, t.coupling)
             squares[k] = [float(p @ p) for p in parts]
         norms = np.sqrt(self.system.comm.allreduce(squares))
-        ratio, rounding = {}, self.rounding
+        ratio, rounding = {}, self.rounding.forces
         for k, body in enumerate(self.system.bodies):
             limit = self.rtol * norms[k, 1:].max() + rounding[k]
             ratio[body.name] = over(norms[k, 0], limit)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,8 +14,9 @@ from dolfinx_nts.step import balance
 from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
-    from dolfinx_nts.run.simulate import Solution
-    from dolfinx_nts.step.problem import Evaluation, StepProblem
+    from dolfinx_nts.run.solution import Solution
+    from dolfinx_nts.step.evaluation import Evaluation
+    from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -53,6 +55,15 @@ class Promises:
         self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if self._closes else _OPEN
         self._largest, self._rounding = 0.0, 0.0
 
+    @property
+    def memory(self) -> tuple[float, float]:
+        """Largest energy and rounding so far [J], for a run that goes on."""
+        return self._largest, self._rounding
+
+    def resume(self, memory: Sequence[float]) -> None:
+        """Go on from another run's memory."""
+        self._largest, self._rounding = memory
+
     def hold(self, problem: StepProblem, step: Evaluation, impulses: float) -> None:
         """Warn if the last row's ledger misses too much, or contact brought energy. Collective.
 
@@ -66,7 +77,7 @@ class Promises:
             self._largest = max(self._largest, *(abs(row[name]) for name in names))
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         moved = np.sqrt(problem.system.comm.allreduce(squares))
-        self._rounding += _ROUNDING * float(problem.rounding @ moved) / problem.factor
+        self._rounding += _ROUNDING * float(problem.rounding.forces @ moved) / problem.factor
         # Where nothing moves, forces still do work over the rounding of positions, of which gaps
         # are solved to 8 eps: 2,450 N at each corner of a box at rest over 1.7e-15 m.
         self._rounding += _ROUNDING * _EPS * impulses / problem.dt * problem.rounded_length
@@ -82,17 +93,31 @@ class Promises:
             )
         else:
             text = (
-                f"the energy is {missing:.3g} J, {part:.2g} of the largest, off what work, "
-                f"friction and contact account for; this integrator does not keep it: {self._open}"
+                f"the energy has changed by {missing:.3g} J, {part:.2g} of the largest, more than "
+                f"work, friction and contact account for; this integrator does not keep it: "
+                f"{self._open}"
             )
-        doubtful = part > (_DOUBTFUL if self._closes else _OPEN)
+        if not np.isfinite(missing):
+            text = (
+                "the energy is not finite: that of a material, a form or a spring may not be "
+                "defined for its deformation"
+            )
+        doubtful = not part <= (_DOUBTFUL if self._closes else _OPEN)
         self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
 
     def _tell_gain(self, problem: StepProblem, step: Evaluation) -> None:
         """Warn if contact has brought energy, in this step or in all. Collective."""
         before, row = self._solution.rows[-2:]
-        total = -row["contact_defect"]
-        gain = total + before["contact_defect"]
+        total = row["impact_restored"] - row["contact_defect"]
+        gain = total - before["impact_restored"] + before["contact_defect"]
+        massless = -row["massless_defect"]
+        if massless > _GAIN * self._largest + self._rounding:
+            self._solution.warn(
+                "energy from massless nodes", row["time"], massless,
+                f"nodes without mass that leave within steps have brought {massless:.3g} J, "
+                f"{massless / self._largest:.2g} of the largest energy; use a smaller dt",
+                grave=True,
+            )  # fmt: skip
         remedy = "use a finer or smoother master, or a smaller, constant dt"
         if gain > _GAIN * abs(row["energy"]) + self._rounding:
             where = balance.expelled(problem, step)
@@ -106,7 +131,9 @@ class Promises:
                 f"{total / self._largest:.2g} of the largest energy; {remedy}"
             )
         else:
-            if -total > _LOSS * self._largest + self._rounding:
+            # What a coefficient of restitution takes is asked for.
+            asked = row["impact_restored"] != 0.0
+            if not asked and -total > _LOSS * self._largest + self._rounding:
                 self._solution.warn(
                     "energy lost to contact", row["time"], -total,
                     f"gaps that close in mid step have taken {-total:.3g} J, "

@@ -12,12 +12,16 @@ from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step.problem import Evaluation, StepProblem
+    from dolfinx_nts.step.evaluation import Evaluation
+    from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Column of the resultants of all contacts.
 CONTACT_FORCES = "contact_forces"
+#: Column of their moments about the origin.
+CONTACT_MOMENTS = "contact_moments"
+CONTACTS = (CONTACT_FORCES, CONTACT_MOMENTS)
 
 
 def reactions_of(item: Any) -> str:
@@ -30,7 +34,8 @@ def at_start(system: System) -> dict[str, FloatArray]:
     row = {reactions_of(b): np.zeros_like(_reactions(b, np.zeros(b.num_owned)))
            for b in system.bodies}  # fmt: skip
     row |= {reactions_of(joint): np.zeros((2, 3)) for joint in system.declared_joints}
-    return row | {CONTACT_FORCES: np.zeros((len(system.contacts), 3))}
+    none = np.zeros((len(system.contacts), 3))
+    return row | {CONTACT_FORCES: none, CONTACT_MOMENTS: none}
 
 
 def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
@@ -42,20 +47,27 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
 
     Returns:
         By column: of each body's conditions, shape (conditions, 3), of each joint on the first of
-        its bodies, force [N] and moment about its point [N m], shape (2, 3), and of each contact on
-        its slave body, shape (contacts, 3).
+        its bodies, force [N] and moment about its point [N m], shape (2, 3), NaN where its elements
+        do not say them, and of each contact on
+        its slave body forces [N] and moments about the origin [N m], shape (contacts, 3) each.
     """
     bodies, contacts = problem.system.bodies, problem.contact_parts(step)
     joints = problem.system.declared_joints
     parts = [_reactions(b, t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
     forces = [part.force.sum(axis=0) for part in contacts]
     parts.append(np.reshape(forces, (len(contacts), 3)))
+    theta, elements = problem.integrator.theta, problem.contacts.elements
+    moments = [c.moment(part, theta) for c, part in zip(elements, contacts, strict=True)]
+    parts.append(np.reshape(moments, (len(contacts), 3)))
     held = list(problem.each(step))[1 : 1 + len(joints)]
-    parts += [_of_joint(problem, step, *each) for each in held]
+    first = [bodies[0] for bodies in problem.system.joint_bodies[: len(joints)]]
+    parts += [
+        _of_joint(problem, step, k, *each) for k, each in zip(first, held, strict=True)
+    ]
     total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     split = np.split(total, np.cumsum([len(part) for part in parts])[:-1])
-    names = [*map(reactions_of, bodies), CONTACT_FORCES]
+    names = [*map(reactions_of, bodies), CONTACT_FORCES, CONTACT_MOMENTS]
     found = {name: value / problem.factor for name, value in zip(names, split, strict=False)}
     for joint, (force, moment, places, count) in zip(joints, split[len(names) :], strict=True):
         point = places / max(count[0], 1.0)
@@ -65,24 +77,20 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
 
 
 def _of_joint(
-    problem: StepProblem, step: Evaluation, coupling: Any, parts: tuple[Any, ...]
+    problem: StepProblem, step: Evaluation, first: int, coupling: Any, parts: tuple[Any, ...]
 ) -> FloatArray:
-    """Of a joint on its first body on this rank. Collective.
+    """Of a joint on its first body, whose number is given, on this rank. Collective.
 
     Returns:
-        Factor of the step times force and moment about the origin, the sum of its points [m], and
-        their number, shape (4, 3); zeros if its elements are not between points.
+        As of `Elements.resultant`, shape (4, 3); NaN if its elements have none.
     """
     out = np.zeros((4, 3))
-    if len(parts) != 1 or not hasattr(coupling.elements[0], "sides"):
-        return out
-    side, k = coupling.elements[0].sides[0], coupling.bodies[0][0]
-    u = problem.state.u[k] + problem.integrator.theta * step.bodies[k].du
-    y = side.reference + side.nodal(u)
-    force = -parts[0].residual[:, : y[0].size if len(y) else 0].reshape(y.shape)
-    out[0] = force[side.places].sum(axis=0)
-    out[1] = cross(y, force).sum(axis=(0, 1))
-    out[2], out[3] = side.combine(y).sum(axis=0), len(y)
+    u = problem.state.u[first] + problem.integrator.theta * step.bodies[first].du
+    for batch, of, part in zip(coupling.elements, coupling.bodies, parts, strict=True):
+        if not hasattr(batch, "resultant"):
+            return np.full((4, 3), np.nan)
+        if first in of:
+            out += batch.resultant(part, of.index(first), u)
     return out
 
 

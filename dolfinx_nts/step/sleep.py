@@ -54,6 +54,10 @@ class Sleepers:
                 found[k] = internal, external
         return found
 
+    def forget(self) -> None:
+        """Evaluate internal forces anew: what they depend on beside u has changed."""
+        self._known.clear()
+
     def _internal(self, k: int, u: FloatArray) -> FloatArray:
         known = k in self._known and np.array_equal(self._known[k][0], u)
         if not self._comm.allreduce(known, op=MPI.LAND):

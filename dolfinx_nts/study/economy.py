@@ -15,7 +15,7 @@ import io
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.kernels.strain_energy import strain_energy
 from dolfinx_nts.output import writers as output
-from dolfinx_nts.step import balance
 from dolfinx_nts.step.linear_solver import SolverOptions
 from dolfinx_nts.validation import known_options, require_positive
 
@@ -314,7 +313,7 @@ class Economy:
         run = nts.simulate(
             self.system(feature), nts.EnergyMomentum(), dt=self.dt, t_end=count * self.dt,
             newton=nts.Newton(rtol=RTOL), petsc_options=_ORDERING, output=[*writers, turn],
-            progress=feature.progress, sleep=feature.sleep,
+            progress=feature.progress, sleep=feature.sleep, ledger=feature.ledger,
         )  # fmt: skip
         if run.status != "completed":
             raise RuntimeError(f"{feature.name}: {run.status}")
@@ -329,15 +328,13 @@ class Economy:
             order: Random numbers, the same on all ranks: whose turn is next.
         """
         count = _WARM + steps + 1  # the last one, which is always written, is not timed
-        ledger = {PLAIN: True} | {f.name: f.ledger for f in FEATURES}
         turns = {PLAIN: Turn(functools.partial(self.run_plain, count))}
         turns |= {f.name: Turn(functools.partial(self.run, f, count, folder)) for f in FEATURES}
         names = list(turns)
         with contextlib.redirect_stderr(io.StringIO()):
             for _ in range(count + 2):  # set-up, steps, end
                 for k in order.permutation(len(names)):
-                    with _ledger(ledger[names[k]]):
-                        turns[names[k]].take()
+                    turns[names[k]].take()
         result = {}
         for name, turn in turns.items():
             laps = np.array(turn.laps[_WARM : _WARM + steps])
@@ -349,28 +346,6 @@ class Economy:
 def _spinning(speed: float) -> Any:
     """Velocity along x and a spin about x, which strains a body at rest otherwise."""
     return lambda x: np.array([speed + 0 * x[0], -_SPIN * (x[2] - 0.5), _SPIN * (x[1] - 0.5)])
-
-
-@contextlib.contextmanager
-def _ledger(on: bool) -> Iterator[None]:
-    """Run without the ledger unless it is on; no option of the package leaves it out."""
-    zero, three = 0.0, np.zeros(3)
-    measured: dict[str, Any] = {"kinetic": zero, "potential": zero}
-    measured |= {"linear_momentum": three, "angular_momentum": three}
-    names = ("external_work", "friction_dissipation", "contact_defect", "active", "min_gap")
-    instead = {
-        "measure": lambda *_: measured,
-        "step_terms": lambda *_: dict.fromkeys((*names, "stick", "slip"), zero),
-        "switches": lambda *_: [],
-    }
-    kept = {name: getattr(balance, name) for name in instead}
-    for name, function in ({} if on else instead).items():
-        setattr(balance, name, function)
-    try:
-        yield
-    finally:
-        for name, function in kept.items():
-            setattr(balance, name, function)
 
 
 @known_options

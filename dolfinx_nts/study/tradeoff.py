@@ -38,7 +38,8 @@ from petsc4py import PETSc
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.step.newton import ACCURACY
+from dolfinx_nts.bodies.body import places_of
+from dolfinx_nts.step.accuracy import ACCURACY
 from dolfinx_nts.study import economy
 from dolfinx_nts.validation import require_bool, require_positive
 
@@ -112,13 +113,14 @@ class Motion:
 
 def _affine(body: Any) -> tuple[FloatArray, float, float]:
     """What u . M is multiplied with for the means of a body, shape (num_owned, 12); M; X . M X."""
-    x, one = body.reference.reshape(-1, 3), np.tile(np.eye(3), (body.num_owned // 3, 1))
+    place = places_of(body).astype(float)[:, None]
+    x, one = body.reference.reshape(-1, 3), np.kron(place, np.eye(3))
     nodal = body.inertia(one[:, 0].copy())[::3]
     square = body.reference @ body.inertia(body.reference)
     moments = body.comm.allreduce(np.array([nodal.sum(), *(nodal @ x), square]))
     mass, centre = moments[0], moments[1:4] / moments[0]
     size = np.sqrt(moments[4] / mass - centre @ centre)
-    arms = (x - centre) / size
+    arms = (x - place * centre) / size
     tests = np.hstack([one, *(np.kron(arms[:, k : k + 1], np.eye(3)) for k in range(3))]) / mass
     return tests, float(mass), float(moments[4])
 
@@ -204,7 +206,7 @@ def _relative(a: float, b: float) -> float:
 def load(scene: str) -> Any:
     """Module of a scene: a file, or a name in `demos/` here or beside the package.
 
-    It is executed anew each time, with what it imports from its folder.
+    It is executed anew each time; what it imports from its folder is imported once.
 
     Raises:
         ValueError: There is no such file, or it has no `main`.
@@ -217,17 +219,13 @@ def load(scene: str) -> Any:
         raise ValueError(f"scene={scene!r}: no such file; looked for {', '.join(map(str, places))}")
     spec = importlib.util.spec_from_file_location(f"scene_{found.stem}", found)
     assert spec is not None and spec.loader is not None
-    folder, known = found.resolve().parent, set(sys.modules)
+    folder = found.resolve().parent
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(folder))
     try:
         spec.loader.exec_module(module)
     finally:
         sys.path.remove(str(folder))
-        for name in set(sys.modules) - known - {spec.name}:
-            # A helper may have taken `nts.simulate` as it is in this run.
-            if Path(getattr(sys.modules[name], "__file__", None) or ".").parent == folder:
-                del sys.modules[name]
     if not callable(getattr(module, "main", None)):
         raise ValueError(f"scene={scene!r}: {found} has no function main")
     return module
@@ -303,9 +301,9 @@ def measure(scene: str, choices: Mapping[str, Any], comm: Any) -> Run:
         choices: Name -> value.
         comm: MPI communicator of the script's bodies.
     """
-    run, simulate = Run(dict(choices)), nts.simulate
+    run = Run(dict(choices))
 
-    def instead(system: Any, integrator: Any, **given: Any) -> nts.Solution:
+    def instead(simulate: Any, system: Any, integrator: Any, **given: Any) -> nts.Solution:
         options = _options({**given, "integrator": integrator}, rest)
         run.path, run.dt = Motion(), options["dt"]
         output = (*options.pop("output", ()), run.path)
@@ -317,20 +315,18 @@ def measure(scene: str, choices: Mapping[str, Any], comm: Any) -> Run:
         run.status = run.solution.status
         raise _MeasuredError
 
-    nts.simulate = instead  # type: ignore[assignment]
     try:
         main = load(scene).main
         taken = set(inspect.signature(main).parameters)
         rest = {k: v for k, v in choices.items() if k not in taken}
-        main(**{k: v for k, v in choices.items() if k in taken})
+        with nts.intercept(instead):
+            main(**{k: v for k, v in choices.items() if k in taken})
     except _MeasuredError:
         pass
     except Exception as error:
         run.status = f"{type(error).__name__}: {error}"
     else:
         run.status = "main never called simulate"
-    finally:
-        nts.simulate = simulate
     return run
 
 

@@ -1,0 +1,138 @@
+"""What acts on a body's boundary: prescribed displacements and loads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact.surfaces import locate_facets
+from dolfinx_nts.validation import is_whole, items, known_options, vector_in_time
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+Vector = Sequence[float] | FloatArray
+VectorInTime = Vector | Callable[[float], Vector]
+
+
+@known_options
+@dataclass(frozen=True)
+class Dirichlet:
+    """Prescribed displacement on a part of the boundary.
+
+    Attributes:
+        where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
+        value: Displacement [m]: a vector, or a function of time; its work is external work. The
+            nodes start where and as fast as the value says at the start.
+        components: Which of x, y, z are prescribed.
+
+    Raises:
+        ValueError: Unknown component.
+    """
+
+    where: Any
+    value: VectorInTime = (0.0, 0.0, 0.0)
+    components: tuple[int, ...] = (0, 1, 2)
+
+    def __post_init__(self) -> None:
+        given = self.components
+        listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
+        if not listed or not given:
+            raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
+
+
+@known_options
+@dataclass(frozen=True)
+class Traction:
+    """Dead traction on a part of the boundary.
+
+    Attributes:
+        where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
+        value: Force per reference area [Pa]: a vector, or a function of time.
+    """
+
+    where: Any
+    value: VectorInTime
+
+
+def facets_of(mesh: Any, where: Any, what: str) -> IntArray:
+    """This rank's facets that a `where` selects, as of `locate_facets`."""
+    if isinstance(where, tuple) and len(where) == 2:
+        return locate_facets(mesh, *where, what)
+    return locate_facets(mesh, where, None, what)
+
+
+class Supports:
+    """The `Dirichlet` conditions of a body. Collective.
+
+    Args:
+        comm: MPI communicator.
+        space: The body's function space.
+        bcs: The conditions.
+        name: Of the body, for messages.
+
+    Attributes:
+        fixed: Positions of the prescribed coordinates among this rank's, ascending.
+        driven: Whether a condition's value is a function of time.
+        still: Those whose conditions do not depend on time.
+        masks: DOLFINx conditions, for rows and columns of matrices.
+
+    Raises:
+        TypeError: An item is no condition.
+        ValueError: A condition selects no facet, or has no vector at t = 0.
+    """
+
+    def __init__(self, comm: Any, space: Any, bcs: Sequence[Dirichlet], name: str) -> None:
+        self._comm, self._name = comm, name
+        self._num_owned = 3 * space.dofmap.index_map.size_local
+        bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")
+        for k, bc in enumerate(bcs):
+            self._value(k, bc.value, 0.0)
+        self.masks: list[Any] = []
+        self._parts: list[tuple[VectorInTime, list[tuple[int, IntArray]]]] = []
+        owner, dim = np.full(self._num_owned, -1), space.mesh.topology.dim
+        for number, bc in enumerate(bcs):
+            what = f"Dirichlet.where of bcs[{number}] of {name!r}"
+            facets = facets_of(space.mesh, bc.where, what)
+            blocks = np.asarray(fem.locate_dofs_topological(space, dim - 1, facets))
+            self._parts.append((bc.value, []))
+            for component in bc.components:
+                self.masks.append(compat.subspace_component_bc(space, component, blocks))
+                dofs = np.sort(blocks * 3 + component)
+                dofs = dofs[dofs < self._num_owned]
+                self._parts[-1][1].append((component, dofs))
+                owner[dofs] = number
+        self.fixed = np.flatnonzero(owner >= 0)
+        self.driven = any(callable(value) for value, _ in self._parts)
+        still = [d for value, parts in self._parts if not callable(value) for _, d in parts]
+        self.still: IntArray = np.concatenate([np.empty(0, dtype=int), *still])
+        # Where two conditions meet, the later one's value holds, so it carries the force.
+        self._condition = owner[self.fixed]
+
+    def _value(self, k: int, value: VectorInTime, time: float) -> FloatArray:
+        what = f"Dirichlet.value of bcs[{k}] of {self._name!r}"
+        return vector_in_time(self._comm, what, value, time, "m")
+
+    def prescribed(self, time: float) -> FloatArray:
+        """Displacements at a time, in the order of `fixed` [m]. Collective."""
+        values = np.zeros(self._num_owned)
+        for k, (value, parts) in enumerate(self._parts):
+            now = self._value(k, value, time)
+            for component, dofs in parts:
+                values[dofs] = now[component]
+        return values[self.fixed]
+
+    def reactions(self, residual: FloatArray) -> FloatArray:
+        """Resultants on the coordinates of each condition, this rank's part [N], (conditions, 3).
+
+        Args:
+            residual: Force on all owned coordinates.
+        """
+        total = np.zeros((len(self._parts), 3))
+        np.add.at(total, (self._condition, self.fixed % 3), residual[self.fixed])
+        return total

@@ -1,0 +1,501 @@
+"""What bodies with a DOLFINx function space and forms in UFL have in common."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+from ufl.corealg.traversal import traverse_unique_terminals
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.bodies.conditions import Dirichlet, Supports
+from dolfinx_nts.bodies.inversion import Determinants
+from dolfinx_nts.bodies.massless import redistributed
+from dolfinx_nts.bodies.materials import misfit
+from dolfinx_nts.bodies.points import Points, in_mesh
+from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.integrators.rule import choose
+from dolfinx_nts.parallel import gather_on_root, raise_together
+from dolfinx_nts.validation import at_points, require_bool, require_name, vector, vectors
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+ExtraForm = Callable[[Any, Any, Any, Any], Any]
+
+
+class UflBody:
+    """A body whose coordinates are the nodes of a Lagrange space of 3-vectors.
+
+    A kind of body calls `_stand`, then `_set_forms`, and has `_mass_form` and `_virtual_work`.
+
+    Args:
+        space: Function space of the displacements.
+        degree: Its polynomial degree.
+        name: Name in messages and files.
+        extra_form: As of `Continuum`.
+        quadrature_degree: That of the energy; cells of 3D meshes are watched at its points.
+        allow_inversion: As of `Continuum`.
+
+    Attributes:
+        u: Displacement [m], dolfinx Function of the last accepted state.
+        v: Velocity [m/s], dolfinx Function.
+        massless: Owned coordinates without mass, shape (num_owned,), see `surface`.
+        has_massless: Whether there are such on any rank.
+    """
+
+    #: Length whose rounding the forces hold beside that of the displacements [m].
+    rounded: float
+
+    def __init__(
+        self, space: Any, degree: int, name: str, extra_form: ExtraForm | None,
+        quadrature_degree: int, allow_inversion: bool,
+    ) -> None:  # fmt: skip
+        require_name("name", name)
+        require_bool("allow_inversion", allow_inversion)
+        if extra_form is not None and not callable(extra_form):
+            raise TypeError(f"extra_form={extra_form!r}: pass a callable (u, v, w, t) -> UFL form")
+        self.name, self.space, self.degree, self._extra_form = name, space, degree, extra_form
+        self.mesh = space.mesh
+        self.comm = self.mesh.comm
+        # DOLFINx makes C identifiers of the names.
+        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
+        self.u, self.v = (fem.Function(space, name=f"{stem}_{s}") for s in "uv")
+        self.num_owned = 3 * space.dofmap.index_map.size_local
+        self.reference = space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
+        self._compiled: dict[Integrator, tuple[Any, Any, Any]] = {}
+        self._stiffness: FloatArray | None = None
+        self.allow_inversion = allow_inversion
+        # Cells of a surface or a line have no inside.
+        self._determinants: Determinants | None = None
+        if self.mesh.topology.dim == 3:
+            self._determinants = Determinants(space, degree, quadrature_degree)
+        self.massless, self.has_massless = np.zeros(self.num_owned, dtype=bool), False
+        self._mass: Any = None
+        self._consistent_mass: Any = None
+        self._mass_change: Any = None
+        self._sum: Any = None
+
+    # ---- what a kind of body has of its own
+    def _mass_form(self, v: Any, w: Any) -> Any:
+        """Kinetic energy's second derivative in UFL, linear in v and w."""
+        raise NotImplementedError
+
+    def _virtual_work(self, rule: Integrator, w: Any) -> Any:
+        """Internal virtual work between the Functions `_u0` and `_u1` by a rule, in UFL."""
+        raise NotImplementedError
+
+    def surface(
+        self,
+        marker: Any,
+        tag: int | None = None,
+        *,
+        smoothing: bool = False,
+        mass: str = "consistent",
+    ) -> Surface:
+        """A part of the boundary for contact.
+
+        With smoothing, a slave touches a smooth surface through the nodes instead of the flat or
+        bilinear facets of a master. It is linear in the nodes, so momentum and energy are kept as
+        without. Over quadrilaterals lie bicubic patches of Overhauser's cubics (Catmull and Rom
+        1974), over each triangle three quartic ones (Clough and Tocher 1965; Shirman and Sequin
+        1987) whose tangent planes fit the rings of its nodes, of any number of neighbours. The
+        normal no longer jumps from facet to facet, and the energy lost or gained by changes of
+        facet (`contact_defect`) falls: on a cylinder more than 1e4 times on even quadrilaterals, 20
+        to 100 times where they differ by up to a half in size, 4e3 times and more on triangles,
+        even or not. For smoothing in contact see Wriggers, Krstulovic-Opara and Korelc (2001) and
+        Puso and Laursen (2002). Limits:
+
+        - It is not smooth at edges whose facets meet at more than 60 degrees, at nodes where other
+          than four quadrilaterals meet, and at nodes whose triangles see no common plane, such as
+          corners where three sharp edges meet on a flat side. A warning tells how many facets.
+        - It bulges beyond the facets by what they cut off the curve, an eighth of the angle between
+          neighbours times the size of a facet: gaps are measured from there.
+        - Beyond its facet a patch goes on as a polynomial, which is good for half a facet; let no
+          slave slide over more than a third of a facet in a step.
+        - An element of a pair takes some ten times as long, and a triangle some 8 kB on each rank.
+          As a slave, a surface is not changed.
+
+        With mass="redistributed" the nodes of a slave surface have no mass (theory section 16;
+        Khenous, Laborde and Renard 2008): other nodes get it, and the body keeps its mass, centre
+        of mass and inertia. An impact then stops no mass at once, so its contact forces do not
+        alternate from step to step. The laws of contact and friction hold for the forces at
+        t_{n+1}, and those of the step are the mean of both ends, so that momenta and the ledger
+        are as exact as without (`massless_defect` in the balance). Only the slave of a contact may
+        have it, of a Continuum with some four cells behind the surface, with `EnergyMomentum()` or
+        `Midpoint()` and without restored impacts; in statics it changes nothing.
+
+        Args:
+            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
+                meshtags.
+            tag: Value in the meshtags.
+            smoothing: Whether slaves touch a smooth surface when this one is the master.
+            mass: "consistent" or "redistributed".
+
+        Raises:
+            TypeError: smoothing is no bool.
+            ValueError: Degree above 1, no facet, or interior facets; mass is unknown, too little of
+                the body is left beside the surface to take its mass, or the body has moved already.
+        """
+        require_bool("smoothing", smoothing)
+        choose("mass", mass, ("consistent", "redistributed"))
+        if self.mesh.topology.dim != 3:
+            raise ValueError(
+                f"body {self.name!r}: contact surfaces are boundaries of 3D meshes, not of "
+                f"{compat.cell_name(self.mesh)}s"
+            )
+        if self.degree != 1:
+            raise ValueError(
+                f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"
+            )
+        found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
+        surface = Surface(self, found, smoothing)
+        if mass == "redistributed":
+            self._make_massless(surface)
+        return surface
+
+    def _make_massless(self, surface: Surface) -> None:
+        """Take the mass of a surface's nodes, and give it to others. Collective."""
+        what = f"mass='redistributed' of a surface of {self.name!r}"
+        if self._compiled:
+            raise ValueError(f"{what}: the body has moved already; ask for it before the first run")
+        massless = self.massless.copy()
+        massless.reshape(-1, 3)[surface.rows] = True
+        old: Any = self._mass if self._consistent_mass is None else self._consistent_mass
+        x = self.reference.reshape(-1, 3)
+        new, problem = redistributed(old, massless[::3], x)
+        if problem:
+            raise ValueError(
+                f"{what}: beside its nodes without mass the body {problem}; use a finer mesh, a "
+                "smaller surface, or mass='consistent'"
+            )
+        self._consistent_mass, self._mass = old, new
+        self.massless, self.has_massless = massless, True
+        self.nodal_mass = self.inertia(np.ones(self.num_owned))
+        change = new.copy()
+        change.axpy(-1.0, old, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        start, _ = change.getOwnershipRange()
+        change.zeroRowsColumns((start + self.fixed).astype(PETSc.IntType), diag=0.0)
+        self._mass_change = change
+
+    def points(self, x: Any) -> Points:
+        """Material points, for joints and springs. Collective.
+
+        Args:
+            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
+
+        Raises:
+            ValueError: x is no array of points, or one of them lies in no cell.
+        """
+        return in_mesh(self, vectors("x", x, "points [m]"), "x")
+
+    def file_order(self) -> IntArray:
+        """Nodes in the order in which the cells of the input name them, on rank 0. Collective."""
+        owned = self.mesh.topology.index_map(self.mesh.topology.dim).size_local
+        cells = compat.cell_dofs(self.space)[:owned]
+        index_map = self.space.dofmap.index_map
+        nodes = index_map.local_to_global(cells.ravel().astype(np.int32)).reshape(cells.shape)
+        original = np.asarray(self.mesh.topology.original_cell_index[:owned], dtype=np.int64)
+        order = np.argsort(gather_on_root(self.comm, original))
+        _, first = np.unique(gather_on_root(self.comm, nodes)[order], return_index=True)
+        return np.argsort(first)
+
+    # ---- set-up
+    def _size(self) -> float:
+        """Largest side of the box around the body [m], the same on all ranks. Collective."""
+        x = self.reference.reshape(-1, 3)
+        ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
+        self.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+        return float(ends.sum(axis=0).max())
+
+    def _stand(self, bcs: Sequence[Dirichlet], velocity: Any, displacement: Any) -> None:
+        """Set conditions, and displacement and velocity at the start."""
+        self._supports = Supports(self.comm, self.space, bcs, self.name)
+        self.fixed = self._supports.fixed
+        self._interpolate(self.v, "velocity", velocity, "m/s")
+        self.v.x.array[self._supports.still] = 0.0
+        self.v.x.scatter_forward()
+        self.initial_velocity = self.v.x.array[: self.num_owned].copy()
+        self._interpolate(self.u, "displacement", displacement, "m")
+        self._starts_moved = self.comm.allreduce(bool(self.u.x.array.any()), op=MPI.LOR)
+        self.u.x.array[self.fixed] = self.prescribed(0.0)
+        self.u.x.scatter_forward()
+        self.initial_displacement = self.u.x.array[: self.num_owned].copy()
+        self._refuse_inversion()
+
+    def _refuse_inversion(self) -> None:
+        """Raise on every rank if the start turns a cell inside out."""
+        if self._determinants is None or not self._starts_moved or self.allow_inversion:
+            return
+        smallest = self._determinants.smallest(self.u.x.array)
+        det, place = min(self.comm.allgather(smallest), key=lambda found: found[0])
+        if det <= 0.0:
+            where = ", ".join(f"{x:.4g}" for x in place)
+            raise ValueError(
+                f"displacement of {self.name!r}: with its Dirichlet values at t=0 it turns a cell "
+                f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
+            )
+
+    @property
+    def driven(self) -> bool:
+        """Whether a condition's value is a function of time."""
+        return self._supports.driven
+
+    def _interpolate(self, function: Any, name: str, given: Any, unit: str) -> None:
+        """Fill a Function from a vector or a callable x (3, n) -> (3, n)."""
+        values = function.x.array
+        if callable(given):
+            # The nodes of Lagrange elements are their interpolation points.
+            x = self.space.tabulate_dof_coordinates().T
+            found = at_points(self.comm, f"{name} of {self.name!r}", given, x, (3,))
+            values[:] = found.T.ravel()
+        else:
+            constant = vector(name, given, unit, or_else="a callable x (3, n) -> (3, n)")
+            values[:] = np.tile(constant, len(values) // 3)
+
+    def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
+        """Compile mass and energy in UFL and any loads, which are returned."""
+        integrands = [part.integrand() for part in energy.integrals()]
+        self._parameters = [
+            t
+            for t in dict.fromkeys(t for i in integrands for t in traverse_unique_terminals(i))
+            if isinstance(t, fem.Constant | fem.Function) and t is not self.u
+        ]
+        v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+        if self._extra_form is not None:
+            self._check_extra_form(self._extra_form, w)
+        mass, *compiled, self._energy_form = compat.compile_forms(
+            [self._mass_form(v, w), *loads, energy]
+        )
+        full = compat.create_matrix(mass)
+        compat.assemble_matrix(full, mass, (), 0.0)
+        # Directions do not mix: two of three entries of the blocks are zero.
+        self._mass = compat.without_zeros(full)
+        full.destroy()
+        self._load = np.zeros(self.num_owned)
+        self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
+        self.nodal_mass = self.inertia(np.ones(self.num_owned))
+        return compiled
+
+    def _check_extra_form(self, extra_form: ExtraForm, w: Any) -> None:
+        # Sums, as those that it will be given.
+        given = self.u + self.v, self.u - self.v, w, fem.Constant(self.mesh, 0.0)
+        self._form_of(
+            f"extra_form={extra_form!r}", lambda: extra_form(*given), {w},
+            "is not linear in the test function w alone",
+            "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx",
+        )  # fmt: skip
+
+    def _form_of(
+        self, what: str, make: Callable[[], Any], wanted: set[Any], else_: str, remedy: str
+    ) -> Any:
+        """A form of the user's; what is wrong with it raises on every rank.
+
+        Args:
+            what: Argument that it comes from, and its value.
+            make: Makes it.
+            wanted: Its test and trial functions.
+            else_: What to say if it has others.
+            remedy: What to do.
+
+        Raises:
+            TypeError: It is none, or cannot be compiled on this mesh.
+        """
+        problem, cause, form, domain = None, None, None, self.mesh.ufl_domain()
+        try:
+            form = make()
+            arguments = set(form.arguments()) if isinstance(form, ufl.Form) else set()
+        except Exception as error:  # any: a rank that raises alone would leave the others waiting
+            problem, cause = f"raised {error!r}; {remedy}", error
+        else:
+            if not isinstance(form, ufl.Form):
+                problem = f"returned an object of type {type(form).__name__}; {remedy}"
+            elif arguments != wanted:
+                problem = f"{else_}; {remedy}"
+            elif any(d != domain for d in form.ufl_domains()):
+                problem = "has a measure of another mesh; use ufl.dx, or one of the body's mesh"
+            else:
+                problem = misfit([part.integrand() for part in form.integrals()], domain)
+        text = f"{what} of {self.name!r}: {problem}"
+        raise_together(self.comm, text if problem else None, TypeError, cause)
+        return form
+
+    def _compile(self, rule: Integrator) -> tuple[Any, Any, Any]:
+        """Compiled internal virtual work, tangent and extra virtual work by a rule."""
+        if rule not in self._compiled:
+            if not self._compiled:
+                self._u0, self._u1, self._drift = (fem.Function(self.space) for _ in range(3))
+                # What multiplies mass and stiffness: in one Constant, as UFL sorts several by their
+                # counts as text, and a form would be compiled again where 9 and 10 meet.
+                self._factors = fem.Constant(self.mesh, np.zeros(2))
+                # Change of the velocity with u_1; time.
+                self._rate, self._time = (fem.Constant(self.mesh, 0.0) for _ in range(2))
+            du, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+            work, extra = self._virtual_work(rule, w), None
+            virtual = work
+            if self._extra_form is not None:
+                moved = self._u1 - self._u0
+                place, velocity = self._u0 + rule.theta * moved, self._rate * moved
+                if rule.accelerations:
+                    velocity += self._drift
+                extra = self._extra_form(place, velocity, w, self._time)
+                virtual = work + extra
+            tangent = self._factors[1] * ufl.derivative(virtual, self._u1, du)
+            if rule.inertia:
+                tangent += self._factors[0] * self._mass_form(du, w)
+            forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
+            self._compiled[rule] = forms[0], forms[1], forms[2] if extra is not None else None
+            if not hasattr(self, "_matrix"):
+                self._matrix = compat.create_matrix(forms[1])
+        return self._compiled[rule]
+
+    # ---- Body protocol
+    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+        """Set the state at t_n."""
+        self._rule, self._forms = rule, self._compile(rule)
+        self._fill(self._u0, moment.u0)
+        if self._extra_form is not None:
+            self._rate.value, self._time.value = moment.rate, moment.time
+            if moment.drift is not None:
+                self._fill(self._drift, moment.drift)
+
+    def inertia(self, v: FloatArray) -> FloatArray:
+        """M v [kg m/s for a velocity]."""
+        self._in.array_w[:] = v
+        self._mass.mult(self._in, self._out)
+        return self._out.array_r.copy()
+
+    def internal(self, u1: FloatArray) -> FloatArray:
+        """Internal forces of the step [N]."""
+        self._fill(self._u1, u1)
+        return self._assemble(self._forms[0])
+
+    def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
+        """Loads and gravity, less the extra work [N]."""
+        force = self._load.copy()
+        if gravity.any():
+            force += self.nodal_mass * np.tile(gravity, self.num_owned // 3)
+        if self._forms[2] is not None:
+            self._fill(self._u1, u1)
+            force -= self._assemble(self._forms[2])
+        return force
+
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+        """Return mass M + stiffness K, the same matrix in each call."""
+        diagonal = mass * self._mean(self.nodal_mass)
+        if not mass:
+            diagonal = stiffness * self._mean(self.nodal_stiffness(self._rule))
+        self._fill(self._u1, u1)
+        self._factors.value = mass, stiffness
+        compat.assemble_matrix(self._matrix, self._forms[1], self._supports.masks, diagonal)
+        if self._mass_change is None:
+            return self._matrix
+        return self._with_change(mass)
+
+    def _with_change(self, mass: float) -> Any:
+        """The assembled matrix with mass where it is, which may be beyond the form's entries."""
+        if self._sum is None:
+            self._sum = self._matrix.copy()
+            other = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+            self._sum.axpy(mass, self._mass_change, structure=other)
+            return self._sum
+        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+        self._sum.zeroEntries()
+        self._sum.axpy(1.0, self._matrix, structure=subset)
+        self._sum.axpy(mass, self._mass_change, structure=subset)
+        return self._sum
+
+    def _mean(self, values: FloatArray) -> float:
+        """Over all coordinates. Collective."""
+        total = self.comm.allreduce(np.array([values.sum(), self.num_owned]))
+        return float(total[0] / total[1])
+
+    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+        """Mean diagonal of a rule's tangent at each node of the undeformed body [N/m]."""
+        if self._stiffness is None:
+            tangent = self._compile(rule)[1]
+            kept = [f.x.array.copy() for f in (self._u0, self._u1)]
+            for u in (self._u0, self._u1):
+                self._fill(u, np.zeros(self.num_owned))
+            self._factors.value, self._rate.value = (0.0, 1.0), 0.0
+            compat.assemble_matrix(self._matrix, tangent, (), 0.0)
+            diagonal = self._matrix.getDiagonal()
+            # The mean of a node's three entries does not depend on the directions of the axes.
+            self._stiffness = np.repeat(diagonal.array_r.reshape(-1, 3).mean(axis=1), 3)
+            diagonal.destroy()
+            for u, values in zip((self._u0, self._u1), kept, strict=True):
+                u.x.array[:] = values
+        return self._stiffness
+
+    def reactions(self, residual: FloatArray) -> FloatArray:
+        """Resultants on the coordinates of each `Dirichlet` condition, this rank's part [N]."""
+        return self._supports.reactions(residual)
+
+    def prescribed(self, time: float) -> FloatArray:
+        """Prescribed displacements at a time, in the order of `fixed` [m]. Collective."""
+        return self._supports.prescribed(time)
+
+    def potential(self, u: FloatArray) -> float:
+        """Strain energy on this rank [J]."""
+        kept = self.u.x.array.copy()
+        self._fill(self.u, u)
+        value = float(fem.assemble_scalar(self._energy_form))
+        self.u.x.array[:] = kept
+        return value
+
+    def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
+        """Smallest det F at corners and quadrature points on this rank, and X of its cell [m].
+
+        Without cells, or on a mesh that is not 3D, it is inf.
+        """
+        if self._determinants is None:
+            return np.inf, np.full(3, np.nan)
+        self._in.array_w[:] = u
+        self._in.ghostUpdate()
+        with self._in.localForm() as here:
+            return self._determinants.smallest(here.array_r)
+
+    def parameters(self) -> FloatArray:
+        """Values of the Constants and Functions in W(C), which a caller may change, shape (n,)."""
+        values = [
+            t.value if isinstance(t, fem.Constant) else t.x.array for t in self._parameters
+        ]
+        return np.concatenate([np.empty(0), *map(np.ravel, values)])
+
+    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
+        """This rank's part of sum p [kg m/s]."""
+        total: FloatArray = momentum.reshape(-1, 3).sum(axis=0)
+        return total
+
+    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
+        """This rank's part of sum x cross p about the origin [kg m^2/s]."""
+        moment = (self.reference + u).reshape(-1, 3).T @ momentum.reshape(-1, 3)
+        return np.array([moment[i, j] - moment[j, i] for i, j in ((1, 2), (2, 0), (0, 1))])
+
+    def accept(self, u: FloatArray, v: FloatArray) -> None:
+        """Write the accepted state into the dolfinx Functions u and v."""
+        self._fill(self.u, u)
+        self._fill(self.v, v)
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
+        of_mass = (self._mass, self._consistent_mass, self._mass_change, self._sum)
+        for a in (*of_mass, self._in, self._out, getattr(self, "_matrix", None)):
+            if a is not None:
+                a.destroy()
+
+    def _fill(self, function: Any, owned: FloatArray) -> None:
+        function.x.array[: self.num_owned] = owned
+        function.x.scatter_forward()
+
+    def _assemble(self, form: Any) -> FloatArray:
+        compat.assemble_vector(self._out, form)
+        return self._out.array_r.copy()

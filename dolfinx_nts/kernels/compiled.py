@@ -1,0 +1,272 @@
+"""The kernels of `facets.c` and `nts_element.c`, compiled once; NumPy's where that cannot be.
+
+For the few pairs of a small scene the calls of NumPy cost more than what they compute, for many
+pairs its arrays go through memory again and again. Each function here is named like its twin in
+NumPy, which it calls for what it does not do itself.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import logging
+import os
+import platform
+import shlex
+import subprocess
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.kernels import (
+    discrete_gradient,
+    facets,
+    nts_element,
+    patches,
+    triangle_patches,
+)
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int_]
+BoolArray = npt.NDArray[np.bool_]
+
+logger = logging.getLogger(__name__)
+
+_SOURCES = [Path(__file__).with_name(name) for name in ("facets.h", "facets.c", "nts_element.c")]
+_FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
+#: Points times facets up to which all pairs' boxes are compared.
+_MOST_PAIRS = 1 << 20
+
+_INT, _LONG, _REAL, _ARRAY = ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_void_p
+
+
+class _Facet(ctypes.Structure):
+    _fields_ = [  # noqa: RUF012
+        *(("nc", _INT), ("degree", _INT), ("together", _INT)),
+        ("coefficients", _ARRAY),
+    ]
+
+
+class _Limits(ctypes.Structure):
+    _fields_ = [("last_step", _REAL), ("far_step", _REAL), ("collinear", _REAL)]  # noqa: RUF012
+
+
+_FACET, _LIMITS = ctypes.POINTER(_Facet), ctypes.POINTER(_Limits)
+#: Arguments of the kernels.
+_KERNELS = {
+    "project": (_FACET, _LIMITS, _LONG, *(_ARRAY,) * 4),
+    "closest_point": (_FACET, _LIMITS, _LONG, *(_ARRAY,) * 4),
+    "closest_facets": (
+        *(_FACET, _LIMITS, _LONG, _ARRAY, _ARRAY),
+        *(_LONG, _ARRAY, _ARRAY, _REAL, *(_ARRAY,) * 3),
+    ),
+    "condensed": (_FACET, _INT, _ARRAY, _ARRAY, _INT, _LONG, *(_ARRAY,) * 13),
+}
+
+
+class Condensed(NamedTuple):
+    """Contribution of pairs by (x, lambda_N, lambda_T); r = 3 (nc + 1) + 1, or + 3 with friction.
+
+    Attributes:
+        residual: [kg m], of lambda_N the gap [m], of lambda_T zero, shape (n, r).
+        tangent: Its derivative, shape (n, r, r).
+        gap: g_N at t_{n+1} [m], shape (n,).
+        slip_gradient: Derivative of the slip times the facet size, shape (n, 2, r).
+        metric: m_ab over the squared facet size, shape (n, 2, 2).
+        metric_gradient: Its derivative, shape (n, 2, 2, r).
+    """
+
+    residual: FloatArray
+    tangent: FloatArray
+    gap: FloatArray
+    slip_gradient: FloatArray
+    metric: FloatArray
+    metric_gradient: FloatArray
+
+
+def _compile(target: Path) -> None:
+    """Make the library; whoever else does so at the same time replaces it by the same."""
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+        made = Path(folder, target.name)
+        files = [*map(str, _SOURCES[1:]), "-o", str(made)]
+        command = [*compiler, *_FLAGS, "-shared", "-fPIC", *files, "-lm"]
+        subprocess.run(command, check=True, capture_output=True)
+        made.replace(target)
+
+
+@lru_cache
+def _library() -> Any:
+    """The library, or None where it can be neither found nor made."""
+    key = hashlib.sha256(" ".join(_FLAGS).encode())
+    for source in _SOURCES:
+        key.update(source.read_bytes())
+    # Beside the forms that DOLFINx compiles.
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    target = Path(cache, "fenics", f"dolfinx_nts_{platform.machine()}_{key.hexdigest()[:16]}.so")
+    try:
+        if not target.exists():
+            _compile(target)
+        library = ctypes.CDLL(str(target))
+    except (OSError, subprocess.CalledProcessError) as error:
+        logger.warning("Contact kernels are not compiled (%s): contact takes longer", error)
+        return None
+    for name, arguments in _KERNELS.items():
+        kernel = getattr(library, name)
+        kernel.argtypes = arguments
+    return library
+
+
+def is_there() -> bool:
+    """Whether the kernels are compiled, which is done here if it can be."""
+    return _library() is not None
+
+
+def leave_out() -> None:
+    """Use NumPy's from now on."""
+    global _library  # noqa: PLW0603
+    _library = lru_cache(lambda: None)
+
+
+def _run(function: Any, *arguments: Any) -> Any:
+    """Call a kernel with arrays as pointers; those that it writes are contiguous."""
+    held = [np.ascontiguousarray(a) if isinstance(a, np.ndarray) else a for a in arguments]
+    return function(*(a.ctypes.data if isinstance(a, np.ndarray) else a for a in held))
+
+
+def _coefficients(nc: int, degree: int) -> FloatArray:
+    """Shape functions and their derivatives as polynomials of a degree in each coordinate.
+
+    Returns:
+        Coefficients by order, how many derivatives by the second coordinate, powers of the first
+        and of the second, and control point, shape (4, 4, degree + 1, degree + 1, nc).
+    """
+    k = degree + 1
+    nodes = np.linspace(-degree, degree, k)
+    grid = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=2).reshape(-1, 2)
+    inverse = np.linalg.inv(nodes[:, None] ** np.arange(k))
+    values = facets.shape(grid, nc)[0].reshape(k, k, nc)
+    plain = np.einsum("ik,jl,kln->ijn", inverse, inverse, values)
+    if nc == triangle_patches.NUM_POINTS:
+        plain = triangle_patches.COEFFICIENTS
+    out = np.zeros((4, 4, k, k, nc))
+    for order in range(4):
+        for second in range(order + 1):
+            found = plain
+            for axis, times in enumerate((order - second, second)):
+                found = np.polynomial.polynomial.polyder(found, times, axis=axis)
+            out[order, second, : found.shape[0], : found.shape[1]] = found
+    return out
+
+
+@lru_cache
+def _facet(nc: int) -> tuple[Any, FloatArray]:
+    """A kind of facet, and the array that it points to."""
+    degree = {patches.NUM_POINTS: 3, triangle_patches.NUM_POINTS: 4}.get(nc, 1)
+    coefficients = _coefficients(nc, degree)
+    together = nc in (3, triangle_patches.NUM_POINTS)
+    return _Facet(nc, degree, together, coefficients.ctypes.data), coefficients
+
+
+@lru_cache
+def _limits() -> Any:
+    """What NumPy's kernels have, too."""
+    return _Limits(facets.LAST_STEP, 1e3 * facets.EPS, facets.COLLINEAR)
+
+
+def project(
+    points: FloatArray, corners: FloatArray, xi: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """`facets.project`, which takes the pairs for which plain Newton steps do not do."""
+    library = _library()
+    if library is None or not len(points):
+        return facets.project(points, corners, xi)
+    n, nc = corners.shape[:2]
+    found, done = np.array(xi, dtype=np.float64), np.empty(n, dtype=bool)
+    _run(library.project, _facet(nc)[0], _limits(), n, points, corners, found, done)
+    rest = ~done
+    if rest.any():
+        found[rest], done[rest] = facets.project(points[rest], corners[rest], found[rest])
+    return found, done
+
+
+def closest_point(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`facets.closest_point`."""
+    library = _library()
+    if library is None or not len(points):
+        return facets.closest_point(points, corners)
+    n, nc = corners.shape[:2]
+    xi, distance = np.empty((n, 2)), np.empty(n)
+    _run(library.closest_point, _facet(nc)[0], _limits(), n, points, corners, xi, distance)
+    return xi, distance
+
+
+def closest_facets(
+    points: FloatArray,
+    corners: FloatArray,
+    sizes: FloatArray,
+    limit: FloatArray,
+    rounding: float,
+    out: tuple[IntArray, FloatArray, FloatArray],
+) -> bool:
+    """What `search.closest_facets` finds before it prefers any, by the boxes of all pairs.
+
+    Args:
+        points: Points [m], shape (n, 3).
+        corners: Facet corners [m], shape (m, nc, 3).
+        sizes: Facet sizes [m], shape (m,).
+        limit: Largest distances of interest [m], shape (n,).
+        rounding: Distances that differ by less than this part of the lengths they come from tie.
+        out: Facet, coordinates and distance as of `search.Closest`, written where there is one.
+
+    Returns:
+        Whether it was done: there are not too many, and the kernels are compiled.
+    """
+    library, (n, m, nc) = _library(), (len(points), *corners.shape[:2])
+    if library is None or n * m > _MOST_PAIRS:
+        return False
+    pairs = n, points, limit, m, corners, sizes, rounding
+    return bool(_run(library.closest_facets, _facet(nc)[0], _limits(), *pairs, *out))
+
+
+def condensed(
+    x0: FloatArray,
+    x1: FloatArray,
+    normal0: FloatArray,
+    xi0: FloatArray,
+    xi1: FloatArray,
+    length: FloatArray,
+    multiplier: FloatArray,
+) -> Condensed | None:
+    """The mean-value element where (d, f) and the multipliers that hold them are eliminated.
+
+    Args:
+        x0: Slave and control points at t_n [m], shape (n, nc + 1, 3).
+        x1: The same at t_{n+1}.
+        normal0: d at t_n [-], shape (n, 3).
+        xi0: f at t_n [-], shape (n, 2).
+        xi1: The projection at t_{n+1}.
+        length: Facet sizes [m], shape (n,).
+        multiplier: lambda_N, or lambda_N and lambda_T, [kg m], shape (n, 1) or (n, 3).
+
+    Returns:
+        The contribution; None where nothing is compiled.
+    """
+    library = _library()
+    if library is None:
+        return None
+    n, nc = len(x0), x0.shape[1] - 1
+    size = 3 * nc + 3 + multiplier.shape[1]
+    shapes = (size,), (size, size), (), (2, size), (2, 2), (2, 2, size)
+    out = Condensed(*(np.zeros((n, *shape)) for shape in shapes))
+    points = nts_element.GAUSS_POINTS[nc]
+    rule = points, *discrete_gradient.gauss(points)
+    tangential = multiplier.shape[1] - 1
+    pairs = x0, x1, normal0, xi0, xi1, length, multiplier
+    _run(library.condensed, _facet(nc)[0], *rule, tangential, n, *pairs, *out)
+    return out

@@ -1,0 +1,387 @@
+"""The file of a checkpoint: HDF5, in numberings that do not depend on the ranks.
+
+Version 2, with h5py's names of types:
+
+- attributes `format` ("dolfinx_nts checkpoint"), `version` (2) and `package` (the version that
+  wrote it);
+- `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
+  to the run, see `dolfinx_nts.run.checkpoint`;
+- `bodies/K/NAME`, of body K of the system, shape (nodes, 3), in the order of `Body.file_order`:
+  `reference` X [m], `u` [m], `v` [m/s]; `a` [m/s^2], where the integrator carries any; further
+  fields of the run;
+- `contacts/K/NAME`, of contact K, shape (slave nodes, ...): `number`, the input number of the node,
+  ascending, and the fields of `ContactHistory`; further ones of the run;
+- `joints/K/number` and `joints/K/value`, of joint K of `System.joints` that remembers something,
+  one row an element;
+- `balance/NAME`, shape (rows, ...): the columns of the balance table;
+- `switches/NAME`: the newest changes of facet, see `dolfinx_nts.run.checkpoint`.
+
+A file is written beside its place and then renamed, and the one before is kept as NAME.previous:
+whenever a process or a machine stops, one of the two is whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import json
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.contact_elements import ContactHistory
+from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
+from dolfinx_nts.step import balance, resultants
+from dolfinx_nts.system import State, System
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+#: Arrays of a file by their place in it, on rank 0; empty elsewhere.
+Tables = dict[str, npt.NDArray[Any]]
+
+_FORMAT, _VERSION = "dolfinx_nts checkpoint", 2
+#: Part of masses and of a body's size by which the same scene may differ on other ranks.
+_ROUNDED = 1e-9
+
+
+# ---- what is in the scene
+def describe(system: System) -> dict[str, Any]:
+    """What a system must have in common with the one of a checkpoint, for JSON. Collective."""
+    comm, bodies = system.comm, system.bodies
+    sizes = [[b.num_owned // 3, float(b.nodal_mass[::3].sum())] for b in bodies]
+    total = comm.allreduce(np.array(sizes))
+    empty = dict.fromkeys(balance.columns(system), 0.0) | resultants.at_start(system)
+    empty |= dict.fromkeys(("linear_momentum", "angular_momentum"), np.zeros(3))
+    return {
+        "bodies": [
+            {
+                "name": b.name,
+                "kind": type(b).__name__,
+                "degree": getattr(b, "degree", None),
+                "nodes": int(nodes),
+                "mass": float(mass),
+            }
+            for b, (nodes, mass) in zip(bodies, total, strict=True)
+        ],
+        "contacts": [_describe_contact(pair) for pair in system.contacts],
+        "joints": [
+            _settings(j) | {"name": j.name, "kind": type(j).__name__} for j in system.joints
+        ],
+        "gravity": system.gravity.tolist(),
+        "columns": {name: list(np.shape(value)) for name, value in empty.items()},
+    }
+
+
+def _settings(item: Any) -> dict[str, Any]:
+    """`settings` of a joint or an obstacle, as they come back from JSON; functions are None."""
+    given = getattr(item, "settings", {})
+    text = json.dumps(given, default=lambda a: a.tolist() if hasattr(a, "tolist") else None)
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def _describe_contact(pair: Any) -> dict[str, Any]:
+    found = {"name": pair.name, "friction": float(pair.friction)}
+    for role in ("slave", "master"):
+        surface = getattr(pair, role)
+        facets = getattr(surface, "facets", None)
+        if facets is None:
+            found[role] = _settings(surface) | {"kind": type(surface).__name__}
+        else:
+            numbers = np.ascontiguousarray(surface.original[facets], dtype=np.int64)
+            found[role] = {
+                "nodes": len(surface.original),
+                "facets": len(facets),
+                "which facets": zlib.crc32(numbers.tobytes()),
+            }
+    return found
+
+
+def differences(there: Any, here: Any, where: str = "") -> list[str]:
+    """Sentences on what differs between two descriptions.
+
+    Args:
+        there: Of the file.
+        here: Of the system.
+        where: Place in both.
+    """
+    if isinstance(there, dict) and isinstance(here, dict):
+        named = "name" in there and there["name"] == here.get("name")
+        name = f" of {there['name']!r}" if named else ""
+        pairs = [(f"{where}.{k}" if where else k, there.get(k), here.get(k))
+                 for k in dict.fromkeys((*there, *here))]  # fmt: skip
+        return [text + name for pair in pairs for text in differences(*pair[1:], pair[0])]
+    if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
+        pairs = [(f"{where}[{k}]", a, b) for k, (a, b) in enumerate(zip(there, here, strict=True))]
+        return [text for pair in pairs for text in differences(*pair[1:], pair[0])]
+    if isinstance(there, float) and isinstance(here, float):
+        # Equal infinities have no difference.
+        same = there == here or abs(there - here) <= _ROUNDED * max(abs(there), abs(here))
+    else:
+        same = there == here
+    if isinstance(there, list) and isinstance(here, list):
+        there, here = ([item.get("name", item) if isinstance(item, dict) else item
+                        for item in items] for items in (there, here))  # fmt: skip
+    return [] if same else [f"{where} is {there!r} there and {here!r} here"]
+
+
+# ---- a state in the numberings of the file
+class Numbering:
+    """Between the arrays of the ranks and those of the file. Collective.
+
+    Args:
+        system: The scene.
+    """
+
+    def __init__(self, system: System) -> None:
+        self.system, self.comm = system, system.comm
+        self._orders, self._counts = [], []
+        for body in system.bodies:
+            counts = self.comm.gather(body.num_owned // 3)
+            order = body.file_order() if hasattr(body, "file_order") else None
+            if counts is not None and order is None:
+                order = np.arange(sum(counts))
+            self._orders.append(order)
+            self._counts.append(counts)
+        self.reference = self.to_file([b.reference for b in system.bodies])
+
+    def to_file(self, values: Sequence[FloatArray]) -> list[FloatArray]:
+        """Of each body, values at all nodes, shape (nodes, 3), on rank 0. Collective."""
+        gathered = [gather_on_root(self.comm, v.reshape(-1, 3)) for v in values]
+        if self.comm.rank > 0:
+            return gathered
+        return [rows[order] for rows, order in zip(gathered, self._orders, strict=True)]
+
+    def from_file(self, tables: Tables, name: str) -> tuple[FloatArray, ...]:
+        """Of each body, a field at this rank's coordinates. Collective."""
+        found = []
+        for k, (order, counts) in enumerate(zip(self._orders, self._counts, strict=True)):
+            parts = None
+            if self.comm.rank == 0:
+                rows = np.empty_like(self.reference[k])
+                rows[order] = tables[f"bodies/{k}/{name}"]
+                parts = np.split(rows, np.cumsum(counts)[:-1])
+            found.append(np.ravel(self.comm.scatter(parts)).copy())
+        return tuple(found)
+
+    def pack(
+        self,
+        state: State,
+        fields: Mapping[str, Sequence[FloatArray]],
+        nodal: Mapping[str, Sequence[npt.NDArray[Any]]],
+    ) -> Tables:
+        """Arrays of a state. Collective.
+
+        Args:
+            state: The state.
+            fields: Further fields of all bodies, or of none.
+            nodal: Further arrays of all contacts, one row for each node of `Surface.share`.
+
+        Raises:
+            TypeError: A joint remembers something that has no place in the file.
+            ValueError: Two elements of a joint have one number.
+        """
+        fields = {"u": state.u, "v": state.v, "a": state.a, **fields}
+        tables: Tables = {}
+        for name, values in fields.items():
+            for k, rows in enumerate(self.to_file(values) if values else []):
+                tables[f"bodies/{k}/{name}"] = rows
+        tables |= {f"bodies/{k}/reference": rows for k, rows in enumerate(self.reference)}
+        for k, (pair, history) in enumerate(
+            zip(self.system.contacts, state.contacts, strict=True)
+        ):
+            numbers = pair.slave.original[pair.slave.share]
+            more = {name: values[k] for name, values in nodal.items()}
+            more |= {"number": numbers, **history._asdict()}
+            tables |= self._rows(f"contacts/{k}", more)
+        for k, joint in enumerate(self.system.joints):
+            value = state.histories[1 + k]
+            raise_together(self.comm, _misfit(joint, value), TypeError)
+            if value is not None:
+                found = self._rows(f"joints/{k}", {"number": joint.numbers, "value": value})
+                raise_together(self.comm, _repeated(joint.name, found.get(f"joints/{k}/number")))
+                tables |= found
+        return tables if self.comm.rank == 0 else {}
+
+    def _rows(self, place: str, rows: Mapping[str, npt.NDArray[Any]]) -> Tables:
+        found = {name: gather_on_root(self.comm, values) for name, values in rows.items()}
+        order = np.argsort(found["number"])
+        return {f"{place}/{name}": values[order] for name, values in found.items()}
+
+    def unpack(self, tables: Tables, time: float) -> State:
+        """The state of a file. Collective."""
+        accelerations = self.comm.bcast("bodies/0/a" in tables)
+        histories = [joint.start() for joint in self.system.joints]
+        for k, joint in enumerate(self.system.joints):
+            rows = self._share(tables, f"joints/{k}", ("number", "value"))
+            if rows is not None:
+                histories[k] = self._at(rows, "value", joint.numbers, joint.name)
+        parts = (self.nodal(tables, name) for name in ContactHistory._fields)
+        contacts = tuple(itertools.starmap(ContactHistory, zip(*parts, strict=True)))
+        return State(
+            time,
+            self.from_file(tables, "u"),
+            self.from_file(tables, "v"),
+            self.from_file(tables, "a") if accelerations else (),
+            (contacts, *histories),
+        )
+
+    def nodal(self, tables: Tables, name: str) -> list[npt.NDArray[Any]]:
+        """Of each contact, an array at this rank's slave nodes. Collective."""
+        found = []
+        for k, pair in enumerate(self.system.contacts):
+            rows = self._share(tables, f"contacts/{k}", ("number", name))
+            numbers = pair.slave.original[pair.slave.share]
+            found.append(self._at(rows, name, numbers, pair.name))
+        return found
+
+    def _at(
+        self, rows: Mapping[str, npt.NDArray[Any]], name: str, numbers: IntArray, whose: str
+    ) -> npt.NDArray[Any]:
+        """Rows of this rank's elements by their numbers; each has one. Collective.
+
+        Raises:
+            ValueError: Elements here and in the file have other numbers, or two have one.
+        """
+        known, here = rows["number"], np.sort(gather_rows(self.comm, numbers))
+        foreign = here[~np.isin(here, known)]
+        remedy = "make the system as it was, with the same `numbers`"
+        problem = _repeated(whose, known) or _repeated(whose, here)
+        if problem is None and len(foreign):
+            problem = f"{whose!r}: {int(foreign[0])} is none of its elements or nodes there"
+            problem = f"{problem}; {remedy}"
+        elif problem is None and len(here) != len(known):
+            problem = f"{whose!r}: has {len(known)} elements or nodes there and {len(here)} here"
+            problem = f"{problem}; {remedy}"
+        if problem is not None:
+            raise ValueError(problem)
+        found: npt.NDArray[Any] = rows[name][np.searchsorted(known, numbers)]
+        return found
+
+    def _share(self, tables: Tables, place: str, names: Sequence[str]) -> Any:
+        here = {n: tables[f"{place}/{n}"] for n in names if f"{place}/{n}" in tables}
+        return self.comm.bcast(here or None)
+
+    def check(self, tables: Tables) -> None:
+        """Raise on every rank if bodies have other nodes than those in the file. Collective.
+
+        Raises:
+            ValueError: They have.
+        """
+        problem = None
+        for k, here in enumerate(self.reference if self.comm.rank == 0 else []):
+            off = np.abs(here - tables[f"bodies/{k}/reference"]).max(initial=0.0)
+            if not off <= _ROUNDED * np.ptp(here, axis=0).max(initial=0.0):
+                problem = problem or (
+                    f"body {self.system.bodies[k].name!r}: its mesh has other nodes, up to "
+                    f"{off:.3g} m away, or the same in another order"
+                )
+        raise_together(self.comm, problem)
+
+
+def _misfit(joint: Any, value: Any) -> str | None:
+    if value is None or (isinstance(value, np.ndarray) and hasattr(joint, "numbers")):
+        return None
+    return (
+        f"joint {joint.name!r} remembers a {type(value).__name__}; a checkpoint takes an array "
+        "with a row for each element and its attribute `numbers`, see Joint; or leave checkpoint "
+        "out"
+    )
+
+
+def _repeated(whose: str, numbers: IntArray | None) -> str | None:
+    """What is wrong with ascending numbers of elements, if two are equal."""
+    twice = [] if numbers is None else numbers[1:][np.diff(numbers) == 0]
+    if not len(twice):
+        return None
+    return (
+        f"{whose!r}: two of its elements or nodes have the number {int(twice[0])}; let each have "
+        "one of its own on all ranks, see Joint.numbers"
+    )
+
+
+# ---- files
+def previous(path: Path) -> Path:
+    """Where the checkpoint before the last one is."""
+    return path.with_name(f"{path.name}.previous")
+
+
+def prepare(path: Path) -> None:
+    """Make the folder, and try whether it can be written; rank 0 only.
+
+    Raises:
+        OSError: It cannot.
+    """
+    if path.is_dir():
+        raise IsADirectoryError("it is a folder; name a file in it")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f"{path.name}.part")
+    draft.touch()
+    draft.unlink()
+
+
+def write(path: Path, tables: Tables, notes: Mapping[str, Any]) -> None:
+    """Write a checkpoint and keep the one before; rank 0 only.
+
+    Raises:
+        OSError: It cannot be written; those before are still whole.
+    """
+    import h5py
+
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        file.attrs.update(format=_FORMAT, version=_VERSION, package=version("dolfinx_nts"))
+        # Numbers may be NumPy's.
+        file["notes"] = json.dumps(notes, default=lambda number: number.item())
+        for place, values in tables.items():
+            file[place] = values
+    draft = path.with_name(f"{path.name}.part")
+    try:
+        with open(draft, "wb") as out:
+            out.write(image.getbuffer())
+            out.flush()
+            # Else a machine that stops may leave the new name with nothing behind it.
+            os.fsync(out.fileno())
+        if path.exists():
+            path.replace(previous(path))
+        draft.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            draft.unlink(missing_ok=True)
+        raise
+
+
+def read(path: Path) -> tuple[Tables, dict[str, Any]]:
+    """Arrays and notes of a checkpoint; rank 0 only.
+
+    Raises:
+        OSError: There is none, or it cannot be read.
+        ValueError: It is another file, or of another version.
+    """
+    import h5py
+
+    tables: Tables = {}
+
+    def keep(place: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and place != "notes":
+            tables[place] = item[()]
+
+    with h5py.File(path, "r") as file:
+        if file.attrs.get("format") != _FORMAT:
+            raise ValueError("it is no checkpoint; pass the path that Checkpoint had")
+        found = int(file.attrs["version"])
+        if found != _VERSION:
+            raise ValueError(
+                f"its format is version {found}, and this package reads version {_VERSION}; read "
+                f"it with dolfinx_nts {file.attrs['package']}"
+            )
+        notes = json.loads(file["notes"][()])
+        file.visititems(keep)
+    return tables, notes

@@ -1,0 +1,155 @@
+"""The state in which a run begins: where it comes from, and what it must satisfy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.parallel import global_max
+from dolfinx_nts.run.solution import Restart, Solution
+from dolfinx_nts.step import consistent
+from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.system import State, System
+from dolfinx_nts.validation import is_finite
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Part of the speed of supports by which a run that goes on may differ from their motion, as it
+#: does by the error of its steps.
+_JUMP = 0.1
+
+
+def check_restart(restart: Restart | None, system: System, time: Any, ledger: bool) -> None:
+    """Raise a ValueError where a checkpoint cannot be continued as asked.
+
+    Args:
+        restart: What to go on from, if it is a checkpoint.
+        system: The scene.
+        time: `start_time` as given.
+        ledger: Whether the ledger is kept.
+    """
+    if restart is None:
+        return
+    if restart.system is not system:
+        raise ValueError("start: its system is another one; pass the system to restart(...)")
+    if time is not None:
+        raise ValueError(f"start_time={time!r}: a restart goes on at its own time; leave it out")
+    if ledger and np.isnan(restart.rows[-1]["energy"]):
+        raise ValueError("ledger=True: the run of the checkpoint kept none; pass ledger=False")
+
+
+def first_state(system: System, start: Any, time: Any) -> State:
+    """State that `start` and `start_time` of `simulate` ask for."""
+    if time is not None and not is_finite(time):
+        raise ValueError(f"start_time={time!r}: must be finite [s]")
+    if start is None:
+        if time is not None:
+            raise ValueError(f"start_time={time!r}: pass start=, too, or leave it out")
+        return system.initial_state()
+    if not (isinstance(start, Solution) and start.state is not None):
+        raise TypeError(
+            f"start of type {type(start).__name__}: pass the result of equilibrium(...), of "
+            "simulate(...) or of restart(...)"
+        )
+    state = start.state if time is None else replace(start.state, time=float(time))
+    return system.state_from(start.system, state, moving=start.moving)
+
+
+def refuse_moved(system: System) -> None:
+    """Raise a ValueError where something moves as prescribed; the same on all ranks.
+
+    The energy that an impact with it leaves depends on its motion.
+    """
+    for pair in system.contacts:
+        if getattr(pair.master, "motion", None) is not None:
+            raise ValueError(
+                f"impact='restored': obstacle {pair.master.name!r} moves; use impact='published', "
+                "or let a heavy rigid body take its place"
+            )
+    for joint in system.joints:
+        if getattr(joint, "motion", None) is not None:
+            raise ValueError(
+                f"impact='restored': joint {joint.name!r} is driven; use impact='published'"
+            )
+    for body in system.bodies:
+        if getattr(body, "driven", False):
+            raise ValueError(
+                f"impact='restored': coordinates of body {body.name!r} move as prescribed by a "
+                "function of time; use impact='published', or supports at rest, given as vectors"
+            )
+
+
+def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: bool) -> State:
+    """The state with the rates of prescribed motion as velocities there. Collective.
+
+    As v_1 = 2 (u_1 - u_0)/h - v_0, another start would make their velocities alternate for ever.
+    The rate is a one-sided difference of second order, as accurate as the integrators.
+
+    Args:
+        system: The scene.
+        state: At the start.
+        dt: First step [s].
+        goes_on: Whether another run ended there: velocities then stay unless the motion is another
+            one.
+    """
+    v = [v.copy() for v in state.v]
+    for body, values in zip(system.bodies, v, strict=True):
+        p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
+        # Written in this way, the rate of what does not move is 0, not rounding.
+        rate = (4.0 * (p1 - p0) - (p2 - p0)) / dt
+        old = values[body.fixed]
+        sizes = [np.abs(a).max(initial=0.0) for a in (rate - old, rate, old)]
+        off, *size = global_max(system.comm, np.array(sizes)).tolist()
+        if not goes_on or off > _JUMP * max(size):
+            values[body.fixed] = rate
+    return replace(state, v=tuple(v))
+
+
+def consistent_start(
+    problem: StepProblem, state: State, dt: float, *, continues: bool, project: bool
+) -> State:
+    """A start that fits the joints. Collective.
+
+    Args:
+        problem: Equations of the step.
+        state: At the start.
+        dt: First step [s].
+        continues: Whether another run with these joints ended there. Velocities at the end of a
+            step need not fit: they only do in the mean of two steps.
+        project: Project velocities that do not fit.
+
+    Raises:
+        ValueError: It does not fit, and its velocities are not to be projected, or cannot be.
+    """
+    if not problem.system.joints:
+        return state
+    still = tuple(np.zeros_like(v) for v in state.v)
+    problem.begin(replace(state, a=state.a or still), dt)
+    found = consistent.violation(problem, state, dt, rates=False)
+    if found is not None:
+        raise ValueError(
+            f"joints: at the start {found[1]!r} is off by {found[0]:.3g} m; let the bodies' "
+            "displacements and prescribed motion, and what the joint prescribes, begin where "
+            "it holds"
+        )
+    if continues:
+        return state
+    found = consistent.violation(problem, state, dt, rates=True)
+    if found is not None and not project:
+        raise ValueError(
+            f"velocity: at the start joint {found[1]!r} is violated at {found[0]:.3g} m/s; "
+            "change the bodies' velocities or the prescribed rates so that they fit, or pass "
+            "project_start=True"
+        )
+    if found is not None:
+        state = replace(state, v=consistent.projection(problem, state, dt))
+        found = consistent.violation(problem, state, dt, rates=True)
+    if found is not None:
+        raise ValueError(
+            f"project_start=True: no velocities fit joint {found[1]!r}, which stays violated "
+            f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it"
+        )
+    return state

@@ -1,0 +1,552 @@
+"""Advances a system step by step, cut where a step fails."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.overlap import OverlapWatch
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.run.solution import Restart, Solution
+from dolfinx_nts.run.start import (
+    check_restart,
+    consistent_start,
+    first_state,
+    refuse_moved,
+    with_prescribed_rates,
+)
+from dolfinx_nts.run.step_size import Pace
+from dolfinx_nts.run.step_warnings import tell_step
+from dolfinx_nts.run.table import Table
+from dolfinx_nts.step import balance, consistent, resultants
+from dolfinx_nts.step.accuracy import Newton
+from dolfinx_nts.step.contact_fields import ContactLoads
+from dolfinx_nts.step.evaluation import Evaluation
+from dolfinx_nts.step.guards import check_momentum
+from dolfinx_nts.step.impact import IMPACTS, Impact, restored
+from dolfinx_nts.step.massless import check_massless, off_balance
+from dolfinx_nts.step.newton import StepSolver
+from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.step.promises import MaterialWatch, Promises
+from dolfinx_nts.system import State, System, is_like
+from dolfinx_nts.validation import (
+    StepFailedError,
+    UserFunctionError,
+    call_together,
+    is_finite,
+    known_options,
+    require_bool,
+    require_positive,
+)
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
+
+#: What a step chosen by its error is cut to: halves would soon end where it has failed.
+_CUT = 0.4
+#: Cuts of a step before nodes that infinite friction holds may slip.
+_CUTS = 3
+#: Searches for contact, each along the motion that came of the one before.
+_SEARCHES = 4
+#: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
+_WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
+
+
+class Trial(NamedTuple):
+    """A solved step that may be accepted.
+
+    Attributes:
+        step: Solution of its equations.
+        state: State at its end.
+        measured: `balance.measure` of that state.
+        impulses: Of all forces in the step, see `check_momentum` [kg m/s].
+        impact: What restoring did to its velocities.
+    """
+
+    step: Evaluation
+    state: State
+    measured: dict[str, Any]
+    impulses: float
+    impact: Impact | None
+
+
+@known_options
+class Stepper:
+    """Advances a system step by step.
+
+    Args:
+        system: The scene.
+        integrator: `EnergyMomentum()`, `Midpoint()`, `Newmark()`, `GeneralizedAlpha()`, or one of
+            the user's own with the `Integrator` protocol.
+        newton: Tolerances and retries.
+        petsc_options: PETSc options of the step's SNES, without prefix.
+        start: Result of `equilibrium` (see there), of another run, or of `restart`, to start from.
+        start_time: Time at the start [s]; see `simulate`.
+        sleep: Leave bodies that nothing moves out of the steps; see `simulate`.
+        watch_overlap: Look whether bodies end up inside each other; see `simulate`.
+        before_step: Called before every attempt at a step; see `simulate`.
+        project_start: Project velocities that joints do not allow; see `simulate`.
+        ledger: Keep the ledger; see `simulate`.
+        impact: "published" or "restored"; see `simulate`.
+        restitution: Coefficient of restitution of "restored"; see `simulate`.
+
+    Attributes:
+        state: Last accepted state.
+        solution: Balance table so far.
+        problem: Equations of the step, for those who want their parts.
+        solver: The SNES that solves them.
+        restart: What it goes on from, if that is a `Restart`.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        integrator: Any,
+        *,
+        newton: Newton | None = None,
+        petsc_options: Mapping[str, Any] | None = None,
+        start: Solution | None = None,
+        start_time: float | None = None,
+        sleep: bool = False,
+        watch_overlap: bool = True,
+        before_step: Callable[[float, float], Any] | None = None,
+        project_start: bool = False,
+        ledger: bool = True,
+        impact: str = "published",
+        restitution: float = 1.0,
+    ) -> None:
+        if not isinstance(system, System):
+            raise TypeError(f"system={system!r}: pass a System([body, ...])")
+        if not isinstance(integrator, Integrator) or isinstance(integrator, type):
+            raise TypeError(
+                f"integrator={integrator!r}: pass EnergyMomentum(), Midpoint() or another one with "
+                "the Integrator protocol"
+            )
+        if not isinstance(newton, Newton | None):
+            raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")
+        given = {} if petsc_options is None else petsc_options
+        if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+            raise TypeError(
+                f"petsc_options={petsc_options!r}: pass a dict of names and values, e.g. "
+                "{'pc_type': 'lu'}"
+            )
+        for name in sorted(name for name in given if name.lower() in _WITHOUT_EFFECT):
+            raise ValueError(
+                f"petsc_options[{name!r}]={given[name]!r}: each block of the residual is tested by "
+                "itself, not by PETSc; pass newton=Newton(rtol=...)"
+            )
+        require_bool("sleep", sleep)
+        require_bool("watch_overlap", watch_overlap)
+        require_bool("project_start", project_start)
+        require_bool("ledger", ledger)
+        if not isinstance(impact, str) or impact not in IMPACTS:
+            known = ", ".join(map(repr, IMPACTS))
+            raise ValueError(f"impact={impact!r}: choose one of {known}")
+        if not (is_finite(restitution) and 0.0 <= restitution <= 1.0):
+            raise ValueError(f"restitution={restitution!r}: must lie between 0 and 1")
+        if impact == "published" and restitution != 1.0:
+            raise ValueError(f"restitution={restitution!r}: pass impact='restored', too")
+        if impact != "published" and integrator.accelerations:
+            raise ValueError(
+                f"impact={impact!r}: {integrator!r} keeps no energy in contact that could be given "
+                "back; choose EnergyMomentum() or Midpoint()"
+            )
+        if impact != "published":
+            refuse_moved(system)
+        check_massless(system, integrator, impact)
+        self._restitution = float(restitution) if impact == "restored" else None
+        self._keeps_ledger = ledger
+        self._project_start = project_start
+        if not callable(before_step) and before_step is not None:
+            raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
+        self._before_step = before_step
+        self.newton = newton or Newton()
+        preset = self.newton.preset(system, integrator.inertia, given)
+        self.problem = StepProblem(
+            system,
+            integrator,
+            rtol=self.newton.rtol,
+            condense=self.newton.condense,
+            sleep=sleep,
+        )
+        self.solver = StepSolver(self.problem, self.newton, preset, given)
+        self.system = system
+        self._overlap = OverlapWatch(system) if watch_overlap else None
+        self._measured: dict[str, balance.Measured] = {}
+        self._recent: deque[tuple[float, tuple[FloatArray, ...]]] = deque(maxlen=2)
+        self.restart = start if isinstance(start, Restart) else None
+        check_restart(self.restart, system, start_time, ledger)
+        self.solution = self.restart.go_on() if self.restart else Solution(system)
+        state = first_state(system, start, start_time)
+        if not integrator.accelerations:
+            state = replace(state, a=())
+        self._accept(state)
+        self._started, self._goes_on = False, start is not None and start.moving
+        self._start = start
+        if self.restart is None:
+            self.solution.rows = Table([self._first_row()])
+        self._promises = Promises(self.solution, integrator, self.newton.rtol)
+        self._materials, self._material_change = MaterialWatch(system), 0.0
+        self._last_step: tuple[float, float] | None = None
+
+    @property
+    def memory(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside state and solution: numbers and tuples of them.
+
+        last: start and length of the last step [s], or None; promised: see `Promises.memory`;
+        bounded: whether nodes that infinite friction holds may slip; measured: see `Rounding`;
+        recent: lengths of the last two steps [s].
+        """
+        return {
+            "last": self._last_step,
+            "promised": self._promises.memory,
+            "bounded": self.problem.contacts.bounded,
+            "measured": self.problem.rounding.measured,
+            "recent": [dt for dt, _ in self._recent],
+        }
+
+    @property
+    def nodal_memory(self) -> dict[str, Any]:
+        """The same of slave nodes: of each contact an array at those of this rank.
+
+        unknowns: whether they had any in the last step; force_before: p_N in the step before [N].
+        """
+        found: dict[str, Any] = {"unknowns": self.problem.contacts.had_unknowns}
+        if len(self._recent) > 1:
+            found["force_before"] = self._recent[0][1]
+        return found
+
+    def _resume(self, restart: Restart, dt: float) -> None:
+        """Begin where a checkpoint was written, with the materials of its last step."""
+        memory, nodal = restart.memory, restart.nodal_memory
+        forces = [nodal["force_before"]] if "force_before" in nodal else []
+        forces.append([contact.force for contact in self.state.contacts])
+        self._recent.extend(zip(memory["recent"], map(tuple, forces), strict=False))
+        self.problem.contacts.resume(nodal["unknowns"])
+        self._promises.resume(memory["promised"])
+        self.problem.contacts.bounded = memory["bounded"]
+        self.problem.rounding.measured = memory["measured"]
+        if memory["last"] is not None:
+            begin, length = self._last_step = tuple(memory["last"])
+            self._call_before(length, begin)
+        self._materials.changed()
+        if self.problem.integrator.accelerations and not self.state.a:
+            # The run had another integrator.
+            a = consistent.accelerations(self.problem, self.state, dt)
+            self._accept(replace(self.state, a=a))
+        self._started = True
+        self.look()
+
+    def advance(self, dt: float, *, end: float | None = None) -> State:
+        """Advance by dt; a step that is not solved is cut, up to `newton.max_retries` times.
+
+        What is left is then cut into one part more than twice as many.
+
+        Args:
+            dt: Time to advance [s], > 0.
+            end: Time there [s], for those who count steps: sums of dt would be rounded.
+
+        Returns:
+            The accepted state at the end.
+
+        Raises:
+            ValueError: dt is not positive.
+            StepFailedError: Not solved even with the smallest step; everything accepted so far is
+                kept.
+            UserFunctionError: A function of time raised or returned no vector on some rank, or
+                `before_step` raised; not tried again, everything is kept.
+        """
+        require_positive("dt", dt, "s")
+        dt = float(dt)
+        self.start(dt)
+        end, parts, retries = self.state.time + dt if end is None else end, 1, 0
+        while parts:
+            try:
+                self._step(dt, end - (parts - 1) * dt)
+            except UserFunctionError:
+                raise
+            except StepFailedError as failure:
+                if retries == self.newton.max_retries:
+                    raise
+                retries += 1
+                self.solution.retries += 1
+                # An odd number: halves of halves would end where one of them has failed.
+                parts = 1 if self._bind(retries) else 2 * parts + 1
+                dt = (end - self.state.time) / parts
+                logger.info("%s; retrying with dt=%.3g", failure, dt)
+            else:
+                parts -= 1
+        return self.state
+
+    def _bind(self, retries: int) -> bool:
+        """Let infinite friction have a bound once cuts are of no use; tells whether that is new."""
+        endless = any(np.isinf(pair.friction) for pair in self.system.contacts)
+        if not endless or self.problem.contacts.bounded or retries < _CUTS:
+            return False
+        self.problem.contacts.bounded = True
+        return True
+
+    def paced(self, pace: Pace, end: float) -> Iterator[None]:
+        """Advance in steps of a pace, stopping after each.
+
+        Args:
+            pace: Sizes of the steps.
+            end: Where to stop [s].
+
+        Raises:
+            StepFailedError: Not solved even after `newton.max_retries` cuts in a row, or as in
+                `advance`.
+        """
+        self.start(pace.dt)
+        retries = 0
+        while self.state.time < end:
+            now = self.state.time
+            left = end - now
+            dt = pace.propose(left)
+            self._begin(dt)
+            part = pace.first_touch(self.problem)
+            if part < 1.0:
+                dt *= part
+                self._begin(dt)
+            try:
+                trial = self._attempt(dt, end if dt == left else now + dt)
+            except StepFailedError as failure:
+                if retries == self.newton.max_retries:
+                    raise
+                retries += 1
+                self.solution.retries += 1
+                pace.dt = dt if self._bind(retries) else _CUT * dt
+                logger.info("%s; retrying with dt=%.3g", failure, pace.dt)
+                continue
+            if not pace.accepts(self.problem, trial.step):
+                self.solution.rejected += 1
+                continue
+            # Steps below the shortest do not reset the retries, else a run might go on with them.
+            retries = 0 if dt >= pace.shortest else retries
+            self._take(trial)
+            if pace.exceeds:
+                self.solution.exceeded += 1
+                self.solution.warn(
+                    "step error", self.state.time, dt,
+                    f"a step of {dt:.3g} s errs more than Adapt asks for: it is the shortest one, "
+                    "or it moves a node out from behind its facet; pass a smaller `shortest` or a "
+                    "larger `tolerance`",
+                )  # fmt: skip
+            yield
+
+    def start(self, dt: float) -> None:
+        """Give prescribed coordinates the rate of their motion; later calls do nothing.
+
+        In a run that goes on from another one they keep their velocities unless the motion is
+        another one.
+
+        Args:
+            dt: First step [s].
+        """
+        if self._started:
+            return
+        if self.restart is not None:
+            self._resume(self.restart, dt)
+            return
+        self._call_before(dt)
+        # What the first call sets is what the run begins with.
+        self._materials.changed()
+        state = with_prescribed_rates(self.system, self.state, dt, goes_on=self._goes_on)
+        state = consistent_start(
+            self.problem, state, dt, continues=self._continues, project=self._project_start
+        )
+        if self.problem.integrator.accelerations and not state.a:
+            state = replace(state, a=consistent.accelerations(self.problem, state, dt))
+        self._accept(state)
+        self._started = True
+        missing, text = off_balance(self.problem, state, dt)
+        if text:
+            self.solution.warn("massless nodes", state.time, missing, text)
+        self.solution.rows = Table([self._first_row()])
+        # Where bodies were before the first step, for one that carries them through each other.
+        self.look()
+
+    @property
+    def _continues(self) -> bool:
+        """Whether the run goes on from another one with the same joints."""
+        if not self._goes_on or self._start is None:
+            return False
+        known = self._start.system.joints
+        return all(any(is_like(j, other) for other in known) for j in self.system.joints)
+
+    def look(self, *, last: bool = False) -> None:
+        """Warn if what is in contact is inside each other; only as often as it has moved.
+
+        Args:
+            last: Look wherever anything has moved since the last look.
+        """
+        if self._overlap is not None:
+            for found in self._overlap.look(self.state.u, self.state.time, last=last):
+                self.solution.warn(
+                    found.kind, self.state.time, found.depth, found.text, grave=True
+                )
+
+    def _first_row(self) -> dict[str, Any]:
+        return balance.first_row(self.system, self.state) | resultants.at_start(self.system)
+
+    def _accept(self, state: State) -> None:
+        for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
+            body.accept(u, v)
+        self.state = self.solution.state = state
+
+    def _step(self, dt: float, time: float) -> None:
+        self._begin(dt)
+        self._take(self._attempt(dt, time))
+
+    def _begin(self, dt: float) -> None:
+        """Fix the equations of a step from the last accepted state."""
+        self._prepare(dt)
+        self.problem.begin(self.state, dt)
+
+    def _prepare(self, dt: float) -> None:
+        """Let the user change what the forms of the step hold, and account for it."""
+        self._call_before(dt)
+        self._note_materials()
+
+    def _call_before(self, dt: float, time: float | None = None) -> None:
+        if self._before_step is not None:
+            time = self.state.time if time is None else time
+            name = f"before_step at t={time!r} with dt={dt!r}"
+            call_together(self.system.comm, name, self._before_step, time, dt)
+
+    def _note_materials(self) -> None:
+        """Name in the ledger what changed parameters of materials do to the stored energy."""
+        names = self._materials.changed()
+        if names:
+            self.problem.forget_forces()
+        if not names or not self._keeps_ledger:
+            return
+        self._measured.clear()
+        stored = balance.measure(self.system, self.state, self._measured)["potential"]
+        change = stored - self.solution.rows[-1]["potential"] - self._material_change
+        self._material_change += change
+        self.solution.warn(
+            "material changed", self.state.time, abs(change),
+            f"a changed parameter of the material of {', '.join(map(repr, names))} adds "
+            f"{change:.3g} J to the stored energy without work; see material_change in the balance",
+        )  # fmt: skip
+
+    def _attempt(self, dt: float, time: float) -> Trial:
+        """Solution of the step that `problem.begin` fixed, if it may be accepted.
+
+        Raises:
+            StepFailedError: Not solved, or what came out cannot be.
+        """
+        step = self._covered(self.solver.solve())
+        state = self._accepted(step, dt, time)
+        impact = None
+        if self._keeps_ledger:
+            before: Mapping[str, Any] = self.solution.rows[-1]
+            measured: dict[str, Any] = balance.measure(self.system, state, self._measured)
+        else:
+            before, measured = (balance.momenta(self.system, s) for s in (self.state, state))
+        impulses = check_momentum(self.problem, step, state, before, measured)
+        if self._restitution is not None:
+            impact = restored(self.problem, step, state, self._restitution)
+        if impact is not None:
+            state = impact.state
+            if self.system.joints:
+                self.solver.renew()
+            if self._keeps_ledger:
+                measured = balance.measure(self.system, state, self._measured)
+        return Trial(step, state, measured, impulses, impact)
+
+    def _covered(self, step: Evaluation) -> Evaluation:
+        """The step itself, or solved again for as long as its motion may have passed by a contact.
+
+        Raises:
+            StepFailedError: No search found all contacts.
+        """
+        problem, iterations = self.problem, step.iterations
+        for k in range(_SEARCHES + 1):
+            if not problem.misses(step):
+                return replace(step, iterations=iterations)
+            if k < _SEARCHES:
+                problem.begin(problem.state, problem.dt, step)
+                step = self.solver.solve()
+                iterations += step.iterations
+        far = float(problem.motion(step).max())
+        raise StepFailedError(
+            f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
+            f"{far:.3g} m, and no search found all contacts on the way of their nodes; use a "
+            "smaller dt"
+        )
+
+    def _take(self, trial: Trial) -> None:
+        """Accept a step: a row of the ledger, and the new state."""
+        step, state, rows, impact = trial.step, trial.state, self.solution.rows, trial.impact
+        time = state.time
+        known = {"time": time, "newton_iterations": step.iterations}
+        if self._keeps_ledger:
+            terms = balance.step_terms(self.problem, step) | known
+            terms["impact_restored"] = 0.0 if impact is None else impact.energy
+            terms["material_change"], self._material_change = self._material_change, 0.0
+            row = balance.next_row(rows[0], rows[-1], trial.measured, terms)
+        else:
+            row = balance.unknown_row(self.system) | known
+        forces_of_step = resultants.of_step(self.problem, step)
+        if impact is not None:
+            for name, impulse in zip(resultants.CONTACTS, impact.impulses, strict=True):
+                forces_of_step[name] = forces_of_step[name] + impulse / self.problem.dt
+        rows.append(row | forces_of_step)
+        self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
+        if self._keeps_ledger:
+            self._promises.hold(self.problem, step, trial.impulses)
+            self.solution.switches.extend(balance.switches(self.problem, step, time))
+        forces = tuple(contact.force for contact in state.contacts)
+        self._last_step = self.state.time, self.problem.dt
+        self._recent.append((time - self.state.time, forces))
+        self._accept(state)
+        tell_step(self.solution, self.problem, step, state)
+        self.look()
+
+    def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
+        """State at t_{n+1}."""
+        old = self.state
+        u, v, a = list(old.u), list(old.v), list(old.a)
+        for k in self.problem.awake:
+            u[k], a0 = step.bodies[k].u1.copy(), self.problem.acceleration(k)
+            v[k], a1 = self.problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
+            if a1 is not None:
+                a[k] = a1
+            massless = getattr(self.system.bodies[k], "massless", None)
+            if massless is not None:
+                # What has no momentum has no velocity of its own either.
+                v[k][massless] = step.bodies[k].du[massless] / dt
+        histories = [coupling.history(parts) for coupling, parts in self.problem.each(step)]
+        return State(time, tuple(u), tuple(v), tuple(a), tuple(histories))
+
+    def mean_force(self, k: int) -> FloatArray:
+        """Contact force p_N of the last two steps in the mean over their time [N].
+
+        That of a single step alternates about it; after one step, or a load step of `equilibrium`,
+        it is that step's.
+
+        Args:
+            k: Number of the contact.
+
+        Returns:
+            At this rank's slave nodes, as in `state.contacts`.
+        """
+        if not self._recent:
+            return self.state.contacts[k].force
+        steps, forces = zip(*self._recent, strict=True)
+        mean: FloatArray = np.average([force[k] for force in forces], axis=0, weights=steps)
+        return mean
+
+    def close(self) -> None:
+        """Free the PETSc objects of the last step."""
+        self.solver.destroy()
+        self.problem.destroy()

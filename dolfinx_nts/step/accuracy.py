@@ -1,0 +1,80 @@
+"""When a step counts as solved, and the levels of accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dolfinx_nts.step.linear_solver import SOLVERS, choose
+from dolfinx_nts.system import System
+from dolfinx_nts.validation import is_finite, is_whole, known_options, require_bool
+
+
+@known_options
+@dataclass(frozen=True, kw_only=True)
+class Newton:
+    """When a step counts as solved and how hard to try.
+
+    Attributes:
+        rtol: Largest residual of a block relative to the forces (or motions) of the step, > 0.
+        max_iterations: Newton iterations before a step is dropped.
+        max_retries: How often a dropped step may be cut (to less than half) before the run stops.
+        condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
+            lambda_N and lambda_T reach the linear solver: the same solution in fewer iterations.
+        linear_solver: "direct" (MUMPS) or "krylov" (FGMRES with incomplete factors of the bodies
+            and a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth.
+            Its incomplete factors weaken as dt grows beyond the time a wave needs through an
+            element.
+            "auto" takes "krylov" while that is the faster one: not below 600 coordinates (100
+            where no contact is declared), nor in statics, nor with `petsc_options` beyond those of
+            SNES, nor for the next steps after a solve that needed more iterations than MUMPS is
+            worth. Where MUMPS fails, it leaves out equations that repeat others for some steps;
+            "krylov" is left alone.
+        reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
+            and steps for as long as Newton contracts well; contact is always linearised anew.
+
+    Raises:
+        TypeError: An argument is of another type.
+        ValueError: An argument is out of range.
+    """
+
+    rtol: float = 1e-12
+    max_iterations: int = 25
+    max_retries: int = 8
+    condense: bool = True
+    linear_solver: str = "auto"
+    reuse: bool = False
+
+    def __post_init__(self) -> None:
+        if not (is_finite(self.rtol) and 0 < self.rtol < 1):
+            raise ValueError(f"rtol={self.rtol!r}: must lie in (0, 1)")
+        for name in ("max_iterations", "max_retries"):
+            value = getattr(self, name)
+            if not is_whole(value):
+                raise TypeError(f"{name}={value!r}: pass a whole number")
+        for name in ("condense", "reuse"):
+            require_bool(name, getattr(self, name))
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
+        if self.max_retries < 0:
+            raise ValueError(f"max_retries={self.max_retries!r}: must not be negative")
+        if self.linear_solver not in SOLVERS:
+            known = ", ".join(map(repr, SOLVERS))
+            raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
+
+    def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
+        """Preset of the linear solver to begin with; arguments as of `choose`."""
+        if self.linear_solver != "auto":
+            return self.linear_solver
+        flexible = [b for b in system.bodies if not getattr(b, "joints", ())]
+        size = int(system.comm.allreduce(sum(b.num_owned for b in flexible)))
+        return choose(size, bool(system.contacts or system.joints), inertia, given)
+
+
+#: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
+ACCURACY: Mapping[str, Newton] = {
+    "exact": Newton(),
+    "balanced": Newton(rtol=1e-9, reuse=True),
+    "fast": Newton(rtol=1e-6, reuse=True),
+}

@@ -1,0 +1,131 @@
+"""Results of contacts at the nodes of a body's mesh: forces, pressure, gap, slip, status."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from mpi4py import MPI
+
+from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.system import State, System
+
+if TYPE_CHECKING:
+    from dolfinx_nts.step.evaluation import Evaluation
+    from dolfinx_nts.step.problem import StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class ContactLoads(NamedTuple):
+    """Contact forces of a step, as its elements have them.
+
+    Attributes:
+        elements: Those of each contact.
+        parts: Their solution.
+        factor: What the step equations multiply forces by [s^2].
+    """
+
+    elements: tuple[Any, ...]
+    parts: tuple[Any, ...]
+    factor: float
+
+    @classmethod
+    def of_step(cls, problem: StepProblem, step: Evaluation) -> ContactLoads:
+        """Of a solved step; its tangents are not kept."""
+        parts = tuple(part._replace(tangent=np.empty(0)) for part in problem.contact_parts(step))
+        return cls(tuple(problem.contacts.elements), parts, problem.factor)
+
+    def on(self, k: int) -> list[tuple[Surface, FloatArray]]:
+        """Forces of a contact on the points of its surfaces [N], (p, 3) each. Collective."""
+        contact, found = self.elements[k], []
+        surfaces = (contact.pair.slave, contact.pair.master)
+        # An obstacle has no points.
+        for surface, force in zip(surfaces, contact.nodal_forces(self.parts[k]), strict=False):
+            surface.body.comm.Allreduce(MPI.IN_PLACE, force, op=MPI.SUM)
+            found.append((surface, force / self.factor))
+        return found
+
+
+def labels(system: System) -> list[str]:
+    """Names of the contacts for fields: those of the same name are numbered."""
+    names = [re.sub(r"^\.+|[^\w.-]+", "_", pair.name) for pair in system.contacts]
+    return [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
+
+
+def at_nodes(
+    system: System, state: State, loads: ContactLoads | None, body: Any
+) -> dict[str, FloatArray]:
+    """Contact fields at the nodes of a body's mesh that this rank owns. Collective.
+
+    Args:
+        system: The scene.
+        state: Last accepted state.
+        loads: Contact forces of the step that led there; None before the first one.
+        body: Body with a mesh.
+
+    Returns:
+        By name, see `Solution.contact_fields`, shape (nodes,) or (nodes, 3).
+    """
+    fields: dict[str, FloatArray] = {}
+    for k, (label, pair) in enumerate(zip(labels(system), system.contacts, strict=True)):
+        if not any(b is body for b in pair.bodies):
+            continue
+        load = np.zeros((body.space.dofmap.index_map.size_local, 3))
+        for surface, force in [] if loads is None else loads.on(k):
+            if surface.body is body:
+                load[surface.rows] += surface.owned(force)
+        fields[f"contact_load_{label}"] = load
+        if pair.slave.body is body:
+            for name, (elsewhere, values) in _of_slave(pair, state, k).items():
+                fields[f"{name}_{label}"] = spread(pair.slave, elsewhere, values)
+    return fields
+
+
+def spread(slave: Surface, elsewhere: float, values: FloatArray) -> FloatArray:
+    """Values at this rank's share of a slave's points, at the nodes it owns. Collective."""
+    owned = slave.body.space.dofmap.index_map.size_local
+    nodal = np.full((owned, *values.shape[1:]), elsewhere)
+    nodal[slave.rows] = slave.at_own(values)
+    return nodal
+
+
+def _of_slave(pair: ContactPair, state: State, k: int) -> dict[str, tuple[float, FloatArray]]:
+    """Name -> value elsewhere and values at this rank's slave nodes."""
+    own, area = state.contacts[k], pair.slave.area[pair.slave.share]
+    force, gap = own.force, own.gap
+    near = np.isfinite(gap)
+    fields = {
+        "contact_force": (0.0, force),
+        "contact_pressure": (0.0, force / area),
+        "contact_gap": (np.nan, np.where(near, gap, np.nan)),
+        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + own.stick),
+    }
+    if pair.friction:
+        fields["contact_friction"] = (0.0, own.tangential)
+        fields["contact_slip"] = (0.0, own.slip)
+    return fields
+
+
+def functions(body: Any, fields: dict[str, FloatArray]) -> dict[str, Any]:
+    """DOLFINx Functions of nodal fields on the body's mesh, of degree 1. Collective.
+
+    Args:
+        body: Its space is of degree 1.
+        fields: As of `at_nodes`.
+    """
+    scalars, of_vector = body.space.sub(0).collapse()
+    node = np.asarray(of_vector) // 3
+    found = {}
+    for name, values in fields.items():
+        vector = values.ndim == 2
+        found[name] = function = fem.Function(body.space if vector else scalars)
+        function.name = re.sub(r"\W", "_", name, flags=re.ASCII)
+        owned = scalars.dofmap.index_map.size_local
+        function.x.array[: values.size] = values.ravel() if vector else values[node[:owned]]
+        function.x.scatter_forward()
+    return found

@@ -1,0 +1,69 @@
+"""What to say of a step that is not solved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinx_nts.step.evaluation import BodyTerms, Evaluation
+from dolfinx_nts.step.problem import StepProblem
+
+
+def diagnosis(
+    problem: StepProblem, e: Evaluation, flips: Sequence[Any], why: str, iterations: int
+) -> str:
+    """One sentence that names the block that failed, and where. Collective.
+
+    Args:
+        problem: The step.
+        e: The last iterate.
+        flips: Of each batch of elements how often its elements changed their status.
+        why: Reason that the solver gives.
+        iterations: Newton iterations.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = problem.ratios(e)
+    ratio = {k: r if np.isfinite(r) else np.inf for k, r in found.items()}
+    worst = max(ratio, key=lambda name: ratio[name])
+    notes = [
+        (c.name, *c.describe(part, flipped))
+        for c, part, flipped in zip(problem.elements, e.parts, flips, strict=True)
+        if c.num_elements
+    ]
+    bodies = list(zip(problem.system.bodies, e.bodies, strict=True))
+    notes += [_body_note(body, terms) for body, terms in bodies if body.num_owned]
+    gathered = [n for part in problem.system.comm.allgather(notes) for n in part]
+    # Of each body and contact the rank with the largest residual speaks, the worst one first.
+    best = {name: text for name, _, text in sorted(gathered, key=lambda n: n[1])}
+    trouble = {
+        name: max((r for k, r in ratio.items() if f"{k} ".startswith(f"{name} ")), default=0.0)
+        for name in best
+    }
+    top = [best[name] for name in sorted(best, key=lambda name: -trouble[name])[:4]]
+    endless = [
+        body.name
+        for body, terms in bodies
+        if not problem.system.comm.allreduce(np.isfinite(terms.internal).all(), op=MPI.LAND)
+    ]
+    if endless:
+        why += (
+            f"; the internal forces of {', '.join(map(repr, endless))} are not finite: the energy "
+            "of its material or form may not be defined for this deformation"
+        )
+    finite = ratio[worst] < np.inf
+    size = f"at {ratio[worst]:.3g} times its tolerance" if finite else "is not finite"
+    return (
+        f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
+        f"{iterations} iterations ({why}); worst block {worst!r} {size}; {'; '.join(top)}"
+    )
+
+
+def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:
+    """Name, weight and text of where the body's equation is worst solved."""
+    r = np.nan_to_num(np.abs(terms.residual), nan=np.inf)
+    r[body.fixed] = 0.0
+    x = ", ".join(f"{c:.4g}" for c in body.reference.reshape(-1, 3)[int(np.argmax(r)) // 3])
+    return body.name, float(r.max()), f"body {body.name!r}: largest residual at X = ({x})"

@@ -1,0 +1,52 @@
+"""What the step equations are at an iterate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTerms:
+    """Parts of a body's equation at an iterate, owned coordinates, [kg m] except u1 and du [m].
+
+    Attributes:
+        u1: Displacement at t_{n+1}.
+        du: u_1 - u_0.
+        internal: h^2/2 internal forces.
+        external: h^2/2 external forces.
+        coupling: h^2/2 forces of elements, such as contact forces G^T lambda.
+        residual: Complete equation, also at prescribed coordinates, where it is h^2/2 times the
+            reaction.
+    """
+
+    u1: FloatArray
+    du: FloatArray
+    internal: FloatArray
+    external: FloatArray
+    coupling: FloatArray
+    residual: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The step equations at an iterate.
+
+    Attributes:
+        x: Iterate it belongs to, this rank's part.
+        bodies: Terms of each body.
+        parts: Contribution of each batch of elements.
+        iterations: Newton iterations it took.
+        min_det: Smallest det F of all bodies, once solved.
+    """
+
+    x: FloatArray
+    bodies: tuple[BodyTerms, ...]
+    parts: tuple[Any, ...]
+    iterations: int = 0
+    min_det: float = np.inf

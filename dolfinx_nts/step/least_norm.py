@@ -1,0 +1,145 @@
+"""The multipliers of least norm, where constraints repeat each other.
+
+The forces on the bodies do not determine the multipliers there (a loop with too many joints): a
+part of them lies in the null space of the forces' columns and does nothing. How large Newton's
+method leaves it depends on the path of the iterates; here it is taken out.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import lsqr
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Tolerance of the least squares, relative to the multipliers.
+_RTOL = 1e-14
+#: Iterations over unknowns that least squares may take; in exact arithmetic one is enough.
+_ITERATIONS = 10
+#: Distance between the coordinate numbers of two bodies.
+_APART = 1 << 40
+#: Solves by least squares, each for what the one before has left.
+_PASSES = 2
+#: What SciPy's lsqr says where its iterations did not do.
+_LIMIT = 7
+#: Norm below which the part of a random vector in the null space counts as zero.
+_NONE = 1e-6
+
+
+def form_tree(joints: Sequence[Sequence[int]]) -> bool:
+    """Whether joints, each given by the numbers of its bodies, form no loop with the ground.
+
+    Those cannot repeat each other.
+    """
+    group: dict[int, int] = {}
+    for bodies in joints:
+        ends = [*bodies, -1] if len(bodies) == 1 else list(bodies)
+        known = [group.setdefault(b, b) for b in ends]
+        if len(set(known)) < len(known):
+            return False
+        for b, g in group.items():
+            if g in known:
+                group[b] = known[0]
+    return True
+
+
+class NullSpace:
+    """Null space of what bilateral constraints of a solved step push the bodies with.
+
+    Args:
+        comm: MPI communicator.
+        elements: Batches of elements.
+        bodies: Numbers of the bodies of each batch.
+        parts: Their contributions at the solution.
+    """
+
+    def __init__(
+        self,
+        comm: Any,
+        elements: Sequence[Any],
+        bodies: Sequence[tuple[int, ...]],
+        parts: Sequence[Any],
+    ) -> None:
+        places, entries, scales, start, count = [], [], [np.empty(0)], 0, 0
+        for batch, numbers, part in zip(elements, bodies, parts, strict=True):
+            n, m = batch.num_elements, batch.widths["constraints"]
+            if batch.bilateral and n * m:
+                places.append(np.arange(start, start + n * m))
+                scale = batch.force_scale
+                scales.append(np.full(n * m, scale))
+                rows = np.arange(count, count + n * m).reshape(n, 1, m)
+                count += n * m
+                both = zip(numbers, batch.dofs(), strict=True)
+                columns = np.concatenate([np.where(d < 0, d, d + k * _APART) for k, d in both], 1)
+                found = np.broadcast_arrays(
+                    rows,
+                    columns[:, :, None],
+                    part.tangent[:, : batch.num_coordinates, -m:] / scale,
+                )
+                some = (found[1] >= 0) & (found[2] != 0.0)
+                entries.append([array[some] for array in found])
+            start += n * m
+        none = [np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)]
+        local = [np.concatenate(arrays) for arrays in zip(none, *entries, strict=True)]
+        ranks = comm.allgather((count, local))
+        first = np.cumsum([0, *(number for number, _ in ranks)])
+        row, column, force = (
+            np.concatenate(arrays) for arrays in zip(*(arrays for _, arrays in ranks), strict=True)
+        )
+        row = row + np.repeat(first[:-1], [len(arrays[0]) for _, arrays in ranks])
+        names, column = np.unique(column, return_inverse=True)
+        self._comm, self._size = comm, start
+        self._places, self._scales = np.concatenate([none[0], *places]), np.concatenate(scales)
+        self._own = slice(first[comm.rank], first[comm.rank + 1])
+        self._matrix = csr_matrix((force, (row, column)), (first[-1], len(names)))
+
+    def is_empty(self) -> bool:
+        """Whether no constraint repeats others.
+
+        Where this holds at one time, it holds at all but single instants, such as dead centres.
+        """
+        size = self._matrix.shape[0]
+        if not size:
+            return True
+        probe = np.random.default_rng(0).standard_normal(size)
+        return float(np.linalg.norm(self._null(probe))) <= _NONE * np.sqrt(size)
+
+    def part(self, multipliers: FloatArray) -> FloatArray:
+        """Part of multipliers in the null space; without it they push alike and have least norm.
+
+        Collective.
+
+        Args:
+            multipliers: Unknowns of all elements on this rank.
+        """
+        out = np.zeros(self._size)
+        own = self._scales * multipliers[self._places]
+        found = self._null(np.concatenate(self._comm.allgather(own)))
+        out[self._places] = found[self._own] / self._scales
+        return out
+
+    def _null(self, v: FloatArray) -> FloatArray:
+        """The part of all bilateral multipliers in the null space."""
+        most = _ITERATIONS * max(self._matrix.shape)
+        found = v
+        # What rounding leaves of all else in the first pass would act on the bodies.
+        for _ in range(_PASSES):
+            least, reason, *_ = lsqr(
+                self._matrix, found, atol=_RTOL, btol=_RTOL, conlim=0.0, iter_lim=most
+            )
+            if reason == _LIMIT and self._comm.rank == 0:
+                logger.warning(
+                    "forces of joints that repeat each other: those of least norm are not found in "
+                    "%d iterations; what is given moves the bodies alike, but may hold a part that "
+                    "does nothing: drop a joint of the loop", most,
+                )  # fmt: skip
+            found = found - self._matrix @ least
+        return found

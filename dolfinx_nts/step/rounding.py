@@ -1,0 +1,106 @@
+"""Size of the forces on each body that is rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+_EPS = float(np.finfo(float).eps)
+#: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
+_ANOTHER_STEP = 4.0
+
+
+class Rounding:
+    """Rounding of the forces on bodies: stiffness times length times machine precision.
+
+    The stiffness is the diagonal of a body's matrix in an accepted state, never in an iterate: one
+    that runs off may be stiffer by any factor, and its rounding excuses no residual. Forces come
+    from displacement gradients, so the length is that of the displacement, wherever the body lies
+    and however large it is.
+
+    Args:
+        bodies: Bodies of the system.
+        tangent: PETSc matrix of a body at the start of the step, by the body's number.
+
+    Attributes:
+        length: Displacement of each body in the step [m], at most, shape (bodies,).
+    """
+
+    def __init__(self, bodies: Sequence[Any], tangent: Callable[[int], Any]) -> None:
+        self._bodies, self._tangent = bodies, tangent
+        self._diagonal, self._of_factor = np.zeros((2, len(bodies)))
+        self.length = self._extent = self._moved = np.zeros(len(bodies))
+        self._factor = 1.0
+
+    def begin(
+        self, factor: float, length: FloatArray, moved: FloatArray, extent: FloatArray
+    ) -> None:
+        """Fix the step; what was measured in steps of another size is forgotten.
+
+        Args:
+            factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
+            length: Displacement of each body in the step [m], at most, shape (bodies,).
+            moved: Displacement at t_n [m], shape (bodies,).
+            extent: Largest coordinate [m], shape (bodies,).
+        """
+        self._factor, self.length, self._moved, self._extent = factor, length, moved, extent
+        # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
+        old = self._of_factor
+        self._diagonal[(factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * factor)] = 0.0
+
+    @property
+    def measured(self) -> list[list[float]]:
+        """Of each body, what its rounding was last measured by: the diagonal [kg], the factor."""
+        return [self._diagonal.tolist(), self._of_factor.tolist()]
+
+    @measured.setter
+    def measured(self, known: Sequence[Sequence[float]]) -> None:
+        self._diagonal[:], self._of_factor[:] = known
+
+    def is_known(self, bodies: Iterable[int]) -> bool:
+        """Whether the rounding of the forces on all these bodies has been measured."""
+        return bool((self._diagonal[list(bodies)] > 0.0).all())
+
+    def measure(self, bodies: Iterable[int]) -> None:
+        """Measure it anew, for bodies that have stiffened. Collective.
+
+        The bodies' matrices are not those of an iterate any more.
+        """
+        for k in bodies:
+            diagonal = self._tangent(k).getDiagonal()
+            self._diagonal[k], self._of_factor[k] = diagonal.norm(), self._factor
+            diagonal.destroy()
+
+    @property
+    def forces(self) -> FloatArray:
+        """Norm of the forces on each body in the step that is rounding [kg m]; [N] in statics."""
+        return self.at(self.length)
+
+    def at(self, length: FloatArray) -> FloatArray:
+        """`forces` at displacements of these lengths [m], shape (bodies,)."""
+        bodies = zip(self._bodies, self._extent, strict=True)
+        beside = np.array([getattr(body, "rounded", extent) for body, extent in bodies])
+        rounding: FloatArray = _EPS * self._diagonal * (length + beside)
+        return rounding
+
+    def of(self, bodies: Sequence[int]) -> float:
+        """`forces` of some bodies in all [kg m]. Collective."""
+        self._measure_unknown(bodies)
+        return float(self.forces[list(bodies)].sum())
+
+    def at_rest(self, k: int) -> float:
+        """The same of a body at rest [N]. Collective.
+
+        The diagonal may be that of another step size; it grows less than the factor does, so this
+        hardly allows more.
+        """
+        self._measure_unknown([k])
+        return float(self.at(self._moved)[k] / max(self._factor, self._of_factor[k]))
+
+    def _measure_unknown(self, bodies: Iterable[int]) -> None:
+        self.measure([k for k in bodies if not self._diagonal[k]])

@@ -1,0 +1,328 @@
+"""Beams: theory section 15; benchmarks B26, B27, B29."""
+
+import logging
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, create_box
+from mpi4py import MPI
+from scipy.spatial.transform import Rotation
+
+import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.kernels import beam as kernel
+
+STEEL = nts.Section(EA=2000, GA=(800, 700), GJ=3, EI=(1, 2), rhoA=1, rhoI=(1e-2, 2e-2))
+EM, MID = nts.EnergyMomentum(), nts.Midpoint()
+
+
+def interval_mesh(x, cells=None, comm=MPI.COMM_WORLD):
+    """A mesh of these nodes, all given by rank 0, in their order unless told."""
+    if cells is None:
+        cells = np.column_stack([np.arange(len(x) - 1), np.arange(1, len(x))])
+    mine = slice(None if comm.rank == 0 else 0)
+    x = np.asarray(x, dtype=float)
+    return compat.create_mesh(comm, np.asarray(cells)[mine], x[mine], "interval")
+
+
+def straight(n, length=1.0, way=(1, 0, 0)):
+    return np.linspace(0, length, n + 1)[:, None] * np.array(way, dtype=float)
+
+
+def arc(n, radius, angle):
+    a = np.linspace(0, angle, n + 1)
+    return radius * np.column_stack([np.sin(a), 1 - np.cos(a), 0 * a])
+
+
+# ---- kernel
+def elements(seed=0, n=3, radius=0.3):
+    """Elements with bent references, and two states of theirs."""
+    rng = np.random.default_rng(seed)
+    length = rng.uniform(0.5, 2.0, n)
+    y = rng.standard_normal((3, n, 8, 3))
+    stiffness = np.array([3.0, 4.0, 9.0, 1.0, 2.0, 0.5])
+    return kernel.beams(y[0], length, radius, stiffness), y[1], y[2]
+
+
+@pytest.mark.parametrize("theta", [None, 0.5, 0.7, 1.0])
+def test_the_tangent_is_the_derivative_of_the_force(theta):
+    of, y0, y1 = elements()
+    way = np.random.default_rng(5).standard_normal(y1.shape)
+    step = 1e-6
+    ahead, behind = (kernel.force(of, y0, y1 + s * way, theta) for s in (step, -step))
+    found = np.einsum("nij,nj->ni", kernel.tangent(of, y0, y1, theta), way.reshape(-1, 24))
+    assert found == pytest.approx((ahead - behind) / (2 * step), rel=1e-7, abs=1e-7)
+
+
+def test_the_force_is_the_derivative_of_the_energy():
+    of, _, y = elements(1)
+    way = np.random.default_rng(6).standard_normal(y.shape)
+    change = kernel.energy(of, y + 1e-6 * way) - kernel.energy(of, y - 1e-6 * way)
+    work = (kernel.force(of, y, y, 1.0) * way.reshape(-1, 24)).sum(axis=1)
+    assert work == pytest.approx(change / 2e-6, rel=1e-7)
+
+
+def test_the_work_of_the_discrete_gradient_is_the_change_of_the_energy():
+    of, y0, y1 = elements(2)
+    work = (kernel.force(of, y0, y1, None) * (y1 - y0).reshape(-1, 24)).sum(axis=1)
+    assert work == pytest.approx(kernel.energy(of, y1) - kernel.energy(of, y0), rel=1e-13)
+
+
+def test_strains_of_known_motions():
+    """Rigid motion, stretch, shear, and the bending of a straight element to an arc."""
+    length, radius = 0.8, 0.3
+    rest = np.zeros((1, 8, 3))
+    rest[0, 4] = (0, 0, length)
+    rest[0, 1:4] = rest[0, 5:] = radius * np.eye(3)
+    of = kernel.beams(rest, np.array([length]), radius, np.ones(6))
+    turn = Rotation.from_rotvec((0.3, -1.2, 2.0)).as_matrix()
+    moved = rest @ turn.T
+    moved[:, ::4] += (3.0, -2.0, 1.0)
+    assert np.abs(kernel.strains(of, moved)).max() < 1e-14
+    pulled = rest.copy()
+    pulled[0, 4] += (0.01, 0.02, 0.03)
+    expected = np.array([0.01, 0.02, 0.03, 0, 0, 0]) / length
+    assert kernel.strains(of, pulled)[0] == pytest.approx(expected, abs=1e-15)
+    for axis in range(3):
+        angle, bent = 0.2, rest.copy()
+        spin = Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix()
+        bent[0, 5:] = radius * spin.T
+        assert kernel.strains(of, bent)[0, 3 + axis] == pytest.approx(np.sin(angle) / length)
+
+
+# ---- equilibrium
+@pytest.mark.mpi
+@pytest.mark.parametrize(("n", "error"), [(8, 3.779e-2), (16, 7.691e-3), (32, 1.853e-3)])
+def test_the_cantilever_of_reissners_equations(n, error):
+    section = nts.Section(EA=2000, GA=(800, 800), GJ=1, EI=(1, 1), rhoA=1, rhoI=(1e-2, 1e-2))
+    beam = nts.Beam(
+        interval_mesh(straight(n)),
+        section,
+        bcs=[nts.Clamp(lambda x: x[0] < 1e-9)],
+        forces=[nts.PointForce(lambda x: x[0] > 1 - 1e-9, (0, 10, 0))],
+    )
+    run = nts.equilibrium(nts.System([beam]), load_steps=5)
+    exact, (start, now) = np.array([0.44412985, 0.81711894, 0.0]), beam.centreline()
+    off = np.linalg.norm(now[-1] - exact) / np.linalg.norm(exact - start[-1])
+    assert run.status == "completed"
+    assert off == pytest.approx(error, rel=2e-4)
+    assert run.reactions["beam"][-1].ravel() == pytest.approx((0, -10, 0), abs=1e-6)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("flipped", [False, True], ids=["in order", "shuffled"])
+def test_the_bend_of_bathe_and_bolourchi(flipped):
+    """Whatever the order and the directions of the cells."""
+    x, cells = arc(16, 100, np.pi / 4), None
+    if flipped:
+        cells = np.column_stack([np.arange(16), np.arange(1, 17)])
+        cells[::3] = cells[::3, ::-1]
+        cells = np.random.default_rng(0).permutation(cells)
+    section = nts.Section(
+        EA=1e7, GA=(5e6, 5e6), GJ=1e7 / 12, EI=(1e7 / 12,) * 2, rhoA=1, rhoI=(1 / 12, 1 / 12)
+    )
+    beam = nts.Beam(
+        interval_mesh(x, cells),
+        section,
+        bcs=[nts.Clamp(lambda x: x[0] < 1e-9)],
+        forces=[nts.PointForce(lambda y: y[0] > x[-1, 0] - 1e-6, (0, 0, 600))],
+    )
+    nts.equilibrium(nts.System([beam]), load_steps=5)
+    assert beam.centreline()[1][-1] == pytest.approx((46.9273, 15.7127, 53.7189), abs=6e-5)
+
+
+def test_a_propped_cantilever_under_its_weight():
+    """Clamped, and a support that holds the place and not the directions: 3/8 q L there."""
+    section = nts.Section(EA=1e9, GA=(1e12,) * 2, GJ=1e6, EI=(1e6, 1e6), rhoA=10, rhoI=(0.1, 0.1))
+    bcs = [
+        nts.Clamp(lambda x: x[0] < 1e-9),
+        nts.Dirichlet(lambda x: x[0] > 4 - 1e-9, components=(2,)),
+    ]
+    beam = nts.Beam(interval_mesh(straight(64, 4)), section, bcs=bcs)
+    run = nts.equilibrium(nts.System([beam], gravity=(0, 0, -9.81)), load_steps=1)
+    load = 10 * 9.81 * 4
+    forces = run.reactions["beam"][-1][:, 2]
+    assert run.status == "completed"
+    assert forces == pytest.approx((5 / 8 * load, 3 / 8 * load), rel=1e-3)
+
+
+# ---- dynamics
+def flying(scale, comm):
+    """B29 in a unit of length 1/scale m."""
+    s = scale
+    section = nts.Section(
+        EA=1e4 * s, GA=(1e4 * s,) * 2, GJ=500 * s**3, EI=(500 * s**3,) * 2, rhoA=1 / s,
+        rhoI=(10 * s,) * 2,
+    )  # fmt: skip
+    return nts.Beam(
+        interval_mesh(straight(8, 10 * s), comm=comm),
+        section,
+        velocity=lambda x: np.array([0, 0, 0.5 * s])[:, None] * np.cos(np.pi * x[0] / (10 * s)),
+        angular_velocity=(0.3, 0.5, 1),
+    )
+
+
+def fly(rule, dt, t_end, scale=1.0, comm=MPI.COMM_WORLD):
+    beam = flying(scale, comm)
+    run = nts.simulate(nts.System([beam]), rule, dt=dt, t_end=t_end)
+    return run, beam.centreline()[1]
+
+
+def off(run):
+    """Errors of E and J over their size."""
+    energy, spin = run.balance["energy"], run.balance["angular_momentum"]
+    return (
+        np.abs(energy / energy[0] - 1).max(),
+        np.abs(spin - spin[0]).max() / np.linalg.norm(spin[0]),
+    )
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("dt", "t_end"), [(0.05, 5), (0.2, 20), (0.5, 20)])
+@pytest.mark.fast("0.2-20")
+def test_a_flying_beam_keeps_energy_and_angular_momentum(dt, t_end):
+    run, _ = fly(EM, dt, t_end)
+    assert run.status == "completed" and run.retries == 0
+    assert max(off(run)) < 1e-12
+
+
+@pytest.mark.slow
+def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
+    with caplog.at_level(logging.ERROR):
+        run, _ = fly(MID, 0.05, 20)
+        coarse, _ = fly(MID, 0.2, 20)
+    energy, spin = off(run)
+    assert energy == pytest.approx(2.8e-3, abs=5e-5) and spin < 1e-12
+    assert off(coarse)[0] > 0.5 and "does not keep it" in coarse.status
+
+
+@pytest.mark.parametrize("rule", [EM, MID, nts.Newmark(), nts.GeneralizedAlpha()])
+@pytest.mark.fast("rule0", "rule2")
+def test_the_order_in_time_is_two(rule):
+    coarse, middle, fine = (fly(rule, dt, 0.08)[1] for dt in (2e-3, 1e-3, 5e-4))
+    ratio = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)
+    assert np.log2(ratio) == pytest.approx(2, abs=0.1)
+
+
+def test_millimetres_take_the_same_iterations():
+    (metres, x), (millimetres, y) = (fly(EM, 0.1, 1, s) for s in (1, 1000))
+    assert np.abs(y / 1000 - x).max() < 1e-11 * np.abs(x).max()
+    assert (millimetres.balance["newton_iterations"] == metres.balance["newton_iterations"]).all()
+
+
+@pytest.mark.mpi
+def test_ranks_give_the_motion_of_one():
+    several, x = fly(EM, 0.1, 1)
+    alone, y = fly(EM, 0.1, 1, comm=MPI.COMM_SELF)
+    assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
+    assert several.balance["energy"] == pytest.approx(alone.balance["energy"], rel=1e-12)
+
+
+# ---- joints
+@pytest.mark.mpi
+def test_a_root_held_by_a_joint_is_clamped():
+    section = nts.Section(EA=2000, GA=(800, 800), GJ=1, EI=(1, 1), rhoA=1, rhoI=(1e-2, 1e-2))
+    tip = nts.PointForce(lambda x: x[0] > 1 - 1e-9, (0, 10, 0))
+    beam = nts.Beam(interval_mesh(straight(8)), section, forces=[tip])
+    held = nts.Fixed(beam, None, point=(0, 0, 0))
+    nts.equilibrium(nts.System([beam], joints=[held]), load_steps=5)
+    exact, (start, now) = np.array([0.44412985, 0.81711894, 0.0]), beam.centreline()
+    off_by = np.linalg.norm(now[-1] - exact) / np.linalg.norm(exact - start[-1])
+    assert off_by == pytest.approx(3.779e-2, rel=2e-4)
+
+
+@pytest.mark.mpi
+def test_a_corner_of_two_beams_and_a_rigid_body_fly_on():
+    """Fixed at right angles, and a hinge: energy and angular momentum are kept."""
+    section = nts.Section(EA=1e4, GA=(1e4,) * 2, GJ=500, EI=(500,) * 2, rhoA=1, rhoI=(0.1, 0.1))
+    spin, end = (0.3, 0.5, 1), np.array([2.0, 0, 0])
+    one = nts.Beam(interval_mesh(straight(4, 2)), section, name="one", angular_velocity=spin,
+                   velocity=np.cross(spin, (1, 0, 0)))  # fmt: skip
+    two = nts.Beam(interval_mesh(end + straight(4, 2, (0, 1, 0))), section, name="two",
+                   angular_velocity=spin, velocity=np.cross(spin, (2, 1, 0)))  # fmt: skip
+    ball = nts.RigidBody.from_inertia(
+        2.0, (0.3, 0.4, 0.5), centre=(2, 3, 0), angular_velocity=spin,
+        velocity=np.cross(spin, (2, 3, 0)), name="ball",
+    )  # fmt: skip
+    joints = [
+        nts.Fixed(one, two, point=end),
+        nts.Revolute(two, ball, point=(2, 2, 0), axis=(0, 0, 1)),
+    ]
+    run = nts.simulate(nts.System([one, two, ball], joints=joints), EM, dt=0.1, t_end=2)
+    assert run.status == "completed" and max(off(run)) < 1e-12
+    (_, a), (_, b) = one.centreline(), two.centreline()
+    assert a[-1] == pytest.approx(b[0], abs=1e-10)
+
+
+def test_a_joint_between_nodes_is_told():
+    beam = nts.Beam(interval_mesh(straight(4)), STEEL)
+    with pytest.raises(ValueError, match=r"is no node of beam 'beam'; the nearest one is \[0.0"):
+        nts.Spherical(beam, None, point=(0.1, 0, 0))
+    with pytest.raises(ValueError, match=r"a='beam': .* or fix one to a node of a beam"):
+        nts.TorsionDamper(beam, None, axis=(0, 0, 1), damping=1.0)
+
+
+# ---- bad input
+def box():
+    return create_box(MPI.COMM_WORLD, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("given", "kind", "text"),
+    [
+        ({"mesh": lambda: "line"}, TypeError, "pass a dolfinx mesh"),
+        ({"mesh": box}, ValueError, "hexahedron in 3D; pass intervals"),
+        ({"mesh": lambda: interval_mesh(straight(2)[:, :2])}, ValueError, "interval in 2D"),
+        ({"mesh": lambda: interval_mesh([[0, 0, 0], [1, 0, 0], [1, 0, 0]])}, ValueError,
+         "1 cells have no length"),
+        ({"mesh": lambda: interval_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+                                        [[0, 1], [0, 2], [0, 3]])}, ValueError,
+         # On DOLFINx 0.9 two ranks find a corner there.
+         "3 cells meet|axis turns by 90 degrees"),
+        ({"mesh": lambda: interval_mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0]])}, ValueError,
+         "turns by 90 degrees"),
+        ({"mesh": lambda: interval_mesh([[0, 0, 0], [1, 0, 0], [np.nan, 0, 0]])}, ValueError,
+         "not finite"),
+        ({"section": 3}, TypeError, "section=3: pass Section"),
+        ({"direction": (1, 0, 0)}, ValueError, "along the axis at x=.*across it everywhere"),
+        ({"direction": (1, 0)}, ValueError, "three finite components"),
+        ({"bcs": [3]}, TypeError, r"bcs\[0\]=3: pass a sequence of Clamp or Dirichlet"),
+        ({"bcs": [nts.Clamp(lambda x: x[0] > 7)]}, ValueError, "selects no node between"),
+        ({"bcs": [nts.Clamp("root")]}, TypeError, "pass a function"),
+        ({"forces": [nts.PointForce(lambda x: x[0] > 0.1, (1, 0, 0))]}, ValueError,
+         "selects 4 nodes; select one"),
+        ({"forces": [nts.PointForce(lambda x: x[0] > 0.9, 1.0)]}, ValueError, "three finite"),
+        ({"velocity": "fast"}, ValueError, "velocity='fast'"),
+        ({"spin": 1}, TypeError, "unknown option of Beam"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_told(given, kind, text):
+    options = {"mesh": lambda: interval_mesh(straight(4)), "section": STEEL} | given
+    mesh = options.pop("mesh")()
+    with pytest.raises(kind, match=text):
+        nts.Beam(mesh, **options)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"EA": 0.0}, {"GA": (1, -1)}, {"EI": 3.0}, {"rhoI": (1, np.inf)}, {"GJ": None}]
+)
+def test_a_section_must_be_positive(wrong):
+    good = {"EA": 1, "GA": (1, 1), "GJ": 1, "EI": (1, 1), "rhoA": 1, "rhoI": (1, 1)}
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}=.*positive"):
+        nts.Section(**good | wrong)
+
+
+@pytest.mark.mpi
+def test_a_run_goes_on_from_a_checkpoint(tmp_path):
+    """As if nothing had stopped it."""
+    comm = MPI.COMM_WORLD
+    path, rule = comm.bcast(tmp_path) / "beam.h5", nts.EnergyMomentum()
+    whole = flying(1.0, comm)
+    nts.simulate(nts.System([whole]), rule, dt=0.05, t_end=0.5)
+    first, second = nts.System([flying(1.0, comm)]), nts.System([flying(1.0, comm)])
+    nts.simulate(first, rule, dt=0.05, t_end=0.25, checkpoint=nts.Checkpoint(path, every=5))
+    start = nts.restart(path, second)
+    nts.simulate(second, rule, dt=0.05, t_end=0.5, start=start)
+    places = [body.centreline()[1] for body in (whole, second.bodies[0])]
+    assert places[1] == pytest.approx(places[0], abs=1e-11)

@@ -1,0 +1,792 @@
+"""Checkpoints: a run that goes on from one is the run that was never interrupted."""
+
+import json
+import logging
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+from dolfinx_nts.output import BalanceCSV, Fields
+from dolfinx_nts.output.checkpoint_file import Numbering, describe, differences, previous
+
+COMM = MPI.COMM_WORLD
+DT, STEPS, EVERY = 2e-3, 14, 9
+INTEGRATORS = {
+    "energy-momentum": nts.EnergyMomentum(),
+    "midpoint": nts.Midpoint(),
+    "generalized-alpha": nts.GeneralizedAlpha(),
+}
+HEX, TET = CellType.hexahedron, CellType.tetrahedron
+RUBBER = nts.NeoHookean(1e6, 0.3)
+
+
+def box(comm, low, high, n, cell=HEX):
+    return create_box(
+        comm, [np.array(low, float), np.array(high, float)], [n] * 3, cell,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+
+
+def blocks(comm, cell=HEX, friction=0.3, cells=(2, 3), name="right"):
+    """A spinning block thrown at a larger one, with friction."""
+    left = nts.Continuum(
+        box(comm, (0, 0, 0), (1, 1, 1), cells[0], cell), RUBBER, density=1e3, name="left",
+        velocity=lambda x: np.array([3 + x[2], 1 + 0 * x[0], -x[0]]),
+    )  # fmt: skip
+    right = nts.Continuum(
+        box(comm, (1.04, -0.1, -0.1), (2.05, 1.1, 1.1), cells[1], cell), RUBBER, density=1e3,
+        name=name,
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        slave=left.surface(lambda x: x[0] > 1 - 1e-9),
+        master=right.surface(lambda x: x[0] < 1.04 + 1e-9),
+        friction=friction,
+    )
+    return nts.System([left, right], contacts=[pair]), {}
+
+
+def mechanism(comm):
+    """An arm that turns more than once on a torsion spring; a bob on a cord; a cube tied to it."""
+    arm = nts.RigidBody(
+        box(comm, (0, -0.1, -0.1), (1, 0.1, 0.1), 1), density=500.0, angular_velocity=(0, 0, 150),
+        velocity=(0, 75, 0), name="arm",
+    )  # fmt: skip
+    bob = nts.RigidBody.from_inertia(2.0, (0.1, 0.2, 0.25), (0, 0, -2), name="bob", comm=comm)
+    cube = nts.Continuum(
+        box(comm, (-0.5, -0.5, -3.2), (0.5, 0.5, -2.2), 2), RUBBER, density=10.0, name="cube"
+    )
+    pivot = nts.Revolute(arm, None, point=(0, 0, 0), axis=(0, 0, 1))
+    joints = [
+        pivot,
+        nts.TorsionSpring.about(pivot, stiffness=40.0, angle=0.0),
+        nts.Distance(bob, None, points=((0, 0.1, -2), (0, 0, 0))),
+        nts.Spring(arm, bob, ((1, 0, 0), (0, 0, -2)), stiffness=300.0, length=1.0),
+        nts.Damper(bob, None, ((0, 0, -2), (3, 0, -2)), damping=2.0),
+        nts.Tie(bob, cube.surface(lambda x: x[2] > -2.2 - 1e-9)),
+    ]
+    return nts.System([arm, bob, cube], joints=joints, gravity=(0, 0, -9.81)), {}
+
+
+def floor(comm):
+    """A rigid box that slides and tips on a rigid floor."""
+    body = nts.RigidBody(
+        box(comm, (0, 0, 0.002), (1, 1, 1.002), 1), density=1e3, velocity=(2, 1, -0.5),
+        angular_velocity=(0.3, 0, 1), name="box",
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        body.surface(lambda x: x[2] < 0.002 + 1e-9), nts.Plane((0, 0, 0), (0, 0, 1)), friction=0.4
+    )
+    return nts.System([body], contacts=[pair], gravity=(0, 0, -9.81)), {}
+
+
+def loaded(comm):
+    """Nodes on edges, a support that moves and a load that the script ramps up."""
+    mesh = box(comm, (0, 0, 0), (1, 1, 1), 2, TET)
+    load = fem.Constant(mesh, 0.0)
+    held = nts.Dirichlet(lambda x: x[2] < 1e-9, lambda t: (0.01 * np.sin(300 * t), 0, 0))
+    stiffness = fem.Constant(mesh, 1e6)
+    body = nts.Continuum(
+        mesh, lambda c: nts.NeoHookean(1e6, 0.3)(c) * stiffness / 1e6, density=1e3, bcs=[held],
+        degree=2, name="block", extra_form=lambda u, v, w, t: -load * w[2] * ufl_ds(mesh),
+    )  # fmt: skip
+
+    def ramp(time, dt):
+        load.value = 1e6 * (time + dt / 2)
+        stiffness.value = 1e6 * (1 + 20 * time)
+
+    return nts.System([body]), {"before_step": ramp}
+
+
+def ufl_ds(mesh):
+    return ufl.Measure("ds", mesh)
+
+
+def sleepers(comm):
+    system, _ = blocks(comm, friction=0.0)
+    far = nts.Continuum(
+        box(comm, (5, 0, 0), (6, 1, 1), 2), RUBBER, density=1e3, name="far"
+    )  # fmt: skip
+    return nts.System([*system.bodies, far], contacts=system.contacts), {"sleep": True}
+
+
+def adapted(comm):
+    system, _ = blocks(comm)
+    return system, {"adapt": nts.Adapt(tolerance=1e-3)}
+
+
+def restored(comm):
+    return blocks(comm)[0], {"impact": "restored"}
+
+
+def endless(comm):
+    return blocks(comm, friction=math.inf)
+
+
+def tetrahedra(comm):
+    return blocks(comm, cell=TET)
+
+
+SCENES = {f.__name__: f for f in (blocks, tetrahedra, mechanism, floor, loaded, sleepers, adapted,
+                                  endless, restored)}  # fmt: skip
+
+
+def run(scene, integrator="energy-momentum", **options):
+    system, own = scene
+    t_end = options.pop("t_end", STEPS * DT)
+    more = {"accuracy": "exact", "dt": DT, "t_end": t_end}
+    return nts.simulate(system, INTEGRATORS[integrator], **{**more, **own, **options})
+
+
+def arrays(state):
+    """Everything in a state, one array after another."""
+    for part in (state.u, state.v, state.a, *state.contacts):
+        yield from part
+    yield from (h for h in state.histories[1:] if h is not None)
+
+
+def assert_same(one, other):
+    """To the bit in serial; on several ranks MUMPS rounds anew in every run."""
+    assert one.state.time == other.state.time
+    assert list(one.warnings) == list(other.warnings)
+    assert (one.retries, one.rejected, one.exceeded) == (
+        other.retries, other.rejected, other.exceeded)  # fmt: skip
+    if COMM.size > 1:
+        assert distance(one, other) < 1e-12
+        energy, another = one.balance["energy"], other.balance["energy"]
+        assert np.abs(energy - another).max() <= 1e-12 * np.abs(energy).max()
+        return
+    assert one.status == other.status
+    for a, b in zip(arrays(one.state), arrays(other.state), strict=True):
+        assert np.array_equal(a, b)
+    for name, column in one.rows.columns.items():
+        assert np.array_equal(column, other.rows.columns[name]), name
+    assert list(one.warnings.values()) == list(other.warnings.values())
+    assert list(one.switches) == list(other.switches)
+    assert one.switches.worst == other.switches.worst and one.switches.size == other.switches.size
+
+
+def in_file_order(solution):
+    """Displacements, velocities and, if any, accelerations of all bodies, the same on all ranks.
+
+    Each over the largest in the system.
+    """
+    state, order, found = solution.state, Numbering(solution.system), []
+    for values in filter(None, (state.u, state.v, state.a)):
+        rows = np.concatenate(solution.system.comm.bcast(order.to_file(values)))
+        found.append(rows / np.abs(rows).max())
+    return found
+
+
+def distance(one, other):
+    """Largest difference of two runs at their ends, in that scale."""
+    pairs = zip(in_file_order(one), in_file_order(other), strict=True)
+    return max(float(np.abs(a - b).max()) for a, b in pairs)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.fast(
+    *(f"{s}-energy-momentum" for s in ("blocks", "mechanism", "adapted", "restored")),
+    "mechanism-generalized-alpha",
+)  # fmt: skip
+def test_a_restarted_run_is_the_uninterrupted_one(scene, integrator, mpi_tmp_path):
+    if scene == "adapted" and COMM.size > 1:
+        pytest.skip("two uninterrupted runs differ there by 1e-9: their steps depend on rounding")
+    if scene == "restored" and INTEGRATORS[integrator].accelerations:
+        pytest.skip("is for integrators without accelerations")
+    path, make = mpi_tmp_path / "deep" / "run.h5", SCENES[scene]
+    whole = run(make(COMM), integrator)
+    saved = run(make(COMM), integrator, checkpoint=nts.Checkpoint(path, every=EVERY))
+    assert_same(whole, saved)
+    again = make(COMM)
+    start = nts.restart(previous(path), again[0])
+    assert 1 < len(start.rows) < len(whole.rows)
+    assert_same(whole, run(again, integrator, start=start))
+    assert "restart" in start.status and len(start.rows) < len(whole.rows)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("scene", ["blocks", "tetrahedra", "mechanism", "floor", "loaded"])
+@pytest.mark.fast(*(f"{s}-energy-momentum" for s in ("blocks", "mechanism")))
+def test_on_other_ranks(scene, integrator, mpi_tmp_path):
+    """From all ranks to each rank alone, and back; serial runs know their own order alone."""
+    make, here = SCENES[scene], MPI.COMM_SELF
+    path, own = mpi_tmp_path / "all.h5", mpi_tmp_path / f"{COMM.rank}.h5"
+    for one, other, file, read in (
+        (COMM, here, path, path), (here, COMM, own, mpi_tmp_path / "0.h5")
+    ):  # fmt: skip
+        saved = run(make(one), integrator, checkpoint=nts.Checkpoint(file, every=EVERY))
+        COMM.barrier()
+        after = make(other)
+        start = nts.restart(previous(read), after[0])
+        found = run(after, integrator, start=start)
+        assert distance(saved, found) < 1e-12
+        assert len(found.rows) == len(saved.rows)
+        COMM.barrier()
+
+
+# ---- how often, and files
+@pytest.mark.mpi
+def test_the_balance_and_its_table_go_on(mpi_tmp_path):
+    """A longer run from the end of one; the start can be used again; the CSV is whole."""
+    path = mpi_tmp_path / "run.h5"
+    half = run(blocks(COMM), t_end=8 * DT, checkpoint=nts.Checkpoint(path, every=100))
+    assert not previous(path).exists()
+    for _ in range(2):
+        scene = blocks(COMM)
+        start = nts.restart(path, scene[0])
+        table = BalanceCSV(mpi_tmp_path / "table.csv")
+        whole = run(scene, start=start, output=[table])
+    one = run(blocks(COMM), t_end=STEPS * DT)
+    times = whole.balance["time"]
+    assert len(times) == STEPS + 1 and times[0] == 0.0
+    assert np.allclose(times, one.balance["time"], rtol=1e-14)
+    assert half.balance["contact_defect"][-1] == whole.balance["contact_defect"][8]
+    for name in ("external_work", "friction_dissipation", "contact_defect", "energy"):
+        column, wanted = whole.balance[name], one.balance[name]
+        assert np.abs(column - wanted).max() <= 1e-10 * one.balance["energy"][0]
+    assert np.abs(whole.balance["ledger_residual"]).max() < 1e-11 * one.balance["energy"][0]
+    if COMM.rank == 0:
+        rows = (mpi_tmp_path / "table.csv").read_text().splitlines()
+        assert len([r for r in rows if r[0].isdigit()]) == STEPS + 1
+
+
+@pytest.mark.mpi
+def test_balanced_is_the_run_to_its_tolerance(mpi_tmp_path):
+    """Matrices kept over steps are made anew, so that iterates differ, within the tolerance."""
+    path = mpi_tmp_path / "run.h5"
+    options = {"accuracy": "balanced"}
+    saved = run(blocks(COMM), checkpoint=nts.Checkpoint(path, every=EVERY), **options)
+    scene = blocks(COMM)
+    found = run(scene, start=nts.restart(previous(path), scene[0]), **options)
+    assert distance(saved, found) < 1e-7
+
+
+@pytest.mark.mpi
+def test_fields_do_not_replace_what_is_there(mpi_tmp_path):
+    path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
+    saves = nts.Checkpoint(path, every=9)
+    run(floor(COMM), t_end=3 * DT, output=[Fields(folder)], checkpoint=saves)
+    size = (folder / "box.h5").stat().st_size
+    scene = floor(COMM)
+    start = nts.restart(path, scene[0])
+    with pytest.raises(FileExistsError, match="holds box.xdmf, which a run from a"):
+        run(scene, start=start, output=[Fields(folder)])
+    assert (folder / "box.h5").stat().st_size == size
+    done = run(scene, start=start, output=[Fields(mpi_tmp_path / "more")])
+    assert done.status == "completed" and (mpi_tmp_path / "more" / "box.xdmf").exists()
+
+
+class Written:
+    """A writer that notes at which steps there is a new checkpoint."""
+
+    def __init__(self, path):
+        self.path, self.at, self.last = path, [], None
+
+    def start(self, stepper):
+        COMM.barrier()
+
+    def write(self, stepper, *, last=False):
+        now = self.path.stat().st_ino if self.path.exists() else None
+        if now != self.last:
+            self.at.append(len(stepper.solution.rows) - 2)
+        self.last = now
+        COMM.barrier()
+
+    def close(self, stepper):
+        pass
+
+
+@pytest.mark.mpi
+def test_how_often(mpi_tmp_path):
+    for k, (cadence, wanted) in enumerate((
+        ({"every": 4}, [4, 8, 12]), ({"seconds": 1e-9}, list(range(1, STEPS))),
+        ({"seconds": 1e6}, []), ({"every": 6, "seconds": 1e6}, [6, 12]),
+    )):  # fmt: skip
+        path = mpi_tmp_path / f"{k}.h5"
+        written = Written(path)
+        saved = run(floor(COMM), output=[written], checkpoint=nts.Checkpoint(path, **cadence))
+        assert written.at == wanted
+        system, _ = floor(COMM)
+        assert nts.restart(path, system).state.time == saved.state.time
+        assert not list(mpi_tmp_path.glob("*.part"))
+
+
+@pytest.mark.mpi
+def test_a_damaged_file_leaves_the_one_before(mpi_tmp_path, caplog):
+    path = mpi_tmp_path / "run.h5"
+    saved = run(floor(COMM), checkpoint=nts.Checkpoint(path, every=EVERY))
+    if COMM.rank == 0:
+        path.write_bytes(path.read_bytes()[:1000])
+    scene = floor(COMM)
+    with caplog.at_level(logging.WARNING):
+        start = nts.restart(path, scene[0])
+    assert start.state.time == saved.balance["time"][EVERY]
+    assert ("going on from the checkpoint before" in caplog.text) == (COMM.rank == 0)
+    if COMM.rank == 0:
+        path.unlink()
+    assert nts.restart(path, scene[0]).state.time == start.state.time
+    if COMM.rank == 0:
+        previous(path).unlink()
+    with pytest.raises(FileNotFoundError, match="pass the path that Checkpoint had"):
+        nts.restart(path, scene[0])
+
+
+class Removes:
+    """A writer that puts a file in the way of the checkpoints."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def start(self, stepper):
+        if COMM.rank == 0:
+            shutil.rmtree(self.path.parent)
+            self.path.parent.write_text("in the way")
+
+    def write(self, stepper, *, last=False):
+        pass
+
+    close = write
+
+
+@pytest.mark.mpi
+def test_what_cannot_be_written_is_told_and_the_run_goes_on(mpi_tmp_path):
+    path = mpi_tmp_path / "folder" / "run.h5"
+    done = run(floor(COMM), output=[Removes(path)], checkpoint=nts.Checkpoint(path, every=4))
+    assert done.status == "completed"
+    assert done.warnings["checkpoint"].count == 4
+    assert "run.h5" in done.warnings["checkpoint"].text
+
+
+# ---- what is refused
+@pytest.mark.parametrize(
+    ("make", "kind", "text"),
+    [
+        (lambda: nts.Checkpoint(3, every=1), TypeError, "path=3: pass a path"),
+        (lambda: nts.Checkpoint("a.h5"), ValueError, "every=None, seconds=None: pass one"),
+        (lambda: nts.Checkpoint("a.h5", every=0), ValueError, "every=0: must be a positive whole"),
+        (lambda: nts.Checkpoint("a.h5", every=1.5), ValueError, "every=1.5: must be a positive"),
+        (lambda: nts.Checkpoint("a.h5", every=True), ValueError, "every=True: must be"),
+        (lambda: nts.Checkpoint("a.h5", seconds=-1), ValueError, r"seconds=-1: must .*\[s\]"),
+        (lambda: nts.Checkpoint("a.h5", evry=3), TypeError, "evry=3: unknown option"),
+    ],
+)
+def test_bad_options(make, kind, text):
+    with pytest.raises(kind, match=text):
+        make()
+
+
+def other_systems():
+    """What differs, a system like that of `blocks`, and what is said."""
+    rough, _ = blocks(COMM, friction=0.2)
+    yield rough, r"contacts\[0\].friction is 0.3 there and 0.2 here of 'left-right'"
+    yield blocks(COMM, cells=(2, 4))[0], r"bodies\[1\].nodes is 64 there and 125 here of 'right'"
+    yield blocks(COMM, cell=TET)[0], r"contacts\[0\].slave.facets is 4 there and 8 here"
+    yield blocks(COMM, name="wall")[0], r"bodies\[1\].name is 'right' there and 'wall' here"
+    system, _ = blocks(COMM)
+    left, right = system.bodies
+    yield nts.System([right, left], contacts=system.contacts), r"bodies\[0\].name is 'left' there"
+    yield nts.System([left, right]), r"contacts is \['left-right'\] there and \[\] here"
+    heavy = nts.System([left, right], contacts=system.contacts, gravity=(0, 0, -1))
+    yield heavy, r"gravity\[2\] is 0.0 there and -1.0 here"
+
+
+@pytest.mark.mpi
+def test_another_system_is_refused(mpi_tmp_path):
+    path = mpi_tmp_path / "run.h5"
+    run(blocks(COMM), t_end=2 * DT, checkpoint=nts.Checkpoint(path, every=1))
+    for system, text in other_systems():
+        with pytest.raises(ValueError, match=text):
+            nts.restart(path, system)
+    run(loaded(COMM), t_end=2 * DT, checkpoint=nts.Checkpoint(path, every=1))
+    system, options = loaded(COMM)
+    system.bodies[0].reference += 1e-6
+    with pytest.raises(ValueError, match="body 'block': its mesh has other nodes, up to 1e-06 m"):
+        nts.restart(path, system)
+    with pytest.raises(TypeError, match=r"system=3: pass the System"):
+        nts.restart(path, 3)
+    with pytest.raises(TypeError, match=r"checkpoint='a': pass Checkpoint\(path, every=100\)"):
+        run((system, options), checkpoint="a")
+
+
+def linked(point=(0, 0, 0.5), **changed):
+    """A body with one of each kind of joint; what is changed of them by keyword."""
+    x, y = np.array([0, 0, 0.5]), np.array([0, 0, 2.0])
+    body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="body", comm=COMM)
+    given = {
+        "stiffness": 300.0, "damping": 2.0, "length": 1.5, "torsion": 4.0, "axis": (0, 0, 1),
+        "arms": ((1, 0, 0), (0, 1, 0)), "angle": None, "height": -9.0, "radius": 1.0,
+        "motion": None,
+    } | changed  # fmt: skip
+    joints = [
+        nts.Spring(body, None, (x, y), stiffness=given["stiffness"], length=given["length"]),
+        nts.Damper(body, None, (x, y), damping=given["damping"]),
+        nts.TorsionSpring(body, None, axis=(0, 0, 1), stiffness=given["torsion"]),
+        nts.Spherical(body, None, point=point),
+        nts.Revolute(body, None, point=x, axis=given["axis"], angle=given["angle"]),
+        nts.Universal(body, None, point=x, axes=given["arms"]),
+    ]
+    mesh = box(COMM, (3, 0, 0), (4, 1, 1), 1)
+    cube = nts.RigidBody(mesh, density=1.0, name="cube")
+    floor = nts.Plane((0, 0, given["height"]), (0, 0, 1), motion=given["motion"])
+    ball = nts.Sphere((3.5, 0.5, -5), given["radius"])
+    contacts = [
+        nts.ContactPair(cube.surface(lambda x: x[2] < 1e-9), master) for master in (floor, ball)
+    ]
+    return nts.System([body, cube], joints=joints, contacts=contacts)
+
+
+@pytest.mark.mpi
+def test_other_joints_and_obstacles_are_refused():
+    """By name, with what differs."""
+    described = json.loads(json.dumps(describe(linked())))
+    assert differences(described, describe(linked())) == []
+    for changed, text in (
+        ({"stiffness": 1200.0}, "joints[0].stiffness is 300.0 there and 1200.0 here of 'spring"),
+        ({"length": 1.4}, "joints[0].rest is 1.5 there and 1.4 here"),
+        ({"damping": 3.0}, "joints[1].damping is 2.0 there and 3.0 here"),
+        ({"torsion": 5.0}, "joints[2].stiffness is 4.0 there and 5.0 here"),
+        ({"point": (0, 0, 0.6)}, "joints[3].points[0][2] is 0.5 there and 0.6 here"),
+        ({"axis": (1, 0, 0)}, "joints[4].axis[0] is 0.0 there and 1.0 here of 'revolute"),
+        ({"angle": lambda t: t}, "joints[4].driven is False there and True here"),
+        ({"arms": ((1, 0, 0), (0, 0, 1))}, "joints[5].axes[1][1] is 1.0 there and 0.0 here"),
+        ({"height": -8.0}, "contacts[0].master.point[2] is -9.0 there and -8.0 here"),
+        ({"motion": lambda t: (t, 0, 0)}, "contacts[0].master.motion is False there and True"),
+        ({"radius": 1.1}, "contacts[1].master.radius is 1.0 there and 1.1 here"),
+    ):
+        found = differences(described, describe(linked(**changed)))
+        assert any(text in sentence for sentence in found), (text, found)
+
+
+@pytest.mark.mpi
+def test_another_spring_or_floor_is_refused(mpi_tmp_path):
+    """The whole way, through a file."""
+    path = mpi_tmp_path / "run.h5"
+    run((linked(), {}), t_end=DT, checkpoint=nts.Checkpoint(path, every=1))
+    for changed in ({"stiffness": 1200.0}, {"height": -8.0}):
+        with pytest.raises(ValueError, match="was written by another system: .*there and"):
+            nts.restart(path, linked(**changed))
+    assert nts.restart(path, linked()).state.time == DT
+
+
+class Counter:
+    """A joint of the user's own that counts in each of its elements, one on each rank."""
+
+    name, losses = "counter", ()
+
+    def __init__(self, body, first=0, step=1):
+        self.bodies, self.numbers = (body,), np.array([first + step * COMM.rank, first + 7])
+
+    def start(self):
+        return 10.0 * self.numbers
+
+    def potential(self, u, history):
+        return 0.0
+
+    def coupling(self, bodies):
+        raise AssertionError("not needed here")
+
+
+@pytest.mark.mpi
+def test_elements_with_foreign_or_repeated_numbers_are_told():
+    def numbering(**options):
+        body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="body", comm=COMM)
+        system = nts.System([body])
+        system.joints = (Counter(body, **options),)
+        return Numbering(system), system.initial_state()
+
+    if COMM.size > 1:
+        order, state = numbering()
+        with pytest.raises(ValueError, match="'counter': two of its elements or nodes have the nu"):
+            order.pack(state, {}, {})
+        return
+    order, state = numbering()
+    tables = order.pack(state, {}, {})
+    assert np.array_equal(order.unpack(tables, 0.0).histories[1], [0.0, 70.0])
+    other, _ = numbering(first=1)
+    with pytest.raises(ValueError, match="'counter': 1 is none of its elements or nodes there"):
+        other.unpack(tables, 0.0)
+    order.system.joints[0].numbers = np.array([7, 7])
+    with pytest.raises(ValueError, match="'counter': two of its elements or nodes have the numbe"):
+        order.unpack(tables, 0.0)
+    order.system.joints[0].numbers = np.array([0, 7])
+    tables["joints/0/number"] = np.array([0, 0])
+    with pytest.raises(ValueError, match="'counter': two of its elements or nodes have the numbe"):
+        order.unpack(tables, 0.0)
+    more = order.pack(state, {}, {})
+    more |= {"joints/0/number": np.array([0, 5, 7]), "joints/0/value": np.zeros(3)}
+    with pytest.raises(ValueError, match="'counter': has 3 elements or nodes there and 2 here"):
+        order.unpack(more, 0.0)
+
+
+@pytest.mark.mpi
+def test_a_start_that_does_not_fit_is_refused(mpi_tmp_path):
+    path = mpi_tmp_path / "run.h5"
+    run(floor(COMM), t_end=2 * DT, checkpoint=nts.Checkpoint(path, every=1), ledger=False)
+    scene = floor(COMM)
+    start = nts.restart(path, scene[0])
+    with pytest.raises(ValueError, match="ledger=True: the run of the checkpoint kept none"):
+        run(scene, start=start)
+    with pytest.raises(ValueError, match="start: its system is another one; pass the system to"):
+        run(floor(COMM), start=start, ledger=False)
+    with pytest.raises(ValueError, match=r"start_time=1.0: a restart goes on at its own time"):
+        run(scene, start=start, ledger=False, start_time=1.0, t_end=2.0)
+    with pytest.raises(ValueError, match="t_end=0.004: must lie after the start's time 0.004"):
+        run(scene, start=start, ledger=False, t_end=2 * DT)
+    assert run(scene, start=start, ledger=False).status == "completed"
+
+
+@pytest.mark.mpi
+def test_other_files_are_refused(mpi_tmp_path):
+    system, _ = floor(COMM)
+    text, other, newer = (mpi_tmp_path / name for name in ("a.txt", "b.h5", "c.h5"))
+    if COMM.rank == 0:
+        text.write_text("no HDF5")
+        with h5py.File(other, "w") as file:
+            file["x"] = 1.0
+        with h5py.File(newer, "w") as file:
+            file.attrs.update(format="dolfinx_nts checkpoint", version=99, package="9.9")
+    COMM.barrier()
+    for path, kind, said in (
+        (text, OSError, "cannot be read"), (other, ValueError, "it is no checkpoint"),
+        (newer, ValueError, "version 99, and this package reads version 2"),
+    ):  # fmt: skip
+        with pytest.raises(kind, match=said):
+            nts.restart(path, system)
+    with pytest.raises(OSError, match="it is a folder; name a file in it"):
+        run(floor(COMM), checkpoint=nts.Checkpoint(mpi_tmp_path, every=1))
+
+
+class Memory:
+    """A joint of the user's own that remembers what no file holds."""
+
+    name, losses, numbers = "own", (), np.arange(0)
+
+    def __init__(self, body):
+        self.bodies = (body,)
+
+    def start(self):
+        return {"turns": 1}
+
+    def potential(self, u, history):
+        return 0.0
+
+    def coupling(self, bodies):
+        raise AssertionError("work before the check")
+
+
+@pytest.mark.mpi
+def test_a_joint_that_remembers_something_else_is_told(mpi_tmp_path):
+    body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="body")
+    tie = nts.System([body])
+    order = Numbering(tie)
+    tie.joints = (Memory(body),)
+    state = tie.initial_state()
+    with pytest.raises(TypeError, match="joint 'own' remembers a dict; a checkpoint takes an arr"):
+        order.pack(state, {}, {})
+
+
+@pytest.mark.mpi
+def test_the_file_is_as_described(mpi_tmp_path):
+    """Read without this package: nodes as the mesh was made, whatever the ranks."""
+    path = mpi_tmp_path / "run.h5"
+    saved = run(blocks(COMM), checkpoint=nts.Checkpoint(path, every=100))
+    if COMM.rank > 0:
+        return
+    with h5py.File(path) as file:
+        notes = json.loads(file["notes"][()])
+        assert notes["time"] == saved.state.time
+        assert [b["name"] for b in notes["scene"]["bodies"]] == ["left", "right"]
+        x, u = file["bodies/0/reference"][()], file["bodies/0/u"][()]
+        assert x.shape == u.shape == (27, 3) and len(np.unique(x, axis=0)) == 27
+        numbers = file["contacts/0/number"][()]
+        assert (np.diff(numbers) > 0).all() and len(numbers) == 9
+        assert np.array_equal(file["balance/energy"][()], saved.balance["energy"])
+        assert file.attrs["version"] == 2
+
+
+# ---- signals
+@pytest.fixture(autouse=True)
+def heard():
+    """SIGINT is not ignored, as it is where the tests run in the background of a shell."""
+    old = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, old)
+
+
+class Signals:
+    """Before the fourth step signals come to the last rank."""
+
+    def __init__(self, number, times=1):
+        self.number, self.times = number, times
+
+    def __call__(self, time, dt):
+        while COMM.rank == COMM.size - 1 and time > 2.5 * DT and self.times:
+            self.times -= 1
+            os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_step_and_the_run(number, mpi_tmp_path):
+    path, table = mpi_tmp_path / "run.h5", BalanceCSV(mpi_tmp_path / "table.csv")
+    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    whole = run(blocks(COMM))
+    found = run(
+        blocks(COMM), before_step=Signals(number), output=[table],
+        checkpoint=nts.Checkpoint(path, every=100),
+    )  # fmt: skip
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
+    assert found.status == (
+        f"interrupted: {number.name} came before t={found.state.time!r}; go on with "
+        f"start=restart({str(path)!r}, system)"
+    )
+    assert len(found.rows) == 5 and found.state.time == whole.balance["time"][4]
+    if COMM.rank == 0:
+        assert len(table.path.read_text().splitlines()) >= 6
+    scene = blocks(COMM)
+    assert_same(whole, run(scene, start=nts.restart(path, scene[0])))
+
+
+@pytest.mark.mpi
+def test_a_signal_without_checkpoint_leaves_the_solution():
+    found = run(floor(COMM), before_step=Signals(signal.SIGTERM))
+    assert found.status.startswith("interrupted: SIGTERM") and "Checkpoint" in found.status
+    assert len(found.rows) == 5
+
+
+@pytest.mark.mpi
+def test_load_steps_end_on_a_signal():
+    system, _ = loaded(COMM)
+    calls = []
+
+    def before(time, dt):
+        calls.append(time)
+        if len(calls) == 3 and COMM.rank == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    found = nts.equilibrium(system, load_steps=5, before_step=before)
+    assert found.status.startswith("interrupted: SIGINT came before t=")
+    assert "go on" not in found.status and 1 < len(found.rows) < 6
+
+
+def test_a_signal_that_no_step_has_seen_is_handed_on():
+    """It came while the writers closed."""
+    if COMM.size > 1:
+        pytest.skip("ends the process there")
+
+    class Late:
+        def start(self, stepper):
+            pass
+
+        def write(self, stepper, *, last=False):
+            pass
+
+        def close(self, stepper):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(floor(COMM), output=[Late()])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("before", ["energy-momentum", "generalized-alpha"])
+@pytest.mark.fast("energy-momentum")
+def test_another_integrator_and_other_steps(before, mpi_tmp_path):
+    """Legal: the run is that from the Solution in memory, and the balance goes on."""
+    path, scene = mpi_tmp_path / "run.h5", mechanism(COMM)
+    other = "energy-momentum" if before == "generalized-alpha" else "generalized-alpha"
+    first = run(scene, before, t_end=6 * DT, checkpoint=nts.Checkpoint(path, every=2))
+    known = run(scene, other, start=first, dt=DT / 3, t_end=8 * DT)
+    again = mechanism(COMM)
+    done = run(again, other, start=nts.restart(path, again[0]), dt=DT / 3, t_end=8 * DT)
+    assert np.allclose(np.diff(done.balance["time"]), [DT] * 6 + [DT / 3] * 6, rtol=1e-9)
+    assert distance(known, done) < 1e-12
+
+
+def test_a_second_interrupt_ends_at_once():
+    if COMM.size > 1:
+        pytest.skip("ends the process there")
+    with pytest.raises(KeyboardInterrupt):
+        run(floor(COMM), before_step=Signals(signal.SIGINT, times=2))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_what_is_ignored_stays_ignored():
+    old = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        assert run(floor(COMM), before_step=Signals(signal.SIGTERM)).status == "completed"
+    finally:
+        signal.signal(signal.SIGTERM, old)
+
+
+def test_other_threads_install_no_handlers():
+    found = []
+    thread = threading.Thread(target=lambda: found.append(run(floor(COMM))))
+    thread.start()
+    thread.join()
+    assert found[0].status == "completed"
+
+
+# ---- kills
+SCRIPT = textwrap.dedent(
+    """
+    import sys, test_checkpoint as t
+    system, _ = t.floor(t.COMM)
+    path, start = sys.argv[1], None
+    if len(sys.argv) > 2:
+        start = t.nts.restart(path, system)
+    print("ready", flush=True)
+    done = t.nts.simulate(
+        system, t.nts.EnergyMomentum(), dt=2e-4, t_end=1.0, accuracy="exact", start=start,
+        watch_overlap=False, checkpoint=t.nts.Checkpoint(path, every=1),
+    )
+    """
+)
+
+
+def killed(path, delay, *more):
+    """Run the script and kill it a while after it has begun."""
+    tests = Path(__file__).parent
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(path), *more], stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": f"{tests}:{tests.parent / 'demos'}"},
+    )  # fmt: skip
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(delay)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    process.stdout.close()
+
+
+@pytest.mark.slow
+def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path):
+    """Fifty processes that write after every step; each goes on from where the last was killed."""
+    if COMM.size > 1:
+        pytest.skip("starts processes of its own")
+    path, random, before = tmp_path / "run.h5", np.random.default_rng(17), 0.0
+    for k in range(50):
+        killed(path, random.uniform(0.2, 0.6), *(["go on"] if k else []))
+        system, _ = floor(COMM)
+        found = nts.restart(path, system)
+        assert found.state.time >= before and found.rows[-1]["time"] == found.state.time
+        before = found.state.time
+    assert before > 50 * 2e-4

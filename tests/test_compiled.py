@@ -1,0 +1,167 @@
+"""The compiled kernels against their twins in NumPy, and runs without a compiler."""
+
+import logging
+import types
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from test_nts import CENTRE, FLAT, KINDS, relative
+
+from dolfinx_nts.contact.facet_elements import FacetElements
+from dolfinx_nts.kernels import compiled, facets
+from dolfinx_nts.parallel import same_kernels
+
+N = 40
+
+
+def pairs(nc, friction, rule, condense=True):
+    """Elements of warped facets with slaves near them, and what they are evaluated with."""
+    rng = np.random.default_rng(nc)
+    control = FLAT[nc] + 0.1 * rng.normal(size=(N, nc, 3))
+    xi = CENTRE[nc] + 0.1 * rng.normal(size=(N, 2))
+    foot, _, normal = facets.frame(control, xi)
+    slave = foot + 0.05 * rng.normal(size=(N, 1)) * normal
+    x0 = np.concatenate([slave[:, None], control], axis=1)
+    x1 = x0 + 0.1 * rng.normal(size=x0.shape)
+    candidates = types.SimpleNamespace(
+        node=np.arange(N), normal=normal, xi=xi, length=facets.size(control)
+    )
+    master = types.SimpleNamespace(patches=np.zeros((1, nc)))
+    elements = FacetElements(
+        pair=types.SimpleNamespace(friction=friction, master=master), candidates=candidates,
+        rule=rule, condense=condense, x0=x0, scale=np.ones(N), theta=0.5, master_scale=np.ones(1),
+    )  # fmt: skip
+    return elements, x1, rng.normal(size=(N, elements.num_constraints))
+
+
+def test_the_library_is_there():
+    assert compiled._library() is not None
+
+
+@pytest.mark.parametrize("rule", ["mean-value", "gonzalez", "direct"])
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("nc", KINDS)
+def test_elements_are_those_of_numpy(nc, friction, rule, monkeypatch):
+    elements, x, multiplier = pairs(nc, friction, rule)
+    here = elements._element(x, None, multiplier)
+    with monkeypatch.context() as patch:
+        patch.setattr(compiled, "_library", lambda: None)
+        there = elements._element(x, None, multiplier)
+    for found, expected in zip(here[:3], there[:3], strict=True):
+        assert relative(found, expected) < 1e-13
+    assert (here[3] is None) == (there[3] is None) == (not friction)
+    if friction:
+        for found, expected in zip(here[3], there[3], strict=True):
+            assert relative(found, expected) < 1e-13
+
+
+@pytest.mark.parametrize("nc", KINDS)
+def test_condensed_is_compiled_for_the_mean_value(nc):
+    elements, x, multiplier = pairs(nc, 0.3, "mean-value")
+    assert elements._compiled(x, multiplier) is not None
+
+
+@pytest.mark.parametrize("far", [0.01, 0.3, 3.0])
+@pytest.mark.parametrize("nc", KINDS)
+def test_projections_are_those_of_numpy(nc, far):
+    """Points beyond the centre of curvature included, for which no plain Newton step does."""
+    rng = np.random.default_rng(5)
+    corners = FLAT[nc] + 0.2 * rng.uniform(-1, 1, (300, nc, 3))
+    points = facets.frame(corners, np.tile(CENTRE[nc], (300, 1)))[0]
+    points += far * rng.uniform(-1, 1, points.shape)
+    start = rng.uniform(-1, 1, (300, 2))
+    found, done = compiled.project(points, corners, start)
+    expected, reached = facets.project(points, corners, start)
+    assert (done == reached).all() and done.mean() > 0.6
+    assert np.abs(found - expected)[done].max() < 1e-12 * max(1.0, np.abs(expected[done]).max())
+
+
+def test_projections_near_the_facet_need_no_numpy(monkeypatch):
+    def fail(*_):
+        raise AssertionError
+
+    for nc in KINDS:
+        start = np.tile(CENTRE[nc], (9, 1))
+        corners = np.tile(FLAT[nc], (9, 1, 1))
+        points = facets.frame(corners, start + 0.1)[0] + 0.01
+        expected = facets.project(points, corners, start)[0]
+        with monkeypatch.context() as patch:
+            patch.setattr(facets, "project", fail)
+            assert np.abs(compiled.project(points, corners, start)[0] - expected).max() < 1e-14
+
+
+@pytest.mark.parametrize("warp", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("nc", [3, 4])
+def test_closest_points_are_those_of_numpy(nc, warp, monkeypatch):
+    rng = np.random.default_rng(6)
+    corners = FLAT[nc] + warp * rng.uniform(-1, 1, (3000, nc, 3))
+    points = rng.uniform(-2, 3, (3000, 3)) * [1, 1, 0.5]
+    # Far from the origin, in small units, and on the facets themselves.
+    corners[:500], points[:500] = corners[:500] + 1e3, points[:500] + 1e3
+    corners[500:1000], points[500:1000] = 1e-6 * corners[500:1000], 1e-6 * points[500:1000]
+    points[1000:1500] = facets.frame(corners[1000:1500], rng.uniform(0, 0.5, (500, 2)))[0]
+    xi, distance = compiled.closest_point(points, corners)
+    there, expected = facets.closest_point(points, corners)
+    size = facets.size(corners)
+    assert (np.abs(distance - expected) < 1e-13 * (size + expected)).all()
+    # Where two points are equally close, either may be told.
+    assert (np.abs(xi - there).max(axis=1) < 1e-9).mean() > 0.999
+    on = facets.shape(xi, nc)[0]
+    found = np.linalg.norm(np.einsum("ni,nij->nj", on, corners) - points, axis=1)
+    assert (np.abs(found - distance) < 1e-12 * (size + expected + 1e3 * (size > 1e-4))).all()
+
+
+def test_closest_points_of_facets_without_area_are_those_of_numpy():
+    corners = np.zeros((3, 4, 3))
+    corners[1, 1:3, 0] = 1.0
+    corners[2, 2:, 1] = 2.0
+    points = np.array([[0.0, 0, 1], [0.5, 1, 0], [3, 4, 0]])
+    for nc in (3, 4):
+        found = compiled.closest_point(points, corners[:, :nc])[1]
+        assert np.array_equal(found, facets.closest_point(points, corners[:, :nc])[1])
+
+
+def test_where_there_is_no_foot_nothing_is_solved():
+    elements, x, multiplier = pairs(4, 0.0, "mean-value")
+    x[0, 1:] = x[0, 1]
+    residual = elements._compiled(x, multiplier)[0]
+    assert np.isnan(residual[0]).any() and np.isfinite(residual[1:]).all()
+
+
+def test_without_compiler_numpy_does(monkeypatch, tmp_path, caplog):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with caplog.at_level(logging.WARNING):
+        assert compiled._library.__wrapped__() is None
+    assert len(caplog.records) == 1 and "no-such-compiler" in caplog.text
+    monkeypatch.setenv("CC", "false")
+    assert compiled._library.__wrapped__() is None
+
+
+def test_without_cache_numpy_does(monkeypatch, tmp_path, caplog):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with caplog.at_level(logging.WARNING):
+        assert compiled._library.__wrapped__() is None
+    assert len(caplog.records) == 1
+
+
+def test_several_may_compile_at_once(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with ThreadPoolExecutor(4) as pool:
+        libraries = list(pool.map(lambda _: compiled._library.__wrapped__(), range(4)))
+    assert all(libraries)
+    assert [path.suffix for path in (tmp_path / "fenics").iterdir()] == [".so"]
+
+
+@pytest.mark.mpi
+def test_ranks_have_the_same_kernels(monkeypatch):
+    comm, last = MPI.COMM_WORLD, MPI.COMM_WORLD.size - 1
+    same_kernels(comm)
+    assert compiled.is_there()
+    real = compiled._library
+    monkeypatch.setattr(compiled, "_library", lambda: None if comm.rank == last else real())
+    same_kernels(comm)
+    assert not compiled.is_there()

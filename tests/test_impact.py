@@ -1,0 +1,203 @@
+"""Impacts that give their energy back: `simulate(impact="restored", restitution=...)`."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+FLOOR = nts.Plane((0, 0, 0), (0, 0, 1))
+INTEGRATORS = [nts.EnergyMomentum(), nts.Midpoint()]
+
+
+def grid(low, size, n):
+    low = np.array(low, dtype=float)
+    return create_box(
+        COMM, [low, low + np.array(size)], list(n), CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+
+
+def cubes(friction=None, gap=0.05, **speeds):
+    """A cube of 2 m/s and 0.5 rad/s meets one at rest."""
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    left = nts.Continuum(
+        grid((0, 0, 0), (1, 1, 1), (3, 3, 3)), rubber, density=1e3, name="left",
+        velocity=lambda x: np.array([2 + 0.5 * (x[2] - 0.5), 0 * x[0], -0.5 * (x[0] - 0.5)]),
+    )  # fmt: skip
+    right = nts.Continuum(
+        grid((1 + gap, 0, 0), (1, 1, 1), (2, 2, 2)), rubber, density=1e3, name="right"
+    )
+    options = {} if friction is None else {"friction": friction}
+    pair = nts.ContactPair(
+        slave=left.surface(lambda x: x[0] > 1 - 1e-9),
+        master=right.surface(lambda x: x[0] < 1 + gap + 1e-9), **options,
+    )  # fmt: skip
+    return nts.System([left, right], contacts=[pair])
+
+
+def drift(table, name):
+    return np.ptp(table[name], axis=0).max() / np.abs(table[name]).max()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", INTEGRATORS, ids=lambda i: type(i).__name__)
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("height", [0.0137, 0.0151])
+def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, height):
+    """It leaves with e times its speed, wherever in a step its gap closes (by h v = 2 mm)."""
+    block = nts.RigidBody(
+        grid((0, 0, height), (1, 1, 1), (1, 1, 1)), density=1e3, velocity=(0.3, 0, -2), name="b"
+    )
+    pair = nts.ContactPair(slave=block.surface(lambda x: x[2] < height + 1e-9), master=FLOOR)
+    run = nts.simulate(
+        nts.System([block], contacts=[pair]), integrator, dt=1e-3, t_end=0.02, impact="restored",
+        restitution=restitution,
+    )  # fmt: skip
+    table = run.balance
+    assert run.status == "completed" and not run.warnings
+    assert block.velocity == pytest.approx((0.3, 0.0, 2.0 * restitution), abs=1e-11)
+    assert np.abs(table["ledger_residual"]).max() < 1e-13 * table["energy"][0]
+    pushed = run.contact_forces[1:, 0] * np.diff(table["time"])[:, None]
+    changes = np.diff(table["linear_momentum"], axis=0)
+    assert np.abs(changes - pushed).max() < 1e-12 * np.abs(changes).max()
+    turned = run.contact_moments[1:, 0] * np.diff(table["time"])[:, None]
+    changes = np.diff(table["angular_momentum"], axis=0)
+    assert np.abs(changes - turned).max() < 1e-12 * np.abs(changes).max()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("accuracy", ["exact", "balanced"])
+@pytest.mark.fast("balanced")
+def test_flexible_cubes_keep_energy_and_momenta(accuracy):
+    """The published scheme loses 8 % of it at this mesh."""
+    energy = []
+    for impact in ("published", "restored"):
+        run = nts.simulate(
+            cubes(), nts.EnergyMomentum(), dt=1e-3, t_end=0.1, impact=impact, accuracy=accuracy
+        )
+        table = run.balance
+        energy.append(table["energy"] / table["energy"][0] - 1.0)
+        assert table["active"].max() > 0 and table["min_gap"].min() > -1e-12
+        assert drift(table, "linear_momentum") < 1e-12
+        assert drift(table, "angular_momentum") < (1e-12 if accuracy == "exact" else 1e-9)
+    assert energy[0][-1] < -0.05
+    assert np.abs(energy[1]).max() < (1e-11 if accuracy == "exact" else 1e-8)
+    lost, given = table["contact_defect"][-1], table["impact_restored"][-1]
+    assert given == pytest.approx(lost, rel=1e-6)
+
+
+def test_friction_is_all_that_an_impact_costs():
+    """Its work is what energy is missing."""
+    run = nts.simulate(cubes(0.3), nts.EnergyMomentum(), dt=1e-3, t_end=0.1, impact="restored")
+    table = run.balance
+    energy, taken = table["energy"], table["friction_dissipation"]
+    assert taken[-1] > 1e-3 * energy[0]
+    switched = table["contact_defect"] - table["impact_restored"]
+    assert np.abs(energy - energy[0] + taken + switched).max() < 1e-11 * energy[0]
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * energy[0]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+def test_bodies_that_do_not_touch_share_no_energy(restitution):
+    """Two blocks reach the floor in one step, at other times within it."""
+    blocks, pairs = [], []
+    for k, height in enumerate((0.0137, 0.0121)):
+        block = nts.RigidBody(
+            grid((3 * k, 0, height), (1, 1, 1), (1, 1, 1)), density=1e3, velocity=(0, 0, -2),
+            name=f"block {k}",
+        )  # fmt: skip
+        slave = block.surface(lambda x, height=height: x[2] < height + 1e-9)
+        blocks.append(block)
+        pairs.append(nts.ContactPair(slave=slave, master=FLOOR))
+    run = nts.simulate(
+        nts.System(blocks, contacts=pairs), nts.EnergyMomentum(), dt=2e-3, t_end=0.02,
+        impact="restored", restitution=restitution,
+    )  # fmt: skip
+    assert run.status == "completed"
+    for block in blocks:
+        assert block.velocity == pytest.approx((0, 0, 2.0 * restitution), abs=1e-11)
+
+
+def test_what_moves_as_prescribed_is_refused():
+    """What an impact with it leaves depends on its motion."""
+    block = nts.RigidBody(
+        grid((0, 0, 0.01), (1, 1, 1), (1, 1, 1)), density=1e3, velocity=(0, 0, -2), name="block"
+    )
+    slave = block.surface(lambda x: x[2] < 0.01 + 1e-9)
+    wall = nts.Plane((0, 0, 0), (0, 0, 1), motion=lambda t: (0, 0, -t), name="wall")
+    system = nts.System([block], contacts=[nts.ContactPair(slave=slave, master=wall)])
+    with pytest.raises(ValueError, match="impact='restored': obstacle 'wall' moves"):
+        nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.1, impact="restored")
+    lift = nts.RigidBody(
+        grid((0, 0, -1), (1, 1, 1), (1, 1, 1)), density=1e3, motion=lambda t: (0, 0, t),
+        name="lift",
+    )  # fmt: skip
+    master = lift.surface(lambda x: x[2] > -1e-9)
+    system = nts.System([block, lift], contacts=[nts.ContactPair(slave=slave, master=master)])
+    with pytest.raises(ValueError, match="body 'lift' move as prescribed"):
+        nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.1, impact="restored")
+    late = nts.Dirichlet(lambda x: x[2] < -1 + 1e-9, lambda t: (0, 0, max(0.0, t - 0.02)))
+    table = nts.Continuum(
+        grid((0, 0, -1), (1, 1, 1), (1, 1, 1)), nts.NeoHookean(young=1e6, poisson=0.3),
+        density=1e3, bcs=[late], name="table",
+    )  # fmt: skip
+    pair = nts.ContactPair(slave=slave, master=table.surface(lambda x: x[2] > -1e-9))
+    system = nts.System([block, table], contacts=[pair])
+    with pytest.raises(ValueError, match="body 'table' move as prescribed"):
+        nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.1, impact="restored")
+    drive = nts.Spherical(block, None, point=(0.5, 0.5, 0.5), displacement=lambda t: (0, 0, -t))
+    with pytest.raises(ValueError, match="joint .* is driven"):
+        nts.simulate(
+            nts.System([block], joints=[drive]), nts.EnergyMomentum(), dt=1e-3, t_end=0.1,
+            impact="restored",
+        )  # fmt: skip
+    with pytest.raises(ValueError, match="adapt=Adapt.*impact='restored'"):
+        nts.simulate(
+            cubes(), nts.EnergyMomentum(), dt=1e-3, t_end=0.1, impact="restored",
+            adapt=nts.Adapt(tolerance=1e-3),
+        )  # fmt: skip
+
+
+@pytest.mark.mpi
+def test_a_pendulum_swings_back_from_a_wall():
+    """A joint holds it: its energy stays, and it turns as fast as before."""
+    bob = nts.RigidBody(
+        grid((-0.1, -0.1, -1.1), (0.2, 0.2, 0.2), (1, 1, 1)), density=1e3,
+        velocity=(1.0, 0, 0),
+        angular_velocity=(0, -1.0, 0), name="bob",
+    )  # fmt: skip
+    hinge = nts.Revolute(bob, None, point=(0, 0, 0), axis=(0, 1, 0), name="hinge")
+    wall = nts.Plane((0.1537, 0, 0), (-1, 0, 0))
+    pair = nts.ContactPair(slave=bob.surface(lambda x: x[0] > 0.1 - 1e-9), master=wall)
+    system = nts.System([bob], joints=[hinge], contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.1, impact="restored")
+    table = run.balance
+    # Velocities and turns differ by the square of the turn of a step.
+    assert run.status == "completed" and bob.angular_velocity[1] == pytest.approx(1.0, abs=1e-6)
+    assert np.abs(table["energy"] / table["energy"][0] - 1.0).max() < 1e-11
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+
+
+def test_newmark_is_refused():
+    """Its contact forces act at the end of a step: what they lose is another amount."""
+    with pytest.raises(ValueError, match="impact='restored': Newmark.* choose EnergyMomentum"):
+        nts.simulate(cubes(), nts.Newmark(), dt=1e-3, t_end=0.1, impact="restored")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"impact": "elastic"}, "impact='elastic': choose one of 'published', 'restored'"),
+        ({"impact": "restored", "restitution": 1.2}, "restitution=1.2: must lie between 0 and 1"),
+        ({"impact": "restored", "restitution": "a"}, "restitution='a': must lie between"),
+        ({"restitution": 0.5}, "restitution=0.5: pass impact='restored', too"),
+    ],
+)
+def test_bad_input(options, message):
+    with pytest.raises(ValueError, match="restitution|impact") as error:
+        nts.simulate(cubes(), nts.EnergyMomentum(), dt=1e-3, t_end=0.1, **options)
+    assert message in str(error.value)

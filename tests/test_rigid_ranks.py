@@ -1,0 +1,88 @@
+"""Rigid bodies in contact and with joints: any number of ranks computes the same."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
+
+COMM = MPI.COMM_WORLD
+G = 9.81
+
+
+def box(comm, low, size, n, **options):
+    low = np.array(low, dtype=float)
+    mesh = create_box(
+        comm, [low, low + size], list(n), CellType.hexahedron, ghost_mode=GhostMode.shared_facet
+    )
+    return nts.RigidBody(mesh, density=1e3, **options)
+
+
+def contact(comm):
+    """A tripod slides and turns with friction on a rigid plate that slides on a plane.
+
+    Three feet: how more of them share a weight is not unique, and with it the torque of friction.
+    """
+    plate = box(comm, (0, 0, 0), (1.0, 0.6, 0.01), (4, 3, 1), name="plate")
+    corners = [(0.2, 0.2, 0.01), (0.5, 0.2, 0.01), (0.3, 0.4, 0.01), (0.34, 0.27, 0.11)]
+    cells = np.array([[0, 1, 2, 3]]) if comm.rank == 0 else np.empty((0, 4))
+    points = np.array(corners) if comm.rank == 0 else np.empty((0, 3))
+    mesh = compat.create_mesh(comm, cells.astype(np.int64), points, "tetrahedron")
+    tripod = nts.RigidBody(
+        mesh, density=1e3, velocity=(1, 0.2, 0), angular_velocity=(0, 0, 3), name="tripod"
+    )
+    on_plate = nts.ContactPair(
+        slave=tripod.surface(lambda x: x[2] < 0.01 + 1e-9),
+        master=plate.surface(lambda x: x[2] > 0.01 - 1e-9),
+        friction=0.3,
+    )
+    on_floor = nts.ContactPair(
+        slave=plate.surface(lambda x: x[2] < 1e-9), master=nts.Plane((0, 0, 0), (0, 0, 1))
+    )
+    return nts.System([plate, tripod], contacts=[on_plate, on_floor], gravity=(0, 0, -G)), 1.0
+
+
+def chain(comm):
+    """Six links of 1 m with ball joints, which fall from the horizontal for a second."""
+    links = [
+        nts.RigidBody.from_inertia(
+            1.0, (0.01, 0.1, 0.1), centre=(k + 0.5, 0, 0), name=f"link {k}", comm=comm
+        )
+        for k in range(6)
+    ]
+    joints = [
+        nts.Spherical(b, links[k - 1] if k else None, point=(k, 0, 0), name=f"joint {k}")
+        for k, b in enumerate(links)
+    ]
+    return nts.System(links, joints=joints, gravity=(0, 0, -G)), 6.0
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("scene", "dt", "t_end"), [(contact, 1e-2, 0.2), (chain, 1e-2, 0.5)])
+def test_ranks_change_nothing(scene, dt, t_end):
+    """The scene of these ranks against the one that every rank computes alone, to 1e-9 of it."""
+    (one, size), (other, _) = scene(COMM), scene(MPI.COMM_SELF)
+    together, alone = (
+        nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=t_end) for system in (one, other)
+    )
+    assert together.status == alone.status == "completed"
+    for a, b in zip(one.bodies, other.bodies, strict=True):
+        moved = np.abs(b.position - b.centre).max()
+        assert np.abs(a.position - b.position).max() < 1e-9 * size
+        assert moved > 1e-3 * size
+        assert np.abs(a.rotation - b.rotation).max() < 1e-9
+    a, b = together.balance, alone.balance
+    largest = max(np.abs(b[name]).max() for name in ("kinetic", "external_work"))
+    for name in ("kinetic", "external_work", "friction_dissipation", "ledger_residual"):
+        assert np.abs(a[name] - b[name]).max() < 1e-9 * largest
+    for name in ("active", "stick", "slip"):
+        assert np.array_equal(a[name], b[name])
+    assert scene is chain or b["slip"].max() > 0
+
+
+@pytest.mark.parametrize("ranks", [3, 4])
+def test_more_ranks_change_nothing(on_ranks, ranks):
+    name = f"{__file__}::test_ranks_change_nothing"
+    on_ranks(ranks, "-m", "pytest", "-q", "-p", "no:cacheprovider", name)
