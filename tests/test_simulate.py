@@ -55,6 +55,31 @@ def test_a_cut_back_step_equals_the_small_steps(integrator):
 
 
 @pytest.mark.mpi
+def test_writers_see_the_parts_of_a_cut_step():
+    """As many writes as rows of the balance, and one of them the last."""
+
+    class Times:
+        def start(self, stepper):
+            self.times, self.ends = [stepper.state.time], []
+            fail_once(stepper, at_call=3)
+
+        def write(self, stepper, *, last=False):
+            self.times.append(stepper.state.time)
+            self.ends.append(last)
+
+        def close(self, stepper):
+            pass
+
+    seen = Times()
+    run = nts.simulate(
+        two_blocks.scene(COMM), nts.EnergyMomentum(), dt=2e-3, t_end=8e-3, output=[seen]
+    )
+    assert run.retries == 1 and seen.ends == [False] * 5 + [True]
+    assert seen.times == list(run.balance["time"])
+    assert np.array(seen.times) == pytest.approx(2e-3 * np.array([0, 1, 2, 7 / 3, 8 / 3, 3, 4]))
+
+
+@pytest.mark.mpi
 def test_a_failed_run_keeps_what_it_has_and_says_where():
     newton = nts.Newton(max_iterations=1, max_retries=2)
     run = nts.simulate(

@@ -85,9 +85,9 @@ class Draft(io.RawIOBase):
     HDF5 writes into this: after an error of writing the library crashes when it closes the file.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._old = open(path, "rb")
-        self._size = os.path.getsize(path)
+    def __init__(self, old: io.BufferedReader) -> None:
+        self._old = old
+        self._size = old.seek(0, os.SEEK_END)
         self._within: list[Part] = []
         self._beyond = bytearray()
         self._at = 0

@@ -119,7 +119,7 @@ class _Series:
         import h5py
 
         group, numbers = f"{self._times:06d}", Path(f"{self.path}.h5")
-        with Draft(numbers) as draft:
+        with Draft(open(numbers, "rb")) as draft:
             with h5py.File(draft, "r+") as file:
                 if group in file:  # from a call that failed for want of space for the other file
                     del file[group]

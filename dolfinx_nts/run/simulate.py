@@ -320,10 +320,13 @@ def _march(
     problem, cause = _call_together(stepper, output, "start")
     if problem is not None:
         raise cause or RuntimeError(problem)
-    for last in _moves(stepper, steps, pace):
+    for whole, last in _moves(stepper, steps, pace):
         problem, cause = _call_together(stepper, output, "write", last=last)
         if problem is not None:
             raise UserFunctionError(problem) from cause
+        # A run that went on from a part of a step would not have the steps of the whole run.
+        if not whole:
+            continue
         if bar is not None:
             row = stepper.solution.rows[-1]
             active, newton = f"{row['active']:.0f}", int(row["newton_iterations"])
@@ -381,16 +384,16 @@ def _call_together(
 
 def _moves(
     stepper: Stepper, steps: Sequence[tuple[float, float]], pace: Pace | None
-) -> Iterator[bool]:
-    """Advance from one state to be written to the next; tells whether it is the last."""
+) -> Iterator[tuple[bool, bool]]:
+    """Advance by one accepted step; tells whether it ends a step asked for, and the run."""
     for k, (dt, time) in enumerate(steps):
         final = k == len(steps) - 1
         if pace is None:
-            stepper.advance(dt, end=time)
-            yield final
+            for whole in stepper.in_parts(dt, end=time):
+                yield whole, whole and final
         else:
             for _ in stepper.paced(pace, time):
-                yield final and stepper.state.time == time
+                yield True, final and stepper.state.time == time
 
 
 def writers(output: Any) -> tuple[Writer, ...]:

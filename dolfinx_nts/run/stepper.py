@@ -263,6 +263,20 @@ class Stepper:
             UserFunctionError: A function of time raised or returned no vector on some rank, or
                 `before_step` raised; not tried again, everything is kept.
         """
+        for _ in self.in_parts(dt, end=end):
+            pass
+        return self.state
+
+    def in_parts(self, dt: float, *, end: float | None = None) -> Iterator[bool]:
+        """`advance`, stopping after every accepted step: dt, or the parts that it is cut into.
+
+        Args:
+            dt: Time to advance [s], > 0.
+            end: Time there [s].
+
+        Yields:
+            Whether this was the last part.
+        """
         require_positive("dt", dt, "s")
         dt = float(dt)
         self.start(dt)
@@ -283,7 +297,7 @@ class Stepper:
                 logger.info("%s; retrying with dt=%.3g", failure, dt)
             else:
                 parts -= 1
-        return self.state
+                yield not parts
 
     def _bind(self, retries: int) -> bool:
         """Let infinite friction have a bound once cuts are of no use; tells whether that is new."""
