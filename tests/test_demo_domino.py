@@ -41,9 +41,12 @@ def test_the_first_impacts():
 
 @pytest.mark.slow
 def test_all_fall():
-    """Rebounds, which the train has none of, change the wave by some per cent either way."""
+    """Rebounds, which the train has none of, change the wave: by 0 to 4 % in seven like steps.
+
+    Which of them a run meets depends on rounding, so on the machine; twice the largest is allowed.
+    """
     r = demo.main()
     assert r["status"].startswith("completed") and r["fallen"] == 20
-    assert r["speed"] == pytest.approx(r["train"], rel=0.05)
+    assert r["speed"] == pytest.approx(r["train"], rel=0.08)
     assert r["late"] < 0.02
     assert r["ledger"] < 1e-11 and r["momentum"] < 1e-12
