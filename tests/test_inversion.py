@@ -199,6 +199,7 @@ def test_no_step_ends_inside_out(name, accuracy, evaluations):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_step_too_long_is_cut_back():
     """In one step the upper face passes the cube's middle, which short ones move in time."""
     runs = [
