@@ -54,6 +54,7 @@ from dolfinx_nts.kernels.strain_energy import Isotropic
 from dolfinx_nts.run.checkpoint import Checkpoint, restart
 from dolfinx_nts.run.equilibrium import Equilibrium, equilibrium
 from dolfinx_nts.run.intercept import intercept
+from dolfinx_nts.run.saved import Saved, load
 from dolfinx_nts.run.simulate import simulate
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.step_size import Adapt
@@ -110,6 +111,7 @@ __all__ = [
     "Revolute",
     "Restart",
     "RigidBody",
+    "Saved",
     "Section",
     "Solution",
     "Sphere",
@@ -134,6 +136,7 @@ __all__ = [
     "cauchy_stress",
     "equilibrium",
     "intercept",
+    "load",
     "motion_of",
     "restart",
     "simulate",

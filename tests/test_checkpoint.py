@@ -23,7 +23,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
-from dolfinx_nts.output.checkpoint_file import Numbering, describe, differences, previous
+from dolfinx_nts.output.state_file import Numbering, describe, differences, previous
 
 COMM = MPI.COMM_WORLD
 DT, STEPS, EVERY = 2e-3, 14, 9

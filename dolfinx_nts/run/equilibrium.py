@@ -375,6 +375,7 @@ def equilibrium(
         system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options,
         watch_overlap=watch_overlap, before_step=before_step,
     )  # fmt: skip
+    stepper.solution.settings |= {"load_steps": times, "stabilization": stabilization}
     lengths = np.diff(times, prepend=0.0).tolist()
     steps = list(zip(lengths, times, strict=True))
     run(stepper, steps, output, progress=progress, remedy=_REMEDY)

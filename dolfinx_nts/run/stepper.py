@@ -184,6 +184,15 @@ class Stepper:
         self.restart = start if isinstance(start, Restart) else None
         check_restart(self.restart, system, start_time, ledger)
         self.solution = self.restart.go_on() if self.restart else Solution(system)
+        self.solution.settings = {
+            "integrator": repr(integrator),
+            "newton": repr(self.newton),
+            "petsc_options": {name: str(value) for name, value in given.items()},
+            "sleep": sleep,
+            "impact": impact,
+            "restitution": float(restitution),
+            "ranks": system.comm.size,
+        }
         state = first_state(system, start, start_time)
         if not integrator.accelerations:
             state = replace(state, a=())

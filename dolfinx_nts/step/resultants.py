@@ -22,11 +22,18 @@ CONTACT_FORCES = "contact_forces"
 #: Column of their moments about the origin.
 CONTACT_MOMENTS = "contact_moments"
 CONTACTS = (CONTACT_FORCES, CONTACT_MOMENTS)
+#: Begin of the columns of reactions.
+REACTIONS = "reactions of "
 
 
 def reactions_of(item: Any) -> str:
     """Column of the reactions of a body or a joint."""
-    return f"reactions of {item.name}"
+    return f"{REACTIONS}{item.name}"
+
+
+def is_resultant(column: str) -> bool:
+    """Whether a column is one of these, not of the ledger."""
+    return column in CONTACTS or column.startswith(REACTIONS)
 
 
 def at_start(system: System) -> dict[str, FloatArray]:
