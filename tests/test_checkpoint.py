@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import textwrap
 import threading
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import h5py
 import numpy as np
@@ -280,15 +282,51 @@ def test_balanced_is_the_run_to_its_tolerance(mpi_tmp_path):
     assert distance(saved, found) < 1e-7
 
 
+def series(folder, name="box"):
+    """Times of a body's files, and its displacements at each."""
+    text = (folder / f"{name}.xdmf").read_text()
+    times = [float(t) for t in re.findall(r'<Time Value="([^"]*)"', text)]
+    places = re.findall(rf"{name}\.h5:/(\d+/displacement)<", text)
+    ElementTree.fromstring(text)
+    with h5py.File(folder / f"{name}.h5", "r") as file:
+        return times, np.array([file[place] for place in places])
+
+
 @pytest.mark.mpi
-def test_fields_do_not_replace_what_is_there(mpi_tmp_path):
-    path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
+@pytest.mark.parametrize("cadence", [{"every": 4}, {"interval": 3.5 * DT}], ids=str)
+def test_fields_go_on_where_the_state_is(cadence, mpi_tmp_path):
+    """Those of a run whose last six steps were lost, and of one that ended too early, too."""
+    path, whole, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "whole", mpi_tmp_path / "fields"
     saves = nts.Checkpoint(path, every=9)
-    run(floor(COMM), t_end=3 * DT, output=[Fields(folder)], checkpoint=saves)
+    for where in (whole, folder):
+        run(floor(COMM), output=[Fields(where, **cadence)], checkpoint=saves)
+    scene = floor(COMM)
+    start = nts.restart(previous(path), scene[0])
+    assert len(start.rows) == 1 + 9
+    run(scene, start=start, t_end=11 * DT, output=[Fields(folder, **cadence)], checkpoint=saves)
+    scene = floor(COMM)
+    start = nts.restart(path, scene[0])
+    assert len(start.rows) == 1 + 11
+    run(scene, start=start, output=[Fields(folder, **cadence)])
+    COMM.barrier()
+    times, wanted = series(whole)
+    steps = [0, 4, 8, 12, 14] if "every" in cadence else [0, 4, 7, 11, 14]
+    assert np.array(times) == pytest.approx(DT * np.array(steps), abs=1e-12)
+    found, values = series(folder)
+    assert found == times and values.shape == wanted.shape
+    assert np.abs(values - wanted).max() <= (0.0 if COMM.size == 1 else 1e-12)
+
+
+@pytest.mark.mpi
+def test_fields_do_not_go_on_with_another_mesh(mpi_tmp_path):
+    path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
+    run(floor(COMM), t_end=3 * DT, checkpoint=nts.Checkpoint(path, every=9))
+    other = nts.RigidBody(box(COMM, (0, 0, 0), (1, 1, 2), 1), density=1e3, name="box")
+    run((nts.System([other]), {}), t_end=DT, output=[Fields(folder)])
     size = (folder / "box.h5").stat().st_size
     scene = floor(COMM)
     start = nts.restart(path, scene[0])
-    with pytest.raises(FileExistsError, match="holds box.xdmf, which a run from a"):
+    with pytest.raises(FileExistsError, match="^folder=.*holds box.xdmf with another mesh"):
         run(scene, start=start, output=[Fields(folder)])
     assert (folder / "box.h5").stat().st_size == size
     done = run(scene, start=start, output=[Fields(mpi_tmp_path / "more")])

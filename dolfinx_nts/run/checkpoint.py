@@ -168,9 +168,9 @@ def restart(path: StrPath, system: System) -> Restart:
     materials, loads, prescribed motion and obstacles, as they are functions: they must be the same.
     `contact_fields` are zero until the first step.
 
-    `BalanceCSV` writes the whole table anew; the files of `Fields` begin at the restart and need
-    another folder than before. A writer of your own must handle a restart
-    itself: `stepper.restart` is not None then.
+    `BalanceCSV` and `ForcesCSV` write the whole table anew; `Fields` goes on with the files in its
+    folder, if there are any, and drops the times after the checkpoint. A writer of your own must
+    handle a restart itself: `stepper.restart` is not None then.
 
     Args:
         path: Of the `Checkpoint`. If it cannot be read the one before it is taken, with a warning.
