@@ -61,6 +61,12 @@ def is_like(one: Joint, other: Joint) -> bool:
 class System:
     """Bodies, contacts between them, and gravity.
 
+    Programs that make hundreds of systems free each of them, as Python does not free what PETSc
+    keeps for several ranks:
+
+        with nts.System([ball, plate], contacts=[pair]) as system:
+            run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.1)
+
     Args:
         bodies: Objects with the `Body` protocol, on one communicator, with different names.
         contacts: Pairs of surfaces of these bodies.
@@ -144,6 +150,18 @@ class System:
             # The search looks half a facet deep; this, the whole body.
             depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
         self._check_penetration(depths)
+
+    def destroy(self) -> None:
+        """Free the PETSc objects of its bodies, which are of no use then. Collective."""
+        for body in self.bodies:
+            if hasattr(body, "destroy"):
+                body.destroy()
+
+    def __enter__(self) -> System:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.destroy()
 
     def initial_state(self) -> State:
         """Bodies with their initial displacements and velocities at t = 0."""
