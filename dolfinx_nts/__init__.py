@@ -12,7 +12,7 @@ from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.rigid import RigidBody
-from dolfinx_nts.bodies.section import Clamp, PointForce, Section
+from dolfinx_nts.bodies.section import Circle, Clamp, PointForce, Rectangle, Section
 from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.contact.facet_pair import FacetPair
@@ -71,6 +71,7 @@ __all__ = [
     "Body",
     "BodyMotion",
     "Checkpoint",
+    "Circle",
     "Clamp",
     "ContactHistory",
     "ContactPair",
@@ -109,6 +110,7 @@ __all__ = [
     "Points",
     "Prismatic",
     "Revolute",
+    "Rectangle",
     "Restart",
     "RigidBody",
     "Saved",
