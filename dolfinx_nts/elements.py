@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import Moment, places_of
+from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
@@ -72,7 +72,7 @@ class Step:
         """Force per motion in the mean over a body's places, in the step's units. Collective."""
         inertia = self.integrator.inertia
         values = body.nodal_mass if inertia else self.stiffness(body)
-        chosen = values[::3][places_of(body)]
+        chosen = values[::3][body.places]
         total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
         return float(total[0] / total[1])
 

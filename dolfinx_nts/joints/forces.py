@@ -194,7 +194,7 @@ class Between:
         self.bodies = tuple(body for body in ends if body is not None)
         both = ["ground" if body is None else body.name for body in ends]
         self._given: dict[str, Any] = {"bodies": both}
-        if ends[0] is ends[1] and hasattr(ends[0], "directions"):
+        if ends[0] is ends[1] and ends[0].rigid:
             raise ValueError(
                 f"a=b={ends[0].name!r}: a rigid body does not change its size, so {self.name!r} "
                 "does nothing; pass another body, or None for the ground"

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
@@ -290,11 +291,10 @@ def _pseudo_times(load_steps: Any) -> list[float]:
 
 def _check_bodies(system: System) -> None:
     for body in system.bodies:
-        for name in ("nodal_stiffness", "reactions"):
-            if not callable(getattr(body, name, None)):
-                raise TypeError(
-                    f"body {body.name!r} has no {name}(): equilibrium needs it, see Body"
-                )
+        if type(body).nodal_stiffness is Body.nodal_stiffness:
+            raise TypeError(
+                f"body {body.name!r} has no nodal_stiffness(): equilibrium needs it, see Body"
+            )
 
 
 @known_options

@@ -94,7 +94,7 @@ def tell_slip(solution: Solution, problem: StepProblem, step: Evaluation, state:
 
 def _tell_turns(solution: Solution, system: System, old: State, new: State) -> None:
     """Warn where directors of a body have turned too far in an accepted step. Collective."""
-    turning = [k for k, body in enumerate(system.bodies) if hasattr(body, "turn")]
+    turning = [k for k, body in enumerate(system.bodies) if body.oriented]
     if not turning:
         return
     turns = np.array([system.bodies[k].turn(old.u[k], new.u[k]) for k in turning])

@@ -535,9 +535,9 @@ class Stepper:
             v[k], a1 = self.problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
             if a1 is not None:
                 a[k] = a1
-            massless = getattr(self.system.bodies[k], "massless", None)
-            if massless is not None:
+            if self.system.bodies[k].has_massless:
                 # What has no momentum has no velocity of its own either.
+                massless = self.system.bodies[k].massless
                 v[k][massless] = step.bodies[k].du[massless] / dt
         histories = [coupling.history(parts) for coupling, parts in self.problem.each(step)]
         return State(time, tuple(u), tuple(v), tuple(a), tuple(histories))

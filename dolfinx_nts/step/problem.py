@@ -20,7 +20,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.body import Moment, motion_of_points, places_of
+from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.elements import Coupling, Step, over
 from dolfinx_nts.parallel import global_max
@@ -113,7 +113,7 @@ class StepProblem:
             u1[body.fixed] = body.prescribed(state.time + dt)
         local = [
             [
-                motion_of_points(b, u1 - u),
+                b.motion_of_points(u1 - u),
                 *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
             ]
             for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
@@ -470,7 +470,7 @@ class StepProblem:
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
         both = zip(self.system.bodies, e.bodies, strict=True)
-        local = [motion_of_points(body, terms.du) for body, terms in both]
+        local = [body.motion_of_points(terms.du) for body, terms in both]
         return global_max(self.system.comm, np.array(local))
 
     def unrest(self, e: Evaluation) -> float:
@@ -535,7 +535,7 @@ def _box(system: System) -> tuple[FloatArray, float]:
     """Middle of the box around all bodies' reference and half its diagonal [m]. Collective."""
     ends = np.full((2, 3), -np.inf)
     for body in system.bodies:
-        x = body.reference.reshape(-1, 3)[places_of(body)]
+        x = body.reference.reshape(-1, 3)[body.places]
         np.maximum(ends, [x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)], ends)
     high, low = global_max(system.comm, ends) * [[1.0], [-1.0]]
     return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
