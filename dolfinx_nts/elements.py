@@ -418,6 +418,14 @@ class EveryStep:
     def let_slip(self) -> None:
         """Nothing slips."""
 
+    def give_way(self) -> bool:
+        """Nothing yields."""
+        return False
+
+    def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
+        """Nothing to warn of."""
+        return []
+
     def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
         """Nothing to tell."""
         return {}
@@ -500,6 +508,23 @@ class Coupling(Protocol):
 
     def let_slip(self) -> None:
         """Let the step be solved by a rule that adds no solution but may find one."""
+
+    def give_way(self) -> bool:
+        """Let what has no bound have one from the next step on, as shorter steps are of no use.
+
+        Returns:
+            Whether there is such a thing that had none yet, the same on all ranks.
+        """
+
+    def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
+        """What an accepted step did that its user may not have meant. Collective.
+
+        Args:
+            parts: Solution, of each of `elements`.
+
+        Returns:
+            Kinds, sizes and sentences as of `RunWarning`, the same on all ranks.
+        """
 
     def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
         """Minima of an accepted step on this rank, by columns of the balance table."""

@@ -51,13 +51,12 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
         do not say them, and of each contact on
         its slave body forces [N] and moments about the origin [N m], shape (contacts, 3) each.
     """
-    bodies, contacts = problem.system.bodies, problem.contact_parts(step)
+    bodies, contacts = problem.system.bodies, problem.touching(step)
     joints = problem.system.declared_joints
     parts = [b.reactions(t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
-    forces = [part.force.sum(axis=0) for part in contacts]
+    forces = [part.force.sum(axis=0) for _, part, _ in contacts]
     parts.append(np.reshape(forces, (len(contacts), 3)))
-    theta, elements = problem.integrator.theta, problem.contacts.elements
-    moments = [c.moment(part, theta) for c, part in zip(elements, contacts, strict=True)]
+    moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
     parts.append(np.reshape(moments, (len(contacts), 3)))
     held = list(problem.each(step))[1 : 1 + len(joints)]
     first = [bodies[0] for bodies in problem.system.joint_bodies[: len(joints)]]
