@@ -21,6 +21,7 @@ from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.section import Clamp, PointForce, Section
 from dolfinx_nts.bodies.triad import Triads, largest_turn
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.integrators.rule import taken_at
 from dolfinx_nts.kernels import beam as kernel
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.validation import (
@@ -326,7 +327,7 @@ class Beam(Body):
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         self._y0 = self._vectors(moment.u0)
-        self._theta = _place(rule)
+        self._theta = taken_at(rule)
         self._load = self._loads_at(moment.time, moment.ramp)
 
     def _loads_at(self, time: float, ramp: float) -> FloatArray:
@@ -441,8 +442,3 @@ class Beam(Body):
         for a in (self._shared, self._matrix):
             if a is not None:
                 a.destroy()
-
-
-def _place(rule: Integrator) -> float | None:
-    """Where a rule takes forces between t_n and t_{n+1}; None: by discrete gradients."""
-    return rule.theta if rule.contact_gradient == "direct" else None
