@@ -47,7 +47,7 @@ def ball():
     return nts.Sphere(top, RADIUS, motion=lambda t: (0.0, 0.0, -DEPTH * t))
 
 
-class Block:
+class Block(nts.Body):
     """Weak form of the block in UFL: what contact asks of a body, and forces and matrix."""
 
     name = "block"

@@ -68,7 +68,7 @@ class System:
             run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.1)
 
     Args:
-        bodies: Objects with the `Body` protocol, on one communicator, with different names.
+        bodies: Objects whose classes inherit from `Body`, on one communicator, of different names.
         contacts: Pairs of surfaces of these bodies.
         joints: What else couples them, objects with the `Joint` protocol.
         gravity: Acceleration [m/s^2]; its work counts as external work.
@@ -93,7 +93,8 @@ class System:
         joints: Sequence[Joint] = (),
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        self.bodies = items("bodies", bodies, lambda b: hasattr(b, "begin_step"), "bodies")
+        wanted = "bodies; the class of a body of your own inherits from nts.Body"
+        self.bodies = items("bodies", bodies, lambda b: isinstance(b, Body), wanted)
         self.contacts = items(
             "contacts", contacts, lambda c: isinstance(c, ContactPair), "ContactPair"
         )
@@ -120,7 +121,7 @@ class System:
                         f"bodies={names}; add it"
                     )
         self.declared_joints = self.joints
-        own = (joint for body in self.bodies for joint in getattr(body, "joints", ()))
+        own = (joint for body in self.bodies for joint in body.joints)
         self.joints = (*self.declared_joints, *own)
         for k, joint in enumerate(self.declared_joints):
             if any(joint is other for other in self.declared_joints[:k]):
@@ -154,8 +155,7 @@ class System:
     def destroy(self) -> None:
         """Free the PETSc objects of its bodies, which are of no use then. Collective."""
         for body in self.bodies:
-            if hasattr(body, "destroy"):
-                body.destroy()
+            body.destroy()
 
     def __enter__(self) -> System:
         return self
@@ -223,7 +223,7 @@ class System:
         """Raise on every rank unless u fits the body's mesh and conditions."""
         problem, there = None, body.prescribed(time)
         if not np.array_equal(body.reference, old.reference):
-            other = "mesh there; use the same mesh object" if hasattr(body, "mesh") else (
+            other = "mesh there; use the same mesh object" if body.mesh is not None else (
                 "reference there; give it the mass, centre, inertia and axes that it has there"
             )
             problem = f"start: body {body.name!r} has another {other}"
@@ -238,8 +238,7 @@ class System:
 
     @staticmethod
     def _at_start(body: Body) -> FloatArray:
-        given = getattr(body, "initial_displacement", None)
-        u = np.zeros(body.num_owned) if given is None else given.copy()
+        u = body.initial_displacement.copy()
         u[body.fixed] = body.prescribed(0.0)
         return u
 

@@ -70,7 +70,7 @@ def describe(system: System) -> dict[str, Any]:
             {
                 "name": b.name,
                 "kind": type(b).__name__,
-                "degree": getattr(b, "degree", None),
+                "degree": b.degree,
                 "nodes": int(nodes),
                 "mass": float(mass),
             }
@@ -151,10 +151,7 @@ class Numbering:
         self._orders, self._counts = [], []
         for body in system.bodies:
             counts = self.comm.gather(body.num_owned // 3)
-            order = body.file_order() if hasattr(body, "file_order") else None
-            if counts is not None and order is None:
-                order = np.arange(sum(counts))
-            self._orders.append(order)
+            self._orders.append(body.file_order())
             self._counts.append(counts)
         self.reference = self.to_file([b.reference for b in system.bodies])
 

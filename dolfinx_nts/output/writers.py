@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.points import at_mesh
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
 from dolfinx_nts.step import balance as ledger
@@ -124,7 +123,7 @@ class _Series:
     def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
         """Nodal fields of the last accepted state on rank 0; collective."""
         state = stepper.state
-        u, v = (at_mesh(self.body, w[self.index]) for w in (state.u, state.v))
+        u, v = (self.body.at_mesh(w[self.index]) for w in (state.u, state.v))
         fields = {
             "displacement": self._nodal(u.reshape(-1, 3)),
             "velocity": self._nodal(v.reshape(-1, 3)),
@@ -224,7 +223,7 @@ class Fields:
         label = contact_fields.labels(system)
         self._series = []
         for i, body in enumerate(system.bodies):
-            if hasattr(body, "mesh"):
+            if body.mesh is not None:
                 own = {n: k for k, n in enumerate(label) if contacts[k].slave.body is body}
                 self._series.append(_Series(body, i, own, self.folder))
         if not self._series:
@@ -364,11 +363,11 @@ class ForcesCSV(BalanceCSV):
         system, header = stepper.system, ["time [s]"]
         joints = system.declared_joints
         columns = [resultants.reactions_of(item) for item in (*system.bodies, *joints)]
-        labels = []
-        for body, column in zip(system.bodies, columns, strict=False):
-            rows = [(str(k), "N") for k in range(len(stepper.solution.rows[0][column]))]
-            rows = getattr(body, "reaction_labels", rows)
-            labels += [f"{body.name}_{row}_{{}} [{unit}]" for row, unit in rows]
+        labels = [
+            f"{body.name}_{row}_{{}} [{unit}]"
+            for body in system.bodies
+            for row, unit in body.reaction_labels
+        ]
         for joint in joints:
             labels += [f"{joint.name}_force_{{}} [N]", f"{joint.name}_moment_{{}} [N m]"]
         labels += [f"contact_{pair.name}_{{}} [N]" for pair in system.contacts]

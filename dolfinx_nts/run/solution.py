@@ -58,7 +58,7 @@ class Solution(Record):
         state = self.state
         if state is None or not any(b is body for b in self.system.bodies):
             raise ValueError(f"body={body!r}: is not in the system of this run")
-        if not hasattr(body, "mesh") or body.degree != 1:
+        if body.degree != 1:
             raise ValueError(
                 f"body {body.name!r}: has no mesh with nodes of degree 1; its contacts are in "
                 "contact_forces and contact_moments"

@@ -36,7 +36,6 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.bodies.body import places_of
 from dolfinx_nts.run.saved import versions
 from dolfinx_nts.step.accuracy import ACCURACY
 from dolfinx_nts.study import economy
@@ -112,7 +111,7 @@ class Motion:
 
 def _affine(body: Any) -> tuple[FloatArray, float, float]:
     """What u . M is multiplied with for the means of a body, shape (num_owned, 12); M; X . M X."""
-    place = places_of(body).astype(float)[:, None]
+    place = body.places.astype(float)[:, None]
     x, one = body.reference.reshape(-1, 3), np.kron(place, np.eye(3))
     nodal = body.inertia(one[:, 0].copy())[::3]
     square = body.reference @ body.inertia(body.reference)
