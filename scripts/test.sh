@@ -16,8 +16,10 @@ case ${1:-} in
   --slow) name=slow which=slow NO_LINT=1 ;;
   *) die "unknown argument: $1" ;;
 esac
-if [ -z "${NO_LINT:-}" ]; then
-  scripts/lint.sh || failed+=(lint)
+if [ -z "${NO_LINT:-}" ]; then # beside the tests, as most of it waits or takes one core
+  said=$(mktemp) || exit 1
+  trap 'rm -f "$said"' EXIT
+  scripts/lint.sh >"$said" 2>&1 &
 fi
 clean_environment
 read -r -a args <<<"${PYTEST_ARGS:-}"
@@ -35,6 +37,11 @@ stage="$name tests, serial"
 say "$stage"
 "$PYTHON" -m pytest -q -n auto --dist loadfile -m "$which and not on_ranks" "${args[@]}" </dev/null
 finished "$stage" $?
+
+if [ -z "${NO_LINT:-}" ]; then
+  wait $! || failed+=(lint)
+  cat "$said"
+fi
 
 stage="$name tests marked mpi, 2 ranks"
 say "$stage"

@@ -93,7 +93,7 @@ def pytest_runtest_makereport(item, call):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Before -m selects: mark what `fast` leaves out, and tests that start ranks of their own."""
+    """Before -m selects: mark what is not fast, and tests that start ranks of their own."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         # A process takes a file at a time: backwards, because a long one (test_two_blocks) as the
         # last would leave the others idle.
@@ -103,18 +103,20 @@ def pytest_collection_modifyitems(config, items):
         if "on_ranks" in item.fixturenames:
             item.add_marker(pytest.mark.on_ranks)
             item.add_marker(pytest.mark.slow)
-        if (fast := item.get_closest_marker("fast")) is None:
-            continue
-        test = item.nodeid.removesuffix(f"[{item.callspec.id}]")
-        unknown.setdefault(test, set(fast.args)).discard(item.callspec.id)
-        if item.callspec.id not in fast.args:
-            item.add_marker(pytest.mark.slow)
+        for name, holds in (("fast", True), ("fast_on_ranks", COMM.size > 1)):
+            if (mark := item.get_closest_marker(name)) is None:
+                continue
+            own = item.callspec.id if hasattr(item, "callspec") else ""
+            test = item.nodeid.removesuffix(f"[{own}]")
+            unknown.setdefault(f"{name} of {test}", set(mark.args)).discard(own)
+            if holds and own not in mark.args:
+                item.add_marker(pytest.mark.slow)
     # Of a test that is named with its parameters the others are not collected; an error in a
     # process of xdist reaches no one, and the tests on 2 ranks are collected without it.
     named = any("[" in argument for argument in config.args)
     if not named and "PYTEST_XDIST_WORKER" not in os.environ and any(unknown.values()):
         missing = [f"{test}: {sorted(ids)}" for test, ids in unknown.items() if ids]
-        raise pytest.UsageError("pytest.mark.fast names no test: " + "; ".join(missing))
+        raise pytest.UsageError("marks name no test: " + "; ".join(missing))
 
 
 def pytest_collection_finish(session):

@@ -94,6 +94,7 @@ def test_strains_of_known_motions():
 # ---- equilibrium
 @pytest.mark.mpi
 @pytest.mark.parametrize(("n", "error"), [(8, 3.779e-2), (16, 7.691e-3), (32, 1.853e-3)])
+@pytest.mark.fast_on_ranks("8-0.03779")
 def test_the_cantilever_of_reissners_equations(n, error):
     section = nts.Section(EA=2000, GA=(800, 800), GJ=1, EI=(1, 1), rhoA=1, rhoI=(1e-2, 1e-2))
     beam = nts.Beam(
@@ -112,6 +113,7 @@ def test_the_cantilever_of_reissners_equations(n, error):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("flipped", [False, True], ids=["in order", "shuffled"])
+@pytest.mark.fast_on_ranks("shuffled")
 def test_the_bend_of_bathe_and_bolourchi(flipped):
     """Whatever the order and the directions of the cells."""
     x, cells = arc(16, 100, np.pi / 4), None
@@ -181,6 +183,7 @@ def off(run):
 @pytest.mark.mpi
 @pytest.mark.parametrize(("dt", "t_end"), [(0.05, 5), (0.2, 20), (0.5, 20)])
 @pytest.mark.fast("0.2-20")
+@pytest.mark.fast_on_ranks()
 def test_a_flying_beam_keeps_energy_and_angular_momentum(dt, t_end):
     run, _ = fly(EM, dt, t_end)
     assert run.status == "completed" and run.retries == 0
@@ -198,7 +201,7 @@ def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
 
 
 @pytest.mark.parametrize("rule", [EM, MID, nts.Newmark(), nts.GeneralizedAlpha()])
-@pytest.mark.fast("rule0", "rule2")
+@pytest.mark.slow
 def test_the_order_in_time_is_two(rule):
     coarse, middle, fine = (fly(rule, dt, 0.08)[1] for dt in (2e-3, 1e-3, 5e-4))
     ratio = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)

@@ -43,6 +43,7 @@ def test_errors_of_steady_precession(results, dt):
 
 
 @pytest.mark.parametrize("motion", ["steady", "nodding"])
+@pytest.mark.slow
 def test_order_and_balance(results, motion):
     runs = results[motion]
     assert demo.orders(runs) == pytest.approx([2.0, 2.0], abs=0.1)
@@ -51,6 +52,7 @@ def test_order_and_balance(results, motion):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_meshed_cone_precesses():
     """What its facets cut off is mass; the precession that its own moments ask for remains."""
     pytest.importorskip("gmsh")

@@ -84,6 +84,7 @@ def check(result, tolerance):
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", REFERENCE)
 @pytest.mark.fast("friction")
+@pytest.mark.fast_on_ranks()
 def test_coarse_mesh_meets_the_closed_form(name):
     result = demo.main(problems=(name,), scales=(0.01,), refinement=0.8)[name][0.01]
     check(result, 0.02)

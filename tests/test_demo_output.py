@@ -31,7 +31,7 @@ def test_all_are_here():
     assert set(SMALL) == {path.stem for path in DEMOS.glob("*.py")}
 
 
-@pytest.mark.fast("two_blocks", "own_problem")
+@pytest.mark.fast("own_problem")
 @pytest.mark.parametrize("name", SMALL)
 def test_what_a_demo_leaves(name, tmp_path, capfd):
     demo = importlib.import_module(name)

@@ -26,6 +26,7 @@ def test_disc_is_a_regular_polygon_of_convex_quadrilaterals():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_friction_turns_the_wheel_while_it_slides():
     """Ten steps of a coarse wheel: mu g brakes it and spins it up, as the rigid one.
 

@@ -27,7 +27,7 @@ def test_ten_steps():
 
 
 @pytest.mark.parametrize("kind", demo.RODS)
-@pytest.mark.fast("flexible")
+@pytest.mark.slow
 def test_a_blow(kind):
     """Balances to round-off, friction under the stop over its way, and joints that hold."""
     dt = 1e-3

@@ -82,6 +82,7 @@ def test_all_parts(floor, integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", demo.INTEGRATORS)
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_rest_on_an_elastic_plate(integrator):
     mesh, floor = demo.block_mesh(COMM, SMALL), {"floor": "elastic"}
     figures, motion = demo.level(mesh, floor, dt=4e-3, integrator=integrator)

@@ -14,6 +14,7 @@ def test_the_step_is_smooth():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_rolls_on_the_flat():
     """The way over the angle is the radius of the tread's length, and the axle is lower."""
     r = demo.main(facets=24, dt=4e-3, duration=0.08)

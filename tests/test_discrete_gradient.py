@@ -60,8 +60,11 @@ def unit_nodes(x):
 class Point:
     """W and a stress at a point, for given strains (C - 1)/2."""
 
-    def __init__(self, material, stress):
+    def __init__(self, material, stress, *parameters):
+        """A material, or a function of parameters that makes one: Constants share a form."""
         mesh = one_tetrahedron()
+        if parameters:
+            material = material(*(fem.Constant(mesh, float(p)) for p in parameters))
         space = compat.vector_space(mesh, 1)
         energy = strain_energy(material)
         self.e0, self.e1 = (fem.Constant(mesh, np.zeros((3, 3))) for _ in range(2))
@@ -100,8 +103,8 @@ def point(name, rule="gonzalez", quadrature=3):
             "mean-value": lambda w, a, b: dg.mean_value_stress(w, a, b, quadrature),
             "derivative": lambda w, a, b: w.stress(b),
         }[rule]
-        material = steep(STEEP[name]) if name in STEEP else MATERIALS[name]
-        _POINTS[key] = Point(material, stress)
+        material = (steep, stress, STEEP[name]) if name in STEEP else (MATERIALS[name], stress)
+        _POINTS[key] = Point(*material)
     return _POINTS[key]
 
 

@@ -248,6 +248,7 @@ def mean_strain(body, n):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(("slave", "master"), [(2, 2), (3, 3), (4, 2), (6, 3)])
+@pytest.mark.fast_on_ranks("3-3")
 def test_patch_with_nested_meshes_is_exact(slave, master):
     pressure, errors, force, _ = patch(slave, master)
     assert len(pressure) == (slave + 1) ** 2
@@ -263,6 +264,7 @@ ONE_PASS = {(3, 2): (0.792, 1.086, 0.098), (2, 3): (0.662, 1.278, 0.36), (4, 3):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("meshes", ONE_PASS)
+@pytest.mark.fast_on_ranks("meshes0")
 def test_patch_with_other_meshes_fails_as_one_pass_must(meshes):
     low, high, error = ONE_PASS[meshes]
     pressure, errors, force, _ = patch(*meshes)
@@ -303,6 +305,7 @@ def test_metres_millimetres_micrometres(stabilization):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("stabilization", [None, 0.1])
+@pytest.mark.fast_on_ranks("0.1")
 def test_any_number_of_ranks(stabilization):
     gap = 0.0 if stabilization is None else 0.04
     here, alone = (
@@ -445,6 +448,7 @@ def test_passing_by_a_facet_is_noticed():
 # ---- start of a dynamic run
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()])
+@pytest.mark.fast_on_ranks("integrator0")
 def test_what_has_settled_stays(integrator):
     """Settled under gravity and left to itself nothing moves, and contact carries on."""
     system = stack()
@@ -630,6 +634,7 @@ def wound():
 @pytest.mark.mpi
 @pytest.mark.parametrize("stabilization", [None, 0.1])
 @pytest.mark.parametrize("make", [pulled, hauled, wound])
+@pytest.mark.fast_on_ranks("hauled-0.1")
 def test_what_a_joint_prescribes_does_work(make, stabilization):
     """As loads do: what the ledger misses falls as the square of the load steps."""
     missing = []

@@ -238,6 +238,7 @@ def test_closest_point_against_dense_sampling(nc, warp):
 
 
 @pytest.mark.parametrize("warp", [0.1, 0.5, 1.0])
+@pytest.mark.fast("1.0")
 def test_closest_point_against_bounded_minimisation(warp):
     rng = np.random.default_rng(12)
     corners, points = random_facets(rng, 25, 4, warp), rng.uniform(-0.5, 1.5, (25, 3))

@@ -54,6 +54,7 @@ def bounce(body, integrator, t_end=0.012, output=()):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS, ids=lambda i: type(i).__name__)
 @pytest.mark.fast("EnergyMomentum0", "Newmark")
+@pytest.mark.fast_on_ranks("EnergyMomentum0")
 def test_a_continuum_of_ones_own_forms(integrator):
     mesh = box()
     space = compat.vector_space(mesh, 1)
@@ -156,6 +157,7 @@ def drift(values):
     return np.abs(values - values[0]).max() / np.abs(values[0]).max()
 
 
+@pytest.mark.slow
 def test_a_turning_membrane_keeps_energy_and_momenta():
     balance = spin(membrane()).balance
     assert balance["potential"].max() > 1.5 * balance["potential"].min()
@@ -181,7 +183,9 @@ def test_energy_is_kept_as_far_as_the_points_are_exact():
 
 def test_tangent():
     body = membrane(power=4)
-    rng, rule, size = np.random.default_rng(1), nts.EnergyMomentum(), 1e-5
+    # The points of the test before, whose forms are compiled.
+    rule = nts.EnergyMomentum(quadrature_points=2)
+    rng, size = np.random.default_rng(1), 1e-5
     u0, u1, du = (0.1 * rng.standard_normal(body.num_owned) for _ in range(3))
     body.begin_step(rule, Moment(u0, 0.0))
     difference = (body.internal(u1 + size * du) - body.internal(u1 - size * du)) / (2 * size)

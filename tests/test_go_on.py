@@ -15,7 +15,7 @@ DT = 2e-3
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.fast("integrator0", "integrator3")
+@pytest.mark.fast("integrator3")
 def test_two_halves_are_the_whole(integrator):
     """With friction, in contact where the first half ends; on several ranks MUMPS rounds anew."""
     newton = nts.Newton(linear_solver="direct", condense=True)
@@ -35,6 +35,7 @@ def test_two_halves_are_the_whole(integrator):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS[:2])
+@pytest.mark.fast_on_ranks("integrator0")
 def test_forces_of_supports_and_contacts(integrator):
     """Impulses of supports, floor and gravity add up to the change of momentum."""
     mesh = create_box(

@@ -95,6 +95,7 @@ def test_sticking_nodes_feel_nothing_across(shape):
 @pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()])
 @pytest.mark.parametrize("friction", [0.3, np.inf])
 @pytest.mark.fast("0.3-integrator1")
+@pytest.mark.fast_on_ranks()
 def test_dynamics_on_a_twisted_plate(integrator, friction):
     """Dragged on from equilibrium the block slides or sticks; the ledger closes."""
     shape, drag = (0.2, 0.5, False), 0.3 if np.isfinite(friction) else 0.02
@@ -148,6 +149,7 @@ def test_rows_are_regular_at_the_edge_of_sticking(shape):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("sliding", [False, True])
+@pytest.mark.fast("False-shape0", "False-shape3", "True-shape1", "True-shape3")
 def test_tangent_is_the_derivative_of_the_residual(shape, sliding):
     contact, x, multiplier = at_rest(shape)
     rng = np.random.default_rng(5)

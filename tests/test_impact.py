@@ -46,6 +46,7 @@ def drift(table, name):
 @pytest.mark.parametrize("integrator", INTEGRATORS, ids=lambda i: type(i).__name__)
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("height", [0.0137, 0.0151])
+@pytest.mark.fast_on_ranks("0.0137-0.5-EnergyMomentum", "0.0151-1.0-Midpoint")
 def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, height):
     """It leaves with e times its speed, wherever in a step its gap closes (by h v = 2 mm)."""
     block = nts.RigidBody(
@@ -71,6 +72,7 @@ def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, heig
 @pytest.mark.mpi
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.fast("balanced")
+@pytest.mark.fast_on_ranks()
 def test_flexible_cubes_keep_energy_and_momenta(accuracy):
     """The published scheme loses 8 % of it at this mesh."""
     energy = []

@@ -184,6 +184,7 @@ SCENES = {
 @pytest.mark.fast("squeeze-balanced", "spin-exact", "1e6 g-balanced")
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("name", SCENES)
+@pytest.mark.fast_on_ranks("squeeze-balanced")
 def test_no_step_ends_inside_out(name, accuracy, evaluations):
     """The run stops with a sentence, soon, and what it has accepted is not inside out."""
     system, integrator, dt, t_end = SCENES[name]()
@@ -250,6 +251,7 @@ def test_statics(allowed):
 @pytest.mark.parametrize(
     "integrator", [nts.EnergyMomentum(), nts.Midpoint()], ids=lambda i: type(i).__name__
 )
+@pytest.mark.fast("Midpoint")
 def test_no_step_of_own_forms_ends_inside_out(integrator):
     watch = Watch()
     run = nts.simulate(

@@ -1,7 +1,9 @@
 """The layers of the package: imports only go down, and importing does nothing else."""
 
 import ast
+import functools
 import importlib.metadata
+import json
 import logging
 import os
 import re
@@ -66,6 +68,7 @@ def for_type_checking(node):
     return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
 
 
+@functools.cache
 def siblings(module):
     """Return the modules of the package that a module imports (types alone do not count)."""
     tree = ast.parse(source(module))
@@ -74,6 +77,7 @@ def siblings(module):
     return {name for name in names if name in FILES} - {module}
 
 
+@functools.cache
 def code_without_text(module):
     """Return the source without comments, docstrings and other bare strings."""
     tree = ast.parse(source(module))
@@ -143,6 +147,16 @@ def test_only_compat_knows_dolfinx_versions(module):
     assert not asks, f"{module} asks for the DOLFINx version: {asks}; dolfinx_compat does that"
 
 
+SHOW = """
+import json, logging, sys
+root, own = logging.root, logging.getLogger("dolfinx_nts")
+print(json.dumps({
+    "modules": [*sys.modules], "root": [len(root.handlers), root.level],
+    "own": [len(own.handlers), own.level], "version": getattr({}, "__version__", None),
+}))
+"""
+
+
 def in_fresh_python(code):
     """Run code in a new interpreter that does not believe to be an MPI rank of this one."""
     mpi = ("OMPI_", "PMIX_", "PRTE_", "ORTE_")
@@ -151,25 +165,34 @@ def in_fresh_python(code):
         [sys.executable, "-c", code], env=environment, cwd="/", text=True, capture_output=True
     )
     assert done.returncode == 0, done.stderr
-    return done.stdout.split()
+    return done.stdout
+
+
+@functools.cache
+def after(*modules):
+    """What a new interpreter holds that has imported these."""
+    shown = in_fresh_python(f"import {', '.join(modules)}" + SHOW.replace("{}", modules[0]))
+    return json.loads(shown)
+
+
+def ours():
+    return after("dolfinx_nts")
+
+
+def theirs():
+    return after("dolfinx", "dolfinx.fem.petsc")
 
 
 def test_importing_is_cheap():
-    loaded = in_fresh_python("import sys, dolfinx_nts; print(*sys.modules)")
-    ours = {name for name in loaded if name.split(".")[0] in OPTIONAL}
+    loaded = {name for name in ours()["modules"] if name.split(".")[0] in OPTIONAL}
     # What DOLFINx itself loads is not ours to avoid.
-    theirs = set(in_fresh_python("import sys, dolfinx, dolfinx.fem.petsc; print(*sys.modules)"))
-    assert not ours - theirs
+    assert not loaded - set(theirs()["modules"])
 
 
 def test_importing_sets_up_no_logging():
-    state = "print(len(logging.root.handlers), logging.root.level)"
-    theirs = in_fresh_python(f"import logging, dolfinx, dolfinx.fem.petsc; {state}")
-    ours = in_fresh_python(f"import logging, dolfinx_nts; {state}")
-    assert ours in (theirs, ["0", str(logging.WARNING)])  # DOLFINx 0.5 itself adds a handler
-    own = "print(logger.handlers, logger.level)"
-    code = f"import logging, dolfinx_nts; logger = logging.getLogger('dolfinx_nts'); {own}"
-    assert in_fresh_python(code) == ["[]", "0"]
+    # DOLFINx 0.5 itself adds a handler.
+    assert ours()["root"] in (theirs()["root"], [0, logging.WARNING])
+    assert ours()["own"] == [0, 0]
 
 
 def test_version_is_stated_once():
@@ -179,4 +202,4 @@ def test_version_is_stated_once():
     for module in PRESENT:
         assert f'"{version}"' not in source(module), f"{module} states the version again"
     if "__init__" in PRESENT:
-        assert in_fresh_python("import dolfinx_nts; print(dolfinx_nts.__version__)") == [version]
+        assert ours()["version"] == version

@@ -106,6 +106,7 @@ def test_schur_complement_is_the_same_on_all_ranks_and_when_made_again():
 
 @pytest.mark.parametrize("condense", [True, False])
 @pytest.mark.parametrize("blocked", [True, False])
+@pytest.mark.fast("False-False", "True-True")
 def test_schur_complements_are_those_of_the_operator(blocked, condense):
     """Against dense matrices; the bodies' part is that of the last fresh assembly."""
     options = {} if blocked else {"fieldsplit_bodies_pc_type": "gamg"}
@@ -488,6 +489,7 @@ def test_a_pattern_that_grows_under_another_run_of_the_same_scene():
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.fast("True")
+@pytest.mark.fast_on_ranks()
 def test_the_choice_changes_no_solution(condense):
     tables = []
     for solver, condensed in (("auto", condense), ("direct", False)):
@@ -508,6 +510,7 @@ def test_the_choice_changes_no_solution(condense):
     [(nts.Midpoint(), 1), (nts.EnergyMomentum(), 1), (nts.EnergyMomentum(), 2)],
 )
 @pytest.mark.fast("integrator1-1-friction2")
+@pytest.mark.fast_on_ranks()
 def test_nodes_with_more_constraints_than_coordinates(integrator, fine, friction):
     """A block slides along a floor into a wall: nodes of its edge stick to one and touch both.
 

@@ -216,6 +216,7 @@ def check_kept(table, integrator):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.fast("0.3")
 def test_small_blocks_lose_little(friction):
     """On any number of ranks; with consistent mass contact takes 5 %, at any step."""
     integrator, cells = nts.EnergyMomentum(), (4, 2)
@@ -348,6 +349,7 @@ def test_bars(elements):
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 @pytest.mark.parametrize("rule", [nts.EnergyMomentum(), nts.Midpoint()])
+@pytest.mark.fast("rule0-0.4")
 def test_jacobian(rule, friction):
     """Of nodes that touch or leave with forces of the step before."""
     upper = nts.Continuum(

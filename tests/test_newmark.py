@@ -67,6 +67,7 @@ def amplification(m, f, beta, gamma, h):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.fast_on_ranks("damped", "alpha 0.5")
 def test_an_oscillator_moves_as_the_scheme_says(scheme):
     integrator, parameters = SCHEMES[scheme]
     stepper = nts.Stepper(nts.System([Oscillator()]), integrator)

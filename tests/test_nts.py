@@ -297,7 +297,7 @@ def random_gaps(rng, n, nc):
 
 
 @pytest.mark.parametrize("nc", KINDS)
-@pytest.mark.fast("3", "4")
+@pytest.mark.fast("3")
 def test_gap_and_its_derivatives(nc):
     rows = 8 if nc < 15 else 1
     x, xi = random_gaps(np.random.default_rng(8), rows, nc)
@@ -427,7 +427,7 @@ def test_gonzalez_is_the_corrected_formula_row_by_row():
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("nc", KINDS)
-@pytest.mark.fast("3-mean-value", "4-gonzalez", "16-mean-value")
+@pytest.mark.fast("3-mean-value", "4-gonzalez")
 def test_tangents(nc, rule):
     z0, z1, multiplier = random_step(np.random.default_rng(14), 10, nc)
     e = nts_element.element(z0, z1, multiplier, rule)
@@ -485,7 +485,7 @@ def test_over_triangles_both_rules_are_the_midpoint_gradient():
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("nc", KINDS)
-@pytest.mark.fast("3-gonzalez", "4-mean-value", "16-mean-value")
+@pytest.mark.fast("3-gonzalez", "4-mean-value")
 def test_at_rest(nc, rule):
     z, _, multiplier = random_step(np.random.default_rng(17), 10 if nc < 15 else 2, nc)
     with np.errstate(all="raise"):

@@ -45,6 +45,7 @@ def on_floor(friction, shift):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("shift", [0.002, 0.1])
+@pytest.mark.fast_on_ranks("0.1")
 def test_friction_carries_the_shear(shift):
     """Pressed down and dragged: sticking, or the whole face slides at mu times the pressure."""
     mu = 0.3

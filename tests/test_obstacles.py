@@ -187,6 +187,7 @@ def test_work_of_the_force_is_the_change_of_the_gap(name, integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("theta", [0.0, 0.1, 0.49, 0.5, 0.51, 1.0])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast_on_ranks("midpoint-0.1", "energy-momentum-0.49", "gonzalez-1.0")
 def test_rebound_from_a_plane(integrator, theta):
     """B6: the step that closes the gap leaves 2 theta - 1 of the speed."""
     start = TURN @ [0.3, 0.2, theta * STEP * SPEED]
@@ -202,6 +203,7 @@ def test_rebound_from_a_plane(integrator, theta):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast_on_ranks("energy-momentum")
 def test_a_plane_is_a_fixed_facet(integrator):
     """Bouncing obliquely under gravity: the same path as on the face of a fixed hexahedron."""
     start, velocity, gravity = np.array([0.3, 0.2, 0.04]), (0.4, -0.7, -SPEED), (0, 1.0, -30.0)
@@ -228,7 +230,7 @@ BOWLS = {
 
 @pytest.mark.parametrize("rule", ["mean-value", "gonzalez"])
 @pytest.mark.parametrize("bowl", BOWLS)
-@pytest.mark.fast("cylinder-mean-value")
+@pytest.mark.slow
 def test_sliding_in_a_bowl_keeps_the_energy(bowl, rule):
     """Round and round without friction, from contact: nothing is lost over many steps."""
     start, velocity = np.array([0.0, 0.0, -1.0]), np.array([0.5, 8.0, 0.0])
@@ -266,7 +268,7 @@ def test_without_gravity_a_mass_in_a_sphere_follows_a_great_circle(integrator):
 
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
 @pytest.mark.parametrize("bowl", BOWLS)
-@pytest.mark.fast("sphere-energy-momentum")
+@pytest.mark.slow
 def test_small_oscillations_have_the_period_of_a_pendulum(bowl, integrator):
     """2 pi sqrt(R/g) (1 + A^2/16), at second order in the step."""
     amplitude, errors = 0.02, []
@@ -286,7 +288,7 @@ def test_small_oscillations_have_the_period_of_a_pendulum(bowl, integrator):
 
 
 @pytest.mark.parametrize("name", OBSTACLES)
-@pytest.mark.fast("sphere", "bore")
+@pytest.mark.fast("sphere")
 def test_units(name):
     """Lengths in m, mm and um: the same iterations, as nothing is absolute."""
     runs = []
@@ -354,6 +356,7 @@ def test_a_rising_floor_lifts_a_mass(integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", OBSTACLES)
 @pytest.mark.fast("bowl")
+@pytest.mark.fast_on_ranks()
 def test_ledger_closes_with_a_shaking_obstacle(name):
     """Hit, lifted and dropped by an obstacle that shakes: every loss is an activation."""
     shaken = changed(
@@ -430,6 +433,7 @@ def test_a_block_falls_on_a_plane_as_on_a_plate(integrator):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_facets_and_obstacles_in_one_scene(mpi_tmp_path):
     """A block on a block on a floor between two walls; fields and balance are written."""
     low, low_face = block((0, 0, 0.002), 1.0, name="low", velocity=(0.4, 0, 0))
@@ -486,6 +490,7 @@ def test_bad_obstacles(make, message):
 @pytest.mark.parametrize("place", [(1e6, 0.0, 1e6), (3e6, -2e6, 1e6)])
 @pytest.mark.parametrize("name", ["plane", "sphere", "cylinder"])
 @pytest.mark.fast("plane-place0", "sphere-place1", "cylinder-place1")
+@pytest.mark.fast_on_ranks("sphere-place1")
 def test_an_obstacle_may_be_anywhere(name, place):
     """At 1e-6 g a cube settles by 1e-8 m, a hundred roundings of coordinates 1e6 m away."""
     works = []

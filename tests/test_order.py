@@ -66,7 +66,7 @@ def flying_block():
 
 
 @pytest.mark.parametrize("integrator", FREE)
-@pytest.mark.fast("energy-momentum", "newmark", "generalised alpha")
+@pytest.mark.slow
 def test_free_flight(integrator):
     results = [run(flying_block, integrator, 0.4, n)[:2] for n in (40, 80, 160, 320)]
     for values in zip(*results, strict=True):

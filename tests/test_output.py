@@ -355,6 +355,7 @@ def run_both():
 
 
 @mpi
+@pytest.mark.fast_on_ranks()
 def test_plots(mpi_tmp_path):
     runs = run_both()
     runs["midpoint"].plot(mpi_tmp_path / "one.png")

@@ -121,7 +121,7 @@ def cube(low, name, velocity=(0.0, 0.0, 0.0), **options):
 @pytest.mark.mpi
 @pytest.mark.parametrize("newton", [{}, {"linear_solver": "direct"}, {"linear_solver": "krylov"}])
 @pytest.mark.parametrize("damping", [0.0, 500.0])
-@pytest.mark.fast("0.0-newton0", "500.0-newton1", "500.0-newton2")
+@pytest.mark.fast("500.0-newton2")
 def test_a_spring_between_cubes(damping, newton, mpi_tmp_path):
     """Both momenta and the ledger, with what the damper takes as a column of its own."""
     a, b = cube((0, 0, 0), "a"), cube((1.6, 0.2, 0.1), "b", velocity=(2.0, 1.0, 0.0))
@@ -321,6 +321,7 @@ def test_a_start_that_violates_a_joint_of_ones_own_is_refused():
 @pytest.mark.parametrize(
     "rule", [nts.Newmark(), nts.GeneralizedAlpha()], ids=lambda rule: type(rule).__name__
 )
+@pytest.mark.fast("GeneralizedAlpha")
 def test_first_accelerations_keep_a_joint_of_ones_own(rule):
     """A point that is drawn at 0.1 m/s and 3 m/s^2 out of a cube that flies at 0.1 m/s."""
     x = np.array([0.3, 0.4, 0.6])

@@ -136,6 +136,7 @@ def test_steps_that_differ_by_rounding_share_their_matrices():
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.fast("True")
+@pytest.mark.fast_on_ranks()
 def test_a_body_without_contact_beside_two_with(condense):
     """The blocks of a split have a place for it."""
 
@@ -248,6 +249,7 @@ def arch():
     [(lambda: thrown(0.0), 60, False), (lambda: thrown(2.0), 130, False), (arch, 16, True)],
     ids=["falling", "turning", "arch"],
 )
+@pytest.mark.fast_on_ranks("falling")
 def test_what_iterations_leave_does_not_add_up(system, steps, contact):
     """A hundredth of the 1e-8 that "balanced" may leave, where 100 such steps left all of it."""
     stepper = nts.Stepper(system(), nts.EnergyMomentum(), newton=ACCURACY["balanced"])

@@ -61,6 +61,8 @@ def chain(comm):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(("scene", "dt", "t_end"), [(contact, 1e-2, 0.2), (chain, 1e-2, 0.5)])
+@pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
+@pytest.mark.fast_on_ranks("contact-0.01-0.2")
 def test_ranks_change_nothing(scene, dt, t_end):
     """The scene of these ranks against the one that every rank computes alone, to 1e-9 of it."""
     (one, size), (other, _) = scene(COMM), scene(MPI.COMM_SELF)

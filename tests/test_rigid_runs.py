@@ -31,6 +31,7 @@ def places(system):
     [({}, 1e-11), ({"sleep": True}, 1e-11), ({"accuracy": "balanced"}, 1e-8)],
     ids=["exact", "sleep", "balanced"],
 )
+@pytest.mark.fast_on_ranks("balanced")
 def test_the_ledger_of_a_double_pendulum(options, promise):
     system = scene()
     run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.1, **options)
@@ -59,6 +60,7 @@ def test_adaptive_steps_of_a_double_pendulum():
 @pytest.mark.parametrize(
     "rule", [nts.EnergyMomentum(), nts.GeneralizedAlpha()], ids=["em", "ga"]
 )
+@pytest.mark.fast("ga")
 def test_two_halves_are_one_run(rule):
     """A run that goes on remembers the joints' multipliers."""
     whole, first, second = scene(), scene(), scene()

@@ -31,6 +31,7 @@ def fail_once(stepper, at_call):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast("integrator1")
 def test_a_cut_back_step_equals_the_small_steps(integrator):
     """Nothing of a rejected step survives: the thirds are those of a run that never tried."""
     tried, plain = (nts.Stepper(two_blocks.scene(COMM), integrator) for _ in range(2))
@@ -159,6 +160,7 @@ def top(x):
     ],
     ids=["moving support", "traction", "body force"],
 )
+@pytest.mark.fast_on_ranks("moving support")
 def test_the_work_of_loads_and_supports_closes_the_ledger(options):
     system = nts.System([block(**options)], gravity=(0, 0, -9.81))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.1)
@@ -171,6 +173,7 @@ def test_the_work_of_loads_and_supports_closes_the_ledger(options):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast_on_ranks("integrator0")
 def test_driven_nodes_have_the_velocity_of_their_support(integrator):
     """They start with it and do not alternate about it; exact for motion at constant speed."""
     speed = np.array([0.5, -0.2, 0.3])

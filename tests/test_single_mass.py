@@ -137,6 +137,7 @@ def run(system, integrator, steps, **newton):
     [0.0, 0.1, 0.25, 0.49, 0.51, 0.99, 1.0] + [pytest.param(0.75, marks=pytest.mark.mpi)] + [0.5],
 )
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast_on_ranks("midpoint-0.75-True", "energy-momentum-0.75-False")
 def test_rebound(integrator, theta, turned):
     system, q = mass_on_wall(theta * STEP * SPEED, turned=turned)
     v, stepper = run(system, integrator, 4)

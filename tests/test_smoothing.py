@@ -130,7 +130,8 @@ def assert_closed(table, changes, count):
 @pytest.mark.parametrize(
     "variant", [pytest.param("middle", marks=pytest.mark.mpi), "start", "smooth"]
 )
-@pytest.mark.fast("middle", "smooth")
+@pytest.mark.fast("middle")
+@pytest.mark.fast_on_ranks()
 def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
     changes, others, table = slide("flat", variant, 0.45, facets=80, uneven=0.25)
     assert_closed(table, changes, 50)
@@ -141,7 +142,7 @@ def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
 
 @pytest.mark.parametrize("part", [0.2137, 0.1137])
 @pytest.mark.parametrize("shape", ["convex", "concave"])
-@pytest.mark.fast("convex-0.2137", "concave-0.1137")
+@pytest.mark.fast("convex-0.2137")
 def test_what_a_change_of_facet_costs_on_a_cylinder(shape, part):
     """At a slope of the angle between facets, the way beyond an edge is a height."""
     angle = 2 * END / FACETS / RADIUS
@@ -163,7 +164,7 @@ def test_what_a_change_of_facet_costs_on_a_cylinder(shape, part):
 
 
 @pytest.mark.parametrize("shape", ["convex", "concave"])
-@pytest.mark.fast("convex")
+@pytest.mark.slow
 def test_smoothing_of_uneven_facets(shape):
     """Their patches have one normal but not one curvature along an edge."""
     mean = {}
@@ -222,7 +223,7 @@ def bumpy(comm, smoothing, kind=CellType.hexahedron, metre=1.0):
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("smoothing", [False, True])
-@pytest.mark.fast("True-hexahedron", "True-tetrahedron")
+@pytest.mark.fast("True-hexahedron")
 def test_momentum_and_energy_on_any_number_of_ranks(smoothing, kind):
     tables = []
     for comm in (COMM, MPI.COMM_SELF):

@@ -103,6 +103,7 @@ def test_tangents_are_derivatives(item, rule, ground):
 @pytest.mark.mpi
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.fast("linear")
+@pytest.mark.fast_on_ranks()
 def test_tumbling_bodies_keep_energy_and_momenta(law):
     a, b = tumbling()
     spring = nts.Spring(a, b, POINTS, **LAWS[law])
@@ -136,6 +137,7 @@ def test_an_energy_that_is_linear_is_a_linear_spring():
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("damping", [0.0, 1.5])
+@pytest.mark.fast("0.0-midpoint", "1.5-energy-momentum", "1.5-generalised alpha")
 def test_oscillator(rule, damping):
     """Order, and what the damper takes, by the closed form; ends change places."""
     m, k, start, v0, end = 2.0, 30.0, 0.3, 0.8, 1.6
@@ -206,7 +208,7 @@ def test_a_spring_of_no_length_passes_through_it():
 
 
 @pytest.mark.parametrize("rule", ["energy-momentum", "midpoint", "generalised alpha"])
-@pytest.mark.fast("energy-momentum")
+@pytest.mark.slow
 def test_torsion_pendulum_over_several_turns(rule):
     """V = k/2 phi^2 + c (1 - cos phi), not periodic: turns count."""
     inertia, k, c, damping, spin, end = 0.5, 0.02, 0.3, 0.02, 8.0, 2.5
@@ -246,6 +248,7 @@ def test_torsion_pendulum_over_several_turns(rule):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_two_wheels_on_one_axis():
     """They turn against each other by more than half a turn; their angular momentum stays."""
     k, axis, spins = 2.0, np.array([2.0, 1.0, 2.0]) / 3.0, (9.0, -2.0)
@@ -291,6 +294,7 @@ def test_an_angle_counts_turns_from_where_a_run_goes_on():
     assert abs(stored[0] - stored[1]) < 1e-12 * stored[0]
 
 
+@pytest.mark.slow
 def test_any_units():
     """m, mm and um: the same iterations, energies by the square of the length."""
     found = [in_units(size) for size in (1.0, 1e3, 1e6)]

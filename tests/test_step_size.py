@@ -142,6 +142,7 @@ def test_free_flight_takes_the_largest_steps_and_ends_on_time():
 @pytest.mark.parametrize("theta", [0.1, 0.5, 0.75])
 @pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()])
 @pytest.mark.fast("integrator0-0.1", "integrator1-0.75")
+@pytest.mark.fast_on_ranks("integrator0-0.1")
 def test_a_mass_rebounds_from_a_wall_without_loss(integrator, theta):
     """Fixed steps leave |1 - 2 theta| of the speed; a step that ends at the wall leaves it all."""
     system, _ = mass_on_wall((3 + theta) * STEP * SPEED)
@@ -227,6 +228,7 @@ def impact(comm=COMM, t_end=0.04, tolerance=1e-3, **scene):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_rejected_steps_leave_no_trace():
     """Fixed steps to the accepted times give the same states, and the ledger stays closed."""
     run = impact()

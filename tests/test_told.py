@@ -104,6 +104,7 @@ def test_load_steps_that_are_too_few_for_the_ledger(load_steps):
 
 @pytest.mark.parametrize("young", [1e1, 1e4])
 @pytest.mark.fast("10.0")
+@pytest.mark.fast_on_ranks()
 def test_a_stiff_body_on_a_soft_one_is_held(young):
     """Steel that sticks to a pad whose base is fixed: soft is not free."""
     mesh = create_box(

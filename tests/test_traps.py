@@ -82,6 +82,7 @@ def run(system, integrator, dt=2e-3, steps=8):
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
+@pytest.mark.fast_on_ranks("energy-momentum-corner")
 def test_touching_at_rest_stays_at_rest(place, integrator):
     table = run(scene(place), integrator)
     assert np.abs(table["energy"]).max() <= 1e-20
@@ -90,6 +91,7 @@ def test_touching_at_rest_stays_at_rest(place, integrator):
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
+@pytest.mark.fast_on_ranks("energy-momentum-across")
 def test_touching_and_leaving_takes_no_force(place, integrator):
     table = run(scene(place, velocity=(0.0, 0.0, 1.0)), integrator)
     assert table["active"].sum() == 0
@@ -99,6 +101,7 @@ def test_touching_and_leaving_takes_no_force(place, integrator):
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
+@pytest.mark.fast_on_ranks("midpoint-edge")
 def test_touching_and_sliding_takes_no_force(place, integrator):
     """Frictionless sliding over edges of facets, at zero gap all the time."""
     table = run(scene(place, velocity=(-2.0, -1.0, 0.0)), integrator, dt=5e-3)
@@ -108,6 +111,7 @@ def test_touching_and_sliding_takes_no_force(place, integrator):
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
+@pytest.mark.fast_on_ranks("energy-momentum-corner")
 def test_pressed_from_zero_gap(place, integrator):
     """A closed gap stays closed for a step, which throws the slaves back; nothing is lost by it."""
     table = run(scene(place, velocity=(0.0, 0.0, -1.0)), integrator)
@@ -123,6 +127,7 @@ def test_pressed_from_zero_gap(place, integrator):
     "midpoint-0.0-edge", "midpoint-0.3-corner", "energy-momentum-0.0-across",
     "energy-momentum-0.3-inside",
 )  # fmt: skip
+@pytest.mark.fast_on_ranks("midpoint-0.3-corner", "energy-momentum-0.0-across")
 def test_falls_onto_edges_and_corners(place, integrator, friction):
     table = run(scene(place, gap=0.003, velocity=(0.0, 0.0, -1.0), friction=friction), integrator)
     assert table["active"].max() == 4
@@ -131,6 +136,7 @@ def test_falls_onto_edges_and_corners(place, integrator, friction):
 
 @rubbing
 @pytest.mark.fast("midpoint-0.3", "energy-momentum-0.0")
+@pytest.mark.fast_on_ranks("energy-momentum-0.0")
 def test_slides_off_the_end_of_the_plate(integrator, friction):
     """Slaves leave over the free edge while in contact; no facet is there to hold them."""
     system = scene("corner", velocity=(2.0, 0.0, -0.2), friction=friction)
@@ -141,10 +147,8 @@ def test_slides_off_the_end_of_the_plate(integrator, friction):
 
 @pytest.mark.parametrize("master", ["free", "driven"])
 @rubbing
-@pytest.mark.fast(
-    "midpoint-0.0-free", "midpoint-0.3-driven", "energy-momentum-0.3-free",
-    "energy-momentum-0.0-driven",
-)  # fmt: skip
+@pytest.mark.fast("midpoint-0.3-driven", "energy-momentum-0.3-free")
+@pytest.mark.fast_on_ranks("energy-momentum-0.3-free")
 def test_slaves_that_cannot_move(master, integrator, friction):
     """A wholly prescribed cube: the plate that comes up must give way."""
     below = nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9, lambda t: (0.0, 0.0, 0.5 * t))
@@ -160,6 +164,7 @@ def test_slaves_that_cannot_move(master, integrator, friction):
     "energy-momentum-0.0-0.001", "energy-momentum-0.3-0.0", "midpoint-0.0-0.0",
     "midpoint-0.3-0.001",
 )  # fmt: skip
+@pytest.mark.fast_on_ranks("energy-momentum-0.3-0.0")
 def test_nothing_can_move(gap, integrator, friction):
     held = [nts.Dirichlet(everywhere)]
     table = run(scene(gap=gap, cube=held, plate=held, friction=friction), integrator)
@@ -167,6 +172,7 @@ def test_nothing_can_move(gap, integrator, friction):
 
 
 @rubbing
+@pytest.mark.fast_on_ranks("energy-momentum-0.3")
 def test_prescribed_slave_bottom_of_a_free_cube(integrator, friction):
     """Slave nodes held, the rest of their body free, the plate comes up against them."""
     held = [nts.Dirichlet(lambda x: x[2] < 0.001 + 1e-9)]
@@ -178,6 +184,7 @@ def test_prescribed_slave_bottom_of_a_free_cube(integrator, friction):
 @pytest.mark.parametrize("components", [(2,), (0, 1)])
 @rubbing
 @pytest.mark.fast("midpoint-0.3-components1", "energy-momentum-0.0-components0")
+@pytest.mark.fast_on_ranks("midpoint-0.3-components1")
 def test_slaves_held_in_some_components(components, integrator, friction):
     held = [nts.Dirichlet(lambda x: x[2] < 0.001 + 1e-9, components=components)]
     system = scene(gap=0.001, cube=held, plate_velocity=(0.1, 0.0, 1.0), friction=friction)
@@ -211,6 +218,7 @@ def test_contact_comes_and_goes(place, integrator, friction):
 
 
 @rubbing
+@pytest.mark.fast_on_ranks("midpoint-0.3")
 def test_one_facet_and_one_slave_cell(integrator, friction):
     """One cell each: every further rank owns neither facet nor slave."""
     system = scene(gap=0.002, velocity=(0.0, 0.0, -1.0), cells=1, friction=friction)
@@ -222,6 +230,7 @@ def test_one_facet_and_one_slave_cell(integrator, friction):
 
 
 @pytest.mark.parametrize("condense", [False, True])
+@pytest.mark.fast_on_ranks("True")
 def test_krylov_with_ranks_that_own_nothing(condense):
     newton = nts.Newton(linear_solver="krylov", condense=condense)
     tables = {}

@@ -97,6 +97,7 @@ def sheet(corners, cells=8):
 
 @pytest.mark.parametrize("corners", [3, 4])
 @pytest.mark.parametrize("angle", [0.0, 0.01, 0.1, 0.3, 1.0])
+@pytest.mark.fast("0.0-4", "0.01-3", "0.1-4", "0.3-3")
 def test_no_path_slips_between_facets_that_turn(corners, angle):
     """Points go from above to below a plate that turns by an angle, and with it.
 
@@ -140,6 +141,7 @@ def test_no_path_slips_through_a_sheet_that_crumples(corners):
 
 
 @pytest.mark.parametrize("corners", [3, 4])
+@pytest.mark.fast("3")
 def test_first_hits_of_facets_that_turn_against_all_pairs(corners):
     """Roots of numpy of the polynomial through four of its values."""
     random = np.random.default_rng(corners)
@@ -178,6 +180,7 @@ def test_first_hits_of_facets_that_turn_against_all_pairs(corners):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("obstacle", [False, True])
+@pytest.mark.fast_on_ranks("False-energy-momentum", "True-midpoint")
 def test_a_mass_at_rest_that_falls_far_in_a_step(obstacle, integrator):
     """Nothing at its start tells that it will move: v = 0, g = 9.81, h = 0.5, 0.2 m above."""
     body, top = plate()
@@ -196,6 +199,7 @@ def test_a_mass_at_rest_that_falls_far_in_a_step(obstacle, integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("aim", [(0.0, 0.0), (150.0, 60.0), (-290.0, 10.0)])
+@pytest.mark.fast_on_ranks("aim0-energy-momentum", "aim1-midpoint", "aim2-gonzalez")
 def test_a_shot_at_a_thin_plate(aim, integrator):
     """Through several facets a step, from beside the plate, too: it bounces as at a plane (B6)."""
     speed, dt = 300.0, 0.01
@@ -235,6 +239,7 @@ def test_a_shot_at_a_small_obstacle(obstacle):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.fast_on_ranks("energy-momentum")
 def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator):
     """It passes the plate's edge, sinks below its top, and the plate moves over it and away."""
     def sideways(t):
@@ -256,6 +261,7 @@ def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator)
 @pytest.mark.mpi
 @pytest.mark.parametrize("dt", [2e-3, 1e-3])
 @pytest.mark.fast("0.002")
+@pytest.mark.fast_on_ranks()
 def test_cubes_off_centre_win_no_energy(dt):
     """Slaves at the rim pass below the master's rim and come back: half the energy was won."""
     bodies = [

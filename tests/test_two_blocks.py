@@ -214,6 +214,7 @@ def test_condensation_changes_nothing():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_field_split_finds_the_same_solution():
     options = {
         "ksp_type": "fgmres",
@@ -242,6 +243,7 @@ def test_field_split_finds_the_same_solution():
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
 @pytest.mark.fast("energy-momentum-True")
+@pytest.mark.fast_on_ranks()
 def test_krylov_follows_the_direct_solver(integrator, condense):
     steppers = [
         nts.Stepper(

@@ -93,6 +93,12 @@ def same_on_all_ranks(value):
     "Dirichlet-raises-all", "Dirichlet-nan-last", "Traction-nan-all", "Traction-two_numbers-last",
     "body_force-raises-last", "body_force-two_numbers-all", "motion-raises-last", "motion-nan-all",
 )  # fmt: skip
+@pytest.mark.fast_on_ranks(
+    "Dirichlet-nan-last",
+    "Traction-two_numbers-last",
+    "body_force-raises-last",
+    "motion-nan-all",
+)
 def test_a_run_keeps_what_it_has(what, fails, ranks):
     system = scene(what, until_late(fails, ranks))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=DT, t_end=5 * DT)
@@ -122,6 +128,7 @@ def test_a_run_of_chosen_steps_keeps_what_it_has():
 
 
 @pytest.mark.parametrize("what", NAMES)
+@pytest.mark.fast_on_ranks("body_force")
 def test_equilibrium_keeps_what_it_has(what):
     supports = nts.Dirichlet(bottom)
     fails = until_late(raises, "last")
@@ -231,6 +238,7 @@ class Writer:
 
 @pytest.mark.parametrize("ranks", ["all", "last"])
 @pytest.mark.parametrize(("failing", "written"), [("write", 2), ("close", 3)])
+@pytest.mark.fast_on_ranks("write-2-last")
 def test_a_writer_that_fails(failing, written, ranks, mpi_tmp_path):
     writers = [Writer(), Writer(failing, ranks), output.BalanceCSV(mpi_tmp_path / "b.csv")]
     run = nts.simulate(scene(), nts.Midpoint(), dt=DT, t_end=3 * DT, output=writers)

@@ -195,6 +195,7 @@ def test_a_full_disk_ends_the_run_with_a_whole_table(mpi_tmp_path):
 @mpi
 @pytest.mark.parametrize("kind", ["plot", "picture"])
 @pytest.mark.fast("picture")
+@pytest.mark.fast_on_ranks()
 def test_an_old_picture_outlives_a_full_disk(kind, mpi_tmp_path):
     run = nts.simulate(flying(), nts.Midpoint(), dt=1e-3, t_end=2e-3)
     path = mpi_tmp_path / "picture.png"

@@ -331,15 +331,16 @@ class UflBody(Body):
                 # Change of the velocity with u_1; time.
                 self._rate, self._time = (fem.Constant(self.mesh, 0.0) for _ in range(2))
             du, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
-            work, extra = self._virtual_work(rule, w), None
-            virtual = work
+            virtual = work = self._virtual_work(rule, w)
+            extra = None
             if self._extra_form is not None:
                 moved = self._u1 - self._u0
                 place, velocity = self._u0 + rule.theta * moved, self._rate * moved
                 if rule.accelerations:
                     velocity += self._drift
                 extra = self._extra_form(place, velocity, w, self._time)
-                virtual = work + extra
+                if self._u1 in extra.coefficients():  # else the tangent is that without it
+                    virtual = work + extra
             tangent = self._factors[1] * ufl.derivative(virtual, self._u1, du)
             if rule.inertia:
                 tangent += self._factors[0] * self._mass_form(du, w)
