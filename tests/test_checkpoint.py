@@ -250,6 +250,34 @@ def test_on_other_ranks(scene, integrator, mpi_tmp_path):
         COMM.barrier()
 
 
+@pytest.mark.slow
+def test_from_two_ranks_to_three(on_ranks, tmp_path):
+    """The last third of a run of two ranks, made again by three, and matched by places."""
+    code = f"""
+        import sys
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from pathlib import Path
+        import test_checkpoint as t
+        folder, first = Path({str(tmp_path)!r}), t.COMM.size == 2
+        for name in ("blocks", "mechanism"):
+            scene, file = t.SCENES[name](t.COMM), folder / f"{{name}}.h5"
+            if first:
+                found = t.run(scene, checkpoint=t.nts.Checkpoint(file, every=t.EVERY))
+            else:
+                found = t.run(scene, start=t.nts.restart(t.previous(file), scene[0]))
+            found.save(folder / f"{{name}} {{t.COMM.size}}.h5")
+    """
+    for ranks in (2, 3):
+        on_ranks(ranks, "-c", textwrap.dedent(code))
+    for name in ("blocks", "mechanism"):
+        one, other = (nts.load(tmp_path / f"{name} {ranks}.h5") for ranks in (2, 3))
+        assert len(one.rows) == len(other.rows) == STEPS + 1 and one.time == other.time
+        for of in ("reference", "u", "v"):
+            mine, theirs = ([body[of] for body in run.bodies.values()] for run in (one, other))
+            off = np.concatenate(mine) - np.concatenate(theirs)
+            assert np.abs(off).max() < 1e-12 * np.abs(np.concatenate(mine)).max()
+
+
 # ---- how often, and files
 @pytest.mark.mpi
 def test_the_balance_and_its_table_go_on(mpi_tmp_path):
