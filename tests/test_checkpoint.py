@@ -278,6 +278,35 @@ def test_from_two_ranks_to_three(on_ranks, tmp_path):
             assert np.abs(off).max() < 1e-12 * np.abs(np.concatenate(mine)).max()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["os.kill(os.getpid(), signal.SIGKILL)", "raise OSError('gone')"])
+def test_a_rank_that_ends_takes_the_others_along(end, on_ranks, tmp_path):
+    """No hang; what was written until then is whole, and the run goes on from it."""
+    path = tmp_path / "run.h5"
+    code = f"""
+        import os, signal, sys
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        import test_checkpoint as t
+
+        def before(time, dt):
+            if t.COMM.rank == 1 and time > 7.5 * t.DT:
+                {end}
+
+        scene = t.blocks(t.COMM)
+        found = t.run(scene, before_step=before, checkpoint=t.nts.Checkpoint({str(path)!r}, every=3))
+        print("status", found.status)
+        sys.exit("not completed")
+    """
+    said = on_ranks(2, "-c", textwrap.dedent(code), well=False)
+    raised = "raise" in end
+    assert ("OSError('gone')" in said and "status before_step" in said) == raised
+    scene = blocks(COMM)
+    start = nts.restart(path, scene[0])
+    # Every third step; a run that ends in order writes its last one, too.
+    assert len(start.rows) == 1 + (8 if raised else 6)
+    assert run(scene, start=start).status == "completed"
+
+
 # ---- how often, and files
 @pytest.mark.mpi
 def test_the_balance_and_its_table_go_on(mpi_tmp_path):
