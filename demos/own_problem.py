@@ -3,7 +3,7 @@
 Problem. A rubber block, 1 x 1 x 0.5, stands on a fixed base. A rigid ball of radius 0.6 is pressed
 0.1 into its top in ten load steps. The block's weak form, its function space, its boundary
 condition and the SNES are this script's; `dolfinx_nts` finds which nodes may touch and gives
-residual and tangent of the contact, see `Contact`, some thirty lines.
+residual and tangent of the contact, see `Contact`, seventy lines with the SNES.
 
 What to see. The same as `nts.equilibrium` on the same scene gives, which the script prints beside
 its own: contact force and number of nodes in contact.
@@ -47,7 +47,7 @@ def ball():
     return nts.Sphere(top, RADIUS, motion=lambda t: (0.0, 0.0, -DEPTH * t))
 
 
-class Block:
+class Block(nts.Body):
     """Weak form of the block in UFL: what contact asks of a body, and forces and matrix."""
 
     name = "block"

@@ -12,7 +12,7 @@ from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.rigid import RigidBody
-from dolfinx_nts.bodies.section import Clamp, PointForce, Section
+from dolfinx_nts.bodies.section import Circle, Clamp, PointForce, Rectangle, Section
 from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.contact.facet_pair import FacetPair
@@ -54,6 +54,7 @@ from dolfinx_nts.kernels.strain_energy import Isotropic
 from dolfinx_nts.run.checkpoint import Checkpoint, restart
 from dolfinx_nts.run.equilibrium import Equilibrium, equilibrium
 from dolfinx_nts.run.intercept import intercept
+from dolfinx_nts.run.saved import Saved, load
 from dolfinx_nts.run.simulate import simulate
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.step_size import Adapt
@@ -70,6 +71,7 @@ __all__ = [
     "Body",
     "BodyMotion",
     "Checkpoint",
+    "Circle",
     "Clamp",
     "ContactHistory",
     "ContactPair",
@@ -108,8 +110,10 @@ __all__ = [
     "Points",
     "Prismatic",
     "Revolute",
+    "Rectangle",
     "Restart",
     "RigidBody",
+    "Saved",
     "Section",
     "Solution",
     "Sphere",
@@ -134,6 +138,7 @@ __all__ = [
     "cauchy_stress",
     "equilibrium",
     "intercept",
+    "load",
     "motion_of",
     "restart",
     "simulate",

@@ -242,7 +242,10 @@ def compile_forms(forms: Sequence[Any]) -> list[Any]:
 def create_vector(space: Any) -> Any:
     """New zero ghosted PETSc vector in the layout of the space."""
     f = fem.Function(space)  # a temporary would be freed under its petsc_vec in 0.9 and later
-    b = (f.x.petsc_vec if hasattr(f.x, "petsc_vec") else f.vector).duplicate()
+    like = f.x.petsc_vec if hasattr(f.x, "petsc_vec") else f.vector
+    b = like.duplicate()
+    # Else it waits for a collection on a communicator that goes with the mesh.
+    like.destroy()
     b.set(0.0)
     return b
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import Moment, places_of
+from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
@@ -72,7 +72,7 @@ class Step:
         """Force per motion in the mean over a body's places, in the step's units. Collective."""
         inertia = self.integrator.inertia
         values = body.nodal_mass if inertia else self.stiffness(body)
-        chosen = values[::3][places_of(body)]
+        chosen = values[::3][body.places]
         total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
         return float(total[0] / total[1])
 
@@ -418,6 +418,14 @@ class EveryStep:
     def let_slip(self) -> None:
         """Nothing slips."""
 
+    def give_way(self) -> bool:
+        """Nothing yields."""
+        return False
+
+    def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
+        """Nothing to warn of."""
+        return []
+
     def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
         """Nothing to tell."""
         return {}
@@ -500,6 +508,23 @@ class Coupling(Protocol):
 
     def let_slip(self) -> None:
         """Let the step be solved by a rule that adds no solution but may find one."""
+
+    def give_way(self) -> bool:
+        """Let what has no bound have one from the next step on, as shorter steps are of no use.
+
+        Returns:
+            Whether there is such a thing that had none yet, the same on all ranks.
+        """
+
+    def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
+        """What an accepted step did that its user may not have meant. Collective.
+
+        Args:
+            parts: Solution, of each of `elements`.
+
+        Returns:
+            Kinds, sizes and sentences as of `RunWarning`, the same on all ranks.
+        """
 
     def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
         """Minima of an accepted step on this rank, by columns of the balance table."""

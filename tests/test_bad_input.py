@@ -42,6 +42,10 @@ def continuum(mesh=None, material=RUBBER, density=1e3, **options):
     return nts.Continuum(mesh or box(), material, density=density, **options)
 
 
+class Meshed(nts.Body):
+    mesh = "a mesh"
+
+
 def top(x):
     return x[2] > 1 - 1e-9
 
@@ -166,7 +170,7 @@ def test_degree(name):
         ),
         ("load_steps", lambda bad: nts.equilibrium(None, load_steps=bad)),
         ("interval", lambda bad: Fields("folder", interval="" if bad is None else bad)),
-        ("width", lambda bad: picture([SimpleNamespace(mesh=None)], "p.png", width=bad)),
+        ("width", lambda bad: picture([Meshed()], "p.png", width=bad)),
         ("accuracy", lambda bad: run(accuracy="" if bad is None else bad)),
         ("components", lambda bad: nts.Dirichlet(top, components=(bad,))),
     ],

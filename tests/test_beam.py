@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
@@ -219,6 +220,122 @@ def test_ranks_give_the_motion_of_one():
     alone, y = fly(EM, 0.1, 1, comm=MPI.COMM_SELF)
     assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
     assert several.balance["energy"] == pytest.approx(alone.balance["energy"], rel=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "gap"), [(32, 0.03), (64, 0.008)])
+def test_an_end_moment_rolls_a_strip_up(n, gap):
+    """2 pi EI / L, by a rigid body at the tip: a full circle, the ends of which meet.
+
+    The bending strain of an element is sin(angle) / length, which is why 32 elements miss by 2.7 %
+    of the length, 64 by 0.6 %: order 2.
+    """
+    stiffness = 2.0
+    section = nts.Section(EA=1e4, GA=(5e3, 5e3), GJ=2, EI=(stiffness,) * 2, rhoA=1,
+                          rhoI=(1e-2, 1e-2))  # fmt: skip
+    beam = nts.Beam(interval_mesh(straight(n)), section, bcs=[nts.Clamp(lambda x: x[0] < 1e-9)])
+    tip = nts.RigidBody.from_inertia(
+        1e-3, (1e-5,) * 3, (1, 0, 0), name="tip", torque=(0, 0, 2 * np.pi * stiffness),
+        comm=MPI.COMM_WORLD,
+    )  # fmt: skip
+    joint = nts.Fixed(beam, tip, point=(1, 0, 0))
+    run = nts.equilibrium(nts.System([beam, tip], joints=[joint]), load_steps=10)
+    _, now = beam.centreline()
+    turned = np.arctan2(tip.rotation[1, 0], tip.rotation[0, 0])
+    assert run.status.startswith("completed")
+    assert np.linalg.norm(now[-1]) < gap
+    assert abs(turned) < 2 * np.pi * gap
+    # The diameter of the circle, within what the ends are apart.
+    assert now[:, 1].max() == pytest.approx(1 / np.pi, abs=gap)
+
+
+# ---- sections of shapes
+def test_torsion_constants_of_rectangles():
+    """Roark's formulas for stress and strain, table 10.7 (to three digits); a thin strip."""
+    for ratio, factor in ((1, 0.141), (1.5, 0.196), (2, 0.229), (3, 0.263), (10, 0.312)):
+        for b, h in ((0.2 * ratio, 0.2), (0.2, 0.2 * ratio)):
+            section = nts.Rectangle(b, h).section(young=2.0, poisson=0.0, density=1.0)
+            assert section.GJ == pytest.approx(factor * 0.2 * ratio * 0.2**3, rel=4e-3)
+
+
+def test_sections_of_shapes_by_quadrature():
+    """Area and second moments of a cloud of points; G A and G J of the circle in closed form."""
+    b, h, n = 0.3, 0.1, 400
+    x, y = (s * ((np.arange(n) + 0.5) / n - 0.5) for s in (b, h))
+    first, second = np.meshgrid(x, y, indexing="ij")
+    for shape, inside in (
+        (nts.Rectangle(b, h), np.ones_like(first)),
+        (nts.Circle(h / 2), first**2 + second**2 < (h / 2) ** 2),
+    ):
+        found = shape.section(young=3.0, poisson=0.25, density=2.0)
+        weights = b * h / n**2 * inside
+        moments = (weights * second**2).sum(), (weights * first**2).sum()
+        assert found.EA == pytest.approx(3 * weights.sum(), rel=2e-3)
+        assert found.rhoA == pytest.approx(2 * weights.sum(), rel=2e-3)
+        assert found.EI == pytest.approx(3 * np.array(moments), rel=2e-3)
+        assert found.rhoI == pytest.approx(2 * np.array(moments), rel=2e-3)
+    circle = nts.Circle(0.1).section(young=2.6, poisson=0.3, density=1.0)
+    assert circle.GJ == pytest.approx(np.pi * 0.1**4 / 2)
+    assert circle.GA == pytest.approx([np.pi * 0.01 * 0.886] * 2, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: nts.Circle(0.0), "^radius=0.0: must be positive"),
+        (lambda: nts.Rectangle(1.0, np.inf), "^height=inf"),
+        (lambda: nts.Circle(1).section(young=-1, poisson=0, density=1), "^young=-1"),
+        (lambda: nts.Circle(1).section(young=1, poisson=0.6, density=1), "^poisson=0.6: must lie"),
+        (lambda: nts.Rectangle(1, 1).section(young=1, poisson=0, density=0), "^density=0"),
+    ],
+)
+def test_shapes_that_are_none_are_told(make, text):
+    with pytest.raises(ValueError, match=text):
+        make()
+
+
+def first_frequency(section, length):
+    """Of a cantilever by Timoshenko's equations [rad/s] (Huang, J. Appl. Mech. 28, 1961)."""
+    stiffness, mass = section.EI[0], section.rhoA
+    r2, s2 = section.rhoI[0] / mass / length**2, stiffness / section.GA[0] / length**2
+
+    def lack(b):
+        root = np.sqrt((r2 - s2) ** 2 + 4 / b**2)
+        alpha, beta = (np.sqrt(0.5 * (k * (r2 + s2) + root)) for k in (-1, 1))
+        both = np.cosh(b * alpha) * np.cos(b * beta), np.sinh(b * alpha) * np.sin(b * beta)
+        return (2 + (b**2 * (r2 - s2) ** 2 + 2) * both[0]
+                - b * (r2 + s2) / np.sqrt(1 - b**2 * r2 * s2) * both[1])  # fmt: skip
+
+    return brentq(lack, 1.0, 4.0) * np.sqrt(stiffness / (mass * length**4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("height", [0.02, 0.2])
+def test_the_first_frequency_of_a_cantilever(height):
+    """Slender, where Euler and Bernoulli are right, and a fifth as thick as long."""
+    section = nts.Rectangle(0.05, height).section(young=2e11, poisson=0.3, density=7800)
+    exact = first_frequency(section, 1.0)
+    if height < 0.05:
+        thin = 1.875104**2 * np.sqrt(section.EI[0] / section.rhoA)
+        assert exact == pytest.approx(thin, rel=1e-3)
+    # Like the first shape, and so small that it stays linear: a node of the beam never turns 1e-3.
+    speed = 1e-4 * exact
+    beam = nts.Beam(
+        interval_mesh(straight(16)), section, bcs=[nts.Clamp(lambda x: x[0] < 1e-9)],
+        direction=(0, 1, 0), velocity=lambda x: speed * np.stack([0 * x[0], 0 * x[0], x[0] ** 2]),
+    )  # fmt: skip
+    period = 2 * np.pi / exact
+    stepper, places = nts.Stepper(nts.System([beam]), EM), [0.0]
+    for _ in range(170):
+        stepper.advance(period / 80)
+        places.append(beam.centreline()[1][-1, 2])
+    stepper.close()
+    places = np.array(places)
+    falls = np.flatnonzero((places[:-1] > 0) & (places[1:] <= 0))
+    at = falls + places[falls] / (places[falls] - places[falls + 1])
+    # Half a period, then whole ones.
+    assert len(at) == 2
+    assert (at[1] - at[0]) / 80 == pytest.approx(1.0, abs=0.01)
 
 
 # ---- joints

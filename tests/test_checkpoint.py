@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import textwrap
 import threading
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import h5py
 import numpy as np
@@ -23,7 +25,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
-from dolfinx_nts.output.checkpoint_file import Numbering, describe, differences, previous
+from dolfinx_nts.output.state_file import Numbering, describe, differences, previous
 
 COMM = MPI.COMM_WORLD
 DT, STEPS, EVERY = 2e-3, 14, 9
@@ -248,6 +250,63 @@ def test_on_other_ranks(scene, integrator, mpi_tmp_path):
         COMM.barrier()
 
 
+@pytest.mark.slow
+def test_from_two_ranks_to_three(on_ranks, tmp_path):
+    """The last third of a run of two ranks, made again by three, and matched by places."""
+    code = f"""
+        import sys
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from pathlib import Path
+        import test_checkpoint as t
+        folder, first = Path({str(tmp_path)!r}), t.COMM.size == 2
+        for name in ("blocks", "mechanism"):
+            scene, file = t.SCENES[name](t.COMM), folder / f"{{name}}.h5"
+            if first:
+                found = t.run(scene, checkpoint=t.nts.Checkpoint(file, every=t.EVERY))
+            else:
+                found = t.run(scene, start=t.nts.restart(t.previous(file), scene[0]))
+            found.save(folder / f"{{name}} {{t.COMM.size}}.h5")
+    """
+    for ranks in (2, 3):
+        on_ranks(ranks, "-c", textwrap.dedent(code))
+    for name in ("blocks", "mechanism"):
+        one, other = (nts.load(tmp_path / f"{name} {ranks}.h5") for ranks in (2, 3))
+        assert len(one.rows) == len(other.rows) == STEPS + 1 and one.time == other.time
+        for of in ("reference", "u", "v"):
+            mine, theirs = ([body[of] for body in run.bodies.values()] for run in (one, other))
+            off = np.concatenate(mine) - np.concatenate(theirs)
+            assert np.abs(off).max() < 1e-12 * np.abs(np.concatenate(mine)).max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["os.kill(os.getpid(), signal.SIGKILL)", "raise OSError('gone')"])
+def test_a_rank_that_ends_takes_the_others_along(end, on_ranks, tmp_path):
+    """No hang; what was written until then is whole, and the run goes on from it."""
+    path = tmp_path / "run.h5"
+    code = f"""
+        import os, signal, sys
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        import test_checkpoint as t
+
+        def before(time, dt):
+            if t.COMM.rank == 1 and time > 7.5 * t.DT:
+                {end}
+
+        scene = t.blocks(t.COMM)
+        found = t.run(scene, before_step=before, checkpoint=t.nts.Checkpoint({str(path)!r}, every=3))
+        print("status", found.status)
+        sys.exit("not completed")
+    """
+    said = on_ranks(2, "-c", textwrap.dedent(code), well=False)
+    raised = "raise" in end
+    assert ("OSError('gone')" in said and "status before_step" in said) == raised
+    scene = blocks(COMM)
+    start = nts.restart(path, scene[0])
+    # Every third step; a run that ends in order writes its last one, too.
+    assert len(start.rows) == 1 + (8 if raised else 6)
+    assert run(scene, start=start).status == "completed"
+
+
 # ---- how often, and files
 @pytest.mark.mpi
 def test_the_balance_and_its_table_go_on(mpi_tmp_path):
@@ -286,15 +345,51 @@ def test_balanced_is_the_run_to_its_tolerance(mpi_tmp_path):
     assert distance(saved, found) < 1e-7
 
 
+def series(folder, name="box"):
+    """Times of a body's files, and its displacements at each."""
+    text = (folder / f"{name}.xdmf").read_text()
+    times = [float(t) for t in re.findall(r'<Time Value="([^"]*)"', text)]
+    places = re.findall(rf"{name}\.h5:/(\d+/displacement)<", text)
+    ElementTree.fromstring(text)
+    with h5py.File(folder / f"{name}.h5", "r") as file:
+        return times, np.array([file[place] for place in places])
+
+
 @pytest.mark.mpi
-def test_fields_do_not_replace_what_is_there(mpi_tmp_path):
-    path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
+@pytest.mark.parametrize("cadence", [{"every": 4}, {"interval": 3.5 * DT}], ids=str)
+def test_fields_go_on_where_the_state_is(cadence, mpi_tmp_path):
+    """Those of a run whose last six steps were lost, and of one that ended too early, too."""
+    path, whole, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "whole", mpi_tmp_path / "fields"
     saves = nts.Checkpoint(path, every=9)
-    run(floor(COMM), t_end=3 * DT, output=[Fields(folder)], checkpoint=saves)
+    for where in (whole, folder):
+        run(floor(COMM), output=[Fields(where, **cadence)], checkpoint=saves)
+    scene = floor(COMM)
+    start = nts.restart(previous(path), scene[0])
+    assert len(start.rows) == 1 + 9
+    run(scene, start=start, t_end=11 * DT, output=[Fields(folder, **cadence)], checkpoint=saves)
+    scene = floor(COMM)
+    start = nts.restart(path, scene[0])
+    assert len(start.rows) == 1 + 11
+    run(scene, start=start, output=[Fields(folder, **cadence)])
+    COMM.barrier()
+    times, wanted = series(whole)
+    steps = [0, 4, 8, 12, 14] if "every" in cadence else [0, 4, 7, 11, 14]
+    assert np.array(times) == pytest.approx(DT * np.array(steps), abs=1e-12)
+    found, values = series(folder)
+    assert found == times and values.shape == wanted.shape
+    assert np.abs(values - wanted).max() <= (0.0 if COMM.size == 1 else 1e-12)
+
+
+@pytest.mark.mpi
+def test_fields_do_not_go_on_with_another_mesh(mpi_tmp_path):
+    path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
+    run(floor(COMM), t_end=3 * DT, checkpoint=nts.Checkpoint(path, every=9))
+    other = nts.RigidBody(box(COMM, (0, 0, 0), (1, 1, 2), 1), density=1e3, name="box")
+    run((nts.System([other]), {}), t_end=DT, output=[Fields(folder)])
     size = (folder / "box.h5").stat().st_size
     scene = floor(COMM)
     start = nts.restart(path, scene[0])
-    with pytest.raises(FileExistsError, match="holds box.xdmf, which a run from a"):
+    with pytest.raises(FileExistsError, match="^folder=.*holds box.xdmf with another mesh"):
         run(scene, start=start, output=[Fields(folder)])
     assert (folder / "box.h5").stat().st_size == size
     done = run(scene, start=start, output=[Fields(mpi_tmp_path / "more")])

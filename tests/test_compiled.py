@@ -31,7 +31,8 @@ def pairs(nc, friction, rule, condense=True):
     master = types.SimpleNamespace(patches=np.zeros((1, nc)))
     elements = FacetElements(
         pair=types.SimpleNamespace(friction=friction, master=master), candidates=candidates,
-        rule=rule, condense=condense, x0=x0, scale=np.ones(N), theta=0.5, master_scale=np.ones(1),
+        contact_gradient=rule, condense=condense, x0=x0, scale=np.ones(N), theta=0.5,
+        master_scale=np.ones(1),
     )  # fmt: skip
     return elements, x1, rng.normal(size=(N, elements.num_constraints))
 

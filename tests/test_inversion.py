@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import two_blocks
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from test_form_body import energy, green
+from test_promises import OPEN, PROMISED, ledger_or_word
 from test_single_mass import PointMass
 
 import dolfinx_nts as nts
@@ -196,6 +198,47 @@ def test_no_step_ends_inside_out(name, accuracy, evaluations):
     assert min(watch.dets) > 0.0 and run.balance["min_det"].min() > 0.0
     tried = len(run.rows) - 1 + run.retries
     assert run.retries >= 8 and len(evaluations) < 15 * tried
+
+
+def struck(speed):
+    return two_blocks.scene(COMM, cells=(3, 2), speed=speed)
+
+
+EM, MP, ADAPT = nts.EnergyMomentum(), nts.Midpoint(), nts.Adapt()
+BOTH = ("exact", "balanced")
+HARD = {
+    "200 m/s": (lambda: struck(200.0), EM, 2e-4, 2e-3, None, BOTH),
+    "200 m/s, adapt": (lambda: struck(200.0), EM, 2e-4, 2e-3, ADAPT, ("balanced",)),
+    "200 m/s, midpoint": (lambda: struck(200.0), MP, 2e-4, 2e-3, None, ("balanced",)),
+    "100 m/s, midpoint": (lambda: struck(100.0), MP, 2e-4, 2e-3, None, BOTH),
+    "100 m/s, midpoint, adapt": (lambda: struck(100.0), MP, 2e-4, 2e-3, ADAPT, ("balanced",)),
+    "1e3 g": (lambda: dropped(1e3), EM, 1e-3, 0.02, None, BOTH),
+    "1e3 g, midpoint": (lambda: dropped(1e3), MP, 1e-3, 0.02, None, ("balanced",)),
+    "1e4 g": (lambda: dropped(1e4), EM, 1e-4, 3e-3, None, BOTH),
+    "1e4 g, midpoint": (lambda: dropped(1e4), MP, 1e-4, 3e-3, None, ("balanced",)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "accuracy"), [(name, accuracy) for name in HARD for accuracy in HARD[name][-1]]
+)
+def test_a_hard_impact_is_whole_or_named(name, accuracy):
+    """Either it completes, or the cell and the remedies stand in the status; never inside out."""
+    make, integrator, dt, t_end, adapt, _ = HARD[name]
+    watch = Watch()
+    run = nts.simulate(
+        make(), integrator, dt=dt, t_end=t_end, accuracy=accuracy, adapt=adapt, output=[watch]
+    )
+    assert run.balance["active"].max() > 0
+    assert min(watch.dets) > 0.0 and run.balance["min_det"].min() > 0.0
+    ledger_or_word(run, PROMISED[accuracy] if integrator.closes_ledger else OPEN)
+    if run.status.startswith("completed"):
+        assert run.balance["time"][-1] == pytest.approx(t_end, rel=1e-12)
+    else:
+        assert "a cell of body '" in run.status and SENTENCE in run.status
+        assert " near X = (" in run.status
+        assert "smaller loads, a finer mesh or another energy may prevent it" in run.status
 
 
 @pytest.mark.mpi

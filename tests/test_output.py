@@ -470,7 +470,7 @@ def test_a_place_that_cannot_be_written_stops_before_any_step(mpi_tmp_path):
 
 
 def test_fields_of_bodies_without_a_mesh(tmp_path):
-    system = SimpleNamespace(bodies=["ball"], contacts=[], comm=COMM)
+    system = SimpleNamespace(bodies=[nts.Body()], contacts=[], comm=COMM)
     with pytest.raises(ValueError, match=r"folder='.*no body has a mesh; leave Fields out"):
         output.Fields(tmp_path).start(SimpleNamespace(system=system))
 

@@ -427,6 +427,41 @@ def test_constraints_that_nobody_can_follow_are_refused():
     assert run.status.startswith("completed") and len(run.rows) == 2
 
 
+class Telling(nts.EveryStep):
+    """Warns of bodies that have moved by 12.5 mm when a step begins, and gives way once."""
+
+    firm = True
+
+    def warnings(self, parts):
+        x = self._begun[0].state.u
+        way = COMM.allreduce(max(float(np.abs(u).max(initial=0.0)) for u in x), op=MPI.MAX)
+        return [("way", way, f"a body has moved by {way:.3g} m")] if way > 0.0125 else []
+
+    def give_way(self):
+        was, self.firm = self.firm, False
+        return was
+
+
+@pytest.mark.mpi
+def test_a_coupling_of_ones_own_warns_and_gives_way():
+    body, x = cube((0, 0, 0), "a", velocity=(1.0, 0.0, 0.0)), np.array([0.3, 0.4, 0.6])
+
+    class Told(Drive):
+        def coupling(self, bodies):
+            return Telling(bodies, super().coupling(bodies)._make)
+
+    stepper = nts.Stepper(nts.System([body], joints=[Told(body, x, 1.0)]), nts.EnergyMomentum())
+    for _ in range(5):
+        stepper.advance(5e-3)
+    # The steps start 0, 5, 10, 15 and 20 mm from the start.
+    (found,) = stepper.solution.warnings.values()
+    assert (found.kind, found.count) == ("way", 2)
+    assert found.worst == pytest.approx(0.02, abs=1e-9)
+    problem = stepper.problem
+    assert [problem.give_way(), problem.give_way()] == [True, False]
+    stepper.close()
+
+
 # ---- resultants
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PushElements(nts.PointElements):

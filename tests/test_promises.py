@@ -11,9 +11,26 @@ from mpi4py import MPI
 from test_single_mass import PointMass
 
 import dolfinx_nts as nts
+from dolfinx_nts.output import BalanceCSV
 from dolfinx_nts.step.promises import Promises
 
 COMM = MPI.COMM_WORLD
+#: What the ledger may miss of the largest energy without a word, by accuracy, where a rule closes
+#: it, and where none does (README).
+PROMISED, OPEN = {"exact": 1e-11, "balanced": 1e-8, "fast": 1e-5}, 1e-2
+
+
+def ledger_or_word(run, promised=1e-8):
+    """What the ledger misses of the largest energy; more than `promised` is told.
+
+    Args:
+        run: A run, complete or not.
+        promised: Of the integrator and accuracy; OPEN of one that does not close the ledger.
+    """
+    table, names = run.balance, ("kinetic", "potential", "external_work", "friction_dissipation")
+    missing = np.abs(table["ledger_residual"]) / max(np.abs(table[name]).max() for name in names)
+    assert missing.max() <= promised or "ledger" in run.warnings
+    return missing.max()
 
 
 def limited(c):
@@ -96,6 +113,34 @@ def test_a_ledger_that_stays_open_is_told(integrator, words):
     assert np.isclose(warning.worst, np.abs(run.balance["ledger_residual"]).max(), rtol=1e-12)
     assert run.status == f"completed, but {warning.text}"
     assert "warning, ledger" in run.summary
+
+
+@pytest.mark.slow
+@pytest.mark.mpi
+@pytest.mark.parametrize("accuracy", PROMISED)
+@pytest.mark.parametrize("part", [0.5, 2.0])
+def test_a_broken_promise_is_told(part, accuracy, mpi_tmp_path):
+    """Half of what may be missing says nothing, twice as much stands wherever warnings do."""
+    path, promised = mpi_tmp_path / "balance.csv", PROMISED[accuracy]
+    run = nts.simulate(
+        nts.System([Sprung(1.0 + part * promised)]), nts.EnergyMomentum(), dt=0.05, t_end=1.5,
+        accuracy=accuracy, output=[BalanceCSV(path)],
+    )  # fmt: skip
+    # Of the energy at the start all but cos^2(1.5), 0.5 %, turns into kinetic energy.
+    missing = np.abs(run.balance["ledger_residual"]).max() / run.balance["energy"][0]
+    assert missing == pytest.approx(0.995 * part * promised, rel=1e-2)
+    COMM.Barrier()
+    text, summary = path.read_text(), run.summary
+    assert run.status == "completed"
+    if part < 1.0:
+        assert not run.warnings and "warning" not in summary + text
+        return
+    warning = run.warnings["ledger"]
+    assert not warning.grave and f"this accuracy promises {promised:.0e};" in warning.text
+    assert warning.count == np.sum(run.balance["ledger_residual"] < -0.5 * promised)
+    assert warning.first in run.balance["time"]
+    for place in (summary, text):
+        assert f"warning, ledger: {warning.count} step" in place and warning.text in place
 
 
 @pytest.mark.mpi

@@ -25,7 +25,7 @@ INTEGRATORS = {
 }
 
 
-class PointMass:
+class PointMass(nts.Body):
     """A mass at one point; rank 0 owns its three coordinates."""
 
     def __init__(self, comm, mass, position, velocity, name="mass"):
@@ -64,14 +64,8 @@ class PointMass:
     def potential(self, u):
         return 0.0
 
-    def linear_momentum(self, momentum):
-        return momentum.reshape(-1, 3).sum(axis=0)
-
-    def angular_momentum(self, u, momentum):
-        x = (self.reference + u).reshape(-1, 3)
-        return np.cross(x, momentum.reshape(-1, 3)).sum(axis=0)
-
     def accept(self, u, v):
+        super().accept(u, v)
         self.u, self.v = u.copy(), v.copy()
 
 
@@ -204,6 +198,24 @@ def test_free_flight_under_gravity(integrator):
             assert np.allclose(mass.u, path, rtol=0, atol=1e-14)
     assert np.abs(stepper.solution.balance["ledger_residual"]).max() < 1e-12
     stepper.close()
+
+
+@pytest.mark.mpi
+def test_what_a_body_inherits():
+    """Defaults of a body of one's own; what does not inherit them is refused."""
+    mass = PointMass(COMM, MASS, (1.0, 2.0, 3.0), (0.5, 0.0, 1.0))
+    n = mass.num_owned
+    assert mass.mesh is None and mass.joints == () and not (mass.driven or mass.oriented)
+    assert np.array_equal(mass.initial_displacement, np.zeros(n)) and mass.places.sum() == n // 3
+    assert mass.reactions(np.ones(n)).shape == (0, 3) and mass.reaction_labels == []
+    assert mass.smallest_det(np.zeros(n))[0] == np.inf and mass.file_order().tolist() == [0]
+    assert np.array_equal(mass.weight(np.array([0.0, 0.0, -2.0])), [0.0, 0.0, -2.0 * MASS][:n])
+    momentum = COMM.allreduce(mass.angular_momentum(np.zeros(n), MASS * mass.initial_velocity))
+    assert np.allclose(momentum, np.cross([1.0, 2.0, 3.0], [0.5 * MASS, 0.0, MASS]), rtol=1e-15)
+    with pytest.raises(TypeError, match=r"^body 'mass' has no points\(\): joints and springs need"):
+        nts.Spherical(mass, None, point=(1.0, 2.0, 3.0))
+    with pytest.raises(TypeError, match=r"^bodies\[0\]=3: .* inherits from nts.Body"):
+        nts.System([3])
 
 
 def test_motion_below_rounding_is_rest():

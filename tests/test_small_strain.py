@@ -224,3 +224,28 @@ def test_ledger_far_from_the_origin(away):
 def test_ledger_of_an_energy_of_c_far_from_the_origin():
     """Nor does its floor grow with the distance: the same energy as a function of C."""
     assert impact(2.0, 0.05, 1e10, lambda c: RUBBER(c)) < 1e-11
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("accuracy", ["exact", "balanced"])
+@pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()], ids=["mp", "em"])
+@pytest.mark.parametrize("meshed", [False, True])
+def test_ledger_of_a_cube_that_hardly_weighs(meshed, integrator, accuracy):
+    """At 1e-6 g a cube of rubber sinks by 1e-8 of its edge: energies of 1e-10 J of 1e6 Pa."""
+    box = dict(cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
+    gap = 1e-9
+    mesh = create_box(COMM, [[0, 0, gap], [1, 1, 1 + gap]], [2] * 3, **box)
+    cube = nts.Continuum(mesh, RUBBER, density=1e3, name="cube")
+    bodies, master = [cube], nts.Plane((0, 0, 0), (0, 0, 1))
+    if meshed:
+        held = nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)
+        mesh = create_box(COMM, [[-1, -1, -0.5], [2, 2, 0]], [3, 3, 1], **box)
+        floor = nts.Continuum(mesh, RUBBER, density=1e3, name="floor", bcs=[held])
+        bodies, master = [cube, floor], floor.surface(lambda x: x[2] > -1e-9)
+    pair = nts.ContactPair(cube.surface(lambda x: x[2] < gap * 1.5), master)
+    system = nts.System(bodies, contacts=[pair], gravity=(0, 0, -9.81e-6))
+    run = nts.simulate(system, integrator, dt=2e-3, t_end=0.08, accuracy=accuracy)
+    table = run.balance
+    assert run.status == "completed" and not run.warnings and table["active"].max() == 9
+    # Of the kinetic energy, the smallest of all terms of the ledger.
+    assert np.abs(table["ledger_residual"]).max() < 1e-9 * table["kinetic"].max()

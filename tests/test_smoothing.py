@@ -195,20 +195,21 @@ def test_smoothing_of_triangles(shape, part, uneven):
     assert np.abs(others).max() < 1e-3 * faceted
 
 
-def bumpy(comm, smoothing, kind=CellType.hexahedron, metre=1.0):
-    """A block that slides over the waves of a plate; both are free."""
+def bumpy(comm, smoothing, kind=CellType.hexahedron, metre=1.0, arch=False):
+    """A block that slides over the waves of a plate, or over an arch; both are free."""
     cells = {"cell_type": kind, "ghost_mode": GhostMode.shared_facet}
     mesh = create_box(comm, [[0, 0, 0], [1.2, 1, 0.3]], [6, 5, 1], **cells)
     top = locate_facets(mesh, lambda x: x[2] > 0.3 - 1e-9, None, "top")
     one = np.full(len(top), 1, np.int32)
     tags = meshtags(mesh, 2, np.sort(top), one)
     x, y, z = mesh.geometry.x.T
-    mesh.geometry.x[:, 2] += 0.03 * np.sin(6 * x) * np.cos(4 * y) * z / 0.3
+    bumps = 0.1 * np.sin(np.pi * x / 1.2) if arch else 0.03 * np.sin(6 * x) * np.cos(4 * y)
+    mesh.geometry.x[:, 2] += bumps * z / 0.3
     mesh.geometry.x[:] *= metre
     # Of a scene in mm and tonnes, say: mass and time keep their units.
     rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
     plate = nts.Continuum(mesh, rubber, density=1e4 / metre**3, name="plate")
-    low = 0.335
+    low = 0.41 if arch else 0.335
     mesh = create_box(comm, [[0.21, 0.23, low], [0.61, 0.63, low + 0.3]], [2, 2, 1], **cells)
     mesh.geometry.x[:] *= metre
     velocity = metre * np.array([2.0, 0.7, -1.0])
@@ -240,6 +241,21 @@ def test_momentum_and_energy_on_any_number_of_ranks(smoothing, kind):
     for name in ("energy", "contact_defect", "linear_momentum", "angular_momentum", "active"):
         scale = max(np.abs(alone[name]).max(), alone["energy"][0])
         assert np.abs(table[name] - alone[name]).max() <= 1e-9 * scale
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_tetrahedra_on_a_smoothed_arch_keep_what_balanced_promises(friction):
+    """They slide over it in contact; what an iteration leaves must not add up to 1e-8 E0."""
+    (pair,) = (scene := bumpy(COMM, True, CellType.tetrahedron, arch=True)).contacts
+    pair = nts.ContactPair(pair.slave, pair.master, friction=friction)
+    scene = nts.System(scene.bodies, contacts=[pair], gravity=(0.0, 0.0, -20.0))
+    run = nts.simulate(scene, nts.EnergyMomentum(), dt=4e-3, t_end=0.2, accuracy="balanced")
+    table = run.balance
+    assert run.status == "completed" and "ledger" not in run.warnings
+    assert np.count_nonzero(table["active"] >= 2) > 10
+    # Energies beside gravity's work, which both fall by.
+    assert np.abs(table["ledger_residual"]).max() <= 1e-8 * table["energy"][0]
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from test_obstacle_friction import sliding
+from test_promises import PROMISED, ledger_or_word
 from test_single_mass import INTEGRATORS, MASS, turn
 
 import dolfinx_nts as nts
@@ -34,15 +35,7 @@ def box(low, high, parts, name, velocity=(0, 0, 0), bcs=()):
 @pytest.mark.fast_on_ranks("False-inf-exact", "True-inf-balanced")
 def test_a_cube_flush_with_a_wall_falls_freely(meshed, friction, accuracy):
     """No force presses it to the wall, so none of friction's acts: v = -g t."""
-    cube = box((0, 0, 0), (1, 1, 1), (2, 2, 2), "cube")
-    side, bodies = cube.surface(lambda x: x[0] < 1e-9), [cube]
-    master = nts.Plane((0, 0, 0), (1, 0, 0))
-    if meshed:
-        still = nts.Dirichlet(lambda x: x[0] < 1e-9)
-        wall = box((-0.5, -1, -1.1), (0, 2, 2.1), (1, 3, 3), "wall", bcs=[still])
-        master, bodies = wall.surface(lambda x: x[0] > -1e-9), [cube, wall]
-    pair = nts.ContactPair(side, master, friction=friction)
-    system = nts.System(bodies, contacts=[pair], gravity=(0, 0, -GRAVITY))
+    system = flush(meshed, friction)
     run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.02, accuracy=accuracy)
     assert run.status == "completed" and run.retries == 0
     momentum = run.balance["linear_momentum"]
@@ -50,6 +43,40 @@ def test_a_cube_flush_with_a_wall_falls_freely(meshed, friction, accuracy):
     assert not run.balance["active"].any()
     assert run.balance["friction_dissipation"][-1] == 0.0
     assert run.balance["min_gap"].min() > -2e-15
+
+
+def flush(meshed, friction, gap=0.0):
+    """A cube beside a vertical wall that is `gap` away."""
+    cube = box((0, 0, 0), (1, 1, 1), (2, 2, 2), "cube")
+    side, bodies = cube.surface(lambda x: x[0] < 1e-9), [cube]
+    master = nts.Plane((-gap, 0, 0), (1, 0, 0))
+    if meshed:
+        still = nts.Dirichlet(lambda x: x[0] < 1e-9)
+        wall = box((-0.5, -1, -1.1), (-gap, 2, 2.1), (1, 3, 3), "wall", bcs=[still])
+        master, bodies = wall.surface(lambda x: x[0] > -1e-9), [cube, wall]
+    pair = nts.ContactPair(side, master, friction=friction)
+    return nts.System(bodies, contacts=[pair], gravity=(0, 0, -GRAVITY))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.0, 1e-12])
+@pytest.mark.parametrize(
+    ("integrator", "friction", "meshed", "accuracy"),
+    [
+        (nts.EnergyMomentum(), 5.0, True, "balanced"), (nts.EnergyMomentum(), 50.0, False, "exact"),
+        (nts.Midpoint(), 5.0, False, "exact"), (nts.Midpoint(), 5.0, True, "balanced"),
+        (nts.Midpoint(), 50.0, False, "balanced"), (nts.Midpoint(), np.inf, True, "exact"),
+    ],
+)  # fmt: skip
+def test_the_way_along_a_wall_is_that_of_free_fall(integrator, friction, meshed, accuracy, gap):
+    """Of each node g t^2 / 2 = 0.04905 m in 0.1 s, whether the wall is flush or 1e-12 m away."""
+    system = flush(meshed, friction, gap)
+    run = nts.simulate(system, integrator, dt=2e-3, t_end=0.1, accuracy=accuracy)
+    assert run.status == "completed" and run.retries == 0 and not run.warnings
+    (cube, *_), u = system.bodies, run.state.u[0].reshape(-1, 3)
+    assert cube.name == "cube" and np.abs(u[:, :2]).max(initial=0.0) < 1e-12
+    assert np.abs(u[:, 2] + 0.5 * GRAVITY * 0.1**2).max(initial=0.0) < 1e-12
+    assert run.balance["friction_dissipation"][-1] == 0.0
 
 
 @pytest.mark.mpi
@@ -170,9 +197,10 @@ def _disc(friction, integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("gap", [0.05, 0.0499])
-@pytest.mark.fast("0.05-exact")
+@pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])
+@pytest.mark.fast("energy-momentum-0.05-exact")
 @pytest.mark.fast_on_ranks()
-def test_cubes_that_meet_at_the_end_of_a_step(gap, accuracy):
+def test_cubes_that_meet_at_the_end_of_a_step(integrator, gap, accuracy):
     """mu = 1e6 binds as no bound does; at 5 m/s a gap of 0.05 m closes after five steps."""
     energies = []
     for friction in (1e6, np.inf):
@@ -182,7 +210,7 @@ def test_cubes_that_meet_at_the_end_of_a_step(gap, accuracy):
         master = right.surface(lambda x: x[0] < 1 + gap + 1e-9)
         pair = nts.ContactPair(slave, master, friction=friction)
         system = nts.System([left, right], contacts=[pair])
-        run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.03, accuracy=accuracy)
+        run = nts.simulate(system, integrator, dt=2e-3, t_end=0.03, accuracy=accuracy)
         assert run.status == "completed" and run.retries == 0
         assert run.balance["linear_momentum"][-1, 0] == pytest.approx(5e3, rel=1e-9)
         energies.append(run.balance["energy"][-1])
@@ -190,6 +218,19 @@ def test_cubes_that_meet_at_the_end_of_a_step(gap, accuracy):
 
 
 # ---- a heavy slave on a light master
+def large_on_small(place, friction, n):
+    """A cube of one cell on a plate of n^2 facets, 50 of which are as wide as the cube."""
+    fine = 1 / 50
+    still = nts.Dirichlet(lambda x: x[2] < -fine + 1e-9)
+    plate = box((0, 0, -fine), (n * fine, n * fine, 0), (n, n, 1), "plate", bcs=[still])
+    cube = box((place, place, 0), (place + 1, place + 1, 1), (1, 1, 1), "cube")
+    pair = nts.ContactPair(
+        cube.surface(lambda x: x[2] < 1e-9), plate.surface(lambda x: x[2] > -1e-9),
+        friction=friction,
+    )  # fmt: skip
+    return nts.System([cube, plate], contacts=[pair], gravity=(0, 0, -GRAVITY))
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.3, 5.0, np.inf])
 @pytest.mark.parametrize("place", [-4e-4, 0.0, 0.062])
@@ -200,16 +241,21 @@ def test_one_large_element_stands_on_small_facets(place, friction):
 
     At the plate's corner they are heavier still, also a little outside of it.
     """
-    fine = 1 / 50
-    still = nts.Dirichlet(lambda x: x[2] < -fine + 1e-9)
-    plate = box((0, 0, -fine), (10 * fine, 10 * fine, 0), (10, 10, 1), "plate", bcs=[still])
-    cube = box((place, place, 0), (place + 1, place + 1, 1), (1, 1, 1), "cube")
-    pair = nts.ContactPair(
-        cube.surface(lambda x: x[2] < 1e-9), plate.surface(lambda x: x[2] > -1e-9),
-        friction=friction,
-    )  # fmt: skip
-    system = nts.System([cube, plate], contacts=[pair], gravity=(0, 0, -GRAVITY))
+    system = large_on_small(place, friction, 10)
     run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=3e-3)
     assert run.status == "completed" and run.retries == 0
     assert run.balance["active"][-1] == 1
     assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * run.balance["kinetic"].max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", [0.3, np.inf])
+@pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])
+def test_one_large_element_presses_a_plate_of_400_facets(integrator, friction):
+    """20 steps, in which the facets under its node give way: it neither stops nor is told of."""
+    system = large_on_small(0.0, friction, 20)
+    run = nts.simulate(system, integrator, dt=1e-3, t_end=0.02, accuracy="balanced")
+    assert run.status == "completed" and run.retries == 0 and not run.warnings
+    assert run.balance["active"].max() == 1
+    closed = PROMISED["balanced"] if integrator.closes_ledger else 1e-5
+    assert ledger_or_word(run, closed) < closed

@@ -15,14 +15,14 @@ from scipy.spatial import cKDTree
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.axis import axis_of, check_line
-from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.bodies.body import Body, Moment
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.section import Clamp, PointForce, Section
 from dolfinx_nts.bodies.triad import Triads, largest_turn
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.integrators.rule import taken_at
 from dolfinx_nts.kernels import beam as kernel
-from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.validation import (
     at_points,
@@ -46,7 +46,7 @@ _PLACE = np.array([[1.0, 0.0, 0.0, 0.0]])
 
 
 @known_options
-class Beam:
+class Beam(Body):
     """A beam on a mesh of its axis, straight or curved, with shear, stretch, bending and twist.
 
     A node has twelve coordinates: its place phi and D_i = l d_i, l the section's radius of gyration
@@ -81,6 +81,8 @@ class Beam:
             has a cell without length, a branch or a corner.
     """
 
+    oriented = True
+
     def __init__(
         self,
         mesh: Any,
@@ -112,7 +114,7 @@ class Beam:
         along = np.empty_like(self._axis.order)
         along[self._axis.order] = np.arange(len(along))
         triads = Triads(self, self._points(held, _PLACE), self.length, along[held])
-        self.joints: tuple[Any, ...] = (triads,)
+        self.joints = (triads,)
         self._matrix: Any = None
         self.accept(np.zeros(self.num_owned), self.initial_velocity)
 
@@ -255,7 +257,7 @@ class Beam:
         Returns:
             In the reference X and now x [m], shape (n, 3) each.
         """
-        moved = gather_rows(self.comm, self.accepted[0].reshape(-1, 4, 3)[:, 0])
+        moved = gather_rows(self.comm, self.last_accepted()[0].reshape(-1, 4, 3)[:, 0])
         order = self._axis.order
         return self._axis.x[order], self._axis.x[order] + moved[order]
 
@@ -321,11 +323,11 @@ class Beam:
         """Values of the axis at the mesh's nodes on this rank, as of `space`."""
         return values.reshape(-1, 4, 3)[:, 0].ravel()
 
-    # ---- Body protocol
+    # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         self._y0 = self._vectors(moment.u0)
-        self._theta = _place(rule)
+        self._theta = taken_at(rule)
         self._load = self._loads_at(moment.time, moment.ramp)
 
     def _loads_at(self, time: float, ramp: float) -> FloatArray:
@@ -359,8 +361,7 @@ class Beam:
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
         """Point forces and gravity [N]."""
-        acceleration = np.tile(gravity, len(self.places)) * np.repeat(self.places, 3)
-        return self._load + self.nodal_mass * acceleration
+        return self._load + self.weight(gravity)
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """Return mass M + stiffness K, the same matrix in each call. Collective."""
@@ -413,17 +414,6 @@ class Beam:
         mean = self._diagonal.reshape(-1, 3).mean(axis=1)
         return np.repeat(mean, 3)
 
-    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
-        """This rank's part of the sum of the places' momenta [kg m/s]."""
-        total: FloatArray = momentum.reshape(-1, 4, 3)[:, 0].sum(axis=0)
-        return total
-
-    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
-        """This rank's part of sum y_a x p_a [kg m^2/s]."""
-        y = (self.reference + u).reshape(-1, 3)
-        moment: FloatArray = cross(y, momentum.reshape(-1, 3)).sum(axis=0)
-        return moment
-
     def potential(self, u: FloatArray) -> float:
         """Strain energy on this rank [J]. Collective."""
         return float(kernel.energy(self._beams, self._vectors(u)).sum())
@@ -442,7 +432,7 @@ class Beam:
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""
-        self.accepted = u, v
+        super().accept(u, v)
         for function, values in ((self.u, u), (self.v, v)):
             function.x.array[: self.num_owned // 4] = self.at_mesh(values)
             function.x.scatter_forward()
@@ -452,8 +442,3 @@ class Beam:
         for a in (self._shared, self._matrix):
             if a is not None:
                 a.destroy()
-
-
-def _place(rule: Integrator) -> float | None:
-    """Where a rule takes forces between t_n and t_{n+1}; None: by discrete gradients."""
-    return rule.theta if rule.contact_gradient == "direct" else None

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.integrators import Integrator
 
 FloatArray = npt.NDArray[np.float64]
@@ -32,31 +35,13 @@ class Moment(NamedTuple):
     drift: FloatArray | None = None
 
 
-def places_of(body: Any) -> BoolArray:
-    """Whether each of this rank's nodes is a place, t_a = 1, or a director (theory section 11)."""
-    given = getattr(body, "places", None)
-    return np.ones(body.num_owned // 3, dtype=bool) if given is None else given
-
-
-def motion_of_points(body: Any, du: FloatArray) -> float:
-    """Bound on the components of the motion of a body's material points on this rank [m].
-
-    It is that of the coordinates unless the body has a method of this name, of `du` alone.
-
-    Args:
-        body: The body.
-        du: Change of its owned coordinates [m].
-    """
-    if hasattr(body, "motion_of_points"):
-        return float(body.motion_of_points(du))
-    return float(np.abs(du).max(initial=0.0))
-
-
-class Body(Protocol):
-    """What a System asks of a body with coordinates q = X + u and a constant mass matrix (39).
+class Body:
+    """A body with coordinates q = X + u and a constant mass matrix (39); what all bodies inherit.
 
     A body knows neither the step's length nor the name of its integrator, which is the `rule` that
-    tells how forces follow from two states.
+    tells how forces follow from two states. A body of one's own sets the first seven attributes and
+    has the first seven methods. All else has a default here, which is that of a body whose
+    coordinates are the places of material points, free of conditions, without a mesh.
 
     Attributes:
         name: Unique in a system.
@@ -64,20 +49,21 @@ class Body(Protocol):
         num_owned: Coordinates this rank owns; the global numbering is contiguous by rank.
         reference: X [m], shape (num_owned,).
         initial_velocity: v at the start [m/s], shape (num_owned,).
-        initial_displacement: u at the start [m], shape (num_owned,); may be missing, and is 0 then.
         nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
         fixed: Positions of the prescribed coordinates among the owned ones.
-        places: Which of this rank's nodes are places that move with a translation, t_a = 1, shape
-            (num_owned / 3,); the others are directors, which only turn. May be missing: all are.
-        joints: Constraints among its own coordinates, see `Joint`; may be missing.
-        file_order: Callable without arguments, collective: on rank 0, which of the nodes of all
-            ranks, rank after rank, comes first in files, which second: an order that does not
-            depend on the ranks. May be missing: rank after rank.
-        driven: Whether prescribed coordinates follow functions of time; may be missing: no.
-        turn: Callable (u0, u1): largest turn of its directors between two displacements [rad], on
-            this rank, of which a run warns if it is far in a step. May be missing.
+        mesh: DOLFINx mesh whose nodes move with the body; None: it has none, hence no surface, no
+            fields and no pictures. With one come `u` and `v`, dolfinx Functions on it.
+        space: Their function space.
+        degree: Its polynomial degree; None without a mesh.
+        joints: Constraints among its own coordinates, see `Joint`.
+        driven: Whether prescribed coordinates follow functions of time.
+        rigid: Whether no motion changes distances in it, so that `directions` turn with it.
+        oriented: Whether it has directors, and with them `length`, `directions_at` and `turn`.
+        length: What its directors are multiples of [m].
         rounded: Length [m], the same on all ranks, whose rounding the forces hold beside that of u;
-            may be missing, and is that of the positions then.
+            None: that of the positions.
+        allow_inversion: Whether steps are accepted that end with `smallest_det` <= 0.
+        has_massless: Whether coordinates on any rank have no mass.
     """
 
     name: str
@@ -88,17 +74,35 @@ class Body(Protocol):
     nodal_mass: FloatArray
     fixed: IntArray
 
+    mesh: Any = None
+    space: Any = None
+    degree: int | None = None
+    joints: tuple[Any, ...] = ()
+    driven: bool = False
+    rigid: bool = False
+    oriented: bool = False
+    length: float
+    rounded: float | None = None
+    allow_inversion: bool = False
+    has_massless: bool = False
+    _accepted: tuple[FloatArray, FloatArray] | None = None
+
+    # ---- what each body has of its own
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Fix what the evaluations of a step have in common."""
+        raise NotImplementedError
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v."""
+        raise NotImplementedError
 
     def internal(self, u1: FloatArray) -> FloatArray:
         """Internal forces between u_0 and u_1 by the rule [N]."""
+        raise NotImplementedError
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
-        """External forces of the step [N]; their work is f . (u_1 - u_0)."""
+        """External forces of the step [N]; their work is f . (u_1 - u_0). See `weight`."""
+        raise NotImplementedError
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """PETSc matrix mass M + stiffness d(internal - external)/du_1.
@@ -106,16 +110,72 @@ class Body(Protocol):
         The same matrix in each call, with the same pattern. Rows and columns of `fixed` hold only a
         diagonal.
         """
+        raise NotImplementedError
+
+    def prescribed(self, time: float) -> FloatArray:
+        """Displacement of the `fixed` coordinates [m]."""
+        raise NotImplementedError
+
+    def potential(self, u: FloatArray) -> float:
+        """Stored energy on this rank [J]."""
+        raise NotImplementedError
+
+    # ---- what may be left as it is
+    @cached_property
+    def initial_displacement(self) -> FloatArray:
+        """Displacement u at the start [m], shape (num_owned,)."""
+        return np.zeros(self.num_owned)
+
+    @cached_property
+    def places(self) -> BoolArray:
+        """Which of this rank's nodes are places, t_a = 1, shape (num_owned / 3,).
+
+        They move with a translation; the others are directors, which only turn (theory section 11).
+        """
+        return np.ones(self.num_owned // 3, dtype=bool)
+
+    @cached_property
+    def massless(self) -> BoolArray:
+        """Which of the owned coordinates have no mass, shape (num_owned,)."""
+        return np.zeros(self.num_owned, dtype=bool)
+
+    def accept(self, u: FloatArray, v: FloatArray) -> None:
+        """Make u and v the body's current state; a body's own `accept` calls this one, too."""
+        self._accepted = u, v
+
+    def last_accepted(self) -> tuple[FloatArray, FloatArray]:
+        """Owned u [m] and v [m/s] of the last accepted state, or of the start."""
+        return self._accepted or (self.initial_displacement, self.initial_velocity)
+
+    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
+        """This rank's part of the sum of the places' momenta [kg m/s], shape (3,)."""
+        total: FloatArray = momentum.reshape(-1, 3)[self.places].sum(axis=0)
+        return total
+
+    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
+        """This rank's part of sum y_a x p_a about the origin [kg m^2/s], shape (3,)."""
+        moment = (self.reference + u).reshape(-1, 3).T @ momentum.reshape(-1, 3)
+        return np.array([moment[i, j] - moment[j, i] for i, j in ((1, 2), (2, 0), (0, 1))])
+
+    def weight(self, gravity: FloatArray) -> FloatArray:
+        """Forces of gravity (3,) [m/s^2], which accelerates places and no directors [N]."""
+        acceleration = np.zeros((len(self.places), 3))
+        acceleration[self.places] = gravity
+        return self.nodal_mass * acceleration.ravel()
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
 
     def nodal_stiffness(self, rule: Integrator) -> FloatArray:
         """Stiffness of each node's neighbourhood at rest [N/m], shape (num_owned,).
 
         What the nodal mass is in dynamics, a scale, is this in statics, which alone asks for it.
         Where it is 0, as of rigid bodies, that of the other bodies counts.
-        """
 
-    def prescribed(self, time: float) -> FloatArray:
-        """Displacement of the `fixed` coordinates [m]."""
+        Raises:
+            NotImplementedError: The body does not tell; `equilibrium` refuses it.
+        """
+        raise NotImplementedError
 
     def reactions(self, residual: FloatArray) -> FloatArray:
         """Resultant of a force [N] on the coordinates of each condition, this rank's part.
@@ -126,22 +186,94 @@ class Body(Protocol):
         Returns:
             Shape (conditions, 3).
         """
+        return np.zeros((0, 3))
 
-    def potential(self, u: FloatArray) -> float:
-        """Stored energy on this rank [J]."""
+    @property
+    def reaction_labels(self) -> list[tuple[str, str]]:
+        """Name and unit of each row of `reactions`."""
+        count = len(self.reactions(np.zeros(self.num_owned)))
+        return [(str(k), "N") for k in range(count)]
 
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
         """Smallest det F on this rank, inf without cells in 3D, and X of its cell [m], shape (3,).
 
-        A body may leave it out; else a step that ends with det F <= 0 is not accepted unless the
-        body's `allow_inversion` is True.
+        A step that ends with det F <= 0 is not accepted unless `allow_inversion` is True.
         """
+        return np.inf, np.full(3, np.nan)
 
-    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
-        """This rank's part of sum x cross p about the origin [kg m^2/s], shape (3,)."""
+    def turn(self, u0: FloatArray, u1: FloatArray) -> float:
+        """Largest turn of its directors between two displacements on this rank [rad].
 
-    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
-        """This rank's part of the linear momentum [kg m/s], shape (3,)."""
+        A run warns of one that is far in a step.
+        """
+        return 0.0
 
-    def accept(self, u: FloatArray, v: FloatArray) -> None:
-        """Make u and v the body's current state."""
+    def parameters(self) -> FloatArray:
+        """Values of the material that a caller may change during a run, shape (n,)."""
+        return np.empty(0)
+
+    def file_order(self) -> IntArray:
+        """Which of the nodes of all ranks, rank after rank, comes first in files, which second.
+
+        An order that does not depend on the ranks; on rank 0. Collective.
+        """
+        return np.arange(self.comm.allreduce(self.num_owned // 3))
+
+    # ---- points
+    def points(self, x: Any) -> Points:
+        """Material points, for joints and springs. Collective.
+
+        Args:
+            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
+
+        Raises:
+            TypeError: The body tells none.
+        """
+        raise TypeError(f"body {self.name!r} has no points(): joints and springs need it, see Body")
+
+    def directions_at(self, direction: FloatArray, x: Any) -> Points:
+        """A direction that turns with a point of an oriented body, for joints. Collective.
+
+        Args:
+            direction: At the start [-], shape (3,).
+            x: Reference position of the point [m], as of `points`.
+        """
+        raise TypeError(f"body {self.name!r} is oriented but has no directions_at(), see Body")
+
+    def directions(self, x: Any) -> Points:
+        """Directions that turn with a rigid body as a whole, for joints and springs. Collective.
+
+        Args:
+            x: At the start [-], shape (3,) or (n, 3), the same on all ranks.
+        """
+        raise TypeError(f"body {self.name!r} is rigid but has no directions(), see Body")
+
+    def motion_of_points(self, du: FloatArray) -> float:
+        """Bound on the components of the motion of its material points on this rank [m].
+
+        Args:
+            du: Change of its owned coordinates [m].
+        """
+        return float(np.abs(du).max(initial=0.0))
+
+    def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
+        """Nodes of its mesh as its material points, for surfaces. Collective.
+
+        Args:
+            nodes: Global numbers in its `space`, sorted, shape (n,), the same on all ranks.
+            x: Reference positions [m], shape (n, 3).
+        """
+        one = np.ones((len(nodes), 1))
+        free = np.zeros((len(nodes), 1, 3), dtype=bool)
+        points = Points(self, nodes[:, None], one, x[:, None], free, one.astype(bool))
+        prescribed = np.zeros(self.num_owned, dtype=bool)
+        prescribed[self.fixed] = True
+        return replace(points, fixed=points.nodal(prescribed))
+
+    def at_mesh(self, values: FloatArray) -> FloatArray:
+        """Values at the nodes of its mesh on this rank, as of its `space`. Collective.
+
+        Args:
+            values: At its owned coordinates, shape (num_owned,).
+        """
+        return values

@@ -191,7 +191,7 @@ class Continuum(UflBody):
         h0, h1 = ufl.grad(self._u0), ufl.grad(self._u1)
         return ufl.inner(rule.piola(self._law, h0, h1), ufl.grad(w)) * self._dx
 
-    # ---- Body protocol
+    # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         if not self._seen_at_rest:

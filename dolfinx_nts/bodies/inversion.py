@@ -102,19 +102,18 @@ def smallest_dets(
     Returns:
         Shape (bodies,).
     """
-    local, known = np.full(len(system.bodies), np.inf), {} if known is None else known
+    local, known = np.empty(len(system.bodies)), {} if known is None else known
     for k, (body, values) in enumerate(zip(system.bodies, u, strict=True)):
-        if hasattr(body, "smallest_det"):
-            if k not in known or known[k][0] is not values:
-                known[k] = values, body.smallest_det(values)[0]
-            local[k] = known[k][1]
+        if k not in known or known[k][0] is not values:
+            known[k] = values, body.smallest_det(values)[0]
+        local[k] = known[k][1]
     system.comm.Allreduce(MPI.IN_PLACE, local, op=MPI.MIN)
     return local
 
 
 def forbidden(system: Any, dets: FloatArray) -> FloatArray:
     """`smallest_dets` with inf at bodies that may turn inside out."""
-    allowed = [getattr(body, "allow_inversion", False) for body in system.bodies]
+    allowed = [body.allow_inversion for body in system.bodies]
     return np.where(allowed, np.inf, dets)
 
 

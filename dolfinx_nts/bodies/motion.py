@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 
-from dolfinx_nts.bodies.body import Body, places_of
+from dolfinx_nts.bodies.body import Body
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -45,12 +46,12 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
     """Mass, centre, velocity, inertia and spin of a body, during and after a run. Collective.
 
     Args:
-        body: Any body with the `Body` protocol.
+        body: Any body.
         u: Owned displacements [m], shape (num_owned,), e.g. `stepper.state.u[0]` in a writer;
-            default: `body.u`, the last accepted ones.
-        v: Owned velocities [m/s], shape (num_owned,); default: `body.v`.
+            default: the last accepted ones.
+        v: Owned velocities [m/s], shape (num_owned,); default: likewise.
     """
-    known = getattr(body, "accepted", (None, None))
+    known = body.last_accepted()
     u, v = _owned(body, "u", u, known[0]), _owned(body, "v", v, known[1])
     place = body.reference + u
     weights = [body.nodal_mass, body.inertia(place), body.inertia(v)]
@@ -59,7 +60,7 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
     mass = float(masses[0])
     centre, velocity = first / mass, momentum / mass
     # About the centre: far from the origin a difference of moments about it would lose digits.
-    moves = places_of(body)[:, None]
+    moves = body.places[:, None]
     arm, off = place.reshape(-1, 3) - moves * centre, u - (moves * centre).ravel()
     turning = [v - (moves * velocity).ravel()]
     turning += [np.cross(axis, arm).ravel() for axis in np.eye(3)]
@@ -73,14 +74,10 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
     return BodyMotion(mass, centre, velocity, about, inertia, spin)
 
 
-def _owned(
-    body: Body, name: str, given: FloatArray | None, known: FloatArray | None
-) -> FloatArray:
-    """The given coordinates, or those known, or the body's dolfinx Function or array."""
+def _owned(body: Body, name: str, given: FloatArray | None, known: FloatArray) -> FloatArray:
+    """The given coordinates, a dolfinx Function or an array, or those known."""
     values: Any = known if given is None else given
-    if values is None:
-        values = getattr(body, name)
-    array = np.asarray(values.x.array if hasattr(values, "x") else values)
+    array = np.asarray(values.x.array if isinstance(values, fem.Function) else values)
     if array.ndim != 1 or len(array) < body.num_owned:
         raise ValueError(
             f"{name} of shape {array.shape}: pass the {body.num_owned} owned coordinates of "

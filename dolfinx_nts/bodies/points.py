@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -163,39 +163,3 @@ def in_mesh(body: Any, x: FloatArray, name: str) -> Points:
     columns = zip(*(found[i] for i in range(len(x))), strict=True)
     nodes, weights, reference, fixed = (np.array(values) for values in columns)
     return Points(body, nodes, weights, reference, fixed, np.ones(nodes.shape, dtype=bool))
-
-
-def at_nodes(body: Any, nodes: IntArray, x: FloatArray) -> Points:
-    """Nodes of a body's mesh as its material points, for surfaces. Collective.
-
-    They are the body's nodes unless it has a method of this name, of `nodes` and `x`.
-
-    Args:
-        body: The body; it has `comm`, `num_owned` and `fixed`.
-        nodes: Global numbers in the body's `space`, sorted, shape (n,), the same on all ranks.
-        x: Reference positions [m], shape (n, 3).
-    """
-    if hasattr(body, "at_nodes"):
-        points: Points = body.at_nodes(nodes, x)
-        return points
-    one = np.ones((len(nodes), 1))
-    free = np.zeros((len(nodes), 1, 3), dtype=bool)
-    points = Points(body, nodes[:, None], one, x[:, None], free, one.astype(bool))
-    prescribed = np.zeros(body.num_owned, dtype=bool)
-    prescribed[body.fixed] = True
-    return replace(points, fixed=points.nodal(prescribed))
-
-
-def at_mesh(body: Any, values: FloatArray) -> FloatArray:
-    """Values at the nodes of a body's mesh on this rank, as of its `space`. Collective.
-
-    They are those of the coordinates unless the body has a method of this name, of `values`.
-
-    Args:
-        body: The body.
-        values: At its owned coordinates, shape (num_owned,).
-    """
-    if hasattr(body, "at_mesh"):
-        moved: FloatArray = body.at_mesh(values)
-        return moved
-    return values

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from scipy.spatial.transform import Rotation
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.bodies.body import Body, Moment
 from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.points import Points
@@ -51,7 +51,7 @@ _ALONG = 1e-6
 
 
 @known_options
-class RigidBody:
+class RigidBody(Body):
     """A rigid body on a DOLFINx mesh, with twelve coordinates and six constraints.
 
     Its coordinates are those of four nodes: the centre of mass phi and D_i = l d_i, l the radius of
@@ -86,6 +86,8 @@ class RigidBody:
         TypeError: `mesh` is none, or an argument is of another kind.
         ValueError: An argument is out of range, or the mesh is not a valid 3D mesh.
     """
+
+    rigid = oriented = True
 
     def __init__(
         self,
@@ -205,6 +207,7 @@ class RigidBody:
                     f"out, or {drive}="
                 )
         self._force, self._torque, self._motion, self._turn = force, torque, motion, rotation
+        self.driven = callable(motion) or callable(rotation)
         self._given = [("force", force, "N"), ("torque", torque, "N m")]
         for what, value, unit in self._given:
             self._vector(what, value, 0.0, unit)
@@ -233,12 +236,12 @@ class RigidBody:
         self._fixed = fixed
         self.prescribed(0.0)
         held = self.points(centre).part(slice(0, int(here)))
-        self.joints: tuple[Any, ...] = () if rotation is not None else (
+        self.joints = () if rotation is not None else (
             Triads(self, held, self.length, np.arange(len(held))),
         )  # fmt: skip
         self._matrix: Any = None
         self._reach = np.ones(4)
-        if hasattr(self, "mesh"):
+        if self.mesh is not None:
             x = self.space.tabulate_dof_coordinates()
             self._mesh_weights = self._weights(x)
             local = np.abs(self._mesh_weights).max(axis=0, initial=0.0)
@@ -306,6 +309,15 @@ class RigidBody:
         local = vectors("x", x, "vectors") @ self._axes / self.length
         return self._points(np.column_stack([np.zeros(len(local)), local]))
 
+    def directions_at(self, direction: FloatArray, x: Any) -> Points:
+        """A direction, which turns alike at all points.
+
+        Args:
+            direction: At the start [-], shape (3,).
+            x: Reference position of a point [m].
+        """
+        return self.directions(direction)
+
     def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
         """Nodes of the mesh as material points, for surfaces.
 
@@ -355,7 +367,7 @@ class RigidBody:
                 f"mass={mass!r} of a surface of {self.name!r}: a rigid body has no nodes that "
                 "could do without mass; leave mass out, or let a Continuum be the slave"
             )
-        if not hasattr(self, "mesh"):
+        if self.mesh is None:
             raise ValueError(
                 f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
             )
@@ -371,11 +383,6 @@ class RigidBody:
     # ---- loads and prescribed motion
     def _vector(self, name: str, value: VectorInTime, time: float, unit: str) -> FloatArray:
         return vector_in_time(self.comm, f"{name} of {self.name!r}", value, time, unit)
-
-    @property
-    def driven(self) -> bool:
-        """Whether its position or its rotation follows a function of time."""
-        return callable(self._motion) or callable(self._turn)
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
@@ -418,7 +425,7 @@ class RigidBody:
                 "torque out"
             )
 
-    # ---- Body protocol
+    # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         self._u0, self._theta = moment.u0, rule.theta
@@ -439,9 +446,9 @@ class RigidBody:
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
         """Gravity, force, and the torque's forces on the directors [N]."""
-        f = np.zeros((self.num_owned // 3, 3))
+        f = self.weight(gravity).reshape(-1, 3)
         if self.num_owned:
-            f[0] = self.mass * gravity + self._load
+            f[0] += self._load
             self._held_at = directors = self._directors(u1)
             if self._couple.any():
                 f[1:] = cross(np.tile(self._turning(directors), (3, 1)), directors)
@@ -497,16 +504,6 @@ class RigidBody:
         """None [N/m]."""
         return np.zeros(self.num_owned)
 
-    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
-        """This rank's part of the linear momentum [kg m/s]."""
-        return momentum[:3].copy() if self.num_owned else np.zeros(3)
-
-    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
-        """This rank's part of sum y_a x p_a [kg m^2/s]."""
-        y = (self.reference + u).reshape(-1, 3)
-        moment: FloatArray = cross(y, momentum.reshape(-1, 3)).sum(axis=0)
-        return moment
-
     def potential(self, u: FloatArray) -> float:
         """None [J]: loads do external work."""
         return 0.0
@@ -534,11 +531,11 @@ class RigidBody:
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""
-        self.accepted = u, v
+        super().accept(u, v)
         local = np.concatenate([(self.reference + u).reshape(-1, 3), v.reshape(-1, 3)], axis=1)
         both = gather_rows(self.comm, local)
         self._y, self._v = both[:, :3], both[:, 3:]
-        if hasattr(self, "mesh"):
+        if self.mesh is not None:
             for function, values in ((self.u, u), (self.v, v)):
                 whole = self._everywhere(values)
                 function.x.array[:] = (self._mesh_weights @ whole).ravel()

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.conditions import VectorInTime
-from dolfinx_nts.validation import floats, known_options, require_positive
+from dolfinx_nts.validation import floats, is_finite, known_options, require_positive
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -66,6 +66,116 @@ class Section:
         """Per length, of the place and of the directors times `radius` [kg/m], shape (4,)."""
         square = self.radius**2
         return np.array([self.rhoA, self.rhoI[1] / square, self.rhoI[0] / square, 0.0])
+
+
+@known_options
+@dataclass(frozen=True)
+class Circle:
+    """Solid circular cross-section.
+
+    Attributes:
+        radius: [m].
+
+    Raises:
+        ValueError: It is not positive and finite.
+    """
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        require_positive("radius", self.radius, "m")
+
+    def section(self, *, young: float, poisson: float, density: float) -> Section:
+        """Stiffness and mass of the section of one material.
+
+        Shear is that of Cowper (1966), 6 (1 + nu) / (7 + 6 nu) of G A.
+
+        Args:
+            young: Young's modulus [Pa].
+            poisson: Poisson's ratio [-].
+            density: [kg/m^3].
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        bending = 0.25 * np.pi * self.radius**4
+        shear = 6 * (1 + poisson) / (7 + 6 * poisson)
+        return _section(np.pi * self.radius**2, (bending, bending), 2 * bending, shear,
+                        young, poisson, density)  # fmt: skip
+
+
+@known_options
+@dataclass(frozen=True)
+class Rectangle:
+    """Solid rectangular cross-section.
+
+    Attributes:
+        width: Along axis 1 [m].
+        height: Along axis 2 [m].
+
+    Raises:
+        ValueError: A value is not positive and finite.
+    """
+
+    width: float
+    height: float
+
+    def __post_init__(self) -> None:
+        require_positive("width", self.width, "m")
+        require_positive("height", self.height, "m")
+
+    def section(self, *, young: float, poisson: float, density: float) -> Section:
+        """Stiffness and mass of the section of one material.
+
+        Shear is that of Cowper (1966), 10 (1 + nu) / (12 + 11 nu) of G A; twist that of
+        Saint-Venant, free to warp (Timoshenko and Goodier, Theory of Elasticity, section 109).
+
+        Args:
+            young: Young's modulus [Pa].
+            poisson: Poisson's ratio [-].
+            density: [kg/m^3].
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        b, h = self.width, self.height
+        long, short = max(b, h), min(b, h)
+        odd = np.arange(1, 40, 2)
+        series = (np.tanh(0.5 * np.pi * odd * long / short) / odd**5).sum()
+        twist = long * short**3 / 3 * (1 - 192 / np.pi**5 * short / long * series)
+        shear = 10 * (1 + poisson) / (12 + 11 * poisson)
+        return _section(b * h, (b * h**3 / 12, h * b**3 / 12), twist, shear,
+                        young, poisson, density)  # fmt: skip
+
+
+def _section(
+    area: float, second: tuple[float, float], twist: float, shear: float,
+    young: float, poisson: float, density: float,
+) -> Section:  # fmt: skip
+    """A section of one material.
+
+    Args:
+        area: [m^2].
+        second: Second moments about the axes 1 and 2 [m^4].
+        twist: Torsion constant [m^4].
+        shear: Part of G A that resists shear.
+        young: Young's modulus [Pa].
+        poisson: Poisson's ratio.
+        density: [kg/m^3].
+    """
+    require_positive("young", young, "Pa")
+    require_positive("density", density, "kg/m^3")
+    if not (is_finite(poisson) and -1.0 < poisson <= 0.5):
+        raise ValueError(f"poisson={poisson!r}: must lie above -1 and not above 0.5")
+    modulus = young / (2 * (1 + poisson))
+    return Section(
+        EA=young * area,
+        GA=(shear * modulus * area,) * 2,
+        GJ=modulus * twist,
+        EI=(young * second[0], young * second[1]),
+        rhoA=density * area,
+        rhoI=(density * second[0], density * second[1]),
+    )
 
 
 @known_options

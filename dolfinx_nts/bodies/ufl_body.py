@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.bodies.body import Body, Moment
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
@@ -32,7 +32,7 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 ExtraForm = Callable[[Any, Any, Any, Any], Any]
 
 
-class UflBody:
+class UflBody(Body):
     """A body whose coordinates are the nodes of a Lagrange space of 3-vectors.
 
     A kind of body calls `_stand`, then `_set_forms`, and has `_mass_form` and `_virtual_work`.
@@ -51,9 +51,6 @@ class UflBody:
         massless: Owned coordinates without mass, shape (num_owned,), see `surface`.
         has_massless: Whether there are such on any rank.
     """
-
-    #: Length whose rounding the forces hold beside that of the displacements [m].
-    rounded: float
 
     def __init__(
         self, space: Any, degree: int, name: str, extra_form: ExtraForm | None,
@@ -78,7 +75,7 @@ class UflBody:
         self._determinants: Determinants | None = None
         if self.mesh.topology.dim == 3:
             self._determinants = Determinants(space, degree, quadrature_degree)
-        self.massless, self.has_massless = np.zeros(self.num_owned, dtype=bool), False
+        self._matrix: Any = None
         self._mass: Any = None
         self._consistent_mass: Any = None
         self._mass_change: Any = None
@@ -219,7 +216,7 @@ class UflBody:
     def _stand(self, bcs: Sequence[Dirichlet], velocity: Any, displacement: Any) -> None:
         """Set conditions, and displacement and velocity at the start."""
         self._supports = Supports(self.comm, self.space, bcs, self.name)
-        self.fixed = self._supports.fixed
+        self.fixed, self.driven = self._supports.fixed, self._supports.driven
         self._interpolate(self.v, "velocity", velocity, "m/s")
         self.v.x.array[self._supports.still] = 0.0
         self.v.x.scatter_forward()
@@ -243,11 +240,6 @@ class UflBody:
                 f"displacement of {self.name!r}: with its Dirichlet values at t=0 it turns a cell "
                 f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
             )
-
-    @property
-    def driven(self) -> bool:
-        """Whether a condition's value is a function of time."""
-        return self._supports.driven
 
     def _interpolate(self, function: Any, name: str, given: Any, unit: str) -> None:
         """Fill a Function from a vector or a callable x (3, n) -> (3, n)."""
@@ -354,11 +346,11 @@ class UflBody:
                 tangent += self._factors[0] * self._mass_form(du, w)
             forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
             self._compiled[rule] = forms[0], forms[1], forms[2] if extra is not None else None
-            if not hasattr(self, "_matrix"):
+            if self._matrix is None:
                 self._matrix = compat.create_matrix(forms[1])
         return self._compiled[rule]
 
-    # ---- Body protocol
+    # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n."""
         self._rule, self._forms = rule, self._compile(rule)
@@ -383,7 +375,7 @@ class UflBody:
         """Loads and gravity, less the extra work [N]."""
         force = self._load.copy()
         if gravity.any():
-            force += self.nodal_mass * np.tile(gravity, self.num_owned // 3)
+            force += self.weight(gravity)
         if self._forms[2] is not None:
             self._fill(self._u1, u1)
             force -= self._assemble(self._forms[2])
@@ -471,25 +463,19 @@ class UflBody:
         ]
         return np.concatenate([np.empty(0), *map(np.ravel, values)])
 
-    def linear_momentum(self, momentum: FloatArray) -> FloatArray:
-        """This rank's part of sum p [kg m/s]."""
-        total: FloatArray = momentum.reshape(-1, 3).sum(axis=0)
-        return total
-
-    def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
-        """This rank's part of sum x cross p about the origin [kg m^2/s]."""
-        moment = (self.reference + u).reshape(-1, 3).T @ momentum.reshape(-1, 3)
-        return np.array([moment[i, j] - moment[j, i] for i, j in ((1, 2), (2, 0), (0, 1))])
-
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Write the accepted state into the dolfinx Functions u and v."""
         self._fill(self.u, u)
         self._fill(self.v, v)
 
+    def last_accepted(self) -> tuple[FloatArray, FloatArray]:
+        """Owned values of the Functions u [m] and v [m/s]."""
+        return self.u.x.array[: self.num_owned], self.v.x.array[: self.num_owned]
+
     def destroy(self) -> None:
         """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
         of_mass = (self._mass, self._consistent_mass, self._mass_change, self._sum)
-        for a in (*of_mass, self._in, self._out, getattr(self, "_matrix", None)):
+        for a in (*of_mass, self._in, self._out, self._matrix):
             if a is not None:
                 a.destroy()
 

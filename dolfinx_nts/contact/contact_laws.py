@@ -118,7 +118,7 @@ class ContactLaws:
     Attributes:
         pair: Its surfaces.
         candidates: This rank's slave nodes and their facets.
-        rule: "direct" for the midpoint rule, else the discrete gradient.
+        contact_gradient: As of `Integrator`.
         condense: Whether (d, f) and their multipliers are eliminated pair by pair.
         x0: Slave, and what the master is interpolated from, at t_n [m], (n, control + 1, 3).
         scale: Force per motion of the slaves in the units of the step equations, shape (n,): the
@@ -134,7 +134,7 @@ class ContactLaws:
 
     pair: ContactPair
     candidates: Candidates
-    rule: str
+    contact_gradient: str
     condense: bool
     x0: FloatArray
     scale: FloatArray
@@ -144,6 +144,11 @@ class ContactLaws:
     bounded: bool = False
     lets_slip: bool = False
     before: FloatArray | None = None
+
+    @property
+    def direct(self) -> bool:
+        """Whether contact forces are those of one state, at theta, without a discrete gradient."""
+        return self.contact_gradient == "direct"
 
     # ---- what a kind of master has of its own
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,8 @@ _TOUCHING = 1e-6
 _TOUCH = 4.0
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
 _ONE = 1e-6
+#: Depth in facet sizes from which on a node behind a surface that it passed by is told.
+_BESIDE = 1e-3
 #: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
 _SURELY = 1e-3
 
@@ -77,9 +79,9 @@ class ContactSearch:
         both = zip(self._had, self.elements, strict=True)
         return [np.isin(np.arange(len(had)), c.candidates.node) for had, c in both]
 
-    def resume(self, had: Sequence[BoolArray]) -> None:
-        """Go on from another run's `had_unknowns`, before the first step."""
-        self._had = list(had)
+    def resume(self, had: Sequence[BoolArray], bounded: bool) -> None:
+        """Go on from another run's `had_unknowns` and `bounded`, before the first step."""
+        self._had, self.bounded = list(had), bounded
 
     # ---- elements of a step
     def begin(
@@ -278,6 +280,47 @@ class ContactSearch:
         gaps = [part.gap for part in parts] + self.idle_gaps
         return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
 
+    def warnings(self, parts: Sequence[Contribution]) -> list[tuple[str, float, str]]:
+        """Nodes that an accepted step leaves beside a surface, or lets slip all the same."""
+        return [*self._beside(), *self._slips(parts)]
+
+    def _beside(self) -> Iterator[tuple[str, float, str]]:
+        """Nodes that have passed by a surface's edge and lie behind it. Collective."""
+        if not self._step.integrator.inertia:
+            return  # what a load step passes by is looked for
+        deepest = np.array([depth for depth, _ in self.beside])
+        self._comm.Allreduce(MPI.IN_PLACE, deepest, op=MPI.MAX)
+        if deepest.max(initial=0.0) <= _BESIDE:
+            return
+        k = int(deepest.argmax())
+        depth, node = max(self._comm.allgather(self.beside[k]))
+        yield (
+            "node beside a surface", depth,
+            f"node {node} of contact {self._pairs[k].name!r} has passed the master's edge "
+            f"and lies {depth:.3g} of a facet behind its surface, where nothing holds it; let the "
+            "master's surface reach farther",
+        )  # fmt: skip
+
+    def _slips(self, parts: Sequence[Contribution]) -> Iterator[tuple[str, float, str]]:
+        """Nodes that slip in spite of infinite friction. Collective.
+
+        They may slip in the next step, too, if any does.
+        """
+        both = zip(self.elements, parts, strict=True)
+        endless = [part for c, part in both if np.isinf(c.pair.friction)]
+        if not (endless and self.bounded):
+            return
+        slips = [part.distance[part.active & ~part.stick].max(initial=0.0) for part in endless]
+        farthest = float(self._comm.allreduce(max(slips), op=MPI.MAX))
+        self.bounded = farthest > 0.0
+        if self.bounded:
+            yield (
+                "slip", farthest,
+                "nodes would pull if they stuck and would enter the master if they left: in spite "
+                f"of infinite friction they slip, by up to {farthest:.3g} m in a step; a finite "
+                "coefficient may be meant",
+            )  # fmt: skip
+
     # ---- first guesses, and what else solves a step
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the contact forces of the last step, shape (n, constraints).
@@ -310,6 +353,13 @@ class ContactSearch:
     def let_slip(self) -> None:
         """Solve this step with nodes that slip rather than leave, see `ContactElements`."""
         self.elements = [replace(c, lets_slip=True) for c in self.elements]
+
+    def give_way(self) -> bool:
+        """Let infinite friction have a bound."""
+        endless = any(np.isinf(pair.friction) for pair in self._pairs)
+        new = endless and not self.bounded
+        self.bounded |= new
+        return new
 
     def flight_gaps(self) -> list[FloatArray]:
         """Gaps of each contact's candidates after free flight over the step [m]. Collective."""

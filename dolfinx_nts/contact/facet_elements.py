@@ -52,7 +52,7 @@ class FacetElements(ContactElements):
     @property
     def _only_normal(self) -> bool:
         """Whether lambda_N is the only multiplier of a constraint."""
-        return self.condense or self.rule == "direct"
+        return self.condense or self.direct
 
     @property
     def num_augmented(self) -> int:
@@ -144,10 +144,10 @@ class FacetElements(ContactElements):
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
         """Residual and tangent in [kg m] and [m], gap and slip, before the laws of contact."""
-        if self.rule == "direct":
+        if self.direct:
             return self._direct(x, multiplier)
         if self.condense:
-            found = self._compiled(x, multiplier) if self.rule == "mean-value" else None
+            found = self._compiled(x, multiplier) if self.contact_gradient == "mean-value" else None
             return found or self._condensed(x, multiplier)
         return self._invariants(x, augmented, multiplier)
 
@@ -240,7 +240,7 @@ class FacetElements(ContactElements):
         given = hold
         if not self.condense:
             given = multiplier[:, : nts_element.NUM_CONSTRAINTS] * scale_g
-        e = nts_element.element(z0, z1, given, self.rule)
+        e = nts_element.element(z0, z1, given, self.contact_gradient)
         residual = np.zeros((n, stop + self.num_tangential))
         residual[:, :size], residual[:, size:stop] = e.force * scale_z, e.constraint * scale_g
         tangent = np.zeros((*residual.shape, residual.shape[1]))

@@ -152,7 +152,7 @@ class FacetPair(ContactPair, master=Surface):
         return FacetElements(
             pair=self,
             candidates=found,
-            rule=rule.contact_gradient,
+            contact_gradient=rule.contact_gradient,
             condense=step.condense,
             x0=self.points(positions, found),
             scale=step.scale(self.slave)[self.slave.share[found.node]],

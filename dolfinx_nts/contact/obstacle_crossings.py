@@ -67,7 +67,7 @@ class ObstacleContact:
     def _rest(self) -> tuple[Surface, IntArray, FloatArray] | None:
         """Boundary, its points that no contact holds, and their facets' size [m]. Collective."""
         slave, obstacle = self._contact.slave, self._contact.master
-        if self._slaves[0] is not slave or not hasattr(slave.body, "mesh"):
+        if self._slaves[0] is not slave or slave.body.mesh is None:
             return None  # another contact with the same obstacle looks at them
         boundary = self._boundary(self._body)
         x = boundary.reference

@@ -112,7 +112,7 @@ class ObstacleElements(ContactElements):
         """Residual and tangent of (x, lambda_N, lambda_T) in [kg m] and [m], gap and slip."""
         master, normal = self.pair.obstacle, multiplier[:, :1]
         end = master.gap(x[:, 0])
-        if self.rule == "direct":
+        if self.direct:
             middle = self._middle(x)
             gradient, slope = middle.gradient[:, 0], self.theta * middle.hessian
         else:

@@ -75,7 +75,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
         return ObstacleElements(
             pair=self,
             candidates=found,
-            rule=rule.contact_gradient,
+            contact_gradient=rule.contact_gradient,
             condense=step.condense,
             x0=self.points(positions, found) - path[0],
             scale=step.scale(self.slave)[self.slave.share[found.node]],

@@ -66,7 +66,7 @@ class OverlapWatch:
                 alike = [c.slave for c in system.contacts if _same_obstacle(contact, c)]
                 slaves = [s for s in alike if len(s.facets)]
                 self._pairs.append(ObstacleContact(contact, bodies[0], slaves, self._boundary))
-            elif len(contact.bodies) == 2 and all(hasattr(b, "mesh") for b in contact.bodies):
+            elif len(contact.bodies) == 2 and all(b.mesh is not None for b in contact.bodies):
                 between.setdefault(tuple(sorted(bodies)), []).append(contact)
         self._pairs += [BodyPair(k, c, self._boundary) for k, c in between.items()]
         self._looked: dict[int, _Looked] = {}

@@ -17,7 +17,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.points import Points, at_mesh, at_nodes
+from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact import search
 from dolfinx_nts.kernels import facets as facet_math
 from dolfinx_nts.kernels import patches, triangle_patches
@@ -145,7 +145,7 @@ class Surface:
         own = self.points[(self.points >= low) & (self.points < high)]
         self.rows = own - low
         self.share = np.flatnonzero(_rank_of(self.original, mesh.comm.size) == mesh.comm.rank)
-        self.material = at_nodes(body, self.points, self.reference)
+        self.material = body.at_nodes(self.points, self.reference)
         free = ~self.material.fixed & (self.material.weights != 0.0)[:, :, None]
         self.fixed = ~free.any(axis=1)
 
@@ -238,7 +238,7 @@ class Surface:
     @property
     def massless(self) -> npt.NDArray[np.bool_]:
         """Whether the points are nodes without mass, shape (p,). Collective."""
-        if not getattr(self.body, "has_massless", False):
+        if not self.body.has_massless:
             return np.zeros(len(self.points), dtype=bool)
         found: npt.NDArray[np.bool_] = self.material.nodal(self.body.massless).all(axis=(1, 2))
         return found
@@ -275,7 +275,7 @@ class Surface:
         mesh, space = self.body.mesh, self.body.space
         nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
         moved = fem.Function(space)
-        here = at_mesh(self.body, u)
+        here = self.body.at_mesh(u)
         moved.x.array[: len(here)] = here
         moved.x.scatter_forward()
         blocks = compat.node_blocks(mesh, space)[nodes]

@@ -147,6 +147,11 @@ class WithAccelerations(InTime):
         return v0 + dt * ((1.0 - gamma) * a0 + gamma * a1), a1
 
 
+def taken_at(rule: Integrator) -> float | None:
+    """Where between t_n and t_{n+1} forces are taken; None: discrete gradients take both ends."""
+    return rule.theta if rule.contact_gradient == "direct" else None
+
+
 def choose(name: str, value: str, known: tuple[str, ...]) -> None:
     """Raise a ValueError unless an option has one of its known values."""
     if value not in known:

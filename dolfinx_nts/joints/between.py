@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations, rank_of
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import (
@@ -131,7 +132,7 @@ class Between(ABC):
             self._vector(end, side, x)
             for end, side, x in zip((0, 1), held, places, strict=True)
         )
-        lengths = [body.length for body in self.bodies if hasattr(body, "length")]
+        lengths = [body.length for body in self.bodies if body.oriented]
         self.length = float(np.exp(np.mean(np.log(lengths)))) if lengths else 1.0
 
     def _vector(self, end: int, side: Any, fixed: FloatArray) -> Vector:
@@ -161,9 +162,7 @@ class Between(ABC):
     @staticmethod
     def _direction(body: Any, along: FloatArray, x: FloatArray) -> Any:
         """`Points` of a direction that turns with a body where a joint holds it; None: ground."""
-        if body is None or hasattr(body, "directions"):
-            return body and body.directions(along)
-        return body.directions_at(along, x)
+        return body and body.directions_at(along, x)
 
     def drive(self, argument: str, function: Any, unit: str, read: Callable[..., Any]) -> None:
         """Prescribe what a function of time says. Collective.
@@ -247,7 +246,7 @@ def named(kind: str, ends: Sequence[Any], name: str | None) -> str:
             raise TypeError(
                 f"{role}={body!r}: is a class; pass a body made from it, {body.__name__}(...)"
             )
-        if body is not None and not hasattr(body, "points"):
+        if body is not None and not isinstance(body, Body):
             raise TypeError(f"{role}={body!r}: pass a body, or None for the ground")
     if all(body is None for body in ends):
         raise ValueError(f"a=None, b=None: a {kind} needs a body; only one end may be the ground")
@@ -264,8 +263,7 @@ def require_directions(ends: Sequence[Any], name: str, *, at_nodes: bool) -> Non
         at_nodes: Whether directions that each node has of its own will do.
     """
     for role, body in zip("ab", ends, strict=True):
-        turns = hasattr(body, "directions") or (at_nodes and hasattr(body, "directions_at"))
-        if not (body is None or turns):
+        if body is not None and not (body.oriented if at_nodes else body.rigid):
             raise ValueError(
                 f"{role}={body.name!r}: a flexible body has no directions for {name!r}; tie a "
                 "rigid body to a patch of its nodes, Tie(rigid, body.surface(...)), or fix one to "

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.elements import EveryStep, PointElements, Step
+from dolfinx_nts.integrators.rule import taken_at
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
 from dolfinx_nts.validation import require_same, vector
@@ -141,22 +142,21 @@ class SpringElements(PointElements):
 
     def evaluate(self, x: FloatArray, own: Any) -> SpringPart:
         """Residual and tangent."""
-        way, rule, n = self.way, self.step.integrator, len(x)
-        direct = rule.contact_gradient == "direct"
+        way, theta, n = self.way, taken_at(self.step.integrator), len(x)
         rate = self.step.moments[0].rate
         du = x - self.y0
-        first, last = (self.y0, x) if not direct else (self.y0 + rule.theta * du,) * 2
+        first, last = (self.y0, x) if theta is None else (self.y0 + theta * du,) * 2
         a, b = way.vectors(first), way.vectors(last)
         at_a = way.coordinate.value(a, self.near)
-        at_b = at_a if direct else way.coordinate.value(b, at_a)
+        at_b = way.coordinate.value(b, at_a) if theta is None else at_a
         gradient = way.coordinate.gradient(a, b, at_a, at_b)
         move = Move(
             ends=(at_a, at_b),
             gradient=gradient,
-            share=2.0 * rule.theta if direct else 1.0,
+            share=1.0 if theta is None else 2.0 * theta,
             speed=way.directed(self.drift + rate * du).reshape(n, 3 * len(way.weights)),
             rate=rate,
-            time=None if direct else self.step.dt,
+            time=self.step.dt if theta is None else None,
         )
         pull, slope = self.force.pull(move)
         bend = move.share * pull[:, None, None] * gradient.change
@@ -194,7 +194,7 @@ class Between:
         self.bodies = tuple(body for body in ends if body is not None)
         both = ["ground" if body is None else body.name for body in ends]
         self._given: dict[str, Any] = {"bodies": both}
-        if ends[0] is ends[1] and hasattr(ends[0], "directions"):
+        if ends[0] is ends[1] and ends[0].rigid:
             raise ValueError(
                 f"a=b={ends[0].name!r}: a rigid body does not change its size, so {self.name!r} "
                 "does nothing; pass another body, or None for the ground"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import Constraints, Equations
 from dolfinx_nts.contact.surfaces import Surface
@@ -33,12 +34,12 @@ class Tie:
     losses: tuple[str, ...] = ()
 
     def __init__(self, rigid: Any, surface: Any, *, name: str | None = None) -> None:
-        if not hasattr(rigid, "directions"):
+        if not (isinstance(rigid, Body) and rigid.rigid):
             raise TypeError(f"rigid={rigid!r}: pass a RigidBody, e.g. RigidBody.from_inertia(...)")
         if not isinstance(surface, Surface):
             raise TypeError(f"surface={surface!r}: pass body.surface(...) of a flexible body")
         flexible = surface.body
-        if hasattr(flexible, "directions"):
+        if flexible.rigid:
             raise ValueError(
                 f"surface: its body {flexible.name!r} is rigid; hold it by Fixed(...), or tie a "
                 "surface of a flexible body"

@@ -329,7 +329,7 @@ def element(
     z0: FloatArray,
     z1: FloatArray,
     multiplier: FloatArray | Callable[[FloatArray], FloatArray],
-    rule: str,
+    contact_gradient: str,
 ) -> Element:
     """Energy-momentum element in invariants with its exact tangent (63)-(66).
 
@@ -337,7 +337,7 @@ def element(
         z0: (x_s, x_I, d, f) at t_n, shape (n, 3 (nc + 2) + 2).
         z1: The same at t_{n+1}.
         multiplier: lambda, shape (n, 6), or what makes it of the `force_gradient`.
-        rule: Discrete gradient in pi, "mean-value" or "gonzalez".
+        contact_gradient: Discrete gradient in pi, "mean-value" or "gonzalez".
 
     Returns:
         Forces, constraints and tangents in z.
@@ -355,7 +355,7 @@ def element(
         """With as many copies of the multipliers as there are points."""
         return constraint_curvature(pi, np.resize(force, (len(pi), NUM_CONSTRAINTS)), nc)
 
-    mean = rule == "mean-value"
+    mean = contact_gradient == "mean-value"
     discrete = discrete_gradient.mean_value if mean else discrete_gradient.gonzalez
     gradient = discrete(pi0, pi1, slope, points)
     force_gradient = np.matmul(gradient, dm)

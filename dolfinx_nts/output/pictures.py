@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.stress import von_mises
 from dolfinx_nts.contact.surfaces import oriented_nodes
 from dolfinx_nts.output.plots import save_figure
@@ -47,7 +48,7 @@ def picture(
         ValueError: Unknown colour, no body, one whose mesh is not 3D, or an argument out of range.
         OSError: On all ranks: the file cannot be written.
     """
-    bodies = items("bodies", bodies, lambda b: hasattr(b, "mesh"), "Continuum bodies")
+    bodies = items("bodies", bodies, _has_mesh, "Continuum bodies")
     _check_picture(bodies, colour, view, limits, width)
     require_bool("labels", labels)
     for body in bodies:
@@ -69,6 +70,10 @@ def picture(
         save_figure(figure, file, dpi=200, bbox_inches="tight", pad_inches=0.05)
 
     write_on_root(comm, f"path={str(path)!r}", draw)
+
+
+def _has_mesh(body: Any) -> bool:
+    return isinstance(body, Body) and body.mesh is not None
 
 
 def _check_picture(

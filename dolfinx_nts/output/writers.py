@@ -8,7 +8,6 @@ on the partition.
 from __future__ import annotations
 
 import io
-import math
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -20,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.points import at_mesh
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
-from dolfinx_nts.parallel import gather_on_root, raise_together, write_on_root
+from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
 from dolfinx_nts.step import balance as ledger
 from dolfinx_nts.step import contact_fields, resultants
 from dolfinx_nts.validation import StrPath, as_path, is_whole, require_positive
@@ -45,6 +43,7 @@ _XDMF_HEAD = (
     '<Grid Name="{}" GridType="Collection" CollectionType="Temporal">\n'
 )
 _XDMF_TAIL = "</Grid>\n</Domain></Xdmf>\n"
+_XDMF_TIME = r'<Grid><Time Value="([^"]*)"/>'
 #: XDMF's name of DOLFINx's cells and its order of their vertices.
 _CELLS = {
     "interval": ('Polyline" NodesPerElement="2', [0, 1]),
@@ -76,6 +75,7 @@ class _Series:
             body.comm, np.asarray(body.mesh.topology.original_cell_index[:owned], dtype=np.int64)
         )
         self._cells = np.searchsorted(numbers, cells[np.argsort(order)])
+        self._kind, self._corners = _CELLS[compat.cell_name(body.mesh)]
 
     def _nodal(self, values: FloatArray) -> FloatArray:
         """Values of owned blocks in the order of the file, on rank 0."""
@@ -86,18 +86,44 @@ class _Series:
         """Write the mesh; rank 0 only."""
         import h5py
 
-        self._kind, corners = _CELLS[compat.cell_name(self.body.mesh)]
         image = io.BytesIO()
         with h5py.File(image, "w") as file:
-            file["mesh/points"], file["mesh/cells"] = self._points, self._cells[:, corners]
+            file["mesh/points"], file["mesh/cells"] = self._points, self._cells[:, self._corners]
         replace_file(Path(f"{self.path}.h5"), image.getvalue())
         head = _XDMF_HEAD.format(self.path.name)
         replace_file(Path(f"{self.path}.xdmf"), (head + _XDMF_TAIL).encode())
 
+    def go_on(self, until: float, due: bool) -> None:
+        """Keep the times of an earlier part of a run up to here; rank 0 only.
+
+        Args:
+            until: Time from which the run goes on [s].
+            due: Whether that itself is one to be written; else it is there because a part ended.
+
+        Raises:
+            OSError: The files cannot be read or written, or hold another mesh.
+        """
+        import h5py
+
+        numbers, path = Path(f"{self.path}.h5"), Path(f"{self.path}.xdmf")
+        with h5py.File(numbers, "r") as file:
+            same = "mesh/points" in file and np.array_equal(file["mesh/points"], self._points)
+        if not same:
+            raise FileExistsError(
+                f"folder={str(path.parent)!r}: holds {path.name} with another mesh; pass another "
+                "folder for what follows"
+            )
+        text = path.read_text()
+        times = [(float(m[1]), m.start()) for m in re.finditer(_XDMF_TIME, text)]
+        kept = [time for time, _ in times if time < until or (due and time == until)]
+        if len(kept) < len(times):
+            replace_file(path, (text[: times[len(kept)][1]] + _XDMF_TAIL).encode())
+        self._times = len(kept)
+
     def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
         """Nodal fields of the last accepted state on rank 0; collective."""
         state = stepper.state
-        u, v = (at_mesh(self.body, w[self.index]) for w in (state.u, state.v))
+        u, v = (self.body.at_mesh(w[self.index]) for w in (state.u, state.v))
         fields = {
             "displacement": self._nodal(u.reshape(-1, 3)),
             "velocity": self._nodal(v.reshape(-1, 3)),
@@ -164,8 +190,9 @@ class Fields:
 
     The initial and the last accepted state are always written, and every time is on disk before the
     run goes on; where it cannot be written (disk full, folder gone), the run ends and all times
-    before are whole. Bodies without a mesh are left out; existing files of the same names are
-    replaced, but by a run that goes on from a checkpoint: it has other files for what follows.
+    before are whole. Bodies without a mesh are left out. Existing files of the same names are
+    replaced, but a run that goes on from a checkpoint goes on with them: times after it are dropped
+    and written anew, as in the uninterrupted run.
 
     Args:
         folder: Where the files go; made if missing.
@@ -176,8 +203,8 @@ class Fields:
     Raises:
         ValueError: The cadence is out of range or given twice; from `start`: no body has a mesh,
             or two bodies' names give one file.
-        OSError: From `start`, before any step and on all ranks: the folder cannot be written, or a
-            run that goes on from a checkpoint would replace what is there.
+        OSError: From `start`, before any step and on all ranks: the folder cannot be written, or
+            what a run from a checkpoint would go on with has another mesh.
     """
 
     def __init__(self, folder: StrPath, *, every: int = 1, interval: float | None = None) -> None:
@@ -196,7 +223,7 @@ class Fields:
         label = contact_fields.labels(system)
         self._series = []
         for i, body in enumerate(system.bodies):
-            if hasattr(body, "mesh"):
+            if body.mesh is not None:
                 own = {n: k for k, n in enumerate(label) if contacts[k].slave.body is body}
                 self._series.append(_Series(body, i, own, self.folder))
         if not self._series:
@@ -204,33 +231,36 @@ class Fields:
         files = [s.path.name for s in self._series]
         if len(set(files)) < len(files):
             raise ValueError(f"name of bodies: file names {files} are not unique; rename a body")
-        if stepper.restart is not None:
-            self._spare(system.comm)
+        if stepper.restart is not None and self._go_on(stepper):
+            return
         for series in self._series:
             self._root(stepper, series.create)
-        self._steps, self._next = 0, self.interval or 0.0
         self._append(stepper)
 
-    def _spare(self, comm: Any) -> None:
-        """Raise on all ranks rather than replace what an earlier part of the run has written."""
-        there = [s.path.name for s in self._series if Path(f"{s.path}.xdmf").exists()]
-        problem = (
-            f"folder={str(self.folder)!r}: holds {there[0]}.xdmf, which a run from a checkpoint "
-            "would replace; pass another folder for what follows"
-        ) if comm.rank == 0 and there else None  # fmt: skip
-        raise_together(comm, problem, FileExistsError)
+    def _go_on(self, stepper: Stepper) -> bool:
+        """Go on with the files of an earlier part of the run; tells whether they are there."""
+        there = all(Path(f"{s.path}.xdmf").exists() for s in self._series)
+        if not stepper.system.comm.bcast(there):
+            return False
+        self._tried, due = stepper.state.time, self._due(stepper)
+        for series in self._series:
+            on_root(stepper.system.comm, partial(series.go_on, self._tried, due))
+        return True
 
     def write(self, stepper: Stepper, *, last: bool = False) -> None:
         """Write the accepted state if the cadence asks for it, or if it is the last."""
-        self._steps += 1
-        due = self._steps % self.every == 0
-        if self.interval is not None:
-            reached = stepper.state.time * (1 + 1e-12)
-            due = reached >= self._next
-            if due:
-                self._next = self.interval * (math.floor(reached / self.interval) + 1)
-        if due or last:
+        if last or self._due(stepper):
             self._append(stepper)
+
+    def _due(self, stepper: Stepper) -> bool:
+        """Whether the cadence asks for the last accepted state; the one at the start is."""
+        times = stepper.solution.rows.column("time")
+        if len(times) == 1:
+            return True
+        if self.interval is None:
+            return (len(times) - 1) % self.every == 0
+        before, now = np.floor(times[-2:] * (1 + 1e-12) / self.interval)
+        return bool(now > before)
 
     def close(self, stepper: Stepper) -> None:
         """Write the last accepted state of a run that failed."""
@@ -333,11 +363,11 @@ class ForcesCSV(BalanceCSV):
         system, header = stepper.system, ["time [s]"]
         joints = system.declared_joints
         columns = [resultants.reactions_of(item) for item in (*system.bodies, *joints)]
-        labels = []
-        for body, column in zip(system.bodies, columns, strict=False):
-            rows = [(str(k), "N") for k in range(len(stepper.solution.rows[0][column]))]
-            rows = getattr(body, "reaction_labels", rows)
-            labels += [f"{body.name}_{row}_{{}} [{unit}]" for row, unit in rows]
+        labels = [
+            f"{body.name}_{row}_{{}} [{unit}]"
+            for body in system.bodies
+            for row, unit in body.reaction_labels
+        ]
         for joint in joints:
             labels += [f"{joint.name}_force_{{}} [N]", f"{joint.name}_moment_{{}} [N m]"]
         labels += [f"contact_{pair.name}_{{}} [N]" for pair in system.contacts]

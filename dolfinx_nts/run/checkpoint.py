@@ -1,12 +1,13 @@
 """Checkpoints: what a run writes so that it can go on after its process has ended.
 
-The file is described in `dolfinx_nts.output.checkpoint_file`; of its `notes` the run has
+The file is described in `dolfinx_nts.output.state_file`; of its `notes` the run has
 
-- `counts`: retries, rejected, exceeded, see `Solution`;
+- `status` and `settings`, see `Record`; `columns`, the names of `balance` in their order;
+- `counts`: retries, rejected, exceeded, see `Record`;
 - `warnings`: the fields of each `RunWarning`;
 - `switches`: number, defect, size and worst of `Switches`; the newest are in `switches/time`,
   `contact` (its number in `contacts`), `node`, `facets` and `defect`;
-- `contacts`: names of the contacts;
+- `contacts`: names of the contacts of these;
 - `last`: start and length of the last step [s], or null;
 - `promised`: largest energy and rounding that the ledger is held against [J];
 - `bounded`: whether nodes that infinite friction holds may slip;
@@ -23,28 +24,21 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import numpy.typing as npt
-
 from dolfinx_nts.parallel import on_root, write_on_root
-from dolfinx_nts.run.run_warnings import RunWarning, RunWarnings
+from dolfinx_nts.run.record import Tables, unpacked
 from dolfinx_nts.run.solution import Restart
 from dolfinx_nts.run.step_size import Pace, PaceMemory
-from dolfinx_nts.run.table import Table
-from dolfinx_nts.step.balance import Switch, Switches
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import StrPath, as_path, is_whole, known_options, require_positive
 
 if TYPE_CHECKING:
-    from dolfinx_nts.output import checkpoint_file as files
     from dolfinx_nts.run.stepper import Stepper
 
 logger = logging.getLogger(__name__)
-FloatArray = npt.NDArray[np.float64]
 
 #: Notes that are the stepper's.
 _MEMORY = ("last", "promised", "bounded", "measured", "recent")
@@ -111,7 +105,7 @@ class Saver:
         self._what = f"checkpoint: path={str(self._path)!r}"
         comm = stepper.system.comm
         # A run without checkpoints loads no writers.
-        from dolfinx_nts.output import checkpoint_file as files
+        from dolfinx_nts.output import state_file as files
 
         write_on_root(comm, self._what, lambda: files.prepare(self._path))
         self._numbering = files.Numbering(stepper.system)
@@ -131,7 +125,7 @@ class Saver:
 
     def save(self) -> None:
         """Write the last accepted state; if that fails, warn and go on."""
-        from dolfinx_nts.output import checkpoint_file as files
+        from dolfinx_nts.output import state_file as files
 
         stepper, state = self._stepper, self._stepper.state
         if state is self._saved:
@@ -139,8 +133,14 @@ class Saver:
         memory = None if self.pace is None else self.pace.memory
         more = {"acceleration": memory.accelerations} if memory else {}
         tables = self._numbering.pack(state, more, stepper.nodal_memory)
-        tables |= _tables(stepper)
-        notes = {"scene": self._scene, "time": state.time, **_notes(stepper, memory)}
+        of_record, notes = stepper.solution.packed()
+        tables |= of_record
+        notes |= {
+            "scene": self._scene,
+            "time": state.time,
+            "pace": memory and memory._replace(accelerations=())._asdict(),
+            **stepper.memory,
+        }
         try:
             comm = stepper.system.comm
             write_on_root(comm, self._what, lambda: files.write(self._path, tables, notes))
@@ -149,32 +149,6 @@ class Saver:
         else:
             self._saved = state
         self._since = time.monotonic()
-
-
-def _tables(stepper: Stepper) -> files.Tables:
-    """Balance table and changes of facet, the same on all ranks."""
-    solution = stepper.solution
-    names = [pair.name for pair in stepper.system.contacts]
-    found: files.Tables = {f"balance/{k}": v for k, v in solution.rows.columns.items()}
-    newest = list(solution.switches)
-    found["switches/time"] = np.array([s.time for s in newest])
-    found["switches/contact"] = np.array([names.index(s.contact) for s in newest], dtype=np.int64)
-    found["switches/node"] = np.array([s.node for s in newest], dtype=np.int64)
-    found["switches/facets"] = np.array([s.facets for s in newest], dtype=np.int64).reshape(-1, 2)
-    found["switches/defect"] = np.array([s.defect for s in newest])
-    return found
-
-
-def _notes(stepper: Stepper, pace: PaceMemory | None) -> dict[str, Any]:
-    solution, switches = stepper.solution, stepper.solution.switches
-    return {
-        "counts": [solution.retries, solution.rejected, solution.exceeded],
-        "warnings": [asdict(w) for w in solution.warnings.values()],
-        "switches": [switches.number, switches.defect, switches.size, switches.worst],
-        "contacts": [pair.name for pair in stepper.system.contacts],
-        "pace": pace and pace._replace(accelerations=())._asdict(),
-        **stepper.memory,
-    }
 
 
 def restart(path: StrPath, system: System) -> Restart:
@@ -194,9 +168,9 @@ def restart(path: StrPath, system: System) -> Restart:
     materials, loads, prescribed motion and obstacles, as they are functions: they must be the same.
     `contact_fields` are zero until the first step.
 
-    `BalanceCSV` writes the whole table anew; the files of `Fields` begin at the restart and need
-    another folder than before. A writer of your own must handle a restart
-    itself: `stepper.restart` is not None then.
+    `BalanceCSV` and `ForcesCSV` write the whole table anew; `Fields` goes on with the files in its
+    folder, if there are any, and drops the times after the checkpoint. A writer of your own must
+    handle a restart itself: `stepper.restart` is not None then.
 
     Args:
         path: Of the `Checkpoint`. If it cannot be read the one before it is taken, with a warning.
@@ -210,7 +184,7 @@ def restart(path: StrPath, system: System) -> Restart:
         OSError: There is no checkpoint, or none can be read.
         ValueError: The file is none, or the system has other bodies, meshes, contacts or joints.
     """
-    from dolfinx_nts.output import checkpoint_file as files
+    from dolfinx_nts.output import state_file as files
 
     place = as_path("path", path)
     if not isinstance(system, System):
@@ -235,30 +209,25 @@ def restart(path: StrPath, system: System) -> Restart:
         pace = PaceMemory(**{**pace, "accelerations": accelerations})
     two = len(notes["recent"]) > 1
     before = {"force_before": numbering.nodal(tables, "force_before")} if two else {}
-    retries, rejected, exceeded = notes["counts"]
     return Restart(
         system,
-        status=f"restart at t={notes['time']!r}",
-        rows=Table.of({k.removeprefix("balance/"): v for k, v in columns.items() if k[0] == "b"}),
-        retries=retries, rejected=rejected, exceeded=exceeded,
-        switches=_switches(columns, notes),
-        warnings=RunWarnings(RunWarning(**w) for w in notes["warnings"]),
+        **unpacked(columns, notes) | {"status": f"restart at t={notes['time']!r}"},
         state=numbering.unpack(tables, notes["time"]),
         memory={name: notes[name] for name in _MEMORY},
         nodal_memory={"unknowns": numbering.nodal(tables, "unknowns")} | before,
         pace=pace,
-    )  # fmt: skip
+    )
 
 
-def _read(path: Path) -> tuple[files.Tables, dict[str, Any]]:
+def _read(path: Path) -> tuple[Tables, dict[str, Any]]:
     """The last whole checkpoint; rank 0 only."""
-    from dolfinx_nts.output import checkpoint_file as files
+    from dolfinx_nts.output import state_file as files
 
     try:
-        return files.read(path)
+        return files.read(path, files.CHECKPOINT)
     except OSError as error:
         try:
-            found = files.read(files.previous(path))
+            found = files.read(files.previous(path), files.CHECKPOINT)
         except OSError:
             kind = FileNotFoundError if not path.exists() else OSError
             raise kind(
@@ -269,18 +238,3 @@ def _read(path: Path) -> tuple[files.Tables, dict[str, Any]]:
         return found
     except ValueError as error:
         raise ValueError(f"path={str(path)!r}: {error}") from error
-
-
-def _switches(columns: files.Tables, notes: dict[str, Any]) -> Switches:
-    parts = (columns[f"switches/{k}"].tolist() for k in ("time", "contact", "node", "facets",
-                                                         "defect"))  # fmt: skip
-    found = Switches()
-    found.extend(
-        Switch(t, notes["contacts"][k], node, (before, after), defect)
-        for t, k, node, (before, after), defect in zip(*parts, strict=True)
-    )
-    found.number, found.defect, found.size, worst = notes["switches"]
-    if worst is not None:
-        t, name, node, (before, after), defect = worst
-        found.worst = Switch(t, name, node, (before, after), defect)
-    return found

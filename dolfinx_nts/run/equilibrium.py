@@ -9,10 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
-from dolfinx_nts.run.step_warnings import tell_inversion, tell_slip
+from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.run.writer import Writer
@@ -158,7 +159,7 @@ class _LoadStepper(Stepper):
             )  # fmt: skip
         self._accept(state)
         tell_inversion(self.solution, self.problem, step, state)
-        tell_slip(self.solution, self.problem, step, state)
+        tell_couplings(self.solution, self.problem, step, state)
         self._solved = step
         self.look()
 
@@ -170,10 +171,11 @@ class _LoadStepper(Stepper):
             new: At its end.
             told: What the ledgers of each joint's elements say, shape (joints,).
         """
-        couplings: list[Any] = self.problem.couplings[1:]
         histories, work = zip(old.histories[1:], new.histories[1:], strict=True), 0.0
-        for coupling, both, ledger in zip(couplings, histories, told.tolist(), strict=True):
-            found = coupling.load_step_work(*both, old.time, new.time)
+        for joint, both, ledger in zip(
+            self.problem.joints, histories, told.tolist(), strict=True
+        ):
+            found = joint.load_step_work(*both, old.time, new.time)
             work += ledger if found is None else found
         return work
 
@@ -290,11 +292,10 @@ def _pseudo_times(load_steps: Any) -> list[float]:
 
 def _check_bodies(system: System) -> None:
     for body in system.bodies:
-        for name in ("nodal_stiffness", "reactions"):
-            if not callable(getattr(body, name, None)):
-                raise TypeError(
-                    f"body {body.name!r} has no {name}(): equilibrium needs it, see Body"
-                )
+        if type(body).nodal_stiffness is Body.nodal_stiffness:
+            raise TypeError(
+                f"body {body.name!r} has no nodal_stiffness(): equilibrium needs it, see Body"
+            )
 
 
 @known_options
@@ -375,6 +376,7 @@ def equilibrium(
         system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options,
         watch_overlap=watch_overlap, before_step=before_step,
     )  # fmt: skip
+    stepper.solution.settings |= {"load_steps": times, "stabilization": stabilization}
     lengths = np.diff(times, prepend=0.0).tolist()
     steps = list(zip(lengths, times, strict=True))
     run(stepper, steps, output, progress=progress, remedy=_REMEDY)

@@ -182,16 +182,17 @@ def simulate(
     if not t_end > begin:
         raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
     remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
+    end, dt = float(t_end), float(dt)
+    stepper.solution.settings |= {"dt": dt, "t_end": end, "adapt": adapt and repr(adapt)}
     if adapt is not None:
-        end, dt = float(t_end), float(dt)
         return run(
             stepper, [(dt, end)], output, progress=progress, remedy=remedy, adapt=adapt,
             checkpoint=checkpoint,
         )  # fmt: skip
-    equal = _equal_steps(begin, float(t_end), dt)
+    equal = _equal_steps(begin, end, dt)
     if isinstance(start, Restart):
         # The steps of the whole run, to the bit, if it had the same and stopped at the end of one.
-        whole = _equal_steps(start.rows[0]["time"], float(t_end), dt)
+        whole = _equal_steps(start.rows[0]["time"], end, dt)
         left = [step for step in whole if step[1] > begin]
         if len(left) == len(whole) or whole[-len(left) - 1][1] == begin:
             equal = left

@@ -75,7 +75,7 @@ def refuse_moved(system: System) -> None:
                 f"impact='restored': joint {joint.name!r} is driven; use impact='published'"
             )
     for body in system.bodies:
-        if getattr(body, "driven", False):
+        if body.driven:
             raise ValueError(
                 f"impact='restored': coordinates of body {body.name!r} move as prescribed by a "
                 "function of time; use impact='published', or supports at rest, given as vectors"

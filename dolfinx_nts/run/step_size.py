@@ -223,7 +223,7 @@ class Pace:
 
     def _expels(self, problem: StepProblem, step: Evaluation) -> bool:
         gain = 0.0
-        for c, part in zip(problem.contacts.elements, problem.contact_parts(step), strict=True):
+        for c, part, _ in problem.touching(step):
             gain += float(np.maximum(c.gains(part, problem.factor), 0.0).sum())
         total = float(problem.system.comm.allreduce(gain))
         return total > self._tolerance * 0.5 * self._top**2

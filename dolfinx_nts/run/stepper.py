@@ -184,6 +184,15 @@ class Stepper:
         self.restart = start if isinstance(start, Restart) else None
         check_restart(self.restart, system, start_time, ledger)
         self.solution = self.restart.go_on() if self.restart else Solution(system)
+        self.solution.settings = {
+            "integrator": repr(integrator),
+            "newton": repr(self.newton),
+            "petsc_options": {name: str(value) for name, value in given.items()},
+            "sleep": sleep,
+            "impact": impact,
+            "restitution": float(restitution),
+            "ranks": system.comm.size,
+        }
         state = first_state(system, start, start_time)
         if not integrator.accelerations:
             state = replace(state, a=())
@@ -229,9 +238,8 @@ class Stepper:
         forces = [nodal["force_before"]] if "force_before" in nodal else []
         forces.append([contact.force for contact in self.state.contacts])
         self._recent.extend(zip(memory["recent"], map(tuple, forces), strict=False))
-        self.problem.contacts.resume(nodal["unknowns"])
+        self.problem.contacts.resume(nodal["unknowns"], memory["bounded"])
         self._promises.resume(memory["promised"])
-        self.problem.contacts.bounded = memory["bounded"]
         self.problem.rounding.measured = memory["measured"]
         if memory["last"] is not None:
             begin, length = self._last_step = tuple(memory["last"])
@@ -300,12 +308,8 @@ class Stepper:
                 yield not parts
 
     def _bind(self, retries: int) -> bool:
-        """Let infinite friction have a bound once cuts are of no use; tells whether that is new."""
-        endless = any(np.isinf(pair.friction) for pair in self.system.contacts)
-        if not endless or self.problem.contacts.bounded or retries < _CUTS:
-            return False
-        self.problem.contacts.bounded = True
-        return True
+        """Let couplings give way once cuts are of no use; tells whether any does anew."""
+        return retries >= _CUTS and self.problem.give_way()
 
     def paced(self, pace: Pace, end: float) -> Iterator[None]:
         """Advance in steps of a pace, stopping after each.
@@ -535,9 +539,9 @@ class Stepper:
             v[k], a1 = self.problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
             if a1 is not None:
                 a[k] = a1
-            massless = getattr(self.system.bodies[k], "massless", None)
-            if massless is not None:
+            if self.system.bodies[k].has_massless:
                 # What has no momentum has no velocity of its own either.
+                massless = self.system.bodies[k].massless
                 v[k][massless] = step.bodies[k].du[massless] / dt
         histories = [coupling.history(parts) for coupling, parts in self.problem.each(step)]
         return State(time, tuple(u), tuple(v), tuple(a), tuple(histories))

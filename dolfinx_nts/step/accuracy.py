@@ -67,7 +67,7 @@ class Newton:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
         if self.linear_solver != "auto":
             return self.linear_solver
-        flexible = [b for b in system.bodies if not getattr(b, "joints", ())]
+        flexible = [b for b in system.bodies if not b.joints]
         size = int(system.comm.allreduce(sum(b.num_owned for b in flexible)))
         return choose(size, bool(system.contacts or system.joints), inertia, given)
 

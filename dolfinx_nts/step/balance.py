@@ -212,7 +212,7 @@ def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
         problem: Equations of the step.
         step: Their solution.
     """
-    work = np.zeros(len(problem.couplings) - 1)
+    work = np.zeros(len(problem.joints))
     for k, (coupling, parts) in enumerate(list(problem.each(step))[1:]):
         for batch, part in zip(coupling.elements, parts, strict=True):
             work[k] += batch.ledger(part, problem.factor).get("external_work", 0.0)
@@ -227,12 +227,10 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
         step: Its solution.
         time: End of the step [s].
     """
-    if not problem.contacts.elements:
+    if not problem.system.contacts:
         return []
     found = []
-    for contact, part, old in zip(
-        problem.contacts.elements, problem.contact_parts(step), problem.state.contacts, strict=True
-    ):
+    for contact, part, old in problem.touching(step):
         c = contact.candidates
         before, gain = old.facet[c.node], contact.gains(part, problem.factor)
         stayed = (old.force[c.node] > 0.0) & part.active
@@ -247,7 +245,7 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
 def expelled(problem: StepProblem, step: Evaluation) -> str:
     """The node that brings most energy in by starting behind its facet. Every rank must call it."""
     best = (0.0, "")
-    for contact, part in zip(problem.contacts.elements, problem.contact_parts(step), strict=True):
+    for contact, part, _ in problem.touching(step):
         gain = contact.gains(part, problem.factor)
         if len(gain) and gain.max() > best[0]:
             i = int(gain.argmax())

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.elements import JointCoupling
 from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
@@ -38,7 +37,7 @@ def violation(
         [m/s] or [m], or None where all constraints hold.
     """
     worst, name = 0.0, ""
-    for joint, coupling in zip(problem.system.joints, _couplings(problem), strict=True):
+    for joint, coupling in zip(problem.system.joints, problem.joints, strict=True):
         for found in filter(None, coupling.kinematics(state, dt)):
             local = np.array([found.size[int(rates)], found.limit[int(rates)]])
             off, limit = global_max(problem.system.comm, local).tolist()
@@ -73,17 +72,12 @@ def _constraints(
     """Elements of joints with constraints that a start has to fit, and their bodies' numbers."""
     return [
         (batch, bodies, found)
-        for c in _couplings(problem)
+        for c in problem.joints
         for batch, bodies, found in zip(
             c.elements, c.bodies, c.kinematics(state, dt), strict=True
         )
         if found is not None
     ]
-
-
-def _couplings(problem: StepProblem) -> list[JointCoupling]:
-    couplings: list[Any] = problem.couplings[1:]
-    return couplings
 
 
 def _solve(

@@ -37,8 +37,9 @@ class ContactLoads(NamedTuple):
     @classmethod
     def of_step(cls, problem: StepProblem, step: Evaluation) -> ContactLoads:
         """Of a solved step; its tangents are not kept."""
-        parts = tuple(part._replace(tangent=np.empty(0)) for part in problem.contact_parts(step))
-        return cls(tuple(problem.contacts.elements), parts, problem.factor)
+        both = problem.touching(step)
+        parts = tuple(part._replace(tangent=np.empty(0)) for _, part, _ in both)
+        return cls(tuple(elements for elements, _, _ in both), parts, problem.factor)
 
     def on(self, k: int) -> list[tuple[Surface, FloatArray]]:
         """Forces of a contact on the points of its surfaces [N], (p, 3) each. Collective."""

@@ -9,7 +9,6 @@ import numpy.typing as npt
 import scipy.linalg
 from mpi4py import MPI
 
-from dolfinx_nts.bodies.body import places_of
 from dolfinx_nts.parallel import global_max
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
     modes, images = [], []
     for k, body in enumerate(bodies):
         y = (body.reference + step.bodies[k].u1).reshape(-1, 3)
-        for shape in _rigid(y, places_of(body), comm):
+        for shape in _rigid(y, body.places, comm):
             mode = shape / stiffness[k]
             direction.set(0.0)
             direction.array_w[problem.of_body(k)] = mode

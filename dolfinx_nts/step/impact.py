@@ -140,6 +140,7 @@ class _New(NamedTuple):
     """Nodes of a contact that came to touch in a step, and zeros for the others.
 
     Attributes:
+        batch: Elements of the contact.
         gradient: Of the gaps at t_{n+1} by the nodes' coordinates, shape (n, coordinates).
         push: Impulse of the step on the slaves along the normal [N s], shape (n,).
         place: Of the slaves [m], shape (n, 3).
@@ -147,6 +148,7 @@ class _New(NamedTuple):
         lost: Energy that they have lost on this rank [J].
     """
 
+    batch: Any
     gradient: FloatArray
     push: FloatArray
     place: FloatArray
@@ -157,27 +159,23 @@ class _New(NamedTuple):
 def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
     """What came to touch in a step, of each contact."""
     found, rate = [], problem.integrator.rate(problem.dt)
-    for batch, part, old in zip(
-        problem.contacts.elements, problem.contact_parts(step), problem.state.contacts, strict=True
-    ):
+    for batch, part, old in problem.touching(step):
         new = part.active & ~(old.force[batch.candidates.node] > 0.0)
         force = np.where(new, -part.multiplier[:, 0], 0.0)
         lost = float(force @ batch.candidates.gap) / problem.factor
         gradient, normal = batch.gap_slopes(part)
-        found.append(_New(gradient, rate * force, batch.pair.origin + part.place, normal, lost))
+        place = batch.pair.origin + part.place
+        found.append(_New(batch, gradient, rate * force, place, normal, lost))
     return found
 
 
 def _forces(problem: StepProblem, contacts: Sequence[_New]) -> list[FloatArray]:
     """Impulses of all contacts on the owned coordinates of each body [N s]."""
-    found, parts = iter(contacts), []
-    for coupling in problem.couplings:
-        for batch in coupling.elements:
-            rows = np.zeros((batch.num_elements, batch.num_coordinates))
-            if coupling is problem.contacts:
-                new = next(found)
-                rows = new.push[:, None] * new.gradient
-            parts.append(SimpleNamespace(residual=rows))
+    pushed = {id(new.batch): new.push[:, None] * new.gradient for new in contacts}
+    parts = []
+    for batch in problem.elements:
+        nothing = np.zeros((batch.num_elements, batch.num_coordinates))
+        parts.append(SimpleNamespace(residual=pushed.get(id(batch), nothing)))
     assert problem.unknowns is not None
     force = problem.unknowns.forces(problem.elements, parts)
     out = []

@@ -25,7 +25,7 @@ def check_massless(system: System, integrator: Any, impact: str) -> None:
         integrator: Of the run.
         impact: As of `simulate`.
     """
-    with_massless = [b.name for b in system.bodies if getattr(b, "has_massless", False)]
+    with_massless = [b.name for b in system.bodies if b.has_massless]
     if not with_massless:
         return
     what = f"mass='redistributed' of {', '.join(map(repr, with_massless))}"
@@ -64,7 +64,7 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
     """
     bodies = problem.system.bodies
     worst, text = 0.0, ""
-    chosen = [getattr(body, "has_massless", False) for body in bodies]
+    chosen = [body.has_massless for body in bodies]
     both = zip(bodies, state.u, chosen, strict=True)
     moved = any(some and bool(u.any()) for _, u, some in both)
     if not problem.system.comm.allreduce(moved, op=MPI.LOR):

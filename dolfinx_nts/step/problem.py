@@ -20,9 +20,11 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.body import Moment, motion_of_points, places_of
+from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
+from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.elements import Coupling, Step, over
+from dolfinx_nts.elements import Coupling, JointCoupling, Step, over
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.step.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.step.rounding import Rounding
@@ -48,7 +50,9 @@ class StepProblem:
 
     Attributes:
         awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
-        contacts: What makes the elements of contacts.
+        contacts: What makes the elements of contacts. Asked by itself where contact is meant: by
+            `touching`, for when gaps close, and for what a checkpoint keeps of slave nodes.
+        joints: What makes those of each joint.
         couplings: All that makes elements.
         unknowns: Their layout; made anew whenever the elements' coordinates change.
         version: Changes whenever `unknowns` does.
@@ -69,9 +73,9 @@ class StepProblem:
         self.awake: tuple[int, ...] = ()
         self._numbers: tuple[Any, ...] | None = None
         self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
-        self.couplings: list[Coupling] = [self.contacts]
-        for joint, bodies in zip(system.joints, system.joint_bodies, strict=True):
-            self.couplings.append(joint.coupling(bodies))
+        both = zip(system.joints, system.joint_bodies, strict=True)
+        self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
+        self.couplings: list[Coupling] = [self.contacts, *self.joints]
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.stabilization = 0.0
@@ -113,7 +117,7 @@ class StepProblem:
             u1[body.fixed] = body.prescribed(state.time + dt)
         local = [
             [
-                motion_of_points(b, u1 - u),
+                b.motion_of_points(u1 - u),
                 *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
             ]
             for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
@@ -166,9 +170,16 @@ class StepProblem:
             yield coupling, e.parts[start:stop]
             start = stop
 
-    def contact_parts(self, e: Evaluation) -> tuple[Any, ...]:
-        """Parts of an evaluation that contacts contribute, one of each."""
-        return next(parts for coupling, parts in self.each(e) if coupling is self.contacts)
+    def touching(
+        self, e: Evaluation
+    ) -> list[tuple[ContactElements, Contribution, ContactHistory]]:
+        """Of each contact its elements, their part of an evaluation, and its memory of t_n.
+
+        For results that only contacts have: pressures, impacts, changes of facet.
+        """
+        elements = self.contacts.elements
+        parts: Any = e.parts[: len(elements)]
+        return list(zip(elements, parts, self.state.contacts, strict=True))
 
     def forget_forces(self) -> None:
         """Take no body's forces from an earlier step: parameters of materials have changed."""
@@ -209,6 +220,10 @@ class StepProblem:
         """Solve this step by a rule that adds no solution but may find one."""
         for coupling in self.couplings:
             coupling.let_slip()
+
+    def give_way(self) -> bool:
+        """Let what has no bound have one from the next step on; tells whether anything new does."""
+        return any([coupling.give_way() for coupling in self.couplings])
 
     def _touched(self) -> set[int]:
         """Bodies that elements move, the same on all ranks. Collective."""
@@ -470,7 +485,7 @@ class StepProblem:
     def motion(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in the step [m], the same on all ranks."""
         both = zip(self.system.bodies, e.bodies, strict=True)
-        local = [motion_of_points(body, terms.du) for body, terms in both]
+        local = [body.motion_of_points(terms.du) for body, terms in both]
         return global_max(self.system.comm, np.array(local))
 
     def unrest(self, e: Evaluation) -> float:
@@ -535,7 +550,7 @@ def _box(system: System) -> tuple[FloatArray, float]:
     """Middle of the box around all bodies' reference and half its diagonal [m]. Collective."""
     ends = np.full((2, 3), -np.inf)
     for body in system.bodies:
-        x = body.reference.reshape(-1, 3)[places_of(body)]
+        x = body.reference.reshape(-1, 3)[body.places]
         np.maximum(ends, [x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)], ends)
     high, low = global_max(system.comm, ends) * [[1.0], [-1.0]]
     return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))

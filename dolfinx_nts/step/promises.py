@@ -149,12 +149,12 @@ class MaterialWatch:
     """Notices that a caller has changed parameters of materials between steps.
 
     Args:
-        system: The scene; bodies without a method `parameters` are left alone.
+        system: The scene.
     """
 
     def __init__(self, system: System) -> None:
         self._comm = system.comm
-        self._bodies = [b for b in system.bodies if hasattr(b, "parameters")]
+        self._bodies = system.bodies
         self._known = self._values()
 
     def _values(self) -> list[FloatArray]:

@@ -22,16 +22,23 @@ CONTACT_FORCES = "contact_forces"
 #: Column of their moments about the origin.
 CONTACT_MOMENTS = "contact_moments"
 CONTACTS = (CONTACT_FORCES, CONTACT_MOMENTS)
+#: Begin of the columns of reactions.
+REACTIONS = "reactions of "
 
 
 def reactions_of(item: Any) -> str:
     """Column of the reactions of a body or a joint."""
-    return f"reactions of {item.name}"
+    return f"{REACTIONS}{item.name}"
+
+
+def is_resultant(column: str) -> bool:
+    """Whether a column is one of these, not of the ledger."""
+    return column in CONTACTS or column.startswith(REACTIONS)
 
 
 def at_start(system: System) -> dict[str, FloatArray]:
     """Zeros of the right shapes, for the row of the start."""
-    row = {reactions_of(b): np.zeros_like(_reactions(b, np.zeros(b.num_owned)))
+    row = {reactions_of(b): np.zeros_like(b.reactions(np.zeros(b.num_owned)))
            for b in system.bodies}  # fmt: skip
     row |= {reactions_of(joint): np.zeros((2, 3)) for joint in system.declared_joints}
     none = np.zeros((len(system.contacts), 3))
@@ -51,13 +58,12 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
         do not say them, and of each contact on
         its slave body forces [N] and moments about the origin [N m], shape (contacts, 3) each.
     """
-    bodies, contacts = problem.system.bodies, problem.contact_parts(step)
+    bodies, contacts = problem.system.bodies, problem.touching(step)
     joints = problem.system.declared_joints
-    parts = [_reactions(b, t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
-    forces = [part.force.sum(axis=0) for part in contacts]
+    parts = [b.reactions(t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
+    forces = [part.force.sum(axis=0) for _, part, _ in contacts]
     parts.append(np.reshape(forces, (len(contacts), 3)))
-    theta, elements = problem.integrator.theta, problem.contacts.elements
-    moments = [c.moment(part, theta) for c, part in zip(elements, contacts, strict=True)]
+    moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
     parts.append(np.reshape(moments, (len(contacts), 3)))
     held = list(problem.each(step))[1 : 1 + len(joints)]
     first = [bodies[0] for bodies in problem.system.joint_bodies[: len(joints)]]
@@ -92,11 +98,3 @@ def _of_joint(
         if first in of:
             out += batch.resultant(part, of.index(first), u)
     return out
-
-
-def _reactions(body: Any, residual: FloatArray) -> FloatArray:
-    """A body of the user's own may have no conditions."""
-    if not hasattr(body, "reactions"):
-        return np.zeros((0, 3))
-    forces: FloatArray = body.reactions(residual)
-    return forces

@@ -84,7 +84,7 @@ class Rounding:
     def at(self, length: FloatArray) -> FloatArray:
         """`forces` at displacements of these lengths [m], shape (bodies,)."""
         bodies = zip(self._bodies, self._extent, strict=True)
-        beside = np.array([getattr(body, "rounded", extent) for body, extent in bodies])
+        beside = np.array([e if body.rounded is None else body.rounded for body, e in bodies])
         rounding: FloatArray = _EPS * self._diagonal * (length + beside)
         return rounding
 

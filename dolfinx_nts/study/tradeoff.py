@@ -34,11 +34,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
-from petsc4py import PETSc
 
 import dolfinx_nts as nts
-from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import places_of
+from dolfinx_nts.run.saved import versions
 from dolfinx_nts.step.accuracy import ACCURACY
 from dolfinx_nts.study import economy
 from dolfinx_nts.validation import require_bool, require_positive
@@ -113,7 +111,7 @@ class Motion:
 
 def _affine(body: Any) -> tuple[FloatArray, float, float]:
     """What u . M is multiplied with for the means of a body, shape (num_owned, 12); M; X . M X."""
-    place = places_of(body).astype(float)[:, None]
+    place = body.places.astype(float)[:, None]
     x, one = body.reference.reshape(-1, 3), np.kron(place, np.eye(3))
     nodal = body.inertia(one[:, 0].copy())[::3]
     square = body.reference @ body.inertia(body.reference)
@@ -434,13 +432,8 @@ def plot(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
 
 def provenance(scene: str, comm: Any) -> str:
     """Scene, versions and ranks."""
-    petsc = ".".join(map(str, PETSc.Sys.getVersion()))
-    dolfinx = ".".join(map(str, compat.VERSION))
-    return (
-        f"{scene}: dolfinx_nts {nts.__version__}, DOLFINx {dolfinx}, PETSc {petsc}, "
-        f"NumPy {np.__version__}, Python {platform.python_version()}, {comm.size} rank(s), "
-        f"{platform.machine()}"
-    )
+    made_by = ", ".join(f"{name} {version}" for name, version in versions().items())
+    return f"{scene}: {made_by}, {comm.size} rank(s), {platform.machine()}"
 
 
 def _choice(text: str) -> tuple[str, list[Any]]:

@@ -1,9 +1,9 @@
-"""The file of a checkpoint: HDF5, in numberings that do not depend on the ranks.
+"""Files of states, checkpoints and saved runs: HDF5, in numberings that do not depend on the ranks.
 
 Version 2, with h5py's names of types:
 
-- attributes `format` ("dolfinx_nts checkpoint"), `version` (2) and `package` (the version that
-  wrote it);
+- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (2) and
+  `package` (the version that wrote it);
 - `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
   to the run, see `dolfinx_nts.run.checkpoint`;
 - `bodies/K/NAME`, of body K of the system, shape (nodes, 3), in the order of `Body.file_order`:
@@ -16,8 +16,8 @@ Version 2, with h5py's names of types:
 - `balance/NAME`, shape (rows, ...): the columns of the balance table;
 - `switches/NAME`: the newest changes of facet, see `dolfinx_nts.run.checkpoint`.
 
-A file is written beside its place and then renamed, and the one before is kept as NAME.previous:
-whenever a process or a machine stops, one of the two is whole.
+A checkpoint is written beside its place and then renamed, and the one before is kept as
+NAME.previous: whenever a process or a machine stops, one of the two is whole.
 """
 
 from __future__ import annotations
@@ -46,7 +46,13 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 #: Arrays of a file by their place in it, on rank 0; empty elsewhere.
 Tables = dict[str, npt.NDArray[Any]]
 
-_FORMAT, _VERSION = "dolfinx_nts checkpoint", 2
+#: Kinds of files, and the sentence for one that is none.
+CHECKPOINT, SOLUTION = "checkpoint", "solution"
+_OTHER = {
+    CHECKPOINT: "it is no checkpoint; pass the path that Checkpoint had",
+    SOLUTION: "it holds no saved run; pass the path that Solution.save had",
+}
+_VERSION = 2
 #: Part of masses and of a body's size by which the same scene may differ on other ranks.
 _ROUNDED = 1e-9
 
@@ -64,7 +70,7 @@ def describe(system: System) -> dict[str, Any]:
             {
                 "name": b.name,
                 "kind": type(b).__name__,
-                "degree": getattr(b, "degree", None),
+                "degree": b.degree,
                 "nodes": int(nodes),
                 "mass": float(mass),
             }
@@ -145,10 +151,7 @@ class Numbering:
         self._orders, self._counts = [], []
         for body in system.bodies:
             counts = self.comm.gather(body.num_owned // 3)
-            order = body.file_order() if hasattr(body, "file_order") else None
-            if counts is not None and order is None:
-                order = np.arange(sum(counts))
-            self._orders.append(order)
+            self._orders.append(body.file_order())
             self._counts.append(counts)
         self.reference = self.to_file([b.reference for b in system.bodies])
 
@@ -327,25 +330,31 @@ def prepare(path: Path) -> None:
     draft.unlink()
 
 
+def image(kind: str, tables: Tables, notes: Mapping[str, Any]) -> memoryview:
+    """Bytes of a file."""
+    import h5py
+
+    found = io.BytesIO()
+    with h5py.File(found, "w") as file:
+        package = version("dolfinx_nts")
+        file.attrs.update(format=f"dolfinx_nts {kind}", version=_VERSION, package=package)
+        # Numbers may be NumPy's.
+        file["notes"] = json.dumps(notes, default=lambda number: number.item())
+        for place, values in tables.items():
+            file[place] = values
+    return found.getbuffer()
+
+
 def write(path: Path, tables: Tables, notes: Mapping[str, Any]) -> None:
     """Write a checkpoint and keep the one before; rank 0 only.
 
     Raises:
         OSError: It cannot be written; those before are still whole.
     """
-    import h5py
-
-    image = io.BytesIO()
-    with h5py.File(image, "w") as file:
-        file.attrs.update(format=_FORMAT, version=_VERSION, package=version("dolfinx_nts"))
-        # Numbers may be NumPy's.
-        file["notes"] = json.dumps(notes, default=lambda number: number.item())
-        for place, values in tables.items():
-            file[place] = values
     draft = path.with_name(f"{path.name}.part")
     try:
         with open(draft, "wb") as out:
-            out.write(image.getbuffer())
+            out.write(image(CHECKPOINT, tables, notes))
             out.flush()
             # Else a machine that stops may leave the new name with nothing behind it.
             os.fsync(out.fileno())
@@ -358,8 +367,8 @@ def write(path: Path, tables: Tables, notes: Mapping[str, Any]) -> None:
         raise
 
 
-def read(path: Path) -> tuple[Tables, dict[str, Any]]:
-    """Arrays and notes of a checkpoint; rank 0 only.
+def read(path: Path, kind: str) -> tuple[Tables, dict[str, Any]]:
+    """Arrays and notes of a file.
 
     Raises:
         OSError: There is none, or it cannot be read.
@@ -374,8 +383,8 @@ def read(path: Path) -> tuple[Tables, dict[str, Any]]:
             tables[place] = item[()]
 
     with h5py.File(path, "r") as file:
-        if file.attrs.get("format") != _FORMAT:
-            raise ValueError("it is no checkpoint; pass the path that Checkpoint had")
+        if file.attrs.get("format") != f"dolfinx_nts {kind}":
+            raise ValueError(_OTHER[kind])
         found = int(file.attrs["version"])
         if found != _VERSION:
             raise ValueError(

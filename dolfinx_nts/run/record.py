@@ -1,0 +1,178 @@
+"""What a run has to tell in numbers and sentences, with or without its scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.run.run_warnings import RunWarning, RunWarnings
+from dolfinx_nts.run.table import Table
+from dolfinx_nts.step import resultants
+from dolfinx_nts.step.balance import COLUMNS, Switch, Switches
+
+FloatArray = npt.NDArray[np.float64]
+#: Arrays by their place in a file.
+Tables = dict[str, npt.NDArray[Any]]
+
+_COUNTS = ("retries", "rejected", "exceeded")
+_OF_SWITCHES = ("time", "contact", "node", "facets", "defect")
+
+
+@dataclass(eq=False, kw_only=True, repr=False)
+class Record:
+    """What a run has to tell: its balance table, resultants, warnings and how it ended.
+
+    Attributes:
+        status: "completed"; "completed, but ..." with what may be wrong in it; or why the run
+            stopped and what to do.
+        rows: Balance table, one row for the start and one per accepted step; some 150 B each.
+        retries: How often a step was dropped and cut.
+        rejected: How often a step was dropped for its error and shortened, see `Adapt`.
+        exceeded: Steps taken though their motion errs more than `Adapt` asks for: the shortest it
+            may take, and those that move nodes out from behind their facets.
+        switches: Changes of facet of nodes in contact: the newest 10,000, and sums over all.
+        warnings: What the run has to say against its result, by kind; see `RunWarning`.
+        settings: What the run was called with, as text and numbers.
+    """
+
+    status: str = "running"
+    rows: Table = field(default_factory=Table)
+    retries: int = 0
+    rejected: int = 0
+    exceeded: int = 0
+    switches: Switches = field(default_factory=Switches)
+    warnings: RunWarnings = field(default_factory=RunWarnings)
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.summary}>"
+
+    @property
+    def balance(self) -> dict[str, FloatArray]:
+        """Columns of the balance table, shape (rows,) or (rows, 3), identical on all ranks.
+
+        They are read-only and hold the rows up to now.
+        """
+        columns = self.rows.columns.items()
+        return {name: column for name, column in columns if not resultants.is_resultant(name)}
+
+    @property
+    def reactions(self) -> dict[str, FloatArray]:
+        """Of each body, force of each `Dirichlet` condition on it [N], shape (rows, conditions, 3).
+
+        Of a rigid body those of its prescribed motion: force, then moment of rotation [N m].
+
+        Of each joint, by its name, force [N] and moment about its point [N m] on the first of its
+        bodies, shape (rows, 2, 3). They are NaN where elements of one's own do not say them, see
+        `Elements.resultant`.
+
+        In dynamics that of each step, with inertia, where the integrator takes its forces. A
+        coordinate that two conditions prescribe counts with the later one.
+        """
+        start, columns = resultants.REACTIONS, self.rows.columns.items()
+        return {name.removeprefix(start): c for name, c in columns if name.startswith(start)}
+
+    @property
+    def contact_forces(self) -> FloatArray:
+        """Resultant of each contact on its slave body [N], shape (rows, contacts, 3).
+
+        In dynamics that of each step; with a consistent mass the forces of single steps alternate.
+        """
+        return self.rows.column(resultants.CONTACT_FORCES)
+
+    @property
+    def contact_moments(self) -> FloatArray:
+        """Moment of each contact on its slave body about the origin [N m], (rows, contacts, 3).
+
+        Of the forces of `contact_forces`, where their nodes are when the integrator takes them;
+        that on the master, if it is a body, is its opposite.
+        """
+        return self.rows.column(resultants.CONTACT_MOMENTS)
+
+    @property
+    def summary(self) -> str:
+        """How the run went in a few lines: steps, energy, changes of facet; equal on all ranks."""
+        if not len(self.rows):
+            return self.status
+        first, last = self.rows[0], self.rows[-1]
+        steps = len(self.rows) - 1
+        iterations = self.balance["newton_iterations"].sum() / max(steps, 1)
+        lines = [
+            f"{self.status}: {steps} steps to t = {last['time']:.6g} s, {self.retries} retries, "
+            f"{self.rejected} rejected, {iterations:.2f} Newton iterations per step",
+        ]
+        if np.isnan(last["energy"]):
+            lines.append("no ledger was kept")
+        else:
+            others = {"massless_defect": -1.0, "impact_restored": 1.0, "material_change": 1.0}
+            # What joints add are losses.
+            others |= dict.fromkeys(self.balance.keys() - set(COLUMNS), -1.0)
+            more = "".join(
+                f"{' + ' if sign > 0 else ' - '}{name.replace('_', ' ')} {last[name]:.6g} J"
+                for name, sign in sorted(others.items())
+                if last[name]
+            )
+            lines.append(
+                f"energy {first['energy']:.6g} J + external work {last['external_work']:.6g} J - "
+                f"friction {last['friction_dissipation']:.6g} J - contact "
+                f"{last['contact_defect']:.6g} J{more} = {last['energy']:.6g} J, "
+                f"but for {last['ledger_residual']:.2g} J"
+            )
+        if self.exceeded:
+            lines.append(f"{self.exceeded} steps taken though they err more than their tolerance")
+        found, worst = self.switches, self.switches.worst
+        if worst is not None:
+            lines.append(
+                f"{found.number} changes of facet: contact defect {found.defect:.3g} J in all, "
+                f"mean of absolute values {found.size / found.number:.3g} J; most "
+                f"{worst.defect:.3g} J at t = {worst.time:.6g} s ({worst.contact}, node "
+                f"{worst.node}, facet {worst.facets[0]} to {worst.facets[1]})"
+            )
+        return "\n".join([*lines, *self.warnings.lines])
+
+    def packed(self) -> tuple[Tables, dict[str, Any]]:
+        """Arrays and notes of a file from which `unpacked` makes the fields of a record."""
+        newest, switches = list(self.switches), self.switches
+        names = list(dict.fromkeys(s.contact for s in newest))
+        found: Tables = {f"balance/{name}": column for name, column in self.rows.columns.items()}
+        found["switches/time"] = np.array([s.time for s in newest])
+        found["switches/contact"] = np.array([names.index(s.contact) for s in newest], dtype=int)
+        found["switches/node"] = np.array([s.node for s in newest], dtype=int)
+        found["switches/facets"] = np.array([s.facets for s in newest], dtype=int).reshape(-1, 2)
+        found["switches/defect"] = np.array([s.defect for s in newest])
+        return found, {
+            "status": self.status,
+            "settings": self.settings,
+            "columns": list(self.rows.columns),
+            "counts": [getattr(self, name) for name in _COUNTS],
+            "warnings": [asdict(w) for w in self.warnings.values()],
+            "switches": [switches.number, switches.defect, switches.size, switches.worst],
+            "contacts": names,
+        }
+
+
+def unpacked(tables: Mapping[str, npt.NDArray[Any]], notes: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a record from what `Record.packed` has made, by name."""
+    columns = {name: tables[f"balance/{name}"] for name in notes["columns"]}
+    parts = (tables[f"switches/{name}"].tolist() for name in _OF_SWITCHES)
+    switches = Switches()
+    switches.extend(
+        Switch(t, notes["contacts"][k], node, (before, after), defect)
+        for t, k, node, (before, after), defect in zip(*parts, strict=True)
+    )
+    switches.number, switches.defect, switches.size, worst = notes["switches"]
+    if worst is not None:
+        t, name, node, (before, after), defect = worst
+        switches.worst = Switch(t, name, node, (before, after), defect)
+    return {
+        "status": notes["status"],
+        "rows": Table.of(columns),
+        "switches": switches,
+        "warnings": RunWarnings(RunWarning(**w) for w in notes["warnings"]),
+        "settings": notes["settings"],
+        **dict(zip(_COUNTS, notes["counts"], strict=True)),
+    }

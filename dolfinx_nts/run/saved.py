@@ -1,0 +1,127 @@
+"""Runs in files: `Solution.save` and `load`, for what is computed of a run without its scene."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.parallel import write_on_root
+from dolfinx_nts.run.record import Record, unpacked
+from dolfinx_nts.system import State, System
+from dolfinx_nts.validation import StrPath, as_path
+
+
+@dataclass(eq=False, kw_only=True, repr=False)
+class Saved(Record):
+    """A run as `load` reads it; its tables and sentences are those of `Record`.
+
+    Attributes:
+        time: Of the last state [s].
+        bodies: Of each body, by its name, arrays of shape (nodes, 3) in the order of its files:
+            `reference` X [m], `u` [m], `v` [m/s], and `a` [m/s^2] where the integrator carries any.
+        contacts: Of each contact, in their order: `number`, the input numbers of its slave nodes,
+            ascending, and for each of them the fields of `ContactHistory`.
+        joints: Of each joint that remembers something, by its name, `number` and `value`.
+        scene: Names, kinds and sizes of bodies, contacts and joints.
+        versions: Of the packages that made the run.
+    """
+
+    time: float
+    bodies: Mapping[str, Mapping[str, npt.NDArray[Any]]]
+    contacts: tuple[Mapping[str, npt.NDArray[Any]], ...]
+    joints: Mapping[str, Mapping[str, npt.NDArray[Any]]]
+    scene: Mapping[str, Any]
+    versions: Mapping[str, str]
+
+    def plot(self, path: StrPath) -> None:
+        """Write a picture of energies, ledger and momenta over time.
+
+        Args:
+            path: Picture file; its ending chooses the format.
+        """
+        from dolfinx_nts.output.plots import plot_balance
+
+        plot_balance(self.balance, as_path("path", path))
+
+
+def save(record: Record, system: System, state: State, path: Path) -> None:
+    """Write a run; see `Solution.save`. Collective."""
+    from dolfinx_nts.output import state_file as files
+    from dolfinx_nts.output.whole_files import replace_file
+
+    tables = files.Numbering(system).pack(state, {}, {})
+    of_record, notes = record.packed()
+    tables |= of_record
+    notes |= {"scene": files.describe(system), "time": state.time, "versions": versions()}
+    write_on_root(
+        system.comm, f"path={str(path)!r}",
+        lambda: replace_file(path, bytes(files.image(files.SOLUTION, tables, notes))),
+    )  # fmt: skip
+
+
+def load(path: StrPath) -> Saved:
+    """Read what `Solution.save` wrote, without the scene; each rank by itself.
+
+        run = nts.load("out/run.h5")
+        print(run.summary)
+        heights = run.bodies["ball"]["reference"][:, 2] + run.bodies["ball"]["u"][:, 2]
+
+    A run cannot start from it; see `restart`.
+
+    Args:
+        path: Of the file.
+
+    Raises:
+        TypeError: `path` is none.
+        OSError: There is no such file, or it cannot be read.
+        ValueError: It is another file, or of another version.
+    """
+    from dolfinx_nts.output import state_file as files
+
+    try:
+        tables, notes = files.read(as_path("path", path), files.SOLUTION)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"path={str(path)!r}: there is no such file; pass the path that Solution.save had"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise type(error)(f"path={str(path)!r}: {error}") from error
+    scene = notes["scene"]
+    groups: dict[str, list[dict[str, Any]]] = {
+        kind: [{} for _ in scene[kind]] for kind in ("bodies", "contacts", "joints")
+    }
+    for place, values in tables.items():
+        kind, number, *name = place.split("/")
+        if kind in groups:
+            groups[kind][int(number)][name[0]] = values
+    names = {kind: [item["name"] for item in scene[kind]] for kind in ("bodies", "joints")}
+    remembered = zip(names["joints"], groups["joints"], strict=True)
+    return Saved(
+        **unpacked(tables, notes),
+        time=notes["time"],
+        bodies=dict(zip(names["bodies"], groups["bodies"], strict=True)),
+        contacts=tuple(groups["contacts"]),
+        joints={name: found for name, found in remembered if found},
+        scene=scene,
+        versions=notes["versions"],
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of what makes a run, by name."""
+    return {
+        "dolfinx_nts": version("dolfinx_nts"),
+        "DOLFINx": ".".join(map(str, compat.VERSION)),
+        "PETSc": ".".join(map(str, PETSc.Sys.getVersion())),
+        "NumPy": np.__version__,
+        "Python": platform.python_version(),
+    }

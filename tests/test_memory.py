@@ -1,0 +1,82 @@
+"""What many runs leave behind: nothing."""
+
+import gc
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+
+
+def scene(comm, modulus=1e6):
+    """Two blocks that rub and a rigid body on a joint."""
+
+    def box(low, high):
+        return create_box(comm, [np.array(low), np.array(high)], [2, 2, 2], CellType.hexahedron)
+
+    rubber = nts.StVenantKirchhoff(modulus, 0.3)
+    left = nts.Continuum(box((0.0, 0, 0), (1.0, 1, 1)), rubber, density=1e3, velocity=(1, 0, 0),
+                         name="left")  # fmt: skip
+    right = nts.Continuum(box((1.001, -0.1, -0.1), (2, 1.1, 1.1)), rubber, density=1e3,
+                          name="right")  # fmt: skip
+    arm = nts.RigidBody.from_inertia(1.0, (1, 1, 1), (5, 0, 0), name="arm", comm=comm)
+    pair = nts.ContactPair(
+        slave=left.surface(lambda x: x[0] > 1 - 1e-9),
+        master=right.surface(lambda x: x[0] < 1.001 + 1e-9), friction=0.2,
+    )  # fmt: skip
+    return nts.System([left, right, arm], contacts=[pair],
+                      joints=[nts.Spherical(arm, None, point=(5, 1, 0))])  # fmt: skip
+
+
+def one_run(modulus):
+    with scene(COMM, modulus) as system:
+        run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=2e-3)
+    assert run.status == "completed"
+    del run, system
+    gc.collect()
+
+
+def resident():
+    """Memory of this process [B]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+@pytest.mark.parametrize("left", ["", "kept = scene(COMM)"])
+def test_a_destroyed_system_leaves_no_petsc_object(left):
+    """PETSc's own list of what was never freed, which names those of a system that is left."""
+    code = f"""
+        import sys
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        import dolfinx_nts as nts
+        from test_memory import COMM, scene
+        with scene(COMM) as system:
+            run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=2e-3)
+        {left}
+        print(run.status)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=300,
+        check=True, env={**os.environ, "PETSC_OPTIONS": "-objects_dump all"},
+    )  # fmt: skip
+    assert "completed" in done.stdout
+    assert ("never freed" in done.stdout + done.stderr) == bool(left)
+
+
+@pytest.mark.slow
+def test_sixty_systems_in_one_process():
+    """After the first some, each leaves less than a tenth of what its objects take (290 kB)."""
+    for k in range(20):
+        one_run(1e6 + k)
+    before = resident()
+    for k in range(40):
+        one_run(2e6 + k)
+    assert resident() - before < 40 * 29e3
