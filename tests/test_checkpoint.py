@@ -883,14 +883,15 @@ def killed(path, delay, *more):
 
 @pytest.mark.slow
 def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path):
-    """Fifty processes that write after every step; each goes on from where the last was killed."""
+    """Processes that write after every step; each goes on from where the last was killed."""
     if COMM.size > 1:
         pytest.skip("starts processes of its own")
     path, random, before = tmp_path / "run.h5", np.random.default_rng(17), 0.0
-    for k in range(50):
+    kills = 25
+    for k in range(kills):
         killed(path, random.uniform(0.2, 0.6), *(["go on"] if k else []))
         system, _ = floor(COMM)
         found = nts.restart(path, system)
         assert found.state.time >= before and found.rows[-1]["time"] == found.state.time
         before = found.state.time
-    assert before > 50 * 2e-4
+    assert before > kills * 2e-4
