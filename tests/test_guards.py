@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import two_blocks
 from mpi4py import MPI
-from test_single_mass import STEP, PointMass, mass_on_wall
+from point_mass import STEP, PointMass, mass_on_wall
 from test_two_blocks import fung
 
 import dolfinx_nts as nts

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from point_mass import PointMass
 from test_form_body import energy, green
-from test_single_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
