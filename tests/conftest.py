@@ -95,9 +95,10 @@ def pytest_runtest_makereport(item, call):
 def pytest_collection_modifyitems(config, items):
     """Before -m selects: mark what is not fast, and tests that start ranks of their own."""
     if "PYTEST_XDIST_WORKER" in os.environ:
-        # A process takes a file at a time: backwards, because a long one (test_two_blocks) as the
-        # last would leave the others idle.
-        items.sort(key=lambda item: item.path.name, reverse=True)
+        # A process takes a file at a time: demos, whose runs are long, and large files first,
+        # because a long one as the last would leave the others idle.
+        size = {path: path.stat().st_size for path in {item.path for item in items}}
+        items.sort(key=lambda i: ("demo" in i.path.name, size[i.path], i.path.name), reverse=True)
     unknown: dict[str, set[str]] = {}
     for item in items:
         if "on_ranks" in item.fixturenames:

@@ -204,13 +204,13 @@ def distance(one, other):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.fast_on_ranks("mechanism-generalized-alpha", "restored-energy-momentum")
 @pytest.mark.fast(
     "blocks-energy-momentum",
     "mechanism-generalized-alpha",
     "adapted-energy-momentum",
     "restored-energy-momentum",
 )
+@pytest.mark.fast_on_ranks("mechanism-generalized-alpha")
 def test_a_restarted_run_is_the_uninterrupted_one(scene, integrator, mpi_tmp_path):
     if scene == "adapted" and COMM.size > 1:
         pytest.skip("two uninterrupted runs differ there by 1e-9: their steps depend on rounding")
@@ -334,6 +334,7 @@ def test_the_balance_and_its_table_go_on(mpi_tmp_path):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_balanced_is_the_run_to_its_tolerance(mpi_tmp_path):
     """Matrices kept over steps are made anew, so that iterates differ, within the tolerance."""
     path = mpi_tmp_path / "run.h5"
@@ -416,6 +417,7 @@ class Written:
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_how_often(mpi_tmp_path):
     for k, (cadence, wanted) in enumerate((
         ({"every": 4}, [4, 8, 12]), ({"seconds": 1e-9}, list(range(1, STEPS))),
@@ -811,6 +813,7 @@ def test_a_signal_that_no_step_has_seen_is_handed_on():
 @pytest.mark.mpi
 @pytest.mark.parametrize("before", ["energy-momentum", "generalized-alpha"])
 @pytest.mark.fast("energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_another_integrator_and_other_steps(before, mpi_tmp_path):
     """Legal: the run is that from the Solution in memory, and the balance goes on."""
     path, scene = mpi_tmp_path / "run.h5", mechanism(COMM)

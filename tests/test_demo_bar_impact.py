@@ -102,7 +102,9 @@ def test_bar_follows_the_linear_bar():
 @pytest.mark.parametrize("elements", REFERENCE)
 def test_impact(elements):
     energy, rebound = REFERENCE[elements]
-    results = demo.main(elements=elements)
+    # The finest costs most of all: by one rule, as the others show that both do the same.
+    rules = ("energy-momentum",) if elements == max(REFERENCE) else tuple(demo.INTEGRATORS)
+    results = demo.main(elements=elements, integrators=rules)
     for result in results.values():
         check_impact(result, elements)
         assert result["energy"] == pytest.approx(energy, abs=3e-4)

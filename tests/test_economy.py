@@ -119,6 +119,7 @@ def test_a_progress_line_and_a_table_without_a_ledger(capsys):
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.fast("midpoint-0.0", "energy-momentum-0.3")
+@pytest.mark.fast_on_ranks("energy-momentum-0.3")
 def test_far_bodies_have_neither_search_nor_contact_unknowns(monkeypatch, integrator, friction):
     scenes = economy.Economy(COMM, 2)
     feature = dataclasses.replace(FEATURE["declared, far"], friction=friction)
@@ -161,6 +162,7 @@ def test_apart_only_where_the_search_finds_nothing():
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.fast("midpoint-0.3", "energy-momentum-0.0")
+@pytest.mark.fast_on_ranks("energy-momentum-0.0")
 def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
     """No unknown, no fill, no iteration; gaps and facets are known as if they were."""
     scenes = economy.Economy(COMM, 2)
@@ -196,6 +198,7 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("scene", ["smooth", "frictional"])
 @pytest.mark.fast("frictional-energy-momentum")
+@pytest.mark.fast_on_ranks()
 def test_an_impact_is_the_same_as_with_all_candidates_awake(monkeypatch, integrator, scene):
     """Approach, impact and separation."""
     make = {

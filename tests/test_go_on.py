@@ -16,6 +16,7 @@ DT = 2e-3
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.fast("integrator3")
+@pytest.mark.fast_on_ranks()
 def test_two_halves_are_the_whole(integrator):
     """With friction, in contact where the first half ends; on several ranks MUMPS rounds anew."""
     newton = nts.Newton(linear_solver="direct", condense=True)

@@ -242,6 +242,7 @@ def test_a_hard_impact_is_whole_or_named(name, accuracy):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_step_too_long_is_cut_back():
     """In one step the upper face passes the cube's middle, which short ones move in time."""
     runs = [

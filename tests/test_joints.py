@@ -504,6 +504,7 @@ def drive(kind, f):
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["spherical", "revolute", "prismatic", "distance"])
 @pytest.mark.fast("prismatic", "revolute")
+@pytest.mark.fast_on_ranks("prismatic")
 def test_a_drive(kind):
     """It goes where it is told, also over many turns, and the ledger knows its work."""
     speed = 12.0 if kind == "revolute" else 0.3

@@ -423,6 +423,7 @@ def test_drawn_along_it_loses_its_motion_across(integrator):
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.fast("energy-momentum-True", "midpoint-False")
+@pytest.mark.fast_on_ranks("energy-momentum-True")
 def test_far_away_and_on_ranks_without_facets(integrator, condense):
     """A plate of one cell, which one rank owns, and another that nothing comes near."""
     near = plate(n=(1, 1), name="near")

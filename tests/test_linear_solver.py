@@ -192,6 +192,7 @@ def test_schur_complement_saves_iterations():
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
 @pytest.mark.fast("True")
+@pytest.mark.fast_on_ranks()
 def test_contact_part_by_a_solver_of_the_user(condense):
     """LU of the first approximation alone: zeros on its diagonal need MUMPS unless condensed."""
     tables = []

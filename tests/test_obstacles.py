@@ -398,6 +398,7 @@ def block(low=(0.1, 0.1, 0.005), size=0.8, n=2, velocity=(0.3, 0.0, -1.0), name=
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.fast("midpoint")
+@pytest.mark.fast_on_ranks()
 def test_a_block_falls_on_a_plane_as_on_a_plate(integrator):
     gravity, tables, ends = (0.0, 0.0, -9.81), [], []
     for meshed in (True, False):

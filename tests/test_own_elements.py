@@ -150,6 +150,7 @@ def test_a_spring_between_cubes(damping, newton, mpi_tmp_path):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_two_stiff_cubes_vibrate_as_two_masses():
     """omega^2 = k (1/m + 1/m); the springs' axis goes through both centres."""
     a, b = cube((0, 0, 0), "a", velocity=(0.1, 0, 0)), cube((2, 0, 0), "b", velocity=(-0.1, 0, 0))

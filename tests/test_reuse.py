@@ -187,6 +187,7 @@ def test_a_failed_step_leaves_no_trace(monkeypatch):
     ("accuracy", "ledger"), [("exact", 1e-11), ("balanced", 1e-8), ("fast", 1e-5)]
 )
 @pytest.mark.fast("fast-1e-05")
+@pytest.mark.fast_on_ranks()
 def test_levels_of_accuracy_close_the_ledger_as_they_say(accuracy, ledger):
     scene, rule = rubbing_blocks(0.3), nts.EnergyMomentum()
     run = nts.simulate(scene, rule, dt=2e-3, t_end=0.08, accuracy=accuracy)

@@ -114,6 +114,7 @@ def test_cubes_sleep_until_they_are_reached(integrator, newton):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_friction_beside_a_sleeper():
     a, b, awake = both(lambda: row(friction=(0.1, 0.0, 0.2)), 8, condense=True)
     assert awake[-1] == "abc" and a.solution.balance["slip"].max() > 0
@@ -133,6 +134,7 @@ def test_units_change_nothing(metre):
 @pytest.mark.mpi
 @pytest.mark.parametrize(("reuse", "iterations"), [(False, 3), (True, 5)])
 @pytest.mark.fast("True-5")
+@pytest.mark.fast_on_ranks()
 def test_a_step_that_fails_is_halved(reuse, iterations):
     """The impact takes more iterations than these."""
     newton = {"max_iterations": iterations, "reuse": reuse, "linear_solver": "direct"}

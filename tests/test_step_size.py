@@ -103,6 +103,7 @@ def test_steps_above_their_tolerance_are_told():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_error_of_a_run_follows_the_tolerance():
     """Steps as tolerance^(-1/3), the error of a run as h^2, thus as tolerance^(2/3)."""
     errors, steps = [], []

@@ -199,6 +199,7 @@ def _disc(friction, integrator):
 @pytest.mark.parametrize("gap", [0.05, 0.0499])
 @pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])
 @pytest.mark.fast("energy-momentum-0.05-exact")
+@pytest.mark.fast_on_ranks()
 def test_cubes_that_meet_at_the_end_of_a_step(integrator, gap, accuracy):
     """mu = 1e6 binds as no bound does; at 5 m/s a gap of 0.05 m closes after five steps."""
     energies = []

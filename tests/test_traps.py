@@ -136,7 +136,7 @@ def test_falls_onto_edges_and_corners(place, integrator, friction):
 
 @rubbing
 @pytest.mark.fast("midpoint-0.3", "energy-momentum-0.0")
-@pytest.mark.fast_on_ranks("energy-momentum-0.0")
+@pytest.mark.fast_on_ranks()
 def test_slides_off_the_end_of_the_plate(integrator, friction):
     """Slaves leave over the free edge while in contact; no facet is there to hold them."""
     system = scene("corner", velocity=(2.0, 0.0, -0.2), friction=friction)
@@ -204,6 +204,7 @@ def test_held_slaves_driven_against_a_held_master_have_nothing_to_solve(integrat
 @pytest.mark.parametrize("place", ["inside", "corner"])
 @rubbing
 @pytest.mark.fast("energy-momentum-0.3-corner")
+@pytest.mark.fast_on_ranks()
 def test_contact_comes_and_goes(place, integrator, friction):
     """Two bounces under gravity on a plate that is held below."""
     held = [nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)]

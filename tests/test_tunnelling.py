@@ -433,6 +433,7 @@ def test_a_shot_at_a_thin_flexible_plate(speed, integrator, accuracy):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
+@pytest.mark.fast_on_ranks("energy-momentum")
 def test_a_block_at_rest_over_a_soft_plate(integrator):
     """6 mm above facets of 1 cm, in steps of 50 ms: the first steps see no motion to come."""
     size, gap = 0.02, 6e-3
