@@ -293,7 +293,8 @@ def test_a_rank_that_ends_takes_the_others_along(end, on_ranks, tmp_path):
                 {end}
 
         scene = t.blocks(t.COMM)
-        found = t.run(scene, before_step=before, checkpoint=t.nts.Checkpoint({str(path)!r}, every=3))
+        saves = t.nts.Checkpoint({str(path)!r}, every=3)
+        found = t.run(scene, before_step=before, checkpoint=saves)
         print("status", found.status)
         sys.exit("not completed")
     """

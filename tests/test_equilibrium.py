@@ -7,8 +7,8 @@ import pytest
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from point_mass import PointMass
 from scipy.optimize import fsolve
-from test_single_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import two_blocks
 from mpi4py import MPI
+from point_mass import STEP, PointMass, mass_on_wall
 from test_promises import OPEN, ledger_or_word
-from test_single_mass import STEP, PointMass, mass_on_wall
 from test_two_blocks import fung
 
 import dolfinx_nts as nts

@@ -5,9 +5,9 @@ import pytest
 import two_blocks
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from point_mass import PointMass
 from test_form_body import energy, green
 from test_promises import OPEN, PROMISED, ledger_or_word
-from test_single_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from mpi4py import MPI
+from point_mass import INTEGRATORS as ALL
+from point_mass import MASS, PointMass, PointSurface
 from scipy.integrate import solve_ivp
-from test_single_mass import INTEGRATORS as ALL
-from test_single_mass import MASS, PointMass, PointSurface
 from test_smoothing import SPEED, Sledge
 
 import dolfinx_nts as nts

@@ -117,6 +117,20 @@ def test_no_imports_in_a_ring():
     assert not below, f"these import each other in a ring, or stand above one: {sorted(below)}"
 
 
+def test_no_folders_in_a_ring():
+    """But for one: contact is between surfaces of bodies, and bodies make their surfaces."""
+    below = {}
+    for module in PRESENT:
+        folder = module.split(".")[0]
+        names = {n for n in siblings(module) if (folder, n) != ("bodies", "contact.surfaces")}
+        below.setdefault(folder, set()).update({name.split(".")[0] for name in names} - {folder})
+    below = {folder: names for folder, names in below.items() if (PACKAGE / folder).is_dir()}
+    while leaves := [folder for folder, names in below.items() if not names & below.keys()]:
+        for folder in leaves:
+            del below[folder]
+    assert not below, f"these import each other in a ring, or stand above one: {sorted(below)}"
+
+
 @pytest.mark.parametrize("module", PRESENT)
 def test_no_module_imports_the_whole_package(module):
     names = {alias for alias in imported(module) if module != "__init__"}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from point_mass import MASS, STEP, PointMass
 from test_order import flying_block, sliding_block
-from test_single_mass import MASS, STEP, PointMass
 
 import dolfinx_nts as nts
 

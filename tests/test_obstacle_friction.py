@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from point_mass import INTEGRATORS, MASS, STEP, PointMass, PointSurface, turn
 from test_obstacles import (
     ACCELERATION,
     CENTRE,
@@ -15,7 +16,6 @@ from test_obstacles import (
     block,
     changed,
 )
-from test_single_mass import INTEGRATORS, MASS, STEP, PointMass, PointSurface, turn
 
 import dolfinx_nts as nts
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
-from test_single_mass import INTEGRATORS, MASS, SPEED, STEP, PointMass, PointSurface, turn, wall
+from point_mass import INTEGRATORS, MASS, SPEED, STEP, PointMass, PointSurface, turn, wall
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import Fields

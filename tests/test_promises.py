@@ -8,7 +8,7 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
-from test_single_mass import PointMass
+from point_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV

@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 from mpi4py import MPI
-from test_single_mass import mass_on_wall
+from point_mass import mass_on_wall
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV

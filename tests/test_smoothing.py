@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from mpi4py import MPI
-from test_single_mass import PointMass, PointSurface
+from point_mass import PointMass, PointSurface
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.surfaces import locate_facets

@@ -7,9 +7,9 @@ import pytest
 import two_blocks
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
+from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall, wall
 from test_friction import rubbing_blocks
 from test_simulate import fail_once
-from test_single_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall, wall
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV

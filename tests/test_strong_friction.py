@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from point_mass import INTEGRATORS, MASS, turn
 from test_obstacle_friction import sliding
 from test_promises import PROMISED, ledger_or_word
-from test_single_mass import INTEGRATORS, MASS, turn
 
 import dolfinx_nts as nts
 

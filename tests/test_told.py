@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
-from test_single_mass import MASS, SPEED, STEP, mass_on_wall
+from point_mass import MASS, SPEED, STEP, mass_on_wall
 
 import dolfinx_nts as nts
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from point_mass import INTEGRATORS, MASS, PointMass, PointSurface
 from scipy.interpolate import LinearNDInterpolator
 from test_promises import OPEN, PROMISED, ledger_or_word
-from test_single_mass import INTEGRATORS, MASS, PointMass, PointSurface
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact import search

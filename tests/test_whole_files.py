@@ -7,7 +7,10 @@ then the system call fails.
 import io
 import resource
 import shutil
+import subprocess
+import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -138,6 +141,46 @@ def test_a_full_disk_ends_the_run_with_whole_fields(mpi_tmp_path):
         assert file.times == [0.0, 1e-3, 2e-3] and len(file.fields) == 3
         assert all(np.isfinite(f["displacement"]).all() for f in file.fields)
     assert np.array_equal(np.loadtxt(table, delimiter=",", skiprows=1)[:, 0], run.balance["time"])
+
+
+SCRIPT = """
+import resource, sys
+from mpi4py import MPI
+from dolfinx_nts import dolfinx_compat
+dolfinx_compat.C_FLAGS[0] = "-O1"
+sys.path.insert(0, {tests!r})
+import dolfinx_nts as nts
+from test_output import flying
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, resource.RLIM_INFINITY))
+system, fields, dt = flying(), nts.output.Fields({folder!r}), 1e-3
+if {loop}:
+    run = nts.Stepper(system, nts.Midpoint())
+    fields.start(run)
+    while True:
+        run.advance(dt)
+        fields.write(run)
+run = nts.simulate(system, nts.Midpoint(), dt=dt, t_end=100 * dt, output=[fields])
+if run.status != "completed":
+    raise RuntimeError(run.status)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loop", [False, True])
+def test_a_script_ends_by_an_exception_where_the_disk_is_full(loop, tmp_path):
+    """By exit status 1, neither by a signal nor in silence; what was written before can be read."""
+    script = SCRIPT.format(tests=str(Path(__file__).parent), folder=str(tmp_path), loop=loop)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 1, done.stderr
+    assert "File too large" in done.stderr and "with space and write permission" in done.stderr
+    file = read(tmp_path / "body.xdmf")
+    assert len(file.times) == len(file.fields) > 2
+    assert np.allclose(file.times, 1e-3 * np.arange(len(file.times)), rtol=1e-12)
+    for time, fields in zip(file.times, file.fields, strict=True):
+        assert np.allclose(fields["displacement"], time * np.array([1.0, 2.0, 3.0]), atol=1e-12)
 
 
 @mpi
