@@ -1,7 +1,7 @@
 #!/bin/bash
 # The tests: pytest in serial (a process on each core, a test file at a time), then the tests marked
 # mpi on 2 ranks.
-#   test.sh          lint and the fast tests
+#   test.sh          the fast tests, and lint beside the serial ones
 #   test.sh --slow   the tests marked slow, which the fast ones leave out; those that start 3 or 4
 #                    ranks of their own come last and one by one, as waiting ranks take a core each
 # A failing stage does not stop the later ones. PYTEST_ARGS is given to pytest ("-n0 --pdb ..." for
