@@ -139,7 +139,7 @@ def test_metres_millimetres_micrometres(integrator):
     runs = [
         impact(
             integrator=integrator,
-            t_end=0.12,  # when all have met and some have parted
+            t_end=0.12,  # the impact ends at 0.1 s
             metre=m,
             density=1e3 / m**3,
             material=nts.NeoHookean(young=1e6 / m, poisson=0.3),
