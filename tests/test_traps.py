@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import dolfinx_nts as nts
 
@@ -321,3 +322,59 @@ def test_nodes_between_two_that_do_not_yield_are_named(by, integrator):
     assert end - 2e-3 <= run.balance["time"][-1] <= end + 1e-9
     both = "'cube-floor' and 'cube-above'" if by == "plane" else "'cube-floor' and a support"
     assert f"{both} may hold the same nodes" in run.status
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("friction", "row", "states"),
+    [(0.0, 0, "contact and none"), (0.3, 0, "contact and none"), (0.3, 1, "stick and slip")],
+)
+def test_nodes_that_flip_are_named_with_their_states(friction, row, states, integrator):
+    """Seven flips of a step are said to be some, eight to be a cycle, with what may end it."""
+    stepper = nts.Stepper(scene(velocity=(0.0, 0.0, -1.0), friction=friction), integrator)
+    stepper.start(2e-3)
+    stepper.problem.begin(stepper.state, 2e-3)
+    step, (contact,) = stepper.solver.solve(), stepper.problem.elements
+    flips = np.zeros((2, contact.num_elements), dtype=int)
+    for count in (7, 8):
+        flips[row] = count
+        if contact.num_elements:
+            text = contact.describe(step.parts[0], flips)[1]
+            assert text.startswith("contact 'cube-plate': node ")
+            assert (f"flips between {states} and settles in neither" in text) == (count == 8)
+            assert ("try another dt" in text) == (count == 8)
+            assert ("smaller coefficient of friction" in text) == (count == 8 and friction > 0)
+    stepper.close()
+
+
+class Breaks:
+    """A solver whose solves end by an error of PETSc."""
+
+    def __init__(self, snes):
+        self._snes = snes
+
+    def __getattr__(self, name):
+        return getattr(self._snes, name)
+
+    def solve(self, *_):
+        raise PETSc.Error(76)
+
+
+@pytest.mark.slow
+def test_an_error_of_petsc_is_told_with_its_likely_cause(integrator, monkeypatch):
+    """As that of a factorisation of constraints of which one repeats another."""
+    newton = nts.Newton(linear_solver="direct", max_retries=0)
+    stepper = nts.Stepper(scene(velocity=(0.0, 0.0, -1.0)), integrator, newton=newton)
+    stepper.start(2e-3)
+    prepare = type(stepper.solver).prepare
+
+    def breaking(self):
+        prepare(self)
+        if not isinstance(self.snes, Breaks):
+            self.snes = Breaks(self.snes)
+
+    monkeypatch.setattr(type(stepper.solver), "prepare", breaking)
+    words = "PETSc stopped with error 76; two contacts, or a contact and a support, may hold the"
+    with pytest.raises(nts.StepFailedError, match=words):
+        stepper.advance(2e-3)
+    stepper.close()
