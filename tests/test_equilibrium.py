@@ -460,6 +460,7 @@ def test_what_has_settled_stays(integrator):
     assert run.balance["potential"][0] == settled.balance["potential"][-1]
     for name in ("active", "stick", "slip", "min_gap"):
         assert run.balance[name][0] == settled.balance[name][-1]
+    assert run.balance["active"][0] == 16 and np.abs(run.balance["min_gap"][0]) < 1e-12
     # A block of this height would have fallen by 2 mm and swung at 0.2 m/s.
     assert run.balance["kinetic"].max() < 1e-18 * 500 * 0.2**2
     for body, u in zip(system.bodies, settled.state.u, strict=True):

@@ -1,6 +1,7 @@
 """What a run keeps of its steps: right, in little memory, and safe from those who read it."""
 
 import gc
+import sys
 import tracemalloc
 from types import SimpleNamespace
 
@@ -96,3 +97,35 @@ def test_memory_of_a_long_run():
     stepper.close()
     assert stepper.solution.rows[-1]["time"] == pytest.approx(1.5)
     assert grown < 250 * steps
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("meshed", [False, True])
+def test_memory_of_a_long_run_in_contact(meshed):
+    """Columns of 8 B a number, also those of the contact's force and moment, and no objects.
+
+    A row of Python's own floats would be 20 blocks of memory and more.
+    """
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)
+    rubber = nts.StVenantKirchhoff(1e6, 0.3)
+    body = nts.Continuum(mesh, rubber, density=1e3, velocity=(0.1, 0, 0), name="body")
+    bodies, master = [body], nts.Plane((0, 0, 0), (0, 0, 1))
+    if meshed:
+        held = nts.Dirichlet(lambda x: x[2] < 9)
+        mesh = create_box(COMM, [[-1, -1, -1], [3, 3, 0]], [2, 2, 1], CellType.hexahedron)
+        bodies.append(nts.Continuum(mesh, rubber, density=1e3, bcs=[held], name="floor"))
+        master = bodies[1].surface(lambda x: x[2] > -1e-9)
+    pair = nts.ContactPair(body.surface(lambda x: x[2] < 1e-9), master, friction=0.01)
+    system = nts.System(bodies, contacts=[pair], gravity=(0, 0, -9.81))
+    stepper, blocks, steps = nts.Stepper(system, nts.EnergyMomentum()), [], 60
+    for _ in range(3):
+        for _ in range(steps):
+            stepper.advance(1e-4)
+        gc.collect()
+        blocks.append(sys.getallocatedblocks())
+    stepper.close()
+    run = stepper.solution
+    assert np.count_nonzero(run.balance["active"]) > steps
+    assert blocks[2] - blocks[1] < 2 * steps
+    tables = *run.balance.values(), run.contact_forces, run.contact_moments
+    assert sum(column.nbytes for column in tables) < 310 * len(run.rows)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import dolfinx_nts as nts
 
@@ -273,8 +274,10 @@ def test_more_ranks_than_cells(on_ranks):
     on_ranks(3, "-m", "pytest", "-q", "-p", "no:cacheprovider", name)
 
 
-def test_the_same_gap_closed_twice_is_refused_or_reported():
-    """Twice the same pair is an error; two fixed plates in one plane end a run, with all it has."""
+@pytest.mark.parametrize("friction", [0.0, 0.3, np.inf])
+@pytest.mark.fast("energy-momentum-0.0")
+def test_the_same_gap_closed_twice_is_refused_or_as_closed_once(friction, integrator):
+    """Twice the same pair is an error; two fixed plates in one plane are that plane."""
     whole = [nts.Dirichlet(lambda x: x[2] < 9)]
     rubber = nts.NeoHookean(young=1e6, poisson=0.3)
 
@@ -282,19 +285,106 @@ def test_the_same_gap_closed_twice_is_refused_or_reported():
         mesh = create_box(COMM, [low, high], cells, CellType.hexahedron)
         return nts.Continuum(mesh, rubber, density=1e3, name=name, **options)
 
+    def falls(masters, *bodies):
+        pairs = [nts.ContactPair(bottom, master, friction=friction) for master in masters]
+        system = nts.System([cube, *bodies], contacts=pairs)
+        run = nts.simulate(system, integrator, dt=5e-3, t_end=0.06)
+        assert run.status == "completed" and run.retries == 0
+        return run.balance
+
     cube = box([0, 0, 0.05], [1, 1, 1.05], [2, 2, 2], "cube", velocity=(0, 0, -2))
     plates = [
         box([k - 0.5, -0.2, -0.5], [k + 0.5, 1.2, 0], [1, 1, 1], f"plate{k}", bcs=whole)
         for k in (0, 1)
     ]
     bottom = cube.surface(lambda x: x[2] < 0.05 + 1e-9)
-    pairs = [nts.ContactPair(bottom, p.surface(lambda x: x[2] > -1e-9)) for p in plates]
+    tops = [p.surface(lambda x: x[2] > -1e-9) for p in plates]
+    pair = nts.ContactPair(bottom, tops[0])
     with pytest.raises(
         ValueError, match=r"same nodes of 'cube'.*same facets of 'plate0'; drop one"
     ):
-        nts.System([cube, *plates], contacts=[pairs[0], pairs[0]])
-    run = nts.simulate(
-        nts.System([cube, *plates], contacts=pairs), nts.EnergyMomentum(), dt=5e-3, t_end=0.06
+        nts.System([cube, *plates], contacts=[pair, pair])
+    once, twice = falls([nts.Plane((0, 0, 0), (0, 0, 1))]), falls(tops, *plates)
+    assert once["active"].max() == 9
+    for name in ("active", "energy", "contact_defect", "friction_dissipation", "linear_momentum"):
+        scale = np.abs(once["energy" if name != "linear_momentum" else name]).max()
+        assert np.abs(once[name] - twice[name]).max() < 1e-9 * scale
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by", ["plane", "support"])
+def test_nodes_between_two_that_do_not_yield_are_named(by, integrator):
+    """Driven at 1 m/s at a plane that is 1 cm away they have nowhere to go from 0.01 s on."""
+    mesh = create_box(COMM, [[0, 0, 0.01], [1, 1, 1.01]], [1, 1, 1], CellType.hexahedron)
+    low, above = (lambda x: x[2] < 0.02), nts.Plane(
+        (0, 0, 0.02), (0, 0, -1), motion=lambda t: (0.0, 0.0, -t), name="above"
     )
-    assert len(run.rows) > 4
-    assert run.status == "completed" or "Try a smaller dt" in run.status
+    held = nts.Dirichlet(low, components=(2,), value=lambda t: (0.0, 0.0, -t))
+    bcs = [held] if by == "support" else []
+    cube = nts.Continuum(mesh, RUBBER, density=1e3, name="cube", bcs=bcs)
+    floor, bottom = nts.Plane((0, 0, 0), (0, 0, 1), name="floor"), cube.surface(low)
+    pairs = [nts.ContactPair(bottom, p) for p in ([floor, above] if by == "plane" else [floor])]
+    run = nts.simulate(
+        nts.System([cube], contacts=pairs), integrator, dt=2e-3, t_end=0.04,
+        newton=nts.Newton(max_retries=1),
+    )  # fmt: skip
+    end = 0.02 if by == "plane" else 0.01
+    assert end - 2e-3 <= run.balance["time"][-1] <= end + 1e-9
+    both = "'cube-floor' and 'cube-above'" if by == "plane" else "'cube-floor' and a support"
+    assert f"{both} may hold the same nodes" in run.status
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("friction", "row", "states"),
+    [(0.0, 0, "contact and none"), (0.3, 0, "contact and none"), (0.3, 1, "stick and slip")],
+)
+def test_nodes_that_flip_are_named_with_their_states(friction, row, states, integrator):
+    """Seven flips of a step are said to be some, eight to be a cycle, with what may end it."""
+    stepper = nts.Stepper(scene(velocity=(0.0, 0.0, -1.0), friction=friction), integrator)
+    stepper.start(2e-3)
+    stepper.problem.begin(stepper.state, 2e-3)
+    step, (contact,) = stepper.solver.solve(), stepper.problem.elements
+    flips = np.zeros((2, contact.num_elements), dtype=int)
+    for count in (7, 8):
+        flips[row] = count
+        if contact.num_elements:
+            text = contact.describe(step.parts[0], flips)[1]
+            assert text.startswith("contact 'cube-plate': node ")
+            assert (f"flips between {states} and settles in neither" in text) == (count == 8)
+            assert ("try another dt" in text) == (count == 8)
+            assert ("smaller coefficient of friction" in text) == (count == 8 and friction > 0)
+    stepper.close()
+
+
+class Breaks:
+    """A solver whose solves end by an error of PETSc."""
+
+    def __init__(self, snes):
+        self._snes = snes
+
+    def __getattr__(self, name):
+        return getattr(self._snes, name)
+
+    def solve(self, *_):
+        raise PETSc.Error(76)
+
+
+@pytest.mark.slow
+def test_an_error_of_petsc_is_told_with_its_likely_cause(integrator, monkeypatch):
+    """As that of a factorisation of constraints of which one repeats another."""
+    newton = nts.Newton(linear_solver="direct", max_retries=0)
+    stepper = nts.Stepper(scene(velocity=(0.0, 0.0, -1.0)), integrator, newton=newton)
+    stepper.start(2e-3)
+    prepare = type(stepper.solver).prepare
+
+    def breaking(self):
+        prepare(self)
+        if not isinstance(self.snes, Breaks):
+            self.snes = Breaks(self.snes)
+
+    monkeypatch.setattr(type(stepper.solver), "prepare", breaking)
+    words = "PETSc stopped with error 76; two contacts, or a contact and a support, may hold the"
+    with pytest.raises(nts.StepFailedError, match=words):
+        stepper.advance(2e-3)
+    stepper.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ def diagnosis(
             f"; the internal forces of {', '.join(map(repr, endless))} are not finite: the energy "
             "of its material or form may not be defined for this deformation"
         )
+    top += _held_twice(problem, e)
     finite = ratio[worst] < np.inf
     size = f"at {ratio[worst]:.3g} times its tolerance" if finite else "is not finite"
     return (
@@ -67,3 +69,32 @@ def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:
     r[body.fixed] = 0.0
     x = ", ".join(f"{c:.4g}" for c in body.reference.reshape(-1, 3)[int(np.argmax(r)) // 3])
     return body.name, float(r.max()), f"body {body.name!r}: largest residual at X = ({x})"
+
+
+def _held_twice(problem: StepProblem, e: Evaluation) -> list[str]:
+    """Which contacts push nodes that others push, too, or none that could move. Collective."""
+    names, pushed, stuck = [], [], []
+    # A rigid body's directors are pushed by all that touches it.
+    nodal = [not hasattr(body, "places") for body in problem.system.bodies]
+    for c, bodies, part in zip(problem.elements, problem.bodies, e.parts, strict=True):
+        if c.bilateral or not c.widths["constraints"] or not all(nodal[k] for k in bodies):
+            continue
+        force = np.abs(part.residual[:, : c.num_coordinates]) > 0.0
+        free = np.concatenate(c.dofs(), axis=1) >= 0
+        points, moved = c.points(), force & free
+        of = [np.full_like(p, k) for k, p in zip(bodies, points, strict=True)]
+        both = (np.concatenate(arrays, axis=1)[moved] for arrays in (of, points))
+        names.append(c.name)
+        pushed.append(set(zip(*(a.tolist() for a in both), strict=True)))
+        stuck.append(bool((force.any(axis=1) & ~moved.any(axis=1)).any()))
+    ranks = problem.system.comm.allgather((pushed, stuck))
+    everywhere = [set().union(*(nodes[k] for nodes, _ in ranks)) for k in range(len(names))]
+    found = [
+        f"{names[i]!r} and {names[j]!r}"
+        for i, j in combinations(range(len(names)), 2)
+        if everywhere[i] & everywhere[j]
+    ]
+    found += [
+        f"{name!r} and a support" for k, name in enumerate(names) if any(s[k] for _, s in ranks)
+    ]
+    return [f"{both} may hold the same nodes" for both in found]
