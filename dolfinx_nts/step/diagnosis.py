@@ -75,7 +75,7 @@ def _held_twice(problem: StepProblem, e: Evaluation) -> list[str]:
     """Which contacts push nodes that others push, too, or none that could move. Collective."""
     names, pushed, stuck = [], [], []
     # A rigid body's directors are pushed by all that touches it.
-    nodal = [not hasattr(body, "places") for body in problem.system.bodies]
+    nodal = [not body.oriented for body in problem.system.bodies]
     for c, bodies, part in zip(problem.elements, problem.bodies, e.parts, strict=True):
         if c.bilateral or not c.widths["constraints"] or not all(nodal[k] for k in bodies):
             continue
