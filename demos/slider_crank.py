@@ -298,7 +298,7 @@ def main(
             output=[path, *([Fields(folder, interval=t_end / 50)] if folder else [])],
         )  # fmt: skip
         if folder:
-            drawn = [body for body in system.bodies if hasattr(body, "mesh")]
+            drawn = [body for body in system.bodies if body.mesh is not None]
             picture(drawn, folder / "mechanism.png", view=(50.0, -80.0))
         results[kind] = figures(run, path) | {"seconds": time.perf_counter() - clock}
         balances[kind] = run.balance
