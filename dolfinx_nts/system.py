@@ -101,6 +101,8 @@ class System:
         self.joints = items("joints", joints, lambda j: hasattr(j, "coupling"), "joints")
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
+        for body in self.bodies:
+            body.check_alive()
         names = [b.name for b in self.bodies]
         if len(set(names)) < len(names):
             raise ValueError(f"bodies: names {names} are not unique; pass name= to each body")
@@ -153,7 +155,10 @@ class System:
         self._check_penetration(depths)
 
     def destroy(self) -> None:
-        """Free the PETSc objects of its bodies, which are of no use then. Collective."""
+        """Free the PETSc objects of its bodies, which are of no use then. Collective.
+
+        What a run has computed can still be read, saved and plotted.
+        """
         for body in self.bodies:
             body.destroy()
 

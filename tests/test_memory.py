@@ -71,6 +71,28 @@ def test_a_destroyed_system_leaves_no_petsc_object(left):
     assert ("never freed" in done.stdout + done.stderr) == bool(left)
 
 
+@pytest.mark.mpi
+def test_what_is_left_of_a_destroyed_system(tmp_path):
+    """Its run can be read, saved and plotted; what would need PETSc says so."""
+    with scene(COMM) as system:
+        run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=2e-3)
+    path = COMM.bcast(tmp_path) / "run.h5"
+    run.save(path)
+    assert nts.load(path).summary == run.summary
+    load = run.contact_fields(system.bodies[0])["contact_load_left-right"].x.array
+    assert np.isfinite(load).all()
+    for use in (
+        lambda: nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=2e-3),
+        lambda: nts.equilibrium(system),
+        lambda: nts.motion_of(system.bodies[0]),
+        lambda: nts.System(system.bodies[:1]),
+    ):
+        with pytest.raises(ValueError, match="^body 'left' was destroyed, by itself or by its"):
+            use()
+    with pytest.raises(ValueError, match="^body 'arm' was destroyed"):
+        nts.motion_of(system.bodies[2])
+
+
 @pytest.mark.slow
 def test_sixty_systems_in_one_process():
     """After the first some, each leaves less than a tenth of what its objects take (290 kB)."""

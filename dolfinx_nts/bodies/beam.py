@@ -439,6 +439,7 @@ class Beam(Body):
 
     def destroy(self) -> None:
         """Free the PETSc objects; the body is of no use then."""
+        super().destroy()
         for a in (self._shared, self._matrix):
             if a is not None:
                 a.destroy()

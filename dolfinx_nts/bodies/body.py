@@ -64,6 +64,7 @@ class Body:
             None: that of the positions.
         allow_inversion: Whether steps are accepted that end with `smallest_det` <= 0.
         has_massless: Whether coordinates on any rank have no mass.
+        destroyed: Whether `destroy` was called.
     """
 
     name: str
@@ -85,6 +86,7 @@ class Body:
     rounded: float | None = None
     allow_inversion: bool = False
     has_massless: bool = False
+    destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None
 
     # ---- what each body has of its own
@@ -164,7 +166,23 @@ class Body:
         return self.nodal_mass * acceleration.ravel()
 
     def destroy(self) -> None:
-        """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
+        """Free the PETSc objects, for those who make many bodies; the body is of no use then.
+
+        A body's own `destroy` calls this one, too.
+        """
+        self.destroyed = True
+
+    def check_alive(self) -> None:
+        """Refuse a body that was destroyed.
+
+        Raises:
+            ValueError: It was.
+        """
+        if self.destroyed:
+            raise ValueError(
+                f"body {self.name!r} was destroyed, by itself or by its system; make it anew, or "
+                "destroy it later"
+            )
 
     def nodal_stiffness(self, rule: Integrator) -> FloatArray:
         """Stiffness of each node's neighbourhood at rest [N/m], shape (num_owned,).

@@ -50,7 +50,11 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
         u: Owned displacements [m], shape (num_owned,), e.g. `stepper.state.u[0]` in a writer;
             default: the last accepted ones.
         v: Owned velocities [m/s], shape (num_owned,); default: likewise.
+
+    Raises:
+        ValueError: The body was destroyed.
     """
+    body.check_alive()
     known = body.last_accepted()
     u, v = _owned(body, "u", u, known[0]), _owned(body, "v", v, known[1])
     place = body.reference + u

@@ -542,6 +542,7 @@ class RigidBody(Body):
 
     def destroy(self) -> None:
         """Free the PETSc objects; the body is of no use then."""
+        super().destroy()
         if self._matrix is not None:
             self._matrix.destroy()
 

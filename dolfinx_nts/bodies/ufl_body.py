@@ -474,6 +474,7 @@ class UflBody(Body):
 
     def destroy(self) -> None:
         """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
+        super().destroy()
         of_mass = (self._mass, self._consistent_mass, self._mass_change, self._sum)
         for a in (*of_mass, self._in, self._out, self._matrix):
             if a is not None:

@@ -124,6 +124,8 @@ class Stepper:
     ) -> None:
         if not isinstance(system, System):
             raise TypeError(f"system={system!r}: pass a System([body, ...])")
+        for body in system.bodies:
+            body.check_alive()
         if not isinstance(integrator, Integrator) or isinstance(integrator, type):
             raise TypeError(
                 f"integrator={integrator!r}: pass EnergyMomentum(), Midpoint() or another one with "
