@@ -12,7 +12,7 @@ from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.rigid import RigidBody
-from dolfinx_nts.bodies.section import Circle, Clamp, PointForce, Rectangle, Section
+from dolfinx_nts.bodies.section import Circle, Clamp, LineForce, PointForce, Rectangle, Section
 from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.contact.facet_pair import FacetPair
@@ -95,6 +95,7 @@ __all__ = [
     "Isotropic",
     "Joint",
     "JointCoupling",
+    "LineForce",
     "Midpoint",
     "Moment",
     "MooneyRivlin",

@@ -149,6 +149,34 @@ def test_a_propped_cantilever_under_its_weight():
     assert forces == pytest.approx((5 / 8 * load, 3 / 8 * load), rel=1e-3)
 
 
+@pytest.mark.mpi
+def test_a_force_per_length():
+    """On the outer half of a cantilever: deflections by Euler and Bernoulli; reactions."""
+    section = nts.Section(EA=1e9, GA=(1e12,) * 2, GJ=1e6, EI=(1e6, 1e6), rhoA=10, rhoI=(0.1, 0.1))
+    length, q = 4.0, 30.0
+    clamp = nts.Clamp(lambda x: x[0] < 1e-9)
+    outer = nts.LineForce((0, 0, -q), where=lambda x: x[0] > length / 2 - 1e-9)
+    beam = nts.Beam(interval_mesh(straight(64, length)), section, bcs=[clamp], forces=[outer])
+    run = nts.equilibrium(nts.System([beam]))
+    # 41/384 q L^4 / EI of a load over the half at the free end.
+    deflection = 41 / 384 * q * length**4 / 1e6
+    assert run.reactions["beam"][-1, 0] == pytest.approx((0, 0, q * length / 2), abs=1e-5)
+    assert beam.centreline()[1][-1, 2] == pytest.approx(-deflection, rel=1e-3)
+
+
+def test_a_force_per_length_is_like_weight():
+    """Everywhere, as a function of time, in dynamics: the same motion as by gravity."""
+    load = nts.LineForce(lambda t: (0, -9.81 * STEEL.rhoA, 0))
+    ends = []
+    for forces, gravity in (([load], (0, 0, 0)), ([], (0, -9.81, 0))):
+        beam = nts.Beam(interval_mesh(arc(6, 2.0, 1.0)), STEEL, forces=forces,
+                        bcs=[nts.Clamp(lambda x: x[0] < 1e-9)])  # fmt: skip
+        run = nts.simulate(nts.System([beam], gravity=gravity), EM, dt=0.02, t_end=0.1)
+        ends.append((beam.centreline()[1], run.balance["external_work"]))
+    assert ends[0][0] == pytest.approx(ends[1][0], abs=1e-12)
+    assert ends[0][1] == pytest.approx(ends[1][1], abs=1e-12)
+
+
 # ---- dynamics
 def flying(scale, comm):
     """B29 in a unit of length 1/scale m."""
@@ -413,6 +441,9 @@ def box():
         ({"forces": [nts.PointForce(lambda x: x[0] > 0.1, (1, 0, 0))]}, ValueError,
          "selects 4 nodes; select one"),
         ({"forces": [nts.PointForce(lambda x: x[0] > 0.9, 1.0)]}, ValueError, "three finite"),
+        ({"forces": [nts.LineForce((1, 0, 0), lambda x: x[0] > 0.9)]}, ValueError,
+         r"LineForce.where of forces\[0\] of 'beam'=.*selects no two neighbours; select both"),
+        ({"forces": [nts.LineForce(1.0)]}, ValueError, "three finite"),
         ({"velocity": "fast"}, ValueError, "velocity='fast'"),
         ({"spin": 1}, TypeError, "unknown option of Beam"),
     ],

@@ -18,7 +18,7 @@ from dolfinx_nts.bodies.axis import axis_of, check_line
 from dolfinx_nts.bodies.body import Body, Moment
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.bodies.section import Clamp, PointForce, Section
+from dolfinx_nts.bodies.section import Clamp, LineForce, PointForce, Section
 from dolfinx_nts.bodies.triad import Triads, largest_turn
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import taken_at
@@ -67,7 +67,7 @@ class Beam(Body):
         velocity: At the start [m/s], a vector, or a function x (3, n) -> (3, n).
         angular_velocity: At the start, about the centre of mass [rad/s].
         bcs: `Clamp` and `Dirichlet` conditions, whose functions `where` select nodes.
-        forces: `PointForce` loads.
+        forces: `PointForce` and `LineForce` loads.
         name: Name in messages and files.
 
     Attributes:
@@ -92,7 +92,7 @@ class Beam(Body):
         velocity: Any = (0.0, 0.0, 0.0),
         angular_velocity: Vector = (0.0, 0.0, 0.0),
         bcs: Sequence[Clamp | Dirichlet] = (),
-        forces: Sequence[PointForce] = (),
+        forces: Sequence[PointForce | LineForce] = (),
         name: str = "beam",
     ) -> None:
         require_name("name", name)
@@ -156,12 +156,15 @@ class Beam(Body):
         self.nodal_mass: FloatArray = self._gather(of_nodes.reshape(owned, 24))
 
     def _set_up_conditions(
-        self, bcs: Sequence[Clamp | Dirichlet], forces: Sequence[PointForce]
+        self, bcs: Sequence[Clamp | Dirichlet], forces: Sequence[PointForce | LineForce]
     ) -> None:
         conditions = items(
             "bcs", bcs, lambda b: isinstance(b, Clamp | Dirichlet), "Clamp or Dirichlet"
         )
-        loads = items("forces", forces, lambda f: isinstance(f, PointForce), "PointForce")
+        loads = items(
+            "forces", forces, lambda f: isinstance(f, PointForce | LineForce),
+            "PointForce or LineForce",
+        )  # fmt: skip
         owner = np.full((self.num_owned // 12, 12), -1)
         self._values: list[Any] = []
         for k, bc in enumerate(conditions):
@@ -175,14 +178,38 @@ class Beam(Body):
         self._condition = owner.ravel()[self.fixed]
         self._loads = []
         for k, load in enumerate(loads):
-            what = f"PointForce.where of forces[{k}] of {self.name!r}"
-            chosen = self._chosen(what, load)
-            count = self.comm.allreduce(len(chosen))
-            if count != 1:
-                raise ValueError(f"{what}={load.where!r}: selects {count} nodes; select one")
-            self._loads.append((chosen, load.value))
+            what = f"{type(load).__name__}.where of forces[{k}] of {self.name!r}"
+            if isinstance(load, LineForce):
+                unit = "N/m"
+                weights = self._lengths(None if load.where is None else self._chosen(what, load))
+                if not self.comm.allreduce(weights.sum()):
+                    raise ValueError(
+                        f"{what}={load.where!r}: selects no two neighbours; select both ends of "
+                        "the elements it acts on"
+                    )
+            else:
+                unit, chosen = "N", self._chosen(what, load)
+                weights = np.zeros(self.num_owned // 12)
+                weights[chosen] = 1.0
+                count = self.comm.allreduce(len(chosen))
+                if count != 1:
+                    raise ValueError(f"{what}={load.where!r}: selects {count} nodes; select one")
+            self._loads.append((type(load).__name__, weights, load.value, unit))
         self.prescribed(0.0)
         self._loads_at(0.0, 1.0)
+
+    def _lengths(self, chosen: IntArray | None) -> FloatArray:
+        """Half of the lengths of the elements at each node [m]. Collective.
+
+        Args:
+            chosen: This rank's nodes at both ends of those that count; None: all.
+        """
+        ends = np.ones(self.num_owned)
+        if chosen is not None:
+            ends.reshape(-1, 12)[:] = np.isin(np.arange(len(ends) // 12), chosen)[:, None]
+        both = self._scatter(ends).reshape(-1, 2, 12)[:, :, 0].min(axis=1)
+        halves = np.repeat(0.5 * self._beams.length * both, 24).reshape(-1, 24)
+        return self._gather(halves)[::12]
 
     def _chosen(self, what: str, given: Any) -> IntArray:
         """This rank's nodes where a condition holds; it must hold somewhere. Collective."""
@@ -331,12 +358,13 @@ class Beam(Body):
         self._load = self._loads_at(moment.time, moment.ramp)
 
     def _loads_at(self, time: float, ramp: float) -> FloatArray:
-        """Point forces [N]. Collective."""
+        """Loads [N]. Collective."""
         load = np.zeros((self.num_owned // 12, 12))
-        for k, (chosen, value) in enumerate(self._loads):
-            what = f"PointForce.value of forces[{k}] of {self.name!r}"
+        for k, (kind, weights, value, unit) in enumerate(self._loads):
+            what = f"{kind}.value of forces[{k}] of {self.name!r}"
             part = 1.0 if callable(value) else ramp
-            load[chosen, :3] += part * vector_in_time(self.comm, what, value, time, "N")
+            force = vector_in_time(self.comm, what, value, time, unit)
+            load[:, :3] += part * weights[:, None] * force
         return load.ravel()
 
     def prescribed(self, time: float) -> FloatArray:

@@ -202,3 +202,18 @@ class PointForce:
 
     where: Any
     value: VectorInTime
+
+
+@known_options
+@dataclass(frozen=True)
+class LineForce:
+    """Dead force per length of a beam's reference.
+
+    Attributes:
+        value: [N/m]: a vector, or a function of time.
+        where: Function x (3, n) -> bool (n,): it acts between neighbours for which it is true;
+            None: everywhere.
+    """
+
+    value: VectorInTime
+    where: Any = None
