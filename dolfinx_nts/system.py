@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.elements import Joint
@@ -68,7 +68,8 @@ class System:
             run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.1)
 
     Args:
-        bodies: Objects whose classes inherit from `Body`, on one communicator, of different names.
+        bodies: Objects whose classes inherit from `Body`, or have all that it has, on one
+            communicator, of different names.
         contacts: Pairs of surfaces of these bodies.
         joints: What else couples them, objects with the `Joint` protocol.
         gravity: Acceleration [m/s^2]; its work counts as external work.
@@ -94,15 +95,14 @@ class System:
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         wanted = "bodies; the class of a body of your own inherits from nts.Body"
-        self.bodies = items("bodies", bodies, lambda b: isinstance(b, Body), wanted)
+        self.bodies = items("bodies", bodies, is_body, wanted)
         self.contacts = items(
             "contacts", contacts, lambda c: isinstance(c, ContactPair), "ContactPair"
         )
         self.joints = items("joints", joints, lambda j: hasattr(j, "coupling"), "joints")
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
-        for body in self.bodies:
-            body.check_alive()
+        self.check_alive()
         names = [b.name for b in self.bodies]
         if len(set(names)) < len(names):
             raise ValueError(f"bodies: names {names} are not unique; pass name= to each body")
@@ -161,6 +161,15 @@ class System:
         """
         for body in self.bodies:
             body.destroy()
+
+    def check_alive(self) -> None:
+        """Refuse a system with a body that was destroyed.
+
+        Raises:
+            ValueError: One was.
+        """
+        for body in self.bodies:
+            body.check_alive()
 
     def __enter__(self) -> System:
         return self

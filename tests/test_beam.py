@@ -314,6 +314,8 @@ def test_sections_of_shapes_by_quadrature():
         (lambda: nts.Rectangle(1.0, np.inf), "^height=inf"),
         (lambda: nts.Circle(1).section(young=-1, poisson=0, density=1), "^young=-1"),
         (lambda: nts.Circle(1).section(young=1, poisson=0.6, density=1), "^poisson=0.6: must lie"),
+        (lambda: nts.Circle(1).section(young=1, poisson=-7 / 6, density=1), "^poisson=-1.16"),
+        (lambda: nts.Rectangle(1, 1).section(young=1, poisson="x", density=1), "^poisson='x'"),
         (lambda: nts.Rectangle(1, 1).section(young=1, poisson=0, density=0), "^density=0"),
     ],
 )

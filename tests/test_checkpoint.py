@@ -382,6 +382,46 @@ def test_fields_go_on_where_the_state_is(cadence, mpi_tmp_path):
 
 
 @pytest.mark.mpi
+def test_fields_do_not_go_on_with_part_of_them_or_with_those_of_another_run(mpi_tmp_path):
+    """What is there stays as it is."""
+    path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
+    saves = nts.Checkpoint(path, every=9)
+    run(blocks(COMM), t_end=3 * DT, output=[Fields(folder)], checkpoint=saves)
+    if COMM.rank == 0:
+        (folder / "right.xdmf").rename(folder / "away.xdmf")
+    COMM.barrier()
+    scene = blocks(COMM)
+    start = nts.restart(path, scene[0])
+    with pytest.raises(FileNotFoundError, match="^folder=.*but no right.xdmf; put it back, or"):
+        run(scene, start=start, output=[Fields(folder)])
+    assert len(series(folder, "left")[0]) == 4
+    other = mpi_tmp_path / "other"
+    run(blocks(COMM), dt=0.7 * DT, t_end=2.1 * DT, output=[Fields(other)])
+    with pytest.raises(FileExistsError, match="^folder=.*left.xdmf is of another run, with a time"):
+        run(scene, start=start, output=[Fields(other)])
+    assert len(series(other, "left")[0]) == 4
+
+
+@pytest.mark.mpi
+def test_fields_of_a_restart_that_fails_have_its_state(mpi_tmp_path):
+    """That state is not due, but it is the last one."""
+    path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
+    saves = nts.Checkpoint(path, every=9)
+    run(floor(COMM), t_end=3 * DT, output=[Fields(folder, every=2)], checkpoint=saves)
+    scene = floor(COMM)
+    start = nts.restart(path, scene[0])
+
+    def fail(time, dt):
+        if time > 2.5 * DT:
+            raise RuntimeError("on purpose")
+
+    failed = run(scene, start=start, output=[Fields(folder, every=2)], before_step=fail)
+    assert "on purpose" in failed.status and failed.state.time == pytest.approx(3 * DT)
+    COMM.barrier()
+    assert np.array(series(folder)[0]) == pytest.approx([0, 2 * DT, 3 * DT], abs=1e-12)
+
+
+@pytest.mark.mpi
 def test_fields_do_not_go_on_with_another_mesh(mpi_tmp_path):
     path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
     run(floor(COMM), t_end=3 * DT, checkpoint=nts.Checkpoint(path, every=9))
@@ -669,7 +709,7 @@ def test_other_files_are_refused(mpi_tmp_path):
     COMM.barrier()
     for path, kind, said in (
         (text, OSError, "cannot be read"), (other, ValueError, "it is no checkpoint"),
-        (newer, ValueError, "version 99, and this package reads version 2"),
+        (newer, ValueError, "version 99, and this package reads version 3"),
     ):  # fmt: skip
         with pytest.raises(kind, match=said):
             nts.restart(path, system)
@@ -722,7 +762,7 @@ def test_the_file_is_as_described(mpi_tmp_path):
         numbers = file["contacts/0/number"][()]
         assert (np.diff(numbers) > 0).all() and len(numbers) == 9
         assert np.array_equal(file["balance/energy"][()], saved.balance["energy"])
-        assert file.attrs["version"] == 2
+        assert file.attrs["version"] == 3
 
 
 # ---- signals

@@ -245,9 +245,32 @@ def test_cadence(cadence, written, mpi_tmp_path):
     assert np.allclose(times, 1e-3 * np.array(written), rtol=1e-12)
 
 
-def flying():
+def test_cadence_of_a_loop_that_writes_now_and_then(tmp_path):
+    """Multiples that were passed since the last call count, also before t = 0."""
+    settled = nts.equilibrium(flying(held=True))
+    stepper = nts.Stepper(flying(), nts.Midpoint(), start=settled, start_time=-5e-3)
+    writers = [
+        output.Fields(tmp_path / "time", interval=2e-3), output.Fields(tmp_path / "count", every=4)
+    ]  # fmt: skip
+    stepper.start(1e-3)
+    for writer in writers:
+        writer.start(stepper)
+    for _ in range(4):
+        for _ in range(3):
+            stepper.advance(1e-3)
+        for writer in writers:
+            writer.write(stepper)
+    stepper.close()
+    for folder, wanted in (("time", [-5, -2, 1, 4, 7]), ("count", [-5, 1, 4, 7])):
+        times = read(tmp_path / folder / "body.xdmf").times
+        assert np.allclose(times, 1e-3 * np.array(wanted), rtol=0, atol=1e-12)
+
+
+def flying(held=False):
     mesh = box([0.0, 0, 0], [1.0, 1, 1], [2, 1, 1])
-    return nts.System([nts.Continuum(mesh, RUBBER, density=1e3, velocity=(1.0, 2.0, 3.0))])
+    bcs = [nts.Dirichlet(lambda x: x[0] < 1e-9)] if held else []
+    velocity = (1.0, 2.0, 3.0)
+    return nts.System([nts.Continuum(mesh, RUBBER, density=1e3, bcs=bcs, velocity=velocity)])
 
 
 class Dies:

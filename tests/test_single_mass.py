@@ -111,6 +111,33 @@ def test_what_a_body_inherits():
         nts.System([3])
 
 
+class Bare:
+    """All that a body has, without being a `Body`."""
+
+    def __init__(self, mass):
+        self._mass = mass
+
+    def __getattr__(self, name):
+        return getattr(self._mass, name)
+
+
+class Own(PointMass):
+    """It keeps what is accepted its own way."""
+
+    def accept(self, u, v):
+        self.u, self.v = u.copy(), v.copy()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("make", [Own, lambda *of: Bare(PointMass(*of))], ids=["own", "bare"])
+def test_a_body_that_overrides_what_a_run_tells_it(make):
+    """v t after free flight, from the body's motion after the run."""
+    mass = make(COMM, MASS, (1.0, 2.0, 3.0), (0.5, 0.0, 1.0))
+    nts.simulate(nts.System([mass]), nts.Midpoint(), dt=STEP, t_end=5 * STEP)
+    moved = np.array([1.0, 2.0, 3.0]) + 5 * STEP * np.array([0.5, 0.0, 1.0])
+    assert nts.motion_of(mass).centre == pytest.approx(moved, rel=1e-14)
+
+
 def test_motion_below_rounding_is_rest():
     """h v is lost when it is added to u: nothing is left to solve, which must not be a failure."""
     mass = PointMass(COMM, MASS, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0))

@@ -90,21 +90,26 @@ class Body:
     _accepted: tuple[FloatArray, FloatArray] | None = None
 
     # ---- what each body has of its own
+    def _missing(self, name: str) -> NotImplementedError:
+        return NotImplementedError(
+            f"{type(self).__name__} has no {name}(), which is asked for here; see nts.Body"
+        )
+
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Fix what the evaluations of a step have in common."""
-        raise NotImplementedError
+        raise self._missing("begin_step")
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v."""
-        raise NotImplementedError
+        raise self._missing("inertia")
 
     def internal(self, u1: FloatArray) -> FloatArray:
         """Internal forces between u_0 and u_1 by the rule [N]."""
-        raise NotImplementedError
+        raise self._missing("internal")
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
         """External forces of the step [N]; their work is f . (u_1 - u_0). See `weight`."""
-        raise NotImplementedError
+        raise self._missing("external")
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """PETSc matrix mass M + stiffness d(internal - external)/du_1.
@@ -112,15 +117,15 @@ class Body:
         The same matrix in each call, with the same pattern. Rows and columns of `fixed` hold only a
         diagonal.
         """
-        raise NotImplementedError
+        raise self._missing("tangent")
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacement of the `fixed` coordinates [m]."""
-        raise NotImplementedError
+        raise self._missing("prescribed")
 
     def potential(self, u: FloatArray) -> float:
         """Stored energy on this rank [J]."""
-        raise NotImplementedError
+        raise self._missing("potential")
 
     # ---- what may be left as it is
     @cached_property
@@ -142,7 +147,7 @@ class Body:
         return np.zeros(self.num_owned, dtype=bool)
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
-        """Make u and v the body's current state; a body's own `accept` calls this one, too."""
+        """Make u and v the body's current state."""
         self._accepted = u, v
 
     def last_accepted(self) -> tuple[FloatArray, FloatArray]:
@@ -166,9 +171,9 @@ class Body:
         return self.nodal_mass * acceleration.ravel()
 
     def destroy(self) -> None:
-        """Free the PETSc objects, for those who make many bodies; the body is of no use then.
+        """Free the PETSc objects, for those who make many bodies; it cannot be used afterwards.
 
-        A body's own `destroy` calls this one, too.
+        An override must call super().destroy().
         """
         self.destroyed = True
 
@@ -180,8 +185,8 @@ class Body:
         """
         if self.destroyed:
             raise ValueError(
-                f"body {self.name!r} was destroyed, by itself or by its system; make it anew, or "
-                "destroy it later"
+                f"body {self.name!r} was destroyed, by body.destroy() or by that of its system; "
+                "make it anew, or destroy it later"
             )
 
     def nodal_stiffness(self, rule: Integrator) -> FloatArray:
@@ -193,7 +198,7 @@ class Body:
         Raises:
             NotImplementedError: The body does not tell; `equilibrium` refuses it.
         """
-        raise NotImplementedError
+        raise self._missing("nodal_stiffness")
 
     def reactions(self, residual: FloatArray) -> FloatArray:
         """Resultant of a force [N] on the coordinates of each condition, this rank's part.
@@ -295,3 +300,14 @@ class Body:
             values: At its owned coordinates, shape (num_owned,).
         """
         return values
+
+
+#: What an object has that is used as a body without being a `Body`.
+_PROTOCOL = tuple(
+    name for name in (*Body.__annotations__, *vars(Body)) if name[0] != "_" and name != "length"
+)
+
+
+def is_body(given: Any) -> bool:
+    """Whether an object is a `Body` or has all that one has."""
+    return isinstance(given, Body) or all(hasattr(given, name) for name in _PROTOCOL)

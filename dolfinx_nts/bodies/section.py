@@ -98,6 +98,7 @@ class Circle:
         Raises:
             ValueError: A value is out of range.
         """
+        _check(young, poisson, density)
         bending = 0.25 * np.pi * self.radius**4
         shear = 6 * (1 + poisson) / (7 + 6 * poisson)
         return _section(np.pi * self.radius**2, (bending, bending), 2 * bending, shear,
@@ -138,6 +139,7 @@ class Rectangle:
         Raises:
             ValueError: A value is out of range.
         """
+        _check(young, poisson, density)
         b, h = self.width, self.height
         long, short = max(b, h), min(b, h)
         odd = np.arange(1, 40, 2)
@@ -146,6 +148,13 @@ class Rectangle:
         shear = 10 * (1 + poisson) / (12 + 11 * poisson)
         return _section(b * h, (b * h**3 / 12, h * b**3 / 12), twist, shear,
                         young, poisson, density)  # fmt: skip
+
+
+def _check(young: float, poisson: float, density: float) -> None:
+    require_positive("young", young, "Pa")
+    require_positive("density", density, "kg/m^3")
+    if not (is_finite(poisson) and -1.0 < poisson <= 0.5):
+        raise ValueError(f"poisson={poisson!r}: must lie above -1 and not above 0.5")
 
 
 def _section(
@@ -163,10 +172,6 @@ def _section(
         poisson: Poisson's ratio.
         density: [kg/m^3].
     """
-    require_positive("young", young, "Pa")
-    require_positive("density", density, "kg/m^3")
-    if not (is_finite(poisson) and -1.0 < poisson <= 0.5):
-        raise ValueError(f"poisson={poisson!r}: must lie above -1 and not above 0.5")
     modulus = young / (2 * (1 + poisson))
     return Section(
         EA=young * area,

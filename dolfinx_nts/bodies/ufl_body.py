@@ -161,6 +161,7 @@ class UflBody(Body):
 
     def _make_massless(self, surface: Surface) -> None:
         """Take the mass of a surface's nodes, and give it to others. Collective."""
+        self.check_alive()
         what = f"mass='redistributed' of a surface of {self.name!r}"
         if self._compiled:
             raise ValueError(f"{what}: the body has moved already; ask for it before the first run")

@@ -1,8 +1,8 @@
 """Files of states, checkpoints and saved runs: HDF5, in numberings that do not depend on the ranks.
 
-Version 2, with h5py's names of types:
+Version 3, with h5py's names of types:
 
-- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (2) and
+- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (3) and
   `package` (the version that wrote it);
 - `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
   to the run, see `dolfinx_nts.run.checkpoint`;
@@ -52,7 +52,7 @@ _OTHER = {
     CHECKPOINT: "it is no checkpoint; pass the path that Checkpoint had",
     SOLUTION: "it holds no saved run; pass the path that Solution.save had",
 }
-_VERSION = 2
+_VERSION = 3
 #: Part of masses and of a body's size by which the same scene may differ on other ranks.
 _ROUNDED = 1e-9
 

@@ -93,15 +93,15 @@ class _Series:
         head = _XDMF_HEAD.format(self.path.name)
         replace_file(Path(f"{self.path}.xdmf"), (head + _XDMF_TAIL).encode())
 
-    def go_on(self, until: float, due: bool) -> None:
+    def go_on(self, run: FloatArray, due: bool) -> None:
         """Keep the times of an earlier part of a run up to here; rank 0 only.
 
         Args:
-            until: Time from which the run goes on [s].
+            run: Times of its balance; the run goes on from the last [s].
             due: Whether that itself is one to be written; else it is there because a part ended.
 
         Raises:
-            OSError: The files cannot be read or written, or hold another mesh.
+            OSError: The files cannot be read or written, or are of another mesh or run.
         """
         import h5py
 
@@ -113,9 +113,16 @@ class _Series:
                 f"folder={str(path.parent)!r}: holds {path.name} with another mesh; pass another "
                 "folder for what follows"
             )
-        text = path.read_text()
+        text, until = path.read_text(), run[-1]
         times = [(float(m[1]), m.start()) for m in re.finditer(_XDMF_TIME, text)]
         kept = [time for time, _ in times if time < until or (due and time == until)]
+        foreign = np.setdiff1d(kept, run)
+        if len(foreign):
+            raise FileExistsError(
+                f"folder={str(path.parent)!r}: {path.name} is of another run, with a time "
+                f"{foreign[0]:.6g} s that is none of this one's; pass another folder for what "
+                "follows"
+            )
         if len(kept) < len(times):
             replace_file(path, (text[: times[len(kept)][1]] + _XDMF_TAIL).encode())
         self._times = len(kept)
@@ -204,7 +211,8 @@ class Fields:
         ValueError: The cadence is out of range or given twice; from `start`: no body has a mesh,
             or two bodies' names give one file.
         OSError: From `start`, before any step and on all ranks: the folder cannot be written, or
-            what a run from a checkpoint would go on with has another mesh.
+            what a run from a checkpoint would go on with is of another mesh or run, or is not
+            complete.
     """
 
     def __init__(self, folder: StrPath, *, every: int = 1, interval: float | None = None) -> None:
@@ -231,36 +239,48 @@ class Fields:
         files = [s.path.name for s in self._series]
         if len(set(files)) < len(files):
             raise ValueError(f"name of bodies: file names {files} are not unique; rename a body")
-        if stepper.restart is not None and self._go_on(stepper):
+        self._seen = len(stepper.solution.rows) - 1
+        due = self._due(stepper)
+        if stepper.restart is not None and self._go_on(stepper, due):
             return
         for series in self._series:
             self._root(stepper, series.create)
         self._append(stepper)
 
-    def _go_on(self, stepper: Stepper) -> bool:
+    def _go_on(self, stepper: Stepper, due: bool) -> bool:
         """Go on with the files of an earlier part of the run; tells whether they are there."""
-        there = all(Path(f"{s.path}.xdmf").exists() for s in self._series)
-        if not stepper.system.comm.bcast(there):
+        comm = stepper.system.comm
+        there = comm.bcast([Path(f"{s.path}.xdmf").exists() for s in self._series])
+        if not any(there):
             return False
-        self._tried, due = stepper.state.time, self._due(stepper)
+        if not all(there):
+            missing = self._series[there.index(False)].path.name
+            raise FileNotFoundError(
+                f"folder={str(self.folder)!r}: holds fields of the run, but no {missing}.xdmf; "
+                "put it back, or pass another folder for what follows"
+            )
+        times = stepper.solution.rows.column("time")
+        self._tried = times[-1] if due else -np.inf
         for series in self._series:
-            on_root(stepper.system.comm, partial(series.go_on, self._tried, due))
+            on_root(comm, partial(series.go_on, times, due))
         return True
 
     def write(self, stepper: Stepper, *, last: bool = False) -> None:
         """Write the accepted state if the cadence asks for it, or if it is the last."""
-        if last or self._due(stepper):
+        if self._due(stepper) or last:
             self._append(stepper)
 
     def _due(self, stepper: Stepper) -> bool:
-        """Whether the cadence asks for the last accepted state; the one at the start is."""
+        """Whether the cadence asks for a state since the last call; the first one of a run is."""
         times = stepper.solution.rows.column("time")
-        if len(times) == 1:
+        before, self._seen = self._seen, len(times)
+        if not before:
             return True
         if self.interval is None:
-            return (len(times) - 1) % self.every == 0
-        before, now = np.floor(times[-2:] * (1 + 1e-12) / self.interval)
-        return bool(now > before)
+            return (len(times) - 1) // self.every > (before - 1) // self.every
+        multiples = times[[before - 1, -1]] / self.interval
+        then, now = np.floor(multiples + 1e-12 * np.abs(multiples))
+        return bool(now > then)
 
     def close(self, stepper: Stepper) -> None:
         """Write the last accepted state of a run that failed."""

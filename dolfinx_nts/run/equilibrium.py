@@ -59,7 +59,7 @@ _OPEN = 0.1
 _ROUNDING = 16 * float(np.finfo(float).eps)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Equilibrium(Solution):
     """What `equilibrium` computed, complete up to where it ended.
 
@@ -104,7 +104,10 @@ class _LoadStepper(Stepper):
         self._rates = [np.zeros_like(u) for u in self.state.u]
         self._forces = [np.zeros_like(u) for u in self.state.u]
         self._accept(replace(self.state, v=tuple(self._rates)))
-        self.solution = Equilibrium(system, rows=Table([self._first_row()]), state=self.state)
+        self.solution = Equilibrium(
+            system, rows=Table([self._first_row()]), state=self.state,
+            settings=self.solution.settings,
+        )  # fmt: skip
 
     def start(self, dt: float) -> None:
         """Nothing moves at the start, but the user may change a material; later calls do nothing.

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.run.solution import Restart, Solution
@@ -124,8 +125,7 @@ class Stepper:
     ) -> None:
         if not isinstance(system, System):
             raise TypeError(f"system={system!r}: pass a System([body, ...])")
-        for body in system.bodies:
-            body.check_alive()
+        system.check_alive()
         if not isinstance(integrator, Integrator) or isinstance(integrator, type):
             raise TypeError(
                 f"integrator={integrator!r}: pass EnergyMomentum(), Midpoint() or another one with "
@@ -289,6 +289,7 @@ class Stepper:
         """
         require_positive("dt", dt, "s")
         dt = float(dt)
+        self.system.check_alive()
         self.start(dt)
         end, parts, retries = self.state.time + dt if end is None else end, 1, 0
         while parts:
@@ -324,6 +325,7 @@ class Stepper:
             StepFailedError: Not solved even after `newton.max_retries` cuts in a row, or as in
                 `advance`.
         """
+        self.system.check_alive()
         self.start(pace.dt)
         retries = 0
         while self.state.time < end:
@@ -419,6 +421,8 @@ class Stepper:
     def _accept(self, state: State) -> None:
         for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
             body.accept(u, v)
+            # A body's own `accept` need not call the base's.
+            Body.accept(body, u, v)
         self.state = self.solution.state = state
 
     def _step(self, dt: float, time: float) -> None:
