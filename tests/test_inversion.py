@@ -219,6 +219,7 @@ HARD = {
 }
 
 
+@pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "accuracy"), [(name, accuracy) for name in HARD for accuracy in HARD[name][-1]]

@@ -226,6 +226,7 @@ def test_ledger_of_an_energy_of_c_far_from_the_origin():
     assert impact(2.0, 0.05, 1e10, lambda c: RUBBER(c)) < 1e-11
 
 
+@pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()], ids=["mp", "em"])

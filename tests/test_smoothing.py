@@ -243,6 +243,7 @@ def test_momentum_and_energy_on_any_number_of_ranks(smoothing, kind):
         assert np.abs(table[name] - alone[name]).max() <= 1e-9 * scale
 
 
+@pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_tetrahedra_on_a_smoothed_arch_keep_what_balanced_promises(friction):

@@ -58,6 +58,7 @@ def flush(meshed, friction, gap=0.0):
     return nts.System(bodies, contacts=[pair], gravity=(0, 0, -GRAVITY))
 
 
+@pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", [0.0, 1e-12])
 @pytest.mark.parametrize(
@@ -248,6 +249,7 @@ def test_one_large_element_stands_on_small_facets(place, friction):
     assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * run.balance["kinetic"].max()
 
 
+@pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.3, np.inf])
 @pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])

@@ -340,6 +340,7 @@ def over(meshed, young=1e6, velocity=(0.0, 0.0, 0.0), gravity=9.81, gap=0.2):
     return nts.System(bodies, contacts=[pair], gravity=(0, 0, -gravity))
 
 
+@pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
@@ -360,6 +361,7 @@ def test_a_block_at_rest_that_falls_far_in_a_step(meshed, young, gravity, dt, in
         assert "ledger" not in run.warnings
 
 
+@pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("meshed", [False, True])
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
@@ -394,6 +396,7 @@ def test_no_first_contact_wins_energy(integrator, meshed):
     assert met >= 6
 
 
+@pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
