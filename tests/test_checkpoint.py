@@ -395,11 +395,32 @@ def test_fields_do_not_go_on_with_part_of_them_or_with_those_of_another_run(mpi_
     with pytest.raises(FileNotFoundError, match="^folder=.*but no right.xdmf; put it back, or"):
         run(scene, start=start, output=[Fields(folder)])
     assert len(series(folder, "left")[0]) == 4
+    if COMM.rank == 0:
+        (folder / "away.xdmf").rename(folder / "right.xdmf")
+        (folder / "left.xdmf").write_text((folder / "left.xdmf").read_text()[:-20])
+    COMM.barrier()
+    with pytest.raises(FileExistsError, match="^folder=.*left.xdmf is not whole; pass another"):
+        run(scene, start=start, output=[Fields(folder)])
     other = mpi_tmp_path / "other"
     run(blocks(COMM), dt=0.7 * DT, t_end=2.1 * DT, output=[Fields(other)])
     with pytest.raises(FileExistsError, match="^folder=.*left.xdmf is of another run, with a time"):
         run(scene, start=start, output=[Fields(other)])
     assert len(series(other, "left")[0]) == 4
+
+
+@pytest.mark.mpi
+def test_fields_go_on_on_other_ranks(mpi_tmp_path):
+    """Places of nodes differ there by rounding."""
+    path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
+    saves = nts.Checkpoint(path, every=9)
+    run(tetrahedra(COMM), t_end=3 * DT, output=[Fields(folder)], checkpoint=saves)
+    if COMM.rank == 0:
+        scene = tetrahedra(MPI.COMM_SELF)
+        start = nts.restart(path, scene[0])
+        run(scene, start=start, t_end=5 * DT, output=[Fields(folder)])
+    COMM.barrier()
+    for name in ("left", "right"):
+        assert np.array(series(folder, name)[0]) == pytest.approx(DT * np.arange(6), abs=1e-12)
 
 
 @pytest.mark.mpi

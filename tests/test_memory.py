@@ -89,8 +89,27 @@ def test_what_is_left_of_a_destroyed_system(tmp_path):
     ):
         with pytest.raises(ValueError, match="^body 'left' was destroyed, by body.destroy"):
             use()
+    body, zero = system.bodies[0], np.zeros(system.bodies[0].num_owned)
+    for use in (
+        lambda: body.internal(zero),
+        lambda: body.inertia(zero),
+        lambda: body.tangent(zero, 1.0, 0.0),
+        lambda: body.nodal_stiffness(nts.Midpoint()),
+    ):
+        with pytest.raises(ValueError, match="^body 'left' was destroyed"):
+            use()
     with pytest.raises(ValueError, match="^body 'arm' was destroyed"):
         nts.motion_of(system.bodies[2])
+
+
+@pytest.mark.mpi
+def test_a_stepper_of_a_destroyed_system_says_so():
+    stepper = nts.Stepper(scene(COMM), nts.EnergyMomentum())
+    stepper.advance(1e-3)
+    stepper.system.destroy()
+    with pytest.raises(ValueError, match="^body 'left' was destroyed"):
+        stepper.advance(1e-3)
+    stepper.close()
 
 
 @pytest.mark.slow

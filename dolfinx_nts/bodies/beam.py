@@ -256,6 +256,7 @@ class Beam(Body):
     # ---- values of this rank's elements
     def _scatter(self, owned: FloatArray) -> FloatArray:
         """Values at the nodes of this rank's elements, shape (n, 8, 3). Collective."""
+        self.check_alive()
         self._shared.array_w[:] = owned
         self._shared.ghostUpdate(PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
         with self._shared.localForm() as local:

@@ -485,6 +485,7 @@ class RigidBody(Body):
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """Return mass M less stiffness times the derivative of the torque's forces."""
+        self.check_alive()
         if self._matrix is None:
             self._matrix = compat.dense_matrix(self.comm, self.num_owned)
         if self.num_owned:

@@ -363,6 +363,7 @@ class UflBody(Body):
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]."""
+        self.check_alive()
         self._in.array_w[:] = v
         self._mass.mult(self._in, self._out)
         return self._out.array_r.copy()
@@ -384,6 +385,7 @@ class UflBody(Body):
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """Return mass M + stiffness K, the same matrix in each call."""
+        self.check_alive()
         diagonal = mass * self._mean(self.nodal_mass)
         if not mass:
             diagonal = stiffness * self._mean(self.nodal_stiffness(self._rule))
@@ -414,6 +416,7 @@ class UflBody(Body):
 
     def nodal_stiffness(self, rule: Integrator) -> FloatArray:
         """Mean diagonal of a rule's tangent at each node of the undeformed body [N/m]."""
+        self.check_alive()
         if self._stiffness is None:
             tangent = self._compile(rule)[1]
             kept = [f.x.array.copy() for f in (self._u0, self._u1)]
@@ -486,5 +489,6 @@ class UflBody(Body):
         function.x.scatter_forward()
 
     def _assemble(self, form: Any) -> FloatArray:
+        self.check_alive()
         compat.assemble_vector(self._out, form)
         return self._out.array_r.copy()

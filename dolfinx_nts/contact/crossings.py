@@ -117,7 +117,7 @@ class Watched:
             for b, s in zip(self._boundaries, self.surfaces, strict=True)
         ]
         first, last = _meeting(*np.array(boxes))
-        number = min(_MOST, int((last - first) * way / (_BETWEEN * through)) + 2)
+        number = places((last - first) * way, through)
         for part in np.linspace(first, last, number) if first < last else ():
             x = {i: (1.0 - part) * before[i] + part * after[i] for i in after}
             yield from self.look(x, True)[0]
@@ -214,6 +214,16 @@ class Watched:
             where = f"up to {depth:.3g} m, or {size:.2g} of a facet, inside {two!r}"
         text = f"{what} lies {where} at ({point(found.place[i])}); {remedy}"
         return Finding(kind, depth, size, found.place[i], (one, two), nodes, text)
+
+
+def places(way: float, through: float) -> int:
+    """At how many places a way is looked at.
+
+    Args:
+        way: Relative motion [m].
+        through: That which may take one through the other [m].
+    """
+    return min(_MOST, int(way / (_BETWEEN * through)) + 2)
 
 
 def _meeting(one: FloatArray, two: FloatArray) -> tuple[float, float]:

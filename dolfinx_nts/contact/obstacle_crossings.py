@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.crossings import Finding, Pause, belong, point
+from dolfinx_nts.contact.crossings import Finding, Pause, belong, places, point
 from dolfinx_nts.contact.intrusion import LEAST, sunk
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as fc
@@ -60,8 +60,24 @@ class ObstacleContact:
     def passed(
         self, before: list[FloatArray], after: list[FloatArray], way: float, through: float
     ) -> list[Finding]:
-        """Nothing: contact with obstacles looks at the paths of the slave's nodes itself."""
-        return []
+        """What was in the obstacle on the straight way from one look to the next. Collective.
+
+        Contact follows the paths of the slave's nodes itself, but not what is between them.
+
+        Args:
+            before: Of `where`.
+            after: The same now.
+            way: Relative motion between them [m].
+            through: That which may take the obstacle through a facet [m].
+        """
+        # Where the ends are clear, so is as much of the way.
+        first, last = (self.look(w, True)[1].clear / way for w in (before, after))
+        part, findings = max(0.0, 1.0 - first - last), []
+        for k in range(number := places(part * way, through)):
+            s = first + part * k / (number - 1)
+            between = [(1.0 - s) * b + s * a for b, a in zip(before, after, strict=True)]
+            findings += self.look(between, True)[0]
+        return findings
 
     @cached_property
     def _rest(self) -> tuple[Surface, IntArray, FloatArray] | None:
@@ -118,8 +134,8 @@ class ObstacleContact:
         near = np.flatnonzero(gap < size)
         smallest = float(scale[near if near.size else slice(None)].min())
         if not near.size:
-            return [], Pause(float((gap - size).min()), smallest)
-        pause = Pause(0.0, smallest)
+            return [], Pause(float((gap - size).min()), smallest, obstacle.width)
+        pause = Pause(0.0, smallest, obstacle.width)
         limit = LEAST * scale[near]
         place, depth = sunk(obstacle, corners[near], limit)
         deep = depth > limit

@@ -189,6 +189,7 @@ def restart(path: StrPath, system: System) -> Restart:
     place = as_path("path", path)
     if not isinstance(system, System):
         raise TypeError(f"system={system!r}: pass the System of the run")
+    system.check_alive()
     comm = system.comm
     tables, notes = on_root(comm, lambda: _read(place)) or ({}, {})
     notes = comm.bcast(notes)

@@ -93,8 +93,10 @@ def load(path: StrPath) -> Saved:
         raise FileNotFoundError(
             f"path={str(path)!r}: there is no such file; pass the path that Solution.save had"
         ) from error
-    except (OSError, ValueError) as error:
-        raise type(error)(f"path={str(path)!r}: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"path={str(path)!r}: {error}") from error
+    except (OSError, KeyError, RuntimeError) as error:
+        raise OSError(f"path={str(path)!r}: cannot be read, it may be damaged ({error})") from error
     scene = notes["scene"]
     groups: dict[str, list[dict[str, Any]]] = {
         kind: [{} for _ in scene[kind]] for kind in ("bodies", "contacts", "joints")
