@@ -90,8 +90,7 @@ def judge(run: nts.Solution, integrator: Any, case: Case) -> tuple[str, str]:
     told = "; ".join(f"{w.kind}: {w.text}" for w in run.warnings.values())
     if not run.status.startswith("completed"):
         return "stopped", run.status
-    failed, b = [], run.balance
-    energy = max(float(np.abs(b[name]).max()) for name in ("kinetic", "potential"))
+    failed, b, energy = [], run.balance, _energy(run)
     checks = ["linear_momentum"] if case.free else []
     if case.free and integrator.keeps_angular_momentum:
         checks.append("angular_momentum")
@@ -111,17 +110,23 @@ def judge(run: nts.Solution, integrator: Any, case: Case) -> tuple[str, str]:
     return ("cut back" if run.retries else "completed"), told
 
 
+def _energy(run: nts.Solution) -> float:
+    """Largest kinetic or stored energy [J]; that at the start may be zero."""
+    b = run.balance
+    return max(float(np.abs(b[name]).max()) for name in ("kinetic", "potential"))
+
+
 def measure(axis: str, value: Any, name: str, comm: Any) -> dict[str, Any]:
     """A row of the table."""
     integrator, begin, scene = INTEGRATORS[name], time.perf_counter(), case(axis, value, comm)
     run = nts.simulate(scene.system, integrator, dt=scene.dt, t_end=scene.steps * scene.dt)
     outcome, why = judge(run, integrator, scene)
-    b, energy = run.balance, float(run.balance["energy"][0])
+    b, energy = run.balance, _energy(run)
     row = {
         "axis": axis, "value": value, "integrator": name, "outcome": outcome,
         "steps": len(b["time"]) - 1, "retries": run.retries,
         "iterations": float(b["newton_iterations"][1:].mean()) if len(b["time"]) > 1 else 0.0,
-        "energy": float(b["energy"][-1]) / energy - 1.0,
+        "energy": float(b["energy"][-1] - b["energy"][0]) / energy,
         "ledger": float(np.abs(b["ledger_residual"]).max()) / energy,
         "seconds": time.perf_counter() - begin, "why": why,
     }  # fmt: skip
@@ -132,7 +137,7 @@ def chart(
     only: Sequence[str] = (),
     integrators: Sequence[str] = (),
     comm: Any = MPI.COMM_WORLD,
-    told: Callable[[str], None] = print,
+    told: Callable[[list[dict[str, Any]]], None] = lambda _: None,
 ) -> list[dict[str, Any]]:
     """Rows of all runs of some axes.
 
@@ -140,7 +145,7 @@ def chart(
         only: Names in `AXES`; all if empty.
         integrators: Names in `INTEGRATORS`; all if empty.
         comm: MPI communicator.
-        told: What is called with a line for each run.
+        told: What is called after each run with the rows so far.
 
     Raises:
         ValueError: No such axis or integrator; before any run.
@@ -154,7 +159,7 @@ def chart(
         for value in AXES[axis][1]:
             for name in integrators or INTEGRATORS:
                 rows.append(measure(axis, value, name, comm))
-                told("{axis} = {value}, {integrator}: {outcome}".format(**rows[-1]))
+                told(rows)
     return rows
 
 
@@ -206,15 +211,21 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--output", default="out/stability", help="folder for table and picture")
     options = parser.parse_args(arguments)
     comm = MPI.COMM_WORLD
-    told = print if comm.rank == 0 else (lambda _: None)
-    rows = chart(options.only, options.integrators, comm, told)
-    if comm.rank == 0:
-        folder = Path(options.output)
+    folder = Path(options.output)
+
+    def told(rows: list[dict[str, Any]]) -> None:
+        # A map takes half an hour: what is known of it stays if a later run ends the program.
+        if comm.rank > 0:
+            return
+        print("{axis} = {value}, {integrator}: {outcome}".format(**rows[-1]), flush=True)
         folder.mkdir(parents=True, exist_ok=True)
         with Path(folder, "stability.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, rows[0])
             writer.writeheader()
             writer.writerows(rows)
+
+    rows = chart(options.only, options.integrators, comm, told)
+    if comm.rank == 0:
         picture(rows, folder / "stability.png")
         counts = {name: sum(row["outcome"] == name for row in rows) for name in OUTCOMES}
         print(", ".join(f"{number} {name}" for name, number in counts.items()))
