@@ -234,10 +234,14 @@ def test_projection_and_normal_satisfy_the_augmented_constraints(nc):
     z[:, -5:-2], z[:, -2:] = normal, xi
     g = nts_element.constraints(nts_element.invariants(z, nc), nc)
     distance = np.linalg.norm(slave - foot, axis=1)
-    assert np.allclose(np.abs(g[:, 0]), distance, rtol=0, atol=1e-14)
-    assert np.allclose(g[:, 1:], 0.0, atol=1e-14)
+    # Sums over the corners round with their weights, which add up to 264 beyond a curved triangle.
+    weights = fc.shape(xi, nc)[:2]
+    sums = 1.0 + sum(np.abs(w).reshape(50, -1).sum(axis=1) for w in weights)
+    rounding = 4 * np.finfo(float).eps * sums
+    assert (np.abs(np.abs(g[:, 0]) - distance) <= rounding).all()
+    assert (np.abs(g[:, 1:]).max(axis=1) <= rounding).all()
     value = nts_element.gap(z[:, :-5].reshape(50, nc + 1, 3), xi).value
-    assert np.allclose(value, g[:, 0], rtol=0, atol=1e-14)
+    assert (np.abs(value - g[:, 0]) <= rounding).all()
 
 
 @pytest.mark.parametrize("nc", KINDS)
