@@ -510,7 +510,9 @@ class Coupling(Protocol):
         """Let the step be solved by a rule that adds no solution but may find one."""
 
     def give_way(self) -> bool:
-        """Let what has no bound have one from the next step on, as shorter steps are of no use.
+        """Limit a force that had no limit (friction=inf) from the next step on.
+
+        The run asks for it where shorter steps do not help.
 
         Returns:
             Whether there is such a thing that had none yet, the same on all ranks.

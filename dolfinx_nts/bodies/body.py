@@ -250,7 +250,7 @@ class Body:
             x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
 
         Raises:
-            TypeError: The body tells none.
+            TypeError: The body does not override this method.
         """
         raise TypeError(f"body {self.name!r} has no points(): joints and springs need it, see Body")
 

@@ -330,8 +330,8 @@ def prepare(path: Path) -> None:
     draft.unlink()
 
 
-def image(kind: str, tables: Tables, notes: Mapping[str, Any]) -> memoryview:
-    """Bytes of a file."""
+def image(kind: str, tables: Tables, notes: Mapping[str, Any]) -> bytes:
+    """Content of a file."""
     import h5py
 
     found = io.BytesIO()
@@ -342,7 +342,7 @@ def image(kind: str, tables: Tables, notes: Mapping[str, Any]) -> memoryview:
         file["notes"] = json.dumps(notes, default=lambda number: number.item())
         for place, values in tables.items():
             file[place] = values
-    return found.getbuffer()
+    return found.getvalue()
 
 
 def write(path: Path, tables: Tables, notes: Mapping[str, Any]) -> None:

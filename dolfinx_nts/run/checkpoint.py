@@ -62,7 +62,7 @@ class Checkpoint:
             checkpoint. One of both must be given.
 
     Raises:
-        TypeError: `path` is none.
+        TypeError: `path` is not a path.
         ValueError: An argument is out of range, or neither cadence is given.
     """
 

@@ -64,7 +64,7 @@ def save(record: Record, system: System, state: State, path: Path) -> None:
     notes |= {"scene": files.describe(system), "time": state.time, "versions": versions()}
     write_on_root(
         system.comm, f"path={str(path)!r}",
-        lambda: replace_file(path, bytes(files.image(files.SOLUTION, tables, notes))),
+        lambda: replace_file(path, files.image(files.SOLUTION, tables, notes)),
     )  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def load(path: StrPath) -> Saved:
         path: Of the file.
 
     Raises:
-        TypeError: `path` is none.
+        TypeError: `path` is not a path.
         OSError: There is no such file, or it cannot be read.
         ValueError: It is another file, or of another version.
     """

@@ -94,7 +94,8 @@ class Solution(Record):
             path: HDF5 file; its folder is made, and what is there is replaced.
 
         Raises:
-            TypeError: `path` is none, or a joint remembers something that has no place in a file.
+            TypeError: `path` is not a path, or a joint remembers something that has no place in a
+                file.
             ValueError: The run has no state yet.
             OSError: The file cannot be written.
         """

@@ -222,7 +222,7 @@ class StepProblem:
             coupling.let_slip()
 
     def give_way(self) -> bool:
-        """Let what has no bound have one from the next step on; tells whether anything new does."""
+        """Limit forces that had no limit from the next step on; tells whether one had none."""
         return any([coupling.give_way() for coupling in self.couplings])
 
     def _touched(self) -> set[int]:
