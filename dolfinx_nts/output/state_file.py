@@ -1,8 +1,8 @@
 """Files of states, checkpoints and saved runs: HDF5, in numberings that do not depend on the ranks.
 
-Version 3, with h5py's names of types:
+Version 4, with h5py's names of types:
 
-- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (3) and
+- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (4) and
   `package` (the version that wrote it);
 - `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
   to the run, see `dolfinx_nts.run.checkpoint`;
@@ -15,6 +15,9 @@ Version 3, with h5py's names of types:
   one row an element;
 - `balance/NAME`, shape (rows, ...): the columns of the balance table;
 - `switches/NAME`: the newest changes of facet, see `dolfinx_nts.run.checkpoint`.
+
+Behind the HDF5 part stand "crc32" and the CRC-32 of that part in four bytes, the lowest first. HDF5
+ignores them; `read` refuses a file that does not agree with its checksum.
 
 A checkpoint is written beside its place and then renamed, and the one before is kept as
 NAME.previous: whenever a process or a machine stops, one of the two is whole.
@@ -52,7 +55,9 @@ _OTHER = {
     CHECKPOINT: "it is no checkpoint; pass the path that Checkpoint had",
     SOLUTION: "it holds no saved run; pass the path that Solution.save had",
 }
-_VERSION = 3
+_VERSION = 4
+#: What stands between the HDF5 part and its checksum.
+_MARK = b"crc32"
 #: Part of masses and of a body's size by which the same scene may differ on other ranks.
 _ROUNDED = 1e-9
 
@@ -342,7 +347,8 @@ def image(kind: str, tables: Tables, notes: Mapping[str, Any]) -> bytes:
         file["notes"] = json.dumps(notes, default=lambda number: number.item())
         for place, values in tables.items():
             file[place] = values
-    return found.getvalue()
+    data = found.getvalue()
+    return data + _MARK + zlib.crc32(data).to_bytes(4, "little")
 
 
 def write(path: Path, tables: Tables, notes: Mapping[str, Any]) -> None:
@@ -371,18 +377,23 @@ def read(path: Path, kind: str) -> tuple[Tables, dict[str, Any]]:
     """Arrays and notes of a file.
 
     Raises:
-        OSError: There is none, or it cannot be read.
+        OSError: There is none, it cannot be read, or it is damaged.
         ValueError: It is another file, or of another version.
     """
     import h5py
 
     tables: Tables = {}
+    content = path.read_bytes()
+    data, mark, told = content[:-9], content[-9:-4], content[-4:]
+    # Before HDF5 sees it, which may not return from a damaged file.
+    if mark == _MARK and zlib.crc32(data) != int.from_bytes(told, "little"):
+        raise OSError("its checksum is wrong")
 
     def keep(place: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and place != "notes":
             tables[place] = item[()]
 
-    with h5py.File(path, "r") as file:
+    with h5py.File(io.BytesIO(content), "r") as file:
         if file.attrs.get("format") != f"dolfinx_nts {kind}":
             raise ValueError(_OTHER[kind])
         found = int(file.attrs["version"])
@@ -391,6 +402,8 @@ def read(path: Path, kind: str) -> tuple[Tables, dict[str, Any]]:
                 f"its format is version {found}, and this package reads version {_VERSION}; read "
                 f"it with dolfinx_nts {file.attrs['package']}"
             )
+        if mark != _MARK:
+            raise OSError("its checksum is missing")
         notes = json.loads(file["notes"][()])
         file.visititems(keep)
     return tables, notes
