@@ -245,13 +245,13 @@ def test_on_other_ranks(scene, integrator, mpi_tmp_path):
     """From all ranks to each rank alone, and back; serial runs know their own order alone."""
     make, here = SCENES[scene], MPI.COMM_SELF
     path, own = mpi_tmp_path / "all.h5", mpi_tmp_path / f"{COMM.rank}.h5"
-    for one, other, file, read in (
+    for one, other, file, source in (
         (COMM, here, path, path), (here, COMM, own, mpi_tmp_path / "0.h5")
     ):  # fmt: skip
         saved = run(make(one), integrator, checkpoint=nts.Checkpoint(file, every=EVERY))
         COMM.barrier()
         after = make(other)
-        start = nts.restart(previous(read), after[0])
+        start = nts.restart(previous(source), after[0])
         found = run(after, integrator, start=start)
         assert distance(saved, found) < 1e-12
         assert len(found.rows) == len(saved.rows)

@@ -18,7 +18,7 @@ SMALL = {
     "ironing": {"block": (16, 2), "die": (4, 2), "steps": (10, 50), "end": 0.2},
     "rolling": {"facets": 16, "duration": 0.016},
     "rotating_cross": {"steps": (0.05,), "t_end": 0.2},
-    "slider_crank": {"rods": ("flexible",), "t_end": 0.002, "cells": 4},
+    "slider_crank": {"rods": ("rigid", "flexible"), "t_end": 0.002, "cells": 4},
     "sliding_block": {"floors": ("plane",), "parts": ("verge",), "cells": (2, 2, 1)},
     "two_blocks": {"t_end": 0.01, "cells": (1, 1)},
     "two_tori": {"t_end": 0.1},

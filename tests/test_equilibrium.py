@@ -650,6 +650,56 @@ def test_what_a_joint_prescribes_does_work(make, stabilization):
         assert table["energy"][-1] == pytest.approx(0.5 * 40.0 * 1.5**2, rel=1e-9)
 
 
+# ---- rigid bodies whose only forces cancel
+@pytest.mark.mpi
+@pytest.mark.parametrize("stabilization", [None, 0.1])
+def test_a_crank_drives_a_slider_against_a_spring(stabilization):
+    """Its moment is the slope of the spring's energy by the crank's angle."""
+    crank, rod, slider = (
+        nts.RigidBody.from_inertia(1.0, (0.01, 0.01, 0.01), centre, name=name, comm=COMM)
+        for name, centre in (
+            ("crank", (0, 0.15, 0)), ("rod", (0.4, 0.15, 0)), ("slider", (0.8, 0, 0))
+        )
+    )  # fmt: skip
+    z = (0, 0, 1)
+    joints = [
+        nts.Revolute(crank, None, point=(0, 0, 0), axis=z, angle=lambda t: -0.5 * t, name="motor"),
+        nts.Revolute(crank, rod, point=(0, 0.3, 0), axis=z),
+        nts.Revolute(rod, slider, point=(0.8, 0, 0), axis=z),
+        nts.Prismatic(slider, None, point=(0.8, 0, 0), axis=(1, 0, 0)),
+        nts.Spring(slider, None, ((0.8, 0, 0), (1.8, 0, 0)), stiffness=1e3),
+    ]
+    run = nts.equilibrium(nts.System([crank, rod, slider], joints=joints),
+                          stabilization=stabilization)  # fmt: skip
+    x, y = 0.3 * np.sin(0.5), 0.3 * np.cos(0.5)
+    way = x + np.sqrt(0.73 - y**2) - 0.8
+    slope = -y - x * y / np.sqrt(0.73 - y**2)
+    assert run.status == "completed"
+    assert slider.position == pytest.approx((0.8 + way, 0, 0), abs=1e-12)
+    assert run.balance["energy"][-1] == pytest.approx(500.0 * way**2, rel=1e-9)
+    moment = 1e3 * way * slope
+    assert run.reactions["motor"][-1, 1] == pytest.approx((0, 0, moment), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("mass", [1.0, 1e-6, 1e-9])
+def test_a_light_body_rests_between_springs_that_pull_at_it(mass):
+    """Three tensions of 3e5 N cancel, beside which the body's inertia is nothing."""
+    body = nts.RigidBody.from_inertia(mass, np.full(3, 0.1 * mass), comm=COMM)
+    angles = 0.1 + 2 * np.pi / 3 * np.arange(3)
+    springs = [
+        nts.Spring(body, None, ((0, 0, 0), (np.cos(a), np.sin(a), 0)), stiffness=1e6, length=0.7,
+                   name=f"spring at {a:.1f}")
+        for a in angles
+    ]  # fmt: skip
+    run = nts.simulate(nts.System([body], joints=springs), nts.EnergyMomentum(), dt=0.01, t_end=0.1)
+    assert run.status == "completed" and run.retries == 0 and not run.warnings
+    assert np.abs(body.position).max() < 1e-14
+    assert run.reactions[springs[0].name][-1, 0] == pytest.approx(
+        (3e5 * np.cos(0.1), 3e5 * np.sin(0.1), 0), abs=1e-6
+    )
+
+
 class Ratchet:
     """A joint of one's own whose elements' ledger names work and a loss: 3 J and 1 J a unit."""
 

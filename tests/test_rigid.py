@@ -49,7 +49,9 @@ MOMENTS, SPIN = np.array([1.0, 2.0, 3.0]), np.array([0.01, 1.0, 0.01])
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(("dt", "figure"), [(0.2, 3.796e-2), (0.1, 9.643e-3), (0.05, 2.420e-3)])
+@pytest.mark.parametrize(
+    ("dt", "figure"), [(0.2, 3.796e-2), (0.1, 9.643e-3), (0.05, 2.420e-3), (0.025, 6.057e-4)]
+)
 @pytest.mark.fast("0.2-0.03796", "0.1-0.009643")
 @pytest.mark.fast_on_ranks("0.2-0.03796")
 def test_a_free_body_errs_as_an_independent_program_does(dt, figure):
@@ -311,8 +313,12 @@ def test_fields_and_pictures_show_the_mesh(mpi_tmp_path):
          "angular_velocity of 'rigid'=[0.0, 0.0, 1.0]: rotation= prescribes it"),
         ({"motion": lambda t: (1, 2)}, "motion of 'rigid' at t=0.0=(1, 2)"),
         ({"name": ""}, "name=''"),
+        ({"comm": 3}, "comm=3: pass an MPI communicator"),
+        ({"comm": None}, "comm=None: pass an MPI communicator"),
     ],
 )
+@pytest.mark.mpi
+@pytest.mark.fast_on_ranks("options0-mass=0.0")
 def test_bad_input_is_told(options, words):
     given = {"mass": 1.0, "inertia": (1, 1, 1)} | options
     with pytest.raises(ValueError) as told:  # noqa: PT011 the words are tested

@@ -67,19 +67,19 @@ def test_a_box_at_rest_stays(nodes, friction):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("nodes", "friction", "steps"),
-    [(2, 0.0, 200), (3, 0.0, 200), (10, 0.0, 200), (2, 0.3, 200), (3, 0.3, 1000), (10, 0.3, 200)],
-)
-def test_a_box_rests_for_hundreds_of_steps(nodes, friction, steps):
-    """One of the boxes; what would move the others does so from the first step on."""
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("nodes", [2, 3, 10])
+def test_a_box_rests_for_a_thousand_steps(nodes, friction):
     body = rigid((0, 0, 0), (1, 1, 1), (nodes - 1, nodes - 1, 1))
     pair = nts.ContactPair(slave=below(body), master=FLOOR, friction=friction)
     system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=1e-2 * steps)
-    assert run.status == "completed" and not run.warnings.lines
-    assert np.abs(run.contact_forces[1:, 0, 2] - body.mass * G).max() < 1e-10 * body.mass * G
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=10.0)
+    weight = body.mass * G
+    assert run.status == "completed" and run.retries == 0 and not run.warnings.lines
+    assert len(run.balance["time"]) == 1001
+    assert np.abs(run.contact_forces[1:, 0, 2] - weight).max() < 1e-10 * weight
     assert np.abs(body.position - body.centre).max() < 1e-12
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * weight
 
 
 @pytest.mark.mpi
@@ -389,5 +389,5 @@ def test_a_smooth_rigid_master_keeps_momenta_and_the_ledger():
     table = run.balance
     assert run.status.startswith("completed") and table["active"].max() > 0
     for name in ("linear_momentum", "angular_momentum"):
-        assert np.ptp(table[name], axis=0).max() < 1e-11 * np.abs(table[name]).max()
+        assert np.ptp(table[name], axis=0).max() < 1e-12 * np.abs(table[name]).max()
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]

@@ -116,7 +116,7 @@ def test_tumbling_bodies_keep_energy_and_momenta(law):
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * kinetic
     for name in ("linear_momentum", "angular_momentum"):
         size = np.abs(table[name]).max()
-        assert np.abs(table[name] - table[name][0]).max() < 1e-11 * size
+        assert np.abs(table[name] - table[name][0]).max() < 1e-12 * size
 
 
 def test_an_energy_that_is_linear_is_a_linear_spring():
@@ -398,7 +398,7 @@ def test_a_rigid_body_on_a_flexible_one():
     assert run.status == "completed" and table["damping_dissipation"][-1] > 0.1
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
     for name in ("linear_momentum", "angular_momentum"):
-        assert np.abs(table[name] - table[name][0]).max() < 1e-10 * np.abs(table[name]).max()
+        assert np.abs(table[name] - table[name][0]).max() < 1e-12 * np.abs(table[name]).max()
 
 
 @pytest.mark.mpi

@@ -161,6 +161,8 @@ class RigidBody(Body):
             ValueError: An argument is out of range: moments that no body has, axes that are not
                 right-handed or not orthonormal.
         """
+        if not isinstance(comm, MPI.Comm):
+            raise TypeError(f"comm={comm!r}: pass an MPI communicator of mpi4py")
         require_same(
             comm, mass=mass, inertia=inertia, centre=centre, axes=axes, velocity=velocity,
             angular_velocity=angular_velocity, force=force, torque=torque, motion=motion,
@@ -206,7 +208,7 @@ class RigidBody(Body):
                     f"{what} of {name!r}={speed.tolist()!r}: {drive}= prescribes it; leave {what} "
                     f"out, or {drive}="
                 )
-        self._force, self._torque, self._motion, self._turn = force, torque, motion, rotation
+        self._force, self._motion, self._turn = force, motion, rotation
         self.driven = callable(motion) or callable(rotation)
         self._given = [("force", force, "N"), ("torque", torque, "N m")]
         for what, value, unit in self._given:

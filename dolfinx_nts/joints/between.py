@@ -282,10 +282,11 @@ def points_of(argument: str, body: Any, x: FloatArray) -> Any:
 def direction(name: str, value: Any) -> FloatArray:
     """A unit vector (3,) along a given one of any length."""
     given = vector(name, value, "-")
-    size = np.linalg.norm(given)
-    if size == 0.0:
+    largest = np.abs(given).max()
+    if largest == 0.0:
         raise ValueError(f"{name}={value!r}: has no direction; pass a vector that is not zero")
-    unit: FloatArray = given / size
+    given = given / largest  # squares of the smallest and largest numbers are none
+    unit: FloatArray = given / np.linalg.norm(given)
     return unit
 
 

@@ -30,6 +30,8 @@ class _Panel(NamedTuple):
 
 #: Lower end of logarithmic axes relative to what is compared: nothing below means anything.
 _ROUND_OFF = 0.1 * float(np.finfo(float).eps)
+#: Of the lines of a run where there are several runs.
+_STYLES = ("-", "--", ":", "-.")
 
 
 def _panels(balance: Balance, several: bool) -> list[_Panel]:
@@ -42,15 +44,15 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
         lines = {"total": balance["energy"]} | {n: balance[n] for n in ("kinetic", "potential")}
         energy = _Panel("Energy", "[J]", lines)
     works = (*ledger.WORKS, *ledger.CHANGES)
+    scale = float(np.abs(balance["energy"]).max()) or 1.0
     work = {
         name.replace("_", " "): balance[name]
         for name in ("contact_defect", *(n for n in works if n != "contact_defect"))
-        if name == "contact_defect" or balance[name].any()
+        if name == "contact_defect" or np.abs(balance[name]).max() > _ROUND_OFF * scale
     }
     nodes = {
         n: balance[n] for n in ("active", "stick", "slip") if n == "active" or balance[n].any()
     }
-    scale = float(np.abs(balance["energy"]).max()) or 1.0
     residual = {"": balance["ledger_residual"] / scale}
     panels = [
         energy,
@@ -121,7 +123,7 @@ def _lines(axes: Any, panel: _Panel, time: FloatArray, run: str, number: int | N
     for j, (name, values) in enumerate(panel.lines.items()):
         look: dict[str, Any] = {"color": f"C{j}", "linewidth": 1.4}
         if number is not None:
-            look = {"color": f"C{number}", "linestyle": ("-", "--", ":")[j]}
+            look = {"color": f"C{number}", "linestyle": _STYLES[j % len(_STYLES)]}
             look["linewidth"] = max(2.6 - 1.4 * number, 1.2)
         alone = number is not None and len(panel.lines) == 1
         shown = panel.title == "Total energy" if alone else bool(name)

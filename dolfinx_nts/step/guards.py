@@ -67,6 +67,9 @@ def check_momentum(
             speed += np.abs(free)
         local[7] += float(body.nodal_mass @ speed)
         local[8] += float(terms.du @ terms.du)
+    for batch, part in zip(problem.elements, step.parts, strict=True):
+        # Also those that cancel each other within a body.
+        local[6] += float(np.abs(part.residual[:, : batch.num_coordinates]).sum())
     total = problem.system.comm.allreduce(local)
     arm = problem.span + math.sqrt(total[8])
     total[:7] *= rule.rate(dt)

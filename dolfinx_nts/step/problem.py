@@ -36,6 +36,10 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
+#: Rounding of a sum of elements' forces over the norm of all of them: their own rounding and that
+#: of the solution, which the elements' stiffness passes on.
+_CANCELLED = 32 * float(np.finfo(float).eps)
+
 
 class StepProblem:
     """Equations of one step of a system; `begin` fixes the step.
@@ -490,29 +494,41 @@ class StepProblem:
 
     def unrest(self, e: Evaluation) -> float:
         """Force of the stabilization over what counts as converged, the largest of the bodies."""
-        squares = []
-        for body, t in zip(self.system.bodies, e.bodies, strict=True):
-            parts = (self._stabilization(body) * t.du, t.internal, t.external, t.coupling)
-            squares.append([float(p @ p) for p in parts])
-        norms = np.sqrt(self.system.comm.allreduce(np.array(squares)))
-        limits = self.rtol * norms[:, 1:].max(axis=1) + self.rounding.at(self._lengths(e))
-        return max(over(a, b) for a, b in zip(norms[:, 0], limits, strict=True))
+        both = zip(self.system.bodies, e.bodies, strict=True)
+        held = [self._stabilization(body) * t.du for body, t in both]
+        ratios = self._over_limits(e, held, self.rounding.at(self._lengths(e)))
+        return float(max(ratios, default=0.0))
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
         """Residual of each block over what counts as converged there; solved when all are <= 1."""
-        squares = np.zeros((len(e.bodies), 5))
-        for k in self.awake:
-            t, free = e.bodies[k], _free(self.system.bodies[k], e.bodies[k].residual)
-            parts = (free, self._inertia[k], t.internal, t.external, t.coupling)
-            squares[k] = [float(p @ p) for p in parts]
-        norms = np.sqrt(self.system.comm.allreduce(squares))
-        ratio, rounding = {}, self.rounding.forces
-        for k, body in enumerate(self.system.bodies):
-            limit = self.rtol * norms[k, 1:].max() + rounding[k]
-            ratio[body.name] = over(norms[k, 0], limit)
+        both = zip(self.system.bodies, e.bodies, strict=True)
+        free = [_free(body, t.residual) for body, t in both]
+        ratios = self._over_limits(e, free, self.rounding.forces)
+        ratio = dict(zip((b.name for b in self.system.bodies), ratios, strict=True))
         if self._laid.own:
             ratio |= self._element_ratios(e)
         return ratio
+
+    def _over_limits(
+        self, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
+    ) -> list[float]:
+        """A force on each body over that which counts as zero there. Collective.
+
+        It is measured by the largest of its inertial, internal, external and coupling forces.
+        Elements' forces that cancel each other, as on a body without mass of note between two
+        springs, are part of that scale in statics, where a body may have no other forces; in
+        dynamics only their rounding is, so that strong joints loosen no tolerance.
+        """
+        squares = np.zeros((len(e.bodies), 6))
+        for k in self.awake:
+            t = e.bodies[k]
+            parts = (forces[k], self._inertia[k], t.internal, t.external, t.coupling)
+            squares[k, :5] = [float(p @ p) for p in parts]
+        squares[:, 5] = self._laid.gross_forces(e.parts, len(e.bodies))
+        norms = np.sqrt(self.system.comm.allreduce(squares))
+        share = _CANCELLED if self.integrator.inertia else self.rtol
+        limits = np.maximum(self.rtol * norms[:, 1:5].max(axis=1), share * norms[:, 5]) + rounding
+        return [over(a, b) for a, b in zip(norms[:, 0], limits, strict=True)]
 
     def _element_ratios(self, e: Evaluation) -> dict[str, float]:
         """`ratios` of the elements' own unknowns."""

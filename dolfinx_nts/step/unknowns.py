@@ -126,6 +126,21 @@ class Unknowns:
                 own[name] = part.reshape(shape)
         return out
 
+    def gross_forces(self, parts: Sequence[Any], bodies: int) -> FloatArray:
+        """Sum of the squares of all elements' forces on each body on this rank, shape (bodies,).
+
+        Forces that cancel each other count in full.
+        """
+        squares, numbers = np.zeros(bodies), list(self._field)
+        if not self.blocks:
+            return squares
+        for block, part in zip(self.blocks, parts, strict=True):
+            for field, columns in zip(block.fields, block.columns, strict=True):
+                if field < len(numbers):
+                    rows = part.residual[:, columns].ravel()
+                    squares[numbers[field]] += rows @ rows
+        return squares
+
     def forces(self, elements: Sequence[Any], parts: Sequence[Any]) -> FloatArray:
         """Rows of coordinates of all elements, summed up at this rank's unknowns. Collective."""
         rows = [
