@@ -682,6 +682,26 @@ def test_a_crank_drives_a_slider_against_a_spring(stabilization):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("way", ["straight", "by a crank"])
+def test_a_drive_that_lifts_a_weight_is_no_gap_in_the_ledger(way):
+    """It does the work that the weight takes, so that their sum and the stored energy are 0."""
+    body = nts.RigidBody.from_inertia(2.0, (1, 1, 1), (1.0, 0, 0), comm=COMM)
+    if way == "straight":
+        drive = nts.Prismatic(
+            body, None, point=(1.0, 0, 0), axis=(0, 0, 1), displacement=lambda t: 3.0 * t
+        )
+    else:
+        drive = nts.Revolute(body, None, point=(0, 0, 0), axis=(0, 1, 0), angle=lambda t: -0.8 * t)
+    system = nts.System([body], joints=[drive], gravity=(0, 0, -10.0))
+    run = nts.equilibrium(system, load_steps=4)
+    assert run.status == "completed" and not run.warnings
+    if way == "by a crank":
+        moment = 20.0 * np.cos(0.8)
+        assert run.reactions[drive.name][-1, 1] == pytest.approx((0, -moment, 0), abs=1e-9)
+    assert run.reactions[drive.name][-1, 0] == pytest.approx((0, 0, 20.0), abs=1e-9)
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("mass", [1.0, 1e-6, 1e-9])
 def test_a_light_body_rests_between_springs_that_pull_at_it(mass):
     """Three tensions of 3e5 N cancel, beside which the body's inertia is nothing."""

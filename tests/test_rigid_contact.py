@@ -275,6 +275,17 @@ def test_equilibrium_names_a_rigid_body_that_may_slide():
     assert "nothing resists body 'brick'" in found.status
 
 
+@pytest.mark.mpi
+def test_equilibrium_names_the_body_that_falls():
+    """Of two, that which has no support."""
+    brick = rigid((0, 0, 0), (0.2, 0.1, 0.05), (2, 2, 1), name="brick")
+    loose = nts.RigidBody.from_inertia(1.0, (1, 1, 1), (0, 0, 5), name="loose", comm=COMM)
+    pair = nts.ContactPair(slave=below(brick), master=FLOOR)
+    system = nts.System([brick, loose], contacts=[pair], gravity=(0, 0, -G))
+    found = nts.equilibrium(system, stabilization=0.1)
+    assert "body 'loose' is not at rest after 100 relaxations; nothing holds it" in found.status
+
+
 def disc(facets, radius=0.1, width=0.02):
     """A ring of hexahedra about the y axis, which stands on z = 0."""
     angle = np.linspace(0, 2 * np.pi, facets, endpoint=False)

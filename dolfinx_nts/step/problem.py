@@ -492,12 +492,13 @@ class StepProblem:
         local = [body.motion_of_points(terms.du) for body, terms in both]
         return global_max(self.system.comm, np.array(local))
 
-    def unrest(self, e: Evaluation) -> float:
-        """Force of the stabilization over what counts as converged, the largest of the bodies."""
+    def unrest(self, e: Evaluation) -> tuple[float, str]:
+        """Force of the stabilization over what counts as zero, the largest; and its body's name."""
         both = zip(self.system.bodies, e.bodies, strict=True)
         held = [self._stabilization(body) * t.du for body, t in both]
         ratios = self._over_limits(e, held, self.rounding.at(self._lengths(e)))
-        return float(max(ratios, default=0.0))
+        k = int(np.argmax(ratios))
+        return ratios[k], self.system.bodies[k].name
 
     def ratios(self, e: Evaluation) -> dict[str, float]:
         """Residual of each block over what counts as converged there; solved when all are <= 1."""
