@@ -24,12 +24,12 @@ decides how much of the approach is kept, between nothing and all; the train los
 rebound and hit again, and single impacts come up to 12 ms off the train's with a step of 3 ms. How
 far off is a matter of chance, not in proportion to the step: of the first seven impacts of a row of
 eight it is 5, 9 and 1 ms at most with 3, 2 and 1 ms. The wave, in the mean over the later half of
-the impacts, has a speed of 1.38 to 1.43 sqrt(g H), as the step changes by up to 1.5 % and as numbers
-are rounded; the train's is 1.379. Half of the energy goes into gaps that close (the contact defect), 27 % into
-friction. The ledger closes to round-off through all impacts, and momentum along the row is what the
-push gave plus the impulses of hinges and floor. Fronts and heels of dominoes that lie on each other
-are no declared contact; the run ends as the last domino falls past 55 degrees, which nothing
-catches.
+the impacts, has a speed of 1.38 to 1.43 sqrt(g H), as the step changes by up to 1.5 % and as
+numbers are rounded; the train's is 1.379. Half of the energy goes into gaps that close (the contact
+defect), 27 % into friction. The ledger closes to round-off through all impacts, and momentum along
+the row is what the push gave plus the impulses of hinges and floor. Fronts and heels of dominoes
+that lie on each other are no declared contact; the run ends as the last domino falls past 55
+degrees, which nothing catches.
 
     mpirun -n 2 python demos/domino.py
 """
