@@ -507,7 +507,10 @@ class Coupling(Protocol):
         """Whether `let_slip` changes anything."""
 
     def let_slip(self) -> None:
-        """Let the step be solved by a rule that adds no solution but may find one."""
+        """Let sticking nodes slip under a slight pull in Newton's iterations of this step.
+
+        Every solution of the step stays one, and no other is added.
+        """
 
     def give_way(self) -> bool:
         """Limit a force that had no limit (friction=inf) from the next step on.

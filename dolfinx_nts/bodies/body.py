@@ -236,9 +236,9 @@ class Body:
         return np.empty(0)
 
     def file_order(self) -> IntArray:
-        """Which of the nodes of all ranks, rank after rank, comes first in files, which second.
+        """Numbers of the nodes, counted rank after rank, in the order of files; on rank 0.
 
-        An order that does not depend on the ranks; on rank 0. Collective.
+        That order does not depend on the ranks. Collective.
         """
         return np.arange(self.comm.allreduce(self.num_owned // 3))
 

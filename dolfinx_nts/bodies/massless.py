@@ -162,7 +162,7 @@ def _moments(affine: FloatArray, products: list[FloatArray], comm: Any) -> Float
 def _factors(
     mass: _Products, shape: FloatArray, wanted: FloatArray, kept: BoolArray, comm: Any
 ) -> tuple[FloatArray, str]:
-    """Factor of each node's coordinates, (n,), with which the moments are those that are wanted."""
+    """Factors of the nodal masses, (n,), that give the wanted moments, and why none do."""
     affine, unknown = shape[:, :4], np.zeros(shape.shape[1])
     pairs = [(i, j) for i in range(4) for j in range(i, 4)]
     problem = _TOO_THIN

@@ -317,7 +317,7 @@ class ContactLaws:
 
     @cached_property
     def blocked(self) -> FloatArray:
-        """Projector on the lambda_T that no free coordinate can tell from zero, shape (n, 2, 2).
+        """Projector on the part of lambda_T that acts on prescribed coordinates only, (n, 2, 2).
 
         Sticking is no equation there, and lambda_T is set to zero.
         """
@@ -435,9 +435,8 @@ class ContactLaws:
         A touch without force has rounding in both, and with strong friction more than one solution
         (Painleve's paradox): so nodes carry where free motion would close their gaps, or did so in
         the last step. If no step comes of that (`lets_slip`), a small pull on a node that sticks
-        lets it slip, by the law continued beyond zero force: to let it go would close its gap
-        again. As the law drives such a node along its slip where solved, which is excluded, this
-        adds no solution.
+        lets it slip, by the law continued beyond zero force, since letting it go would close its
+        gap again. A solved step never ends in such a state, so this adds no solution.
         """
         none = self._yielding * self.gap_rounding
         endless = self._endless

@@ -168,7 +168,7 @@ class ContactSearch:
         return replace(elements, before=before)
 
     def _drop_doubles(self) -> None:
-        """Of two pairs that keep a node out of the same fixed surface, leave one.
+        """Keep one of two pairs that keep a node out of the same fixed surface.
 
         Two constraints on one gap are one too many where no master can yield, as over the seam of
         two plates. A node stays with the one that carried it.

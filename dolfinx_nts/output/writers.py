@@ -33,7 +33,7 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 def _file_name(name: str) -> str:
-    """Of a body: a name without folders, and none that is hidden."""
+    """A file name for a body: without folders, and not hidden."""
     return re.sub(r"^\.+|[^\w.-]+", "_", name)
 
 

@@ -191,7 +191,7 @@ def _response(
 ) -> tuple[FloatArray, ...]:
     """Change of velocities by impulses [m/s], as joints allow it.
 
-    With joints the bodies' matrices are not those of an iterate any more.
+    With joints it overwrites the bodies' matrices; the caller must have them assembled again.
     """
     system = problem.system
     chosen: list[tuple[Any, Any, tuple[int, ...]]] = [

@@ -221,7 +221,8 @@ class SolverOptions:
 
         Nothing is solved yet: most options are asked for when the solver is set up. If some are
         not, a small model problem with a constraint is solved, which asks for those of the solve
-        itself and of a field split that waits for contact.
+        itself and of a field split that waits for contact. PETSc has no list of the names it knows:
+        it marks an option as used when the code that reads it runs.
 
         Args:
             snes: The configured SNES.

@@ -1,4 +1,4 @@
-"""What slave nodes without mass go with (theory section 16)."""
+"""Checks of runs with massless slave nodes: integrator, balance at the start (theory 16)."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ _STALLED = 0.5
 #: ... and is at most this many tolerances large may be the rounding of forces that have grown since
 #: rounding was measured.
 _NEAR = 1e4
-#: Of the tolerance, what an iteration aims at that could be the last: a step that only just
+#: Part of the tolerance that an iteration aims at if it may be the last: a step that only just
 #: converges would leave its whole tolerance to the ledger, where factors leave rounding.
 _AIM = 1e-3
 #: Range of the linear solver's tolerance that is worth it.

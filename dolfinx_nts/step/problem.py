@@ -221,7 +221,7 @@ class StepProblem:
         return any(coupling.may_slip for coupling in self.couplings)
 
     def let_slip(self) -> None:
-        """Solve this step by a rule that adds no solution but may find one."""
+        """Let sticking nodes slip under a slight pull in the iterations; no solution changes."""
         for coupling in self.couplings:
             coupling.let_slip()
 

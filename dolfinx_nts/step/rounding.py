@@ -69,7 +69,7 @@ class Rounding:
     def measure(self, bodies: Iterable[int]) -> None:
         """Measure it anew, for bodies that have stiffened. Collective.
 
-        The bodies' matrices are not those of an iterate any more.
+        It overwrites the bodies' matrices; the caller must have them assembled again.
         """
         for k in bodies:
             diagonal = self._tangent(k).getDiagonal()

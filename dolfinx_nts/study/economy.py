@@ -385,10 +385,10 @@ def table(comm: Any, *, cells: int = 8, steps: int = 10, rounds: int = 9) -> lis
 def _row(
     name: str, base: str, seconds: Mapping[str, Sequence[FloatArray]], iterations: float
 ) -> dict[str, Any]:
-    """Of times the mean over the steps of the median over the rounds, or of the fastest.
+    """Row of the table: the median time over the rounds, averaged over the steps; so the fastest.
 
-    Others' programs only ever make a step slower. Ratios and differences are those of steps of one
-    turn, and of them the medians.
+    The fastest counts, too, as other programs only ever make a step slower. Ratios and differences
+    are medians over steps of the same turn.
     """
     own, other, plain = (np.array(seconds[key]) for key in (name, base, PLAIN))
     middle = 1e3 * np.median(own, axis=0).mean(axis=0)
