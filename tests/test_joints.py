@@ -770,3 +770,23 @@ def test_a_drive_that_raises_ends_a_run():
 def test_only_loops_are_looked_at_for_joints_that_repeat_each_other(joints, tree):
     """A chain of 800 bodies needs no search for a null space."""
     assert least_norm.form_tree(joints) is tree
+
+
+@pytest.mark.mpi
+def test_half_a_turn_in_a_step_is_refused():
+    """It cannot be told from half a turn the other way: a motor of 80 rad/s ran at -91."""
+
+    def motor(rate):
+        body = nts.RigidBody.from_inertia(1.0, (1, 1, 1))
+        hinge = nts.Revolute(
+            body, None, point=(0, 0, 0), axis=(0, 0, 1), angle=lambda t: rate * t, name="motor"
+        )
+        return body, nts.System([body], joints=[hinge])
+
+    run = nts.simulate(motor(80.0)[1], nts.EnergyMomentum(), dt=0.05, t_end=0.2)
+    assert "the angle of 'motor' changes by 4 rad, half a turn or more; use a sm" in run.status
+    body, system = motor(7.0)
+    assert nts.equilibrium(system).status == "completed"
+    turned = [[np.cos(7), -np.sin(7), 0], [np.sin(7), np.cos(7), 0], [0, 0, 1]]
+    # Newton's tolerance times the motion of the directors.
+    assert np.abs(body.rotation - turned).max() < 1e-11

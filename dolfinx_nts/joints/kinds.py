@@ -23,6 +23,7 @@ from dolfinx_nts.joints.between import (
     triad,
 )
 from dolfinx_nts.validation import (
+    StepFailedError,
     UserFunctionError,
     at_time,
     floats,
@@ -115,8 +116,8 @@ class Revolute(_WithAxis):
         b: A rigid body, or None.
         point: On the axis at the start [m].
         axis: n at the start, of any length.
-        angle: Function of time, the angle about n by which A turns relative to B [rad], less than
-            half a turn in a step; None: free.
+        angle: Function of time, the angle about n by which A turns relative to B [rad]; None: free.
+            A step in which it changes by half a turn or more is cut, or the run stops.
         name: In messages and files; default: kind and bodies.
 
     Raises:
@@ -148,6 +149,12 @@ class Revolute(_WithAxis):
         yield from self.parallel()
         if self.motion is not None:
             angles = np.array([self.motion.since_start(t) for t in times])
+            if np.ptp(angles) >= np.pi:
+                # The products cannot tell such a turn from one the other way.
+                raise StepFailedError(
+                    f"step from t={times[0]:.6g}: the angle of {self.name!r} changes by "
+                    f"{np.ptp(angles):.3g} rad, half a turn or more; use a smaller dt"
+                )
             middle = angles.mean()
             b = np.cos(middle) * self.m2_b - np.sin(middle) * self.m1_b
             value = self.length * np.sin(angles - middle)
