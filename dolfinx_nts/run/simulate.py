@@ -11,7 +11,7 @@ from dolfinx_nts.parallel import first_problem
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.intercept import interceptable
 from dolfinx_nts.run.interrupts import Interrupts
-from dolfinx_nts.run.solution import Restart, Solution
+from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
@@ -190,7 +190,7 @@ def simulate(
             checkpoint=checkpoint,
         )  # fmt: skip
     equal = _equal_steps(begin, end, dt)
-    if isinstance(start, Restart):
+    if start is not None and start.moving and start_time is None:
         # The steps of the whole run, to the bit, if it had the same and stopped at the end of one.
         whole = _equal_steps(start.rows[0]["time"], end, dt)
         left = [step for step in whole if step[1] > begin]
@@ -205,10 +205,12 @@ def _equal_steps(begin: float, end: float, dt: float) -> list[tuple[float, float
     """Length and end of each step [s], at most dt long.
 
     A last step much shorter than the others would expel a node that the one before left behind a
-    facet with a speed of gap / dt.
+    facet with a speed of gap / dt. Where steps of dt meet the end, dt stays as it is to the bit, so
+    that a run in two parts has the steps of one.
     """
     steps = max(1, math.ceil((end - begin) / dt * (1 - 1e-9)))
-    dt = (end - begin) / steps
+    if not math.isclose(begin + steps * dt, end, rel_tol=1e-15):
+        dt = (end - begin) / steps
     return [(dt, begin + (k + 1) * dt) for k in range(steps)]
 
 
