@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import two_blocks
+from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 from point_mass import STEP, PointMass, mass_on_wall
 from test_promises import OPEN, ledger_or_word
@@ -95,3 +96,13 @@ def test_no_tolerance_comes_from_an_iterate():
     assert problem.momentum_rounding == before
     far.destroy()
     stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("force", [1e-150, 1e-155, 1e-165, 1e-300])
+def test_a_force_whose_square_is_no_number_stops_nothing(force):
+    """As at the foot of a pulse exp(-(t - t0)^2 / s^2): the norm of its residual is zero."""
+    mesh = create_box(COMM, [np.zeros(3), np.ones(3)], [1, 1, 2], CellType.hexahedron)
+    body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3, body_force=(force, 0, 0))
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=1e-4, t_end=3e-4)
+    assert run.status == "completed" and run.retries == 0
