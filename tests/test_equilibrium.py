@@ -682,6 +682,25 @@ def test_a_crank_drives_a_slider_against_a_spring(stabilization):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("stabilization", [None, 0.1])
+@pytest.mark.parametrize("tension", [1e3, 1e6])
+def test_forces_that_cancel_loosen_no_tolerance(tension, stabilization):
+    """A soft direction beside them: 0.01 N on a spring of 1 N/m."""
+    body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), force=(0, 0, 0.01), comm=COMM)
+    ends = (0, 0, 0), (0, 0, 1)
+    joints = [
+        nts.Prismatic(body, None, point=(0, 0, 0), axis=(0, 0, 1)),
+        nts.Spring(body, None, ends, stiffness=1.0, name="soft"),
+        nts.Spring(body, None, ends, energy=lambda x: tension * x, name="up"),
+        nts.Spring(body, None, ends, energy=lambda x: -tension * x, name="down"),
+    ]
+    run = nts.equilibrium(nts.System([body], joints=joints), stabilization=stabilization)
+    assert run.status == "completed"
+    # 32 eps of all forces over the stiffness
+    assert body.position[2] == pytest.approx(0.01, rel=1e-9, abs=1e-14 * tension)
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("way", ["straight", "by a crank"])
 def test_a_drive_that_lifts_a_weight_is_no_gap_in_the_ledger(way):
     """It does the work that the weight takes, so that their sum and the stored energy are 0."""

@@ -44,11 +44,11 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
         lines = {"total": balance["energy"]} | {n: balance[n] for n in ("kinetic", "potential")}
         energy = _Panel("Energy", "[J]", lines)
     works = (*ledger.WORKS, *ledger.CHANGES)
-    scale = float(np.abs(balance["energy"]).max()) or 1.0
+    scale = float(np.nanmax(np.abs(balance["energy"]), initial=0.0)) or 1.0
     work = {
         name.replace("_", " "): balance[name]
         for name in ("contact_defect", *(n for n in works if n != "contact_defect"))
-        if name == "contact_defect" or np.abs(balance[name]).max() > _ROUND_OFF * scale
+        if name == "contact_defect" or not np.abs(balance[name]).max() <= _ROUND_OFF * scale
     }
     nodes = {
         n: balance[n] for n in ("active", "stick", "slip") if n == "active" or balance[n].any()

@@ -17,7 +17,8 @@ from dolfinx_nts.validation import StepFailedError
 _MOMENTUM = 1e-6
 #: ... and how many times the tolerance of Newton's method, where that is larger.
 _TOLERANCES = 1e3
-#: Rounding of an angular momentum about the origin over that of the distance times the momentum.
+#: Rounding of an angular momentum about the origin over that of the distance times the momentum,
+#: and of sums of forces that cancel each other over those forces.
 _FAR = 1e3 * float(np.finfo(float).eps)
 #: Residuals whose norms, which square them, are rounded to nothing: they count as solved.
 _SQUARED_AWAY = math.sqrt(float(np.finfo(float).tiny))
@@ -50,7 +51,7 @@ def check_momentum(
     Raises:
         StepFailedError: The step is wrong.
     """
-    local, rule, dt = np.zeros(12), problem.integrator, problem.dt
+    local, rule, dt = np.zeros(13), problem.integrator, problem.dt
     for k, (body, terms, u0, v0, v1) in enumerate(zip(
         problem.system.bodies, step.bodies, problem.state.u, problem.state.v, state.v, strict=True
     )):
@@ -65,20 +66,20 @@ def check_momentum(
             # What the velocity would be without the forces of this step.
             a0 = problem.acceleration(k)
             free, _ = rule.advance(rule.ahead(v0, a0, dt), v0, a0, dt)
-            local[9:] += body.linear_momentum(body.inertia(free - v0))
+            local[9:12] += body.linear_momentum(body.inertia(free - v0))
             speed += np.abs(free)
         local[7] += float(body.nodal_mass @ speed)
         local[8] += float(terms.du @ terms.du)
     for batch, part in zip(problem.elements, step.parts, strict=True):
-        # Also those that cancel each other within a body.
-        local[6] += float(np.abs(part.residual[:, : batch.num_coordinates]).sum())
+        # Of forces that cancel each other within a body only the rounding counts.
+        local[12] += float(np.abs(part.residual[:, : batch.num_coordinates]).sum())
     total = problem.system.comm.allreduce(local)
     arm = problem.span + math.sqrt(total[8])
     total[:7] *= rule.rate(dt)
     activity = total[6] + total[7]
     allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * activity + problem.momentum_rounding
-    allowed += problem.system.size * rule.rate(dt) * _SQUARED_AWAY
-    off = after["linear_momentum"] - before["linear_momentum"] - total[:3] - total[9:]
+    allowed += (_FAR * total[12] + problem.system.size * _SQUARED_AWAY) * rule.rate(dt)
+    off = after["linear_momentum"] - before["linear_momentum"] - total[:3] - total[9:12]
     # About the middle of the bodies: about a far origin every error of P would look like one of J.
     turn = after["angular_momentum"] - before["angular_momentum"] - total[3:6]
     turn -= np.cross(problem.centre, off)

@@ -515,10 +515,9 @@ class StepProblem:
     ) -> list[float]:
         """A force on each body over that which counts as zero there. Collective.
 
-        It is measured by the largest of its inertial, internal, external and coupling forces.
-        Elements' forces that cancel each other, as on a body without mass of note between two
-        springs, are part of that scale in statics, where a body may have no other forces; in
-        dynamics only their rounding is, so that strong joints loosen no tolerance.
+        It is measured by the largest of its inertial, internal, external and coupling forces. Of
+        elements' forces that cancel each other, as on a body without mass of note between two
+        springs, only the rounding counts, so that strong joints loosen no tolerance.
         """
         squares = np.zeros((len(e.bodies), 6))
         for k in self.awake:
@@ -527,8 +526,7 @@ class StepProblem:
             squares[k, :5] = [float(p @ p) for p in parts]
         squares[:, 5] = self._laid.gross_forces(e.parts, len(e.bodies))
         norms = np.sqrt(self.system.comm.allreduce(squares))
-        share = _CANCELLED if self.integrator.inertia else self.rtol
-        limits = np.maximum(self.rtol * norms[:, 1:5].max(axis=1), share * norms[:, 5]) + rounding
+        limits = self.rtol * norms[:, 1:5].max(axis=1) + _CANCELLED * norms[:, 5] + rounding
         return [over(a, b) for a, b in zip(norms[:, 0], limits, strict=True)]
 
     def _element_ratios(self, e: Evaluation) -> dict[str, float]:
