@@ -15,6 +15,7 @@ from dolfinx_nts.bodies.inversion import smallest_dets
 from dolfinx_nts.output import BalanceCSV
 from dolfinx_nts.step.accuracy import ACCURACY
 from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.step.upright import Upright
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
@@ -343,7 +344,7 @@ def test_an_update_is_halved_until_a_tenth_of_det_is_left(scale):
     (body,) = system.bodies
     stepper = nts.Stepper(system, nts.EnergyMomentum())
     stepper.problem.begin(stepper.state, 1e-3)
-    stepper.solver.prepare()
+    upright = Upright(stepper.problem)
     step = scale * np.cos(9 * body.reference.reshape(-1, 3)[:, [1, 2, 0]]).ravel()
 
     def left(part):
@@ -352,9 +353,9 @@ def test_an_update_is_halved_until_a_tenth_of_det_is_left(scale):
 
     x, y = stepper.problem.x, stepper.problem.x.duplicate()
     for careful in (False, True):
-        stepper.solver._careful = careful
+        upright.begin(careful=careful)
         y.array_w[:] = step
-        changed = stepper.solver._shorten(x, y)
+        changed = upright.shorten(x, y)
         part = COMM.allreduce(y.array_r @ step) / COMM.allreduce(step @ step)
         assert changed == (part < 1.0) == (careful and left(1.0) < 0.1)
     # Halved as often as needed and no more; at such a smooth update corners have the smallest det.

@@ -103,7 +103,7 @@ class Linearised:
     def __init__(self, system, rule, active, state, dt=0.02):
         self.stepper = stepper_of(system, rule)
         self.problem = problem = self.stepper.problem
-        problem.stabilization = 0.2 if rule == "static" else 0.0
+        problem.stabilization.share = 0.2 if rule == "static" else 0.0
         problem.begin(state, dt)
         self.solver = self.stepper.solver
         rng = np.random.default_rng(COMM.rank)
@@ -331,7 +331,7 @@ def convergence(system, rule, state, dt):
     def record(snes, iteration, norm):
         norms.append(norm)
         iterates.append(snes.getSolution().array_r.copy())
-        sets.append([c.active.astype(int) + c.stick for c in solver._last.parts])
+        sets.append([c.active.astype(int) + c.stick for c in solver.iterates.last.parts])
 
     solver.snes.setMonitor(record)
     (last,) = solver.solve().parts

@@ -273,3 +273,28 @@ def test_the_step_is_the_same_number_in_all_steps():
         )  # fmt: skip
         assert len(set(lengths)) == 1
         lengths.clear()
+
+
+@pytest.mark.mpi
+def test_runs_of_one_system_in_turn_use_no_matrix_of_each_other():
+    """A body has one matrix; a run that took it of another step size would hardly converge."""
+    system = rubbing_blocks(0.3)
+    steps = {2e-3: 20, 1e-4: 20}
+
+    def runs():
+        newton = nts.Newton(reuse=True, rtol=1e-9)
+        return {dt: nts.Stepper(system, nts.EnergyMomentum(), newton=newton) for dt in steps}
+
+    alone, in_turn = runs(), runs()
+    for dt, stepper in alone.items():
+        for _ in range(steps[dt]):
+            stepper.advance(dt)
+    for _ in range(20):
+        for dt, stepper in in_turn.items():
+            stepper.advance(dt)
+    for dt in steps:
+        a, b = alone[dt].solution.balance, in_turn[dt].solution.balance
+        assert difference(a, b) < 1e-9
+        assert b["newton_iterations"].sum() <= a["newton_iterations"].sum()
+        alone[dt].close()
+        in_turn[dt].close()

@@ -20,6 +20,7 @@ from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.step import balance, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
+from dolfinx_nts.step.convergence import unrest
 from dolfinx_nts.step.evaluation import Evaluation
 from dolfinx_nts.step.free_motion import free_motion
 from dolfinx_nts.system import State, System
@@ -216,7 +217,7 @@ class _LoadStepper(Stepper):
         search, since = True, 0.0
         relaxed = _Relaxed(self.system)
         slipped = [contact.slip for contact in kept.contacts]
-        problem.stabilization = self._stabilization
+        problem.stabilization.share = self._stabilization
         state = replace(kept, v=tuple(self._rates))
         try:
             for _ in range(_RELAXATIONS):
@@ -238,27 +239,27 @@ class _LoadStepper(Stepper):
                     raise
                 except StepFailedError:
                     # Bodies in search of each other move by load over stabilization, whatever dt.
-                    if not 0.0 < problem.stabilization < _STIFFEST:
+                    if not 0.0 < problem.stabilization.share < _STIFFEST:
                         raise
-                    problem.stabilization /= _RELIEF
+                    problem.stabilization.share /= _RELIEF
                     continue
                 iterations += step.iterations
                 relaxed.driven += balance.told_by_joints(problem, step)
                 state, dt = reached, 0.0
-                unrest, restless = problem.unrest(step)
-                if unrest <= 1.0:
+                left, restless = unrest(problem, step)
+                if left <= 1.0:
                     return step, state, iterations, relaxed
                 terms = balance.step_terms(problem, step)
                 since = terms["friction_dissipation"]
                 for name in relaxed.of_joints:
                     relaxed.lost[name] += terms[name]
-                if unrest < _RELIEVED * last:
-                    problem.stabilization *= _RELIEF
-                last = unrest
+                if left < _RELIEVED * last:
+                    problem.stabilization.share *= _RELIEF
+                last = left
                 # A node on an edge could change its facet for ever, and its place with it.
-                search = unrest * self.newton.rtol > _NEARLY_AT_REST
+                search = left * self.newton.rtol > _NEARLY_AT_REST
         finally:
-            problem.stabilization = 0.0
+            problem.stabilization.share = 0.0
         raise StepFailedError(
             f"step from t={kept.time:.6g}: body {restless!r} is not at rest after {_RELAXATIONS} "
             "relaxations; nothing holds it, or it hops from facet to facet"

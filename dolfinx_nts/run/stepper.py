@@ -481,8 +481,6 @@ class Stepper:
             impact = restored(self.problem, step, state, self._restitution)
         if impact is not None:
             state = impact.state
-            if self.system.joints:
-                self.solver.renew()
             if self._keeps_ledger:
                 measured = balance.measure(self.system, state, self._measured)
         return Trial(step, state, measured, impulses, impact)

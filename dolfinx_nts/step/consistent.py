@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
@@ -54,9 +55,42 @@ def accelerations(problem: StepProblem, state: State, dt: float) -> tuple[FloatA
         state: At the start; its own accelerations play no part.
         dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
     """
-    forces, held = zip(*problem.forces(state, dt), strict=True)
+    forces, held = zip(*accelerating_forces(problem, state, dt), strict=True)
     solved = _solve(problem, replace(state, a=held), forces, 1, dt)
     return tuple(a + given for a, given in zip(solved, held, strict=True))
+
+
+def accelerating_forces(
+    problem: StepProblem, state: State, dt: float
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Forces that accelerate bodies at a state, with contact's of its last step. Collective.
+
+    Args:
+        problem: Equations of the run.
+        state: The state; its own accelerations play no part.
+        dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+
+    Returns:
+        Of each body the forces [N], less the inertia of its prescribed coordinates, and
+        accelerations that hold but those [m/s^2].
+    """
+    still = tuple(np.zeros_like(v) for v in state.v)
+    ramp = problem.integrator.ramp(state.time)
+    moments = [Moment(u, state.time, ramp, 0.0, v) for u, v in zip(state.u, state.v, strict=True)]
+    problem.begin(replace(state, a=still), dt, moments=moments)
+    problem.guess(flight=False, forces=True)
+    contact = [terms.coupling / problem.factor for terms in problem.evaluate(problem.x).bodies]
+    gravity = ramp * problem.system.gravity
+    out = []
+    for body, u, force in zip(problem.system.bodies, state.u, contact, strict=True):
+        right = body.external(u, gravity) - body.internal(u) - force
+        p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
+        a = np.zeros_like(u)
+        a[body.fixed] = 4.0 * (p0 - 2.0 * p1 + p2) / dt**2
+        right -= body.inertia(a)
+        right[body.fixed] = 0.0
+        out.append((right, a))
+    return out
 
 
 def projection(problem: StepProblem, state: State, dt: float) -> tuple[FloatArray, ...]:

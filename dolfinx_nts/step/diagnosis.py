@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from dolfinx_nts.step.convergence import ratios
 from dolfinx_nts.step.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.step.problem import StepProblem
 
@@ -26,7 +27,7 @@ def diagnosis(
         iterations: Newton iterations.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        found = problem.ratios(e)
+        found = ratios(problem, e)
     ratio = {k: r if np.isfinite(r) else np.inf for k, r in found.items()}
     worst = max(ratio, key=lambda name: ratio[name])
     notes = [

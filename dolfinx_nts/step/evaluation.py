@@ -50,3 +50,10 @@ class Evaluation:
     parts: tuple[Any, ...]
     iterations: int = 0
     min_det: float = np.inf
+
+
+def free(body: Any, residual: FloatArray) -> FloatArray:
+    """Residual with zeros at the prescribed coordinates, whose equation is the prescription."""
+    out = residual.copy()
+    out[body.fixed] = 0.0
+    return out

@@ -189,10 +189,7 @@ def _forces(problem: StepProblem, contacts: Sequence[_New]) -> list[FloatArray]:
 def _response(
     problem: StepProblem, step: Evaluation, impulses: Sequence[FloatArray]
 ) -> tuple[FloatArray, ...]:
-    """Change of velocities by impulses [m/s], as joints allow it.
-
-    With joints it overwrites the bodies' matrices; the caller must have them assembled again.
-    """
+    """Change of velocities by impulses [m/s], as joints allow it."""
     system = problem.system
     chosen: list[tuple[Any, Any, tuple[int, ...]]] = [
         (batch, part, of)

@@ -8,6 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.step.consistent import accelerating_forces
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import State, System
 
@@ -69,7 +70,7 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
     moved = any(some and bool(u.any()) for _, u, some in both)
     if not problem.system.comm.allreduce(moved, op=MPI.LOR):
         return worst, text
-    forces = problem.forces(state, dt)
+    forces = accelerating_forces(problem, state, dt)
     for body, (force, _), u, some in zip(bodies, forces, state.u, chosen, strict=True):
         if not some:
             continue

@@ -1,4 +1,4 @@
-"""The equations of one step: residual, tangents of bodies, convergence of each block.
+"""The equations of one step: residual and tangents of bodies.
 
 What couples bodies comes as `Elements`, of whatever kind they are.
 
@@ -11,9 +11,7 @@ pure: nothing here changes a State, and history changes only when a step is acce
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,11 +22,12 @@ from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.elements import Coupling, JointCoupling, Step, over
+from dolfinx_nts.elements import Coupling, JointCoupling, Step
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.step.evaluation import BodyTerms, Evaluation
+from dolfinx_nts.step.evaluation import BodyTerms, Evaluation, free
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.sleep import Sleepers
+from dolfinx_nts.step.stabilization import Stabilization
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.system import State, System
 
@@ -36,9 +35,18 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Rounding of a sum of elements' forces over the norm of all of them: their own rounding and that
-#: of the solution, which the elements' stiffness passes on.
-_CANCELLED = 32 * float(np.finfo(float).eps)
+class Lengths(NamedTuple):
+    """Lengths of each body in a step [m], shape (bodies,).
+
+    Attributes:
+        motion: Largest motion of a point that is predicted.
+        extent: Largest coordinate.
+        moved: Largest displacement at t_n.
+    """
+
+    motion: FloatArray
+    extent: FloatArray
+    moved: FloatArray
 
 
 class StepProblem:
@@ -64,7 +72,9 @@ class StepProblem:
         rtol: As given.
         rounding: What part of the forces on bodies is rounding.
         centre: Middle of all bodies in the reference [m], shape (3,).
-        stabilization: In statics, the stiffness that holds each node at t_n over its own stiffness.
+        stabilization: In statics, what holds each node at t_n.
+        lengths: Lengths of the step, after `begin`.
+        flight: M (u_1 - u_0) of each body in free flight [kg m], after `begin`; zero in statics.
     """
 
     def __init__(
@@ -82,8 +92,8 @@ class StepProblem:
         self.couplings: list[Coupling] = [self.contacts, *self.joints]
         self.unknowns: Unknowns | None = None
         self.version = 0
-        self.stabilization = 0.0
         self.centre, self._span = _box(system)
+        self.stabilization = Stabilization(system, integrator, self._span)
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k])
         )
@@ -127,33 +137,34 @@ class StepProblem:
             for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
         ]
         top = global_max(system.comm, np.array(local)).T
-        self._motion, self._extent, speed, self._moved = top
+        motion, extent, speed, moved = top
         if state.a:
             local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
             speed = np.maximum(speed, global_max(system.comm, np.array(local)))
         # In statics v only predicts the first guess.
         moves = (speed > 0.0) & self.integrator.inertia
-        self._inertia = [
+        self.flight = [
             self._inertial(b, ahead) if top else np.zeros_like(ahead)
             for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
         ]
         way = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
         if again is not None:
-            self._motion = np.maximum(self._motion, self.motion(again))
+            motion = np.maximum(motion, self.motion(again))
             way = [terms.du for terms in again.bodies]
+        self.lengths = Lengths(motion, extent, moved)
         # Bodies at rest may fall.
-        length = self._moved + self._motion + dt**2 * float(np.linalg.norm(self._gravity))
+        length = moved + motion + dt**2 * float(np.linalg.norm(self._gravity))
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
         for bodies in map(list, (*system.contact_bodies, *system.joint_bodies)):
             length[bodies] = length[bodies].max()
-        self.rounding.begin(self.factor, length, self._moved, self._extent)
+        self.rounding.begin(self.factor, length, moved, extent)
         step = Step(
             state, dt, self.factor, self.integrator, self.condense, self.first, way,
-            self._motion, length, self._stiffness, moments, self.rounding.of,
+            motion, length, self.stabilization.stiffness, moments, self.rounding.of,
         )  # fmt: skip
         for coupling, history in zip(self.couplings, state.histories, strict=True):
             coupling.begin(step, history, again, search)
-        self._asleep = self._find_asleep(np.maximum(self._motion, speed) == 0.0)
+        self._asleep = self._find_asleep(np.maximum(motion, speed) == 0.0)
         self._lay_out()
 
     @property
@@ -254,19 +265,20 @@ class StepProblem:
     @property
     def x(self) -> Any:
         """PETSc vector of the unknowns, holding the first guess after `begin`."""
-        return self._laid.x
+        return self.laid.x
 
     def of_body(self, k: int) -> slice:
         """Where a body that is awake stands among this rank's unknowns."""
-        return self._laid.of_body(k)
+        return self.laid.of_body(k)
 
     @property
     def of_constraints(self) -> slice:
         """Where the elements' multipliers stand among this rank's unknowns."""
-        return self._laid.of_elements("constraints")
+        return self.laid.of_elements("constraints")
 
     @property
-    def _laid(self) -> Unknowns:
+    def laid(self) -> Unknowns:
+        """The layout, after `begin`."""
         assert self.unknowns is not None, "begin comes first"
         return self.unknowns
 
@@ -290,37 +302,6 @@ class StepProblem:
         rate = rule.theta * rule.rate(self.dt) if rule.inertia else 0.0
         return Moment(state.u[k], self._when, rule.ramp(self._when), rate, drift)
 
-    def forces(self, state: State, dt: float) -> list[tuple[FloatArray, FloatArray]]:
-        """Forces that accelerate bodies at a state, with contact's of its last step. Collective.
-
-        Args:
-            state: Its own accelerations play no part.
-            dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
-
-        Returns:
-            Of each body the forces [N], less the inertia of its prescribed coordinates, and
-            accelerations that hold but those [m/s^2].
-        """
-        still = tuple(np.zeros_like(v) for v in state.v)
-        ramp = self.integrator.ramp(state.time)
-        moments = [
-            Moment(u, state.time, ramp, 0.0, v) for u, v in zip(state.u, state.v, strict=True)
-        ]
-        self.begin(replace(state, a=still), dt, moments=moments)
-        self.guess(flight=False, forces=True)
-        contact = [terms.coupling / self.factor for terms in self.evaluate(self.x).bodies]
-        gravity = ramp * self.system.gravity
-        out = []
-        for body, u, force in zip(self.system.bodies, state.u, contact, strict=True):
-            right = body.external(u, gravity) - body.internal(u) - force
-            p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
-            a = np.zeros_like(u)
-            a[body.fixed] = 4.0 * (p0 - 2.0 * p1 + p2) / dt**2
-            right -= body.inertia(a)
-            right[body.fixed] = 0.0
-            out.append((right, a))
-        return out
-
     def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
         """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
         if self._sleepers is None:
@@ -339,31 +320,7 @@ class StepProblem:
         if self.integrator.inertia:
             force: FloatArray = body.inertia(du)
             return force
-        return self._stabilization(body) * du
-
-    def _stiffness(self, body: Any) -> FloatArray:
-        """Stiffness of each coordinate's surroundings [N/m]; where there is none, of the others."""
-        own: FloatArray = body.nodal_stiffness(self.integrator)
-        return np.where(own > 0.0, own, self._mean_stiffness)
-
-    @cached_property
-    def _mean_stiffness(self) -> float:
-        """Of all flexible bodies [N/m], or weight over size where all are rigid. Collective."""
-        local = np.zeros(3)
-        for body in self.system.bodies:
-            own = body.nodal_stiffness(self.integrator)
-            local += own.sum(), np.count_nonzero(own), body.nodal_mass.max(initial=0.0)
-        total, number, mass = self.system.comm.allreduce(local).tolist()
-        if number:
-            return float(total / number)
-        weight = mass * float(np.linalg.norm(self.system.gravity))
-        return weight / self._span if weight and self._span else 1.0
-
-    def _stabilization(self, body: Any) -> FloatArray:
-        """Stiffness that holds each free coordinate at t_n [N/m]."""
-        stiffness = self.stabilization * self._stiffness(body)
-        stiffness[body.fixed] = 0.0
-        return stiffness
+        return self.stabilization.of(body) * du
 
     def guess(self, *, flight: bool, forces: bool | None = None) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
@@ -374,7 +331,7 @@ class StepProblem:
                 and no forces. Prescribed coordinates are at t_{n+1}.
             forces: Whether to start with the contact forces of the last step; None: as `flight`.
         """
-        laid, elements = self._laid, self.elements
+        laid, elements = self.laid, self.elements
         with self.x as x:
             x[:] = 0.0
             for k in self.awake:
@@ -405,7 +362,7 @@ class StepProblem:
         Args:
             x: PETSc vector of the unknowns.
         """
-        values, laid, elements = x.array_r.copy(), self._laid, self.elements
+        values, laid, elements = x.array_r.copy(), self.laid, self.elements
         positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
         parts = tuple(
             c.evaluate(y, own)
@@ -421,16 +378,16 @@ class StepProblem:
             internal = self.factor * body.internal(u1)
             external = self.factor * body.external(u1, self._gravity)
             du, coupling = u1 - u0, force[here]
-            residual = self._inertial(body, du) - self._inertia[k] + internal - external + coupling
+            residual = self._inertial(body, du) - self.flight[k] + internal - external + coupling
             bodies[k] = BodyTerms(u1, du, internal, external, coupling, residual)
         return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
 
     def residual(self, e: Evaluation) -> FloatArray:
         """This rank's part of the residual, zero at prescribed coordinates."""
-        laid = self._laid
+        laid = self.laid
         out = np.zeros(len(e.x))
         for k in self.awake:
-            out[laid.of_body(k)] = _free(self.system.bodies[k], e.bodies[k].residual)
+            out[laid.of_body(k)] = free(self.system.bodies[k], e.bodies[k].residual)
         for name in laid.own:
             rows = [c.rows(p, name).ravel() for c, p in zip(self.elements, e.parts, strict=True)]
             out[laid.of_elements(name)] = np.concatenate(rows)
@@ -444,9 +401,9 @@ class StepProblem:
         """PETSc matrix of a body at a displacement, without contact."""
         mass = 1.0 if self.integrator.inertia else 0.0
         a = self.system.bodies[k].tangent(u1, mass, self.factor)
-        if self.stabilization:
+        if self.stabilization.share:
             held = a.createVecLeft()
-            held.array_w[:] = self._stabilization(self.system.bodies[k])
+            held.array_w[:] = self.stabilization.of(self.system.bodies[k])
             a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
             held.destroy()
         return a
@@ -457,17 +414,18 @@ class StepProblem:
         Args:
             e: Iterate whose motion is longer than the one that was predicted, at most the extent.
         """
-        self.rounding.length = np.maximum(self.rounding.length, self._lengths(e))
+        self.rounding.length = np.maximum(self.rounding.length, self.displacement(e))
         self.rounding.measure(self.awake)
 
-    # ---- convergence
-    def _lengths(self, e: Evaluation) -> FloatArray:
+    # ---- lengths and rounding
+    def displacement(self, e: Evaluation) -> FloatArray:
         """Largest displacement of each body in an evaluation [m]. Collective.
 
         An iterate that runs off excuses no more than the positions would.
         """
         local = np.array([np.abs(terms.u1).max(initial=0.0) for terms in e.bodies])
-        return np.minimum(global_max(self.system.comm, local), self._extent + self._moved)
+        there = self.lengths.extent + self.lengths.moved
+        return np.minimum(global_max(self.system.comm, local), there)
 
     @property
     def momentum_rounding(self) -> float:
@@ -478,7 +436,7 @@ class StepProblem:
     @property
     def span(self) -> float:
         """Distance of the bodies' farthest coordinate from `centre` [m], at most."""
-        return self._span + float((self._moved + self._motion).max())
+        return self._span + float((self.lengths.moved + self.lengths.motion).max())
 
     @property
     def rounded_length(self) -> float:
@@ -492,73 +450,11 @@ class StepProblem:
         local = [body.motion_of_points(terms.du) for body, terms in both]
         return global_max(self.system.comm, np.array(local))
 
-    def unrest(self, e: Evaluation) -> tuple[float, str]:
-        """Force of the stabilization over what counts as zero, the largest; and its body's name."""
-        both = zip(self.system.bodies, e.bodies, strict=True)
-        held = [self._stabilization(body) * t.du for body, t in both]
-        ratios = self._over_limits(e, held, self.rounding.at(self._lengths(e)))
-        k = int(np.argmax(ratios))
-        return ratios[k], self.system.bodies[k].name
-
-    def ratios(self, e: Evaluation) -> dict[str, float]:
-        """Residual of each block over what counts as converged there; solved when all are <= 1."""
-        both = zip(self.system.bodies, e.bodies, strict=True)
-        free = [_free(body, t.residual) for body, t in both]
-        ratios = self._over_limits(e, free, self.rounding.forces)
-        ratio = dict(zip((b.name for b in self.system.bodies), ratios, strict=True))
-        if self._laid.own:
-            ratio |= self._element_ratios(e)
-        return ratio
-
-    def _over_limits(
-        self, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
-    ) -> list[float]:
-        """A force on each body over that which counts as zero there. Collective.
-
-        It is measured by the largest of its inertial, internal, external and coupling forces. Of
-        elements' forces that cancel each other, as on a body without mass of note between two
-        springs, only the rounding counts, so that strong joints loosen no tolerance.
-        """
-        squares = np.zeros((len(e.bodies), 6))
-        for k in self.awake:
-            t = e.bodies[k]
-            parts = (forces[k], self._inertia[k], t.internal, t.external, t.coupling)
-            squares[k, :5] = [float(p @ p) for p in parts]
-        squares[:, 5] = self._laid.gross_forces(e.parts, len(e.bodies))
-        norms = np.sqrt(self.system.comm.allreduce(squares))
-        limits = self.rtol * norms[:, 1:5].max(axis=1) + _CANCELLED * norms[:, 5] + rounding
-        return [over(a, b) for a, b in zip(norms[:, 0], limits, strict=True)]
-
-    def _element_ratios(self, e: Evaluation) -> dict[str, float]:
-        """`ratios` of the elements' own unknowns."""
-        moved = max(float(np.abs(b.du).max(initial=0.0)) for b in e.bodies)
-        # MPI's maximum may swallow a NaN, so it travels as a flag.
-        local = [moved, float(any(np.isnan(p.residual).any() for p in e.parts))]
-        for c, part in zip(self.elements, e.parts, strict=True):
-            local += c.largest(part)
-        top = global_max(self.system.comm, np.array(local))
-        motion = max(top[0], float(self._motion.max()))
-        rounded = motion + float(self._moved.max())
-        ratio: dict[str, float] = {}
-        for c, largest in zip(self.elements, top[2:].reshape(-1, 4), strict=True):
-            broken = np.inf if top[1] else 0.0
-            # Several contacts of two bodies have one name.
-            for name, value in c.ratios(largest, motion, rounded, self.rtol).items():
-                ratio[name] = max(value, broken, ratio.get(name, 0.0))
-        return ratio
-
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
         if self.unknowns is not None:
             self.unknowns.destroy()
         self.unknowns, self._numbers = None, None
-
-
-def _free(body: Any, residual: FloatArray) -> FloatArray:
-    """Residual with zeros at the prescribed coordinates, whose equation is the prescription."""
-    free = residual.copy()
-    free[body.fixed] = 0.0
-    return free
 
 
 def _box(system: System) -> tuple[FloatArray, float]:

@@ -67,10 +67,7 @@ class Rounding:
         return bool((self._diagonal[list(bodies)] > 0.0).all())
 
     def measure(self, bodies: Iterable[int]) -> None:
-        """Measure it anew, for bodies that have stiffened. Collective.
-
-        It overwrites the bodies' matrices; the caller must have them assembled again.
-        """
+        """Measure it anew, for bodies that have stiffened. Collective."""
         for k in bodies:
             diagonal = self._tangent(k).getDiagonal()
             self._diagonal[k], self._of_factor[k] = diagonal.norm(), self._factor

@@ -1,0 +1,84 @@
+"""When the equations of a step count as solved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.elements import over
+from dolfinx_nts.parallel import global_max
+from dolfinx_nts.step.evaluation import Evaluation, free
+from dolfinx_nts.step.problem import StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Rounding of a sum of elements' forces over the norm of all of them: their own rounding and that
+#: of the solution, which the elements' stiffness passes on.
+_CANCELLED = 32 * float(np.finfo(float).eps)
+
+
+def ratios(problem: StepProblem, e: Evaluation) -> dict[str, float]:
+    """Residual of each block over what counts as converged there; solved when all are <= 1.
+
+    Collective.
+    """
+    both = zip(problem.system.bodies, e.bodies, strict=True)
+    residuals = [free(body, t.residual) for body, t in both]
+    of_bodies = _over_limits(problem, e, residuals, problem.rounding.forces)
+    ratio = dict(zip((b.name for b in problem.system.bodies), of_bodies, strict=True))
+    if problem.laid.own:
+        ratio |= _of_elements(problem, e)
+    return ratio
+
+
+def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
+    """Force of the stabilization over what counts as zero, the largest; and its body's name.
+
+    Collective.
+    """
+    both = zip(problem.system.bodies, e.bodies, strict=True)
+    held = [problem.stabilization.of(body) * t.du for body, t in both]
+    found = _over_limits(problem, e, held, problem.rounding.at(problem.displacement(e)))
+    k = int(np.argmax(found))
+    return found[k], problem.system.bodies[k].name
+
+
+def _over_limits(
+    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
+) -> list[float]:
+    """A force on each body over that which counts as zero there. Collective.
+
+    It is measured by the largest of its inertial, internal, external and coupling forces. Of
+    elements' forces that cancel each other, as on a body without mass of note between two springs,
+    only the rounding counts, so that strong joints loosen no tolerance.
+    """
+    squares = np.zeros((len(e.bodies), 6))
+    for k in problem.awake:
+        t = e.bodies[k]
+        parts = (forces[k], problem.flight[k], t.internal, t.external, t.coupling)
+        squares[k, :5] = [float(p @ p) for p in parts]
+    squares[:, 5] = problem.laid.gross_forces(e.parts, len(e.bodies))
+    norms = np.sqrt(problem.system.comm.allreduce(squares))
+    limits = problem.rtol * norms[:, 1:5].max(axis=1) + _CANCELLED * norms[:, 5] + rounding
+    return [over(a, b) for a, b in zip(norms[:, 0], limits, strict=True)]
+
+
+def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
+    """`ratios` of the elements' own unknowns."""
+    moved = max(float(np.abs(b.du).max(initial=0.0)) for b in e.bodies)
+    # MPI's maximum may swallow a NaN, so it travels as a flag.
+    local = [moved, float(any(np.isnan(p.residual).any() for p in e.parts))]
+    for c, part in zip(problem.elements, e.parts, strict=True):
+        local += c.largest(part)
+    top = global_max(problem.system.comm, np.array(local))
+    motion = max(top[0], float(problem.lengths.motion.max()))
+    rounded = motion + float(problem.lengths.moved.max())
+    ratio: dict[str, float] = {}
+    for c, largest in zip(problem.elements, top[2:].reshape(-1, 4), strict=True):
+        broken = np.inf if top[1] else 0.0
+        # Several contacts of two bodies have one name.
+        for name, value in c.ratios(largest, motion, rounded, problem.rtol).items():
+            ratio[name] = max(value, broken, ratio.get(name, 0.0))
+    return ratio

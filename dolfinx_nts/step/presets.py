@@ -1,0 +1,130 @@
+"""Which preset of the linear solver a run uses, and how far its solves go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from petsc4py import PETSc
+
+from dolfinx_nts.step.accuracy import Newton
+from dolfinx_nts.step.linear_solver import SolverOptions, most_iterations
+from dolfinx_nts.system import System
+
+#: Part of the tolerance that an iteration aims at if it may be the last: a step that only just
+#: converges would leave its whole tolerance to the ledger, where factors leave rounding.
+_AIM = 1e-3
+#: Range of the linear solver's tolerance that is worth it.
+_FINE, _COARSE = 1e-12, 1e-5
+#: Its tolerance with kept matrices, with which an iteration gains two or three digits anyway.
+_KEPT = 1e-3
+#: An iteration from a residual of this many tolerances, or less, may be the last.
+_LAST = 1e5
+#: Steps before the first linear solver is tried again, at the price of about one of them.
+_PATIENCE = 10
+
+
+class Presets:
+    """The presets of a run in the order in which they take over where a linear solve fails.
+
+    After "krylov" comes MUMPS, and then MUMPS without equations that repeat others.
+
+    Args:
+        system: The scene.
+        newton: Tolerances.
+        first: Preset to begin with.
+        given: The user's PETSc options, which override the presets.
+        condense: Whether the contact unknowns are condensed.
+
+    Attributes:
+        options: PETSc options of the preset in use.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        newton: Newton,
+        first: str,
+        given: Mapping[str, Any],
+        condense: bool,
+    ) -> None:
+        self._system, self._newton, self._given = system, newton, given
+        self._condense, self._patience = condense, 0
+        mumps: tuple[str, ...] = ("direct", "null-pivots")
+        if any(pair.redundant for pair in system.contacts):
+            mumps = ("redundant", "null-pivots")
+        own = given.keys() & {"ksp_type", "pc_type", "pc_factor_mat_solver_type"}
+        self._names: tuple[str, ...] = ("krylov",)
+        if first == "direct":
+            self._names = mumps[:1] if own else mumps
+        elif newton.linear_solver == "auto":
+            self._names += mumps
+        self.use(0)
+
+    @property
+    def name(self) -> str:
+        """The preset in use."""
+        return self._names[self._chosen]
+
+    @property
+    def has_next(self) -> bool:
+        """Whether another preset may take over now."""
+        return self._chosen < len(self._names) - 1
+
+    def first_is_due(self) -> bool:
+        """Count a step; tells whether another than the first preset was in use for long enough."""
+        self._patience -= 1
+        return self._chosen > 0 and self._patience < 0
+
+    def use(self, chosen: int) -> None:
+        """Change to a preset by its number; the SNES and its options must be gone."""
+        self._chosen = chosen
+        weighed = self.name == "krylov" and self._newton.linear_solver == "auto"
+        limit = most_iterations(self._system.size) if weighed else None
+        self.options = SolverOptions(
+            self._system.comm, self.name, self._condense, self._given, limit
+        )
+
+    def use_next(self) -> None:
+        """Change to the preset that takes over."""
+        self._patience = _PATIENCE
+        self.use(self._chosen + 1)
+
+    def aim(self, snes: Any, worst: float, adds_up: Callable[[], bool]) -> None:
+        """Let the linear solver of "krylov" go as far as is worth it at an iterate.
+
+        Args:
+            snes: The SNES.
+            worst: Residual of the iterate over its tolerance.
+            adds_up: Tells whether what an iteration leaves adds up over steps; collective.
+        """
+        if self.name != "krylov" or self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
+            return
+        aim, limit = _AIM / worst, self.options.most_iterations
+        if self._newton.reuse:
+            rtol = aim if worst <= _LAST and adds_up() else _KEPT
+        else:
+            rtol = aim if _FINE <= aim <= _COARSE else _COARSE
+            limit = int(limit * math.log(rtol) / math.log(_COARSE))
+        snes.getKSP().setTolerances(rtol=rtol, max_it=limit)
+
+    def why_failed(self, snes: Any, reason: int) -> str:
+        """PETSc's reason of a failure in words.
+
+        Args:
+            snes: The SNES that failed.
+            reason: Its own reason.
+        """
+        if reason != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+            return f"SNES reason {reason}"
+        ksp = snes.getKSP().getConvergedReason()
+        why = f"the linear solver {self.name!r} failed, KSP reason {ksp}{self.with_options}"
+        if self._names == ("krylov",):
+            why += "; linear_solver='auto' goes on with MUMPS where that happens"
+        return why
+
+    @property
+    def with_options(self) -> str:
+        """The user's options as the end of a sentence, if there are any."""
+        return f", with petsc_options={dict(self._given)!r}" if self._given else ""

@@ -1,0 +1,100 @@
+"""Bodies that iterations must not turn inside out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.bodies.inversion import describe, forbidden, smallest_dets
+from dolfinx_nts.step.problem import StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+#: An update that would leave less than this part of the smallest det F of a body is halved, ...
+_KEPT_DET = 0.1
+#: ... so often at most, ...
+_HALVINGS = 10
+#: ... and in so many iterations in a row before the step is dropped.
+_SHORTENED = 5
+_REMEDY = "smaller loads, a finer mesh or another energy may prevent it"
+
+
+class Upright:
+    """Watches the cells of a step's iterates and shortens updates that would invert them.
+
+    Args:
+        problem: Equations of the step.
+    """
+
+    def __init__(self, problem: StepProblem) -> None:
+        self._problem = problem
+        self._known: dict[int, tuple[FloatArray, float]] = {}
+        self._careful, self._shortened = False, 0
+
+    def begin(self, *, careful: bool) -> None:
+        """Begin an attempt.
+
+        Args:
+            careful: Shorten updates. Where Newton's method ends well without that, what its
+                iterates were does not matter.
+        """
+        self._careful, self._shortened = careful, 0
+
+    @property
+    def gives_up(self) -> bool:
+        """Whether too many updates in a row were shortened."""
+        return self._shortened >= _SHORTENED
+
+    def smallest(self, x: FloatArray) -> FloatArray:
+        """Smallest det F of each body at an iterate, shape (bodies,). Collective."""
+        return smallest_dets(self._problem.system, self._displacements(x), self._known)
+
+    def accepts(self, dets: FloatArray) -> bool:
+        """Whether no body with these smallest det F is inside out that must not be."""
+        return bool((forbidden(self._problem.system, dets) > 0.0).all())
+
+    def shorten(self, x: Any, y: Any) -> bool:
+        """Scale an update y that SNES subtracts from x; tells whether it did. Collective."""
+        if not self._careful:
+            return False
+        system, start, update = self._problem.system, x.array_r, y.array_r
+        dets = forbidden(system, self.smallest(start))
+        least = np.where(dets > 0.0, _KEPT_DET * dets, -np.inf)
+        part = 1.0
+        for _ in range(_HALVINGS):
+            if (forbidden(system, self.smallest(start - part * update)) >= least).all():
+                break
+            part *= 0.5
+        if part == 1.0:
+            self._shortened = 0
+            return False
+        self._shortened += 1
+        y.scale(part)
+        return True
+
+    def describe_inverted(self, x: FloatArray) -> str:
+        """The cell that is inside out at an iterate, and what to do. Collective."""
+        system, dets = self._problem.system, self._forbidden(x)
+        kind = type(system.bodies[int(dets.argmin())]).__name__
+        where = describe(system, self._displacements(x), dets)
+        return f"{where}; {_REMEDY}, {kind}(..., allow_inversion=True) accepts it"
+
+    def describe_flat(self, x: FloatArray) -> str | None:
+        """The cell that is nearly inside out at an iterate, if one is. Collective."""
+        dets = self._forbidden(x)
+        if not dets.min() <= _KEPT_DET:
+            return None
+        where = describe(self._problem.system, self._displacements(x), dets)
+        return f"{where}; {_REMEDY}"
+
+    def _forbidden(self, x: FloatArray) -> FloatArray:
+        return forbidden(self._problem.system, self.smallest(x))
+
+    def _displacements(self, x: FloatArray) -> list[FloatArray]:
+        """Displacement of each body at an iterate [m]; bodies asleep stay where they are."""
+        u = list(self._problem.state.u)
+        for k in self._problem.awake:
+            u[k] = x[self._problem.of_body(k)]
+        return u
