@@ -2,8 +2,8 @@
 
 Problem. A rubber block, 1 x 1 x 0.5, stands on a fixed base. A rigid ball of radius 0.6 is pressed
 0.1 into its top in ten load steps. The block's weak form, its function space, its boundary
-condition and the SNES are this script's; `dolfinx_nts` finds which nodes may touch and gives
-residual and tangent of the contact, see `Contact`, seventy lines with the SNES.
+condition and the SNES are this script's; `nts.ContactTerms` finds which nodes may touch and adds
+residual and tangent of contact to yours, see `solve` and `by_hand`: thirty lines.
 
 What to see. The same as `nts.equilibrium` on the same scene gives, which the script prints beside
 its own: contact force and number of nodes in contact.
@@ -24,12 +24,8 @@ from tqdm import tqdm
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.integrators import Static
 from dolfinx_nts.output import Fields
 from dolfinx_nts.output.pictures import picture
-from dolfinx_nts.step.assembly import StepMatrix
-from dolfinx_nts.step.unknowns import Unknowns
 
 HEIGHT, RADIUS, DEPTH = 0.5, 0.6, 0.1
 MU, LAMBDA = 4e5, 6e5
@@ -68,7 +64,7 @@ class Block(nts.Body):
         self.fixed = np.flatnonzero(self.reference[2::3].repeat(3) < 1e-9)
         base = fem.locate_dofs_geometrical(self.space, lambda x: x[2] < 1e-9)
         self._bcs = [compat.subspace_component_bc(self.space, i, base) for i in range(3)]
-        self.nodal_mass = np.ones(self.num_owned)
+        self.nodal_mass, self.initial_velocity = np.ones((2, self.num_owned))
 
     def at(self, u):
         """Take displacements [m] of this rank."""
@@ -85,80 +81,37 @@ class Block(nts.Body):
         compat.assemble_matrix(self._matrix, self._stiffness, self._bcs, MU)
         return self._matrix
 
+    def prescribed(self, time):
+        """Displacements of the base [m]."""
+        return np.zeros(len(self.fixed))
+
     def nodal_stiffness(self, rule):
         """Scale of the contact forces [N/m]."""
         return np.full(self.num_owned, MU)
 
 
-class Contact:
-    """Contact elements of a load step, their unknowns beside the block's, and a SNES for both."""
+def solve(block, contact, x):
+    """Newton's method for a load step, with a SNES of your own."""
 
-    def __init__(self, block, pair):
-        self.block, self.comm = block, block.comm
-        self.search = ContactSearch([pair], [(0,)], block.comm)
-        history = nts.ContactHistory.of_start(len(pair.slave.share))
-        u = np.zeros(block.num_owned)
-        self.state = nts.State(0.0, (u,), (0 * u,), (), ((history,),))
+    def residual(snes, x, f):
+        block.at(*contact.displacements(x))
+        f.array_w[:] = contact.residual(x, [block.force()])
 
-    def step(self, time):
-        """Solve the load step that ends at a pseudo time."""
-        (u,), zero = self.state.u, np.zeros(1)
-        size = self.comm.allreduce(np.abs(u).max(initial=0.0), op=MPI.MAX)
-        rule = Static()
-        step = nts.Step(
-            state=self.state, dt=time - self.state.time, factor=1.0, integrator=rule,
-            condense=True, first=[u], ahead=[0 * u], motion=zero + 0.1 * HEIGHT,
-            length=zero + size, stiffness=lambda body: body.nodal_stiffness(rule), moments=[],
-            force_rounding=lambda bodies: 0.0,
-        )  # fmt: skip
-        self.search.begin(step, self.state.contacts, None, search=True)
-        elements = self.search.elements
-        self.laid = Unknowns(self.comm, {0: len(u)}, elements, self.search.bodies)
-        with self.laid.x as x:
-            x[self.laid.of_body(0)] = u
-        (place,) = self.laid.positions(self.laid.x, elements)
-        with self.laid.x as x:
-            x[self.laid.of_elements("constraints")] = self.search.guess(0, place).ravel()
-        self.matrix = StepMatrix(self.laid.layout, [self.block.stiffness()], self.laid.blocks)
-        self.jacobian(None, self.laid.x, None, None)
-        snes, f = PETSc.SNES().create(self.comm), self.laid.x.duplicate()
-        snes.setFunction(self.residual, f)
-        snes.setJacobian(self.jacobian, self.matrix.operator)
-        snes.getKSP().setType("preonly")
-        snes.getKSP().getPC().setType("lu")
-        snes.getKSP().getPC().setFactorSolverType("mumps")
-        snes.setTolerances(rtol=0.0, atol=1e-8 * MU, stol=0.0)
-        snes.solve(None, self.laid.x)
-        assert snes.getConvergedReason() > 0, "Newton's method failed"
-        (part,) = self.evaluate(self.laid.x)
-        u1 = self.laid.x.array_r[self.laid.of_body(0)].copy()
-        self.state = nts.State(time, (u1,), (0 * u1,), (), (self.search.history([part]),))
-        return part
+    def jacobian(snes, x, j, p):
+        block.at(*contact.displacements(x))
+        contact.jacobian(x, [block.stiffness()])
 
-    def evaluate(self, x):
-        """Contact at an iterate, which the block takes over, too."""
-        self.block.at(x.array_r[self.laid.of_body(0)])
-        own = self.laid.own_values(x.array_r, self.search.elements)
-        places = self.laid.positions(x, self.search.elements)
-        return [
-            c.evaluate(y, mine)
-            for c, y, mine in zip(self.search.elements, places, own, strict=True)
-        ]
-
-    def residual(self, snes, x, f):
-        """Your forces, and contact's; then the constraints."""
-        parts, body = self.evaluate(x), self.laid.of_body(0)
-        force = self.laid.forces(self.search.elements, parts)[body] + self.block.force()
-        force[self.block.fixed] = 0.0
-        rows = [c.rows(p, "constraints") for c, p in zip(self.search.elements, parts, strict=True)]
-        f.array_w[body] = force
-        f.array_w[self.laid.of_elements("constraints")] = np.concatenate(rows).ravel()
-
-    def jacobian(self, snes, x, j, p):
-        """Your matrix, to which contact is added in place."""
-        parts = self.evaluate(x)
-        self.block.stiffness()
-        self.matrix.assemble([part.tangent for part in parts])
+    snes, f = PETSc.SNES().create(block.comm), x.duplicate()
+    snes.setFunction(residual, f)
+    snes.setJacobian(jacobian, contact.jacobian(x, [block.stiffness()]))
+    snes.getKSP().setType("preonly")
+    snes.getKSP().getPC().setType("lu")
+    snes.getKSP().getPC().setFactorSolverType("mumps")
+    snes.setTolerances(rtol=0.0, atol=1e-8 * MU, stol=0.0)
+    snes.solve(None, x)
+    assert snes.getConvergedReason() > 0, "Newton's method failed"
+    snes.destroy()
+    f.destroy()
 
 
 def mesh_of(comm, cells):
@@ -172,12 +125,16 @@ def by_hand(comm, cells, steps, progress):
     """Contact force [N] and number of nodes in contact after each load step."""
     block = Block(mesh_of(comm, cells))
     top = nts.Surface(block, compat.exterior_facets(block.mesh))
-    contact, rows = Contact(block, nts.ContactPair(top, ball())), []
+    contact, rows = nts.ContactTerms([block], [nts.ContactPair(top, ball())]), []
     for k in tqdm(range(steps), unit="step", disable=not (progress and comm.rank == 0)):
-        part = contact.step((k + 1) / steps)
-        local = np.array([-part.residual[:, 2].sum(), part.active.sum()])
+        x = contact.begin((k + 1) / steps, reach=2 * DEPTH / steps)
+        solve(block, contact, x)
+        contact.accept(x)
+        (force,), (last,) = contact.forces(x), contact.state.contacts
+        local = np.array([force[2::3].sum(), np.count_nonzero(last.force)])
         rows.append(comm.allreduce(local))
-    return np.array(rows), block
+    contact.destroy()
+    return np.array(rows)
 
 
 def by_package(comm, cells, steps, output):
@@ -201,7 +158,7 @@ def by_package(comm, cells, steps, output):
 
 def main(comm=MPI.COMM_WORLD, *, cells=4, steps=10, output=None, progress=False):
     """Contact force [N] and nodes in contact by hand and by the package, shape (steps, 2) each."""
-    ours, _ = by_hand(comm, cells, steps, progress)
+    ours = by_hand(comm, cells, steps, progress)
     theirs, status = by_package(comm, cells, steps, output)
     if comm.rank == 0:
         print(f"contact force {-ours[-1, 0]:.6g} N by hand, {-theirs[-1, 0]:.6g} N by equilibrium")

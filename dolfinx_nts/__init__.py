@@ -61,6 +61,7 @@ from dolfinx_nts.run.step_size import Adapt
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.step.accuracy import Newton
+from dolfinx_nts.step.contact_terms import ContactTerms
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
@@ -75,6 +76,7 @@ __all__ = [
     "Clamp",
     "ContactHistory",
     "ContactPair",
+    "ContactTerms",
     "Continuum",
     "Coupling",
     "Cylinder",
