@@ -328,20 +328,25 @@ class ContactSearch:
         In statics nodes that touch at t_n start as active: without inertia a body may have nothing
         but its contacts to hold it.
         """
-        c, old = self.elements[k], self._old[k]
-        node = c.candidates.node
-        force, tangential = old.force[node], old.tangential[node]
+        c, multipliers = self.elements[k], self.carried(k)
         if c.pair.redundant:
             # Else rounding adds up over the steps in what sticking nodes hold among themselves.
-            tangential = np.zeros_like(tangential)
-        multipliers = self._step.factor * c.multipliers(force, tangential) / c.scale[:, None]
+            multipliers[:, 1:] = 0.0
         if not self._step.integrator.inertia:
             near = _TOUCHING * c.candidates.length
-            touching = (force > 0.0) | (c.candidates.gap <= near)
+            touching = (self._old[k].force[c.candidates.node] > 0.0) | (c.candidates.gap <= near)
             augmented = np.empty((c.num_elements, 0))
             nothing = {"augmented": augmented, "constraints": np.zeros_like(multipliers)}
             gap = c.evaluate(x, nothing).gap
             multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
+        return multipliers
+
+    def carried(self, k: int) -> FloatArray:
+        """Multipliers of the contact forces of the last step as they were, (n, constraints)."""
+        c, old = self.elements[k], self._old[k]
+        node = c.candidates.node
+        forces = c.multipliers(old.force[node], old.tangential[node])
+        multipliers: FloatArray = self._step.factor * forces / c.scale[:, None]
         return multipliers
 
     @property

@@ -35,6 +35,7 @@ from dolfinx_nts.step.massless import check_massless, off_balance
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.promises import MaterialWatch, Promises
+from dolfinx_nts.step.resting import with_resting_forces
 from dolfinx_nts.system import State, System, is_like
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -178,7 +179,7 @@ class Stepper:
             condense=self.newton.condense,
             sleep=sleep,
         )
-        self.solver = StepSolver(self.problem, self.newton, preset, given)
+        self.solver, self._given = StepSolver(self.problem, self.newton, preset, given), given
         self.system = system
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._measured: dict[str, balance.Measured] = {}
@@ -385,7 +386,8 @@ class Stepper:
             self.problem, state, dt, continues=self._continues, project=self._project_start
         )
         if self.problem.integrator.accelerations and not state.a:
-            state = replace(state, a=consistent.accelerations(self.problem, state, dt))
+            carried = with_resting_forces(self.system, state, dt, self.newton, self._given)
+            state = replace(state, a=consistent.accelerations(self.problem, carried, dt))
         self._accept(state)
         self._started = True
         missing, text = off_balance(self.problem, state, dt)

@@ -322,14 +322,15 @@ class StepProblem:
             return force
         return self.stabilization.of(body) * du
 
-    def guess(self, *, flight: bool, forces: bool | None = None) -> None:
+    def guess(self, *, flight: bool, carried: bool = False) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 
         Args:
             flight: Free flight from t_n under the contact forces of the last step; else the
                 positions of t_n, which free flight of a fast turning or vibrating body may invert,
                 and no forces. Prescribed coordinates are at t_{n+1}.
-            forces: Whether to start with the contact forces of the last step; None: as `flight`.
+            carried: Take the contact forces of the last step as they were, whatever `flight` is,
+                also what is no good as a guess.
         """
         laid, elements = self.laid, self.elements
         with self.x as x:
@@ -339,14 +340,16 @@ class StepProblem:
                 start = u1 if flight else self.state.u[k].copy()
                 start[fixed] = u1[fixed]
                 x[laid.of_body(k)] = start
-        forces = flight if forces is None else forces
-        if "constraints" in laid.own and (forces or not self.integrator.inertia):
+        if "constraints" in laid.own and (flight or carried or not self.integrator.inertia):
             places = iter(laid.positions(self.x, elements))
             guess = [
                 coupling.guess(k, next(places)).ravel()
                 for coupling in self.couplings
                 for k in range(len(coupling.elements))
             ]
+            if carried:
+                of_contacts = range(len(self.contacts.elements))
+                guess[: len(of_contacts)] = [self.contacts.carried(k).ravel() for k in of_contacts]
             with self.x as x:
                 x[laid.of_elements("constraints")] = np.concatenate(guess)
         if "augmented" in laid.own:
