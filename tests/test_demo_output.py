@@ -13,6 +13,7 @@ SMALL = {
     "newtons_cradle": {
         "kinds": ("rigid, touching",), "parts": (0.5,), "cells": 2, "duration": 2e-3,
     },
+    "partial_slip": {"scales": (0.01,), "refinement": 0.5},
     "own_problem": {"cells": 2, "steps": 4},
     "hertz": {"problems": ("cylinders",), "scales": (0.01,), "refinement": 0.5},
     "ironing": {"block": (16, 2), "die": (4, 2), "steps": (10, 50), "end": 0.2},
