@@ -1,41 +1,29 @@
-"""Hertz contact: pressure and friction between cylinders and spheres against the closed forms.
+"""Hertz contact: the pressure between cylinders and between spheres against the closed forms.
 
 Problems. Two neo-Hookean half cylinders or half spheres, flat faces outwards, touch at a point of
-their round sides and are pressed together.
+their round sides and are pressed together. `partial_slip.py` shears the cylinders afterwards.
 - cylinders: R = 8, E = 200, nu = 0.3, plane strain; a pressure of 0.625 on the upper flat face,
   that is P = 10 per length.
-- friction (Cattaneo, Mindlin): the same with mu = 0.2; once they are pressed together, a plate
-  holds that face level, and a traction of 0.05851 on it, Q = 0.93616 per length, shears the
-  contact.
 - spheres: D = 12.2474, nu = 0.29, E = 1e6 of the upper and 1e8 of the lower one, F = 117808.79.
 
 Reference (Johnson 1985). With 1/R* the sum of both 1/R and 1/E* that of both (1 - nu^2)/E, the
 pressure is p0 sqrt(1 - x^2/a^2): between cylinders a^2 = 4 P R*/(pi E*), p0 = 2 P/(pi a); between
-spheres a^3 = 3 F R*/(4 E*), p0 = 3 F/(2 pi a^2). Sheared cylinders stick in |x| < c, c^2 = a^2
-(1 - Q/(mu P)), and slip outside. The traction is mu p there; inside it is less, by mu p0 (c/a)
-sqrt(1 - x^2/c^2). It is largest at c.
+spheres a^3 = 3 F R*/(4 E*), p0 = 3 F/(2 pi a^2).
 
 Method. A structured mesh (meshes/half_round.py) is fine under the contact and grows from there.
 The bodies are mirror images, so that nodes meet nodes: one-pass node-to-surface contact fails the
 patch test on meshes that do not match, and its nodal pressures scatter there. Symmetry saves half
-of the cylinders, unless they are sheared, and three quarters of the spheres; cylinders are one cell
-long and held at both ends. Pressures and tractions are nodal forces over tributary areas, on the
-undeformed surface, as the linear theory has it. The figures come from them without the closed form:
+of the cylinders and three quarters of the spheres; cylinders are one cell long and held at both
+ends. Pressures are nodal forces over tributary areas, on the undeformed surface, as the linear
+theory has it. The figures come from them without the closed form:
 - p0 is the largest nodal pressure;
 - a follows from the second moment of the contact forces: the mean of x^2 is a^2/4 for cylinders
-  and 2 a^2/5 for spheres;
-- c follows in the same way from what friction has in reserve, mu p less the traction, which is a
-  pressure of Hertz on the part that sticks; q_max is mu times the pressure at c, between the nodes.
+  and 2 a^2/5 for spheres.
 
 What to see. As prescribed (scale 1), p0/E is 5 % for the cylinders and 14 % for the spheres:
 strains that the linear theory leaves out. p0 misses it by 1 % and 4 %, on any mesh. Under loads
-that make a and the strains a hundredth (scale 0.01), a, p0, c and q_max are within 0.6 % of the
-closed form on these meshes; half as many cells (`--refinement 0.5`) give 2 to 5 %. The traction
-converges slowest, at its kink.
-
-Pressing takes several load steps where there is friction. A node that closes its gap within a load
-step counts its whole way along the facet in that step as slip, although it touches only at the
-end; the traction that this leaves behind, seen at scale 1, shrinks with the step.
+that make a and the strains a hundredth (scale 0.01), a and p0 are within 0.6 % of the closed form
+on these meshes; half as many cells (`--refinement 0.5`) give 2 to 5 %.
 
     mpirun -n 2 python demos/hertz.py
 """
@@ -57,7 +45,8 @@ from dolfinx_nts.output.pictures import picture
 MESHES = runpy.run_path(str(Path(__file__).resolve().parents[1] / "meshes" / "half_round.py"))
 #: Size of the finely meshed block over the half-width of contact.
 BLOCK = 1.3
-PRESSING, SHEARING = 8, 4
+#: Of the closed forms and of the nodes, for each curve of a problem.
+LINES, MARKERS = ("-", "--"), ("ox", "s+")
 
 
 @dataclass(frozen=True)
@@ -71,8 +60,6 @@ class Problem:
         force: What presses them together [N], of cylinders per length [N/m].
         cells: From the middle of the contact to the side of the finely meshed block.
         spheres: Or cylinders.
-        shear: Tangential force [N/m].
-        friction: Coulomb's coefficient.
     """
 
     radius: float
@@ -81,13 +68,10 @@ class Problem:
     force: float
     cells: int
     spheres: bool = False
-    shear: float = 0.0
-    friction: float = 0.0
 
     def scaled(self, scale):
-        """The same under a load that makes contact and strains `scale` times as large."""
-        load = scale**3 if self.spheres else scale**2
-        return replace(self, force=load * self.force, shear=load * self.shear)
+        """Return the same under a load that makes contact and strains `scale` times as large."""
+        return replace(self, force=(scale**3 if self.spheres else scale**2) * self.force)
 
     @property
     def modulus(self):
@@ -108,33 +92,25 @@ class Problem:
         return 1.5 * self.force / np.pi / a**2 if self.spheres else 2 * self.force / np.pi / a
 
     @property
-    def stick(self):
-        """Half-width of the part that sticks [m]."""
-        return self.half_width * (1 - self.shear / self.friction / self.force) ** 0.5
-
-    @property
     def block(self):
         """Size of the finely meshed block [m]."""
         return BLOCK * self.half_width
 
     def pressure(self, x):
-        """At a distance from the middle [Pa]."""
+        """Return the pressure at a distance from the middle [Pa]."""
         return self.peak * half_ellipse(x / self.half_width)
 
-    def traction(self, x):
-        """Of friction, at a distance from the middle [Pa]."""
-        a, c = self.half_width, self.stick
-        return self.friction * (self.pressure(x) - self.peak * c / a * half_ellipse(x / c))
+    def curves(self):
+        """Return {column of the profile: (its name, closed form, largest value)}."""
+        return {"pressure": ("p / p0", self.pressure, self.peak)}
 
 
 def half_ellipse(x):
     return np.sqrt(np.maximum(0.0, 1.0 - x**2))
 
 
-CYLINDERS = Problem(8.0, (200.0, 200.0), 0.3, force=16 * 0.625, cells=8)
 PROBLEMS = {
-    "cylinders": CYLINDERS,
-    "friction": replace(CYLINDERS, shear=16 * 0.05851, friction=0.2),
+    "cylinders": Problem(8.0, (200.0, 200.0), 0.3, force=16 * 0.625, cells=8),
     "spheres": Problem(12.2474 / 2, (1e6, 1e8), 0.29, force=117808.79, cells=6, spheres=True),
 }
 
@@ -198,41 +174,12 @@ def scene(comm, problem, *, held=(), loads=(), whole=False, friction=0.0):
 
 
 def press(comm, problem, **options):
-    """Equilibrium under an even pressure on the flat face; `options` are of `equilibrium`."""
+    """Return the equilibrium under an even pressure on the flat face; options of `equilibrium`."""
     r, n = problem.radius, problem.cells
     rim = np.sin(np.diff(np.arctan(np.arange(n + 1) / n)))  # the face of a sphere is a polygon
     area = 4 * r**2 * rim.sum() if problem.spheres else 2 * r
     load = nts.Traction(plane(problem, 2, r), (0.0, 0.0, -problem.force / area))
     return nts.equilibrium(scene(comm, problem, loads=[load]), load_steps=2, **options)
-
-
-def depth(comm, problem, *, progress=False):
-    """How far a plate on the flat face goes down under the force [m], without friction."""
-    top = plane(problem, 2, problem.radius)
-    a, per_modulus = problem.half_width, problem.force / np.pi / problem.modulus
-    most = 1.2 * per_modulus * (2 * np.log(4 * problem.radius / a) - 1)
-    down = nts.Dirichlet(top, value=lambda t: (0, 0, -most * t), components=(2,))
-    parts = np.array([0.7, 0.8, 0.9, 1.0])
-    run = nts.equilibrium(
-        scene(comm, problem, held=[down]), load_steps=parts, progress=progress
-    )
-    force = pressing_force(problem, run, parts=2)[1:]
-    return most * np.polyval(np.polyfit(force / problem.force, parts, 3), 1.0)
-
-
-def press_and_shear(comm, problem, *, progress=False, **options):
-    """Equilibrium after pressing, until t = 1, and shearing, until t = 2.
-
-    The plate keeps the face level, which a dead load would not: it would roll off. `options` are of
-    `equilibrium`.
-    """
-    top, deepest = plane(problem, 2, problem.radius), depth(comm, problem, progress=progress)
-    down = nts.Dirichlet(top, value=lambda t: (0, 0, -deepest * min(t, 1.0)), components=(2,))
-    most = problem.shear / (2 * problem.radius)
-    shear = nts.Traction(top, lambda t: (most * max(t - 1.0, 0.0), 0, 0))
-    steps = [*np.linspace(0, 1, PRESSING + 1)[1:], *np.linspace(1, 2, SHEARING + 1)[1:]]
-    system = scene(comm, problem, held=[down], loads=[shear], whole=True, friction=problem.friction)
-    return nts.equilibrium(system, load_steps=steps, progress=progress, **options)
 
 
 def pressing_force(problem, run, *, parts):
@@ -268,39 +215,41 @@ def difference(area, values, exact):
 
 
 def figures(problem, run):
-    """What is to be compared, beside the closed form, and the profiles; the same on all ranks."""
-    x, y, area, normal, tangential = nodes_in_contact(problem, run)
-    sheared = problem.shear > 0
-    if sheared:
-        x = x - (normal * x).sum() / normal.sum()
+    """Return what is to be compared, beside the closed form, and the profile of the pressure."""
+    x, y, area, normal, _ = nodes_in_contact(problem, run)
     distance = np.hypot(x, y) if problem.spheres else np.abs(x)
-    pressure, a = normal / area, half_width(problem, distance, normal)
-    parts = 4 if problem.spheres else 1 if sheared else 2
-    force = pressing_force(problem, run, parts=parts)[-1]
+    pressure = normal / area
+    force = pressing_force(problem, run, parts=4 if problem.spheres else 2)[-1]
     table = {
         "force": (force, problem.force),
-        "a": (a, problem.half_width),
+        "a": (half_width(problem, distance, normal), problem.half_width),
         "p0": (pressure.max(), problem.peak),
     }
     columns = {
-        "position": distance if problem.spheres else x,
+        "position": distance,
         "pressure": pressure,
         "exact_pressure": problem.pressure(distance),
     }
-    if sheared:
-        mu, order = problem.friction, np.argsort(distance)
-        c = half_width(problem, distance, mu * normal - tangential)
-        at_c = np.interp(c**2, distance[order] ** 2, pressure[order] ** 2) ** 0.5
-        table["c"] = (c, problem.stick)
-        table["q_max"] = (mu * at_c, mu * problem.pressure(problem.stick))
-        columns["traction"] = tangential / area
-        columns["exact_traction"] = problem.traction(distance)
-    names = ("pressure", "traction") if sheared else ("pressure",)
+    return summary(problem, run, table, columns, area)
+
+
+def summary(problem, run, table, columns, area):
+    """Return the figures of a run, the same on all ranks.
+
+    Args:
+        problem: The problem.
+        run: Its equilibrium.
+        table: {figure: (computed, exact)}.
+        columns: Of the profile: "position", and each curve of the problem beside its "exact_" one.
+        area: Tributary areas of the nodes in contact [m^2], shape (n,).
+    """
     return {
         "computed": {name: float(values[0]) for name, values in table.items()},
         "exact": {name: float(values[1]) for name, values in table.items()},
         "error": {name: float(values[0] / values[1] - 1) for name, values in table.items()},
-        "difference": {n: difference(area, columns[n], columns["exact_" + n]) for n in names},
+        "difference": {
+            n: difference(area, columns[n], columns["exact_" + n]) for n in problem.curves()
+        },
         "profile": columns,
         "status": run.status,
         "load_steps": len(run.rows) - 1,
@@ -322,40 +271,75 @@ def report(problem, name, scale, result):
         print(f"  {key} of the nodes, root mean square difference {value:.2%}")
 
 
-def write(results, folder):
-    """A CSV file of each profile, and a picture of all, in units of the closed form."""
+def write(problems, results, path, *, start=0.0):
+    """Write a CSV file of each profile, and a picture of all, in units of the closed form.
+
+    Args:
+        problems: {name: problem}.
+        results: {name: {scale: figures}}.
+        path: The picture; the tables go beside it.
+        start: Where the closed forms start, over the half-width.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    folder.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     size = (7, 3 * len(results))
     figure, axes = plt.subplots(len(results), figsize=size, layout="constrained", squeeze=False)
     for (name, runs), axis in zip(results.items(), axes[:, 0], strict=True):
-        problem = PROBLEMS[name]
-        x = np.linspace(-1.0 if problem.shear > 0 else 0.0, 1.0, 1001)
-        at = x * problem.half_width
-        axis.plot(x, problem.pressure(at) / problem.peak, "k-", lw=1, label="p / p0, closed form")
-        if problem.shear > 0:
-            peak = problem.friction * problem.peak
-            axis.plot(x, problem.traction(at) / peak, "k--", lw=1, label="q / (mu p0), closed form")
+        problem, x = problems[name], np.linspace(start, 1.0, 1001)
+        for (label, curve, peak), look in zip(problem.curves().values(), LINES, strict=False):
+            y = curve(x * problem.half_width) / peak
+            axis.plot(x, y, look, color="k", lw=1, label=f"{label}, closed form")
         for number, (scale, result) in enumerate(runs.items()):
-            table, exact = result["profile"], result["exact"]
-            path = folder / f"{name}_{scale:g}.csv"
+            table = result["profile"]
             columns = np.column_stack(list(table.values()))
-            np.savetxt(path, columns, delimiter=",", header=",".join(table), comments="")
+            file = path.parent / f"{name}_{scale:g}.csv"
+            np.savetxt(file, columns, delimiter=",", header=",".join(table), comments="")
+            scaled = problem.scaled(scale)
+            at = table["position"] / scaled.half_width
             look = {"color": f"C{number}", "mfc": "none", "ls": "none"}
-            at = table["position"] / exact["a"]
-            p = table["pressure"] / exact["p0"]
-            axis.plot(at, p, marker="ox"[number % 2], label=f"p / p0, scale {scale:g}", **look)
-            if "traction" in table:
-                q = table["traction"] / exact["p0"] / problem.friction
-                axis.plot(at, q, marker="s+"[number % 2], label=f"q / (mu p0), {scale:g}", **look)
+            for (column, (label, _, peak)), signs in zip(
+                scaled.curves().items(), MARKERS, strict=False
+            ):
+                y, sign = table[column] / peak, signs[number % 2]
+                axis.plot(at, y, marker=sign, label=f"{label}, scale {scale:g}", **look)
         axis.set(title=name, xlabel="x / a", ylabel="traction over its closed-form peak")
         axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    figure.savefig(folder / "hertz.png", dpi=150)
+    figure.savefig(path, dpi=150)
     plt.close(figure)
+
+
+def at_each_scale(name, problem, solve, figures, *, comm, output, scales, refinement, progress):
+    """Return {scale: figures} of a problem, and leave a picture and fields of each run.
+
+    Args:
+        name: Name of the problem.
+        problem: The problem as prescribed.
+        solve: Function (comm, problem, output=, progress=) that returns the equilibrium.
+        figures: Function (problem, run).
+        comm: MPI communicator.
+        output: Folder, or None.
+        scales: Sizes of contact and strains over those of the problem as prescribed.
+        refinement: Cells across the contact over those of the demo's mesh.
+        progress: Show a progress line.
+    """
+    results = {}
+    for scale in scales:
+        clock = time.perf_counter()
+        at = replace(problem.scaled(scale), cells=round(refinement * problem.cells))
+        folder = output and Path(output) / f"{name}_{scale:g}"
+        run = solve(comm, at, output=[Fields(folder)] if folder else [], progress=progress)
+        if folder:
+            bodies = run.system.bodies
+            picture(bodies, folder / "stress.png", colour="stress", view=(10.0, -75.0))
+        results[scale] = figures(at, run)
+        results[scale]["seconds"] = time.perf_counter() - clock
+        if comm.rank == 0:
+            report(at, name, scale, results[scale])
+    return results
 
 
 def main(
@@ -367,12 +351,12 @@ def main(
     refinement=1.0,
     progress=False,
 ):
-    """Solve the problems.
+    """Press cylinders and spheres together.
 
     Args:
         comm: MPI communicator.
         output: Folder for profiles (CSV), pictures and fields, or None.
-        problems: Which of "cylinders", "friction", "spheres".
+        problems: Which of "cylinders", "spheres".
         scales: Sizes of contact and strains over those of the problem as prescribed.
         refinement: Cells across the contact over those of the demo's mesh.
         progress: Show a progress line.
@@ -380,27 +364,13 @@ def main(
     Returns:
         {problem: {scale: figures}}; see `figures`.
     """
-    results = {}
-    for name in problems:
-        results[name] = {}
-        for scale in scales:
-            clock = time.perf_counter()
-            problem = PROBLEMS[name].scaled(scale)
-            problem = replace(problem, cells=round(refinement * problem.cells))
-            solve = press_and_shear if problem.shear > 0 else press
-            folder = output and Path(output) / f"{name}_{scale:g}"
-            writers = [Fields(folder)] if folder else []
-            run = solve(comm, problem, output=writers, progress=progress)
-            if folder:
-                bodies = run.system.bodies
-                picture(bodies, folder / "stress.png", colour="stress", view=(10.0, -75.0))
-            result = figures(problem, run)
-            result["seconds"] = time.perf_counter() - clock
-            results[name][scale] = result
-            if comm.rank == 0:
-                report(problem, name, scale, result)
+    options = {"comm": comm, "output": output, "scales": scales, "refinement": refinement}
+    results = {
+        name: at_each_scale(name, PROBLEMS[name], press, figures, progress=progress, **options)
+        for name in problems
+    }
     if output is not None and comm.rank == 0:
-        write(results, Path(output))
+        write(PROBLEMS, results, Path(output) / "hertz.png")
     return results
 
 

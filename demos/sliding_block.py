@@ -1,19 +1,12 @@
-"""A block slides to rest, down a slope, and in jerks behind a spring, as Coulomb says.
+"""A block that is thrown along the floor slides to rest, as Coulomb says.
 
-A stiff block (0.2 x 0.2 x 0.05 m, 2 kg) settles on a floor under its weight and is let go. The
-floor is a rigid plane without a mesh, a plate of hexahedra that does not move, or ("elastic") a
-plate ten times as soft as the block, held at its bottom. For a rigid block the answers are closed:
+Problem. A stiff block (0.2 x 0.2 x 0.05 m, 2 kg) settles on a floor under its weight and is thrown
+with v0 = 1 m/s; mu = 0.2. The floor is a rigid plane without a mesh, a plate of hexahedra that does
+not move, or ("elastic") a plate ten times as soft as the block, held at its bottom. `slope.py` and
+`stick_slip.py` put the same block on a slope and behind a spring.
 
-- level ground, mu = 0.2, thrown with 1 m/s: at rest after v0/(mu g) = 0.509684 s and
-  v0^2/(2 mu g) = 0.254842 m, friction dissipates all of m v0^2/2;
-- slope of 30 degrees, mu = 0.3: acceleration g (sin 30 - mu cos 30) = 2.356287 m/s^2, so 1.178144 m
-  in the first second, and 3.002750 J per kg dissipated;
-- same slope, settled with friction: the block stays where it is if mu is a thousandth above
-  tan 30 = 0.577350, and slides with g sin(30)/1000 if it is a thousandth below;
-- stick-slip: a soft spring (angular frequency w of block and spring) whose end moves to and fro
-  with V = 0.1 m/s pulls the block. It sticks until the spring carries mu m g, then slips with
-  V (1 - cos w t) through 2 pi V/w, where the end turns; it sticks while the spring is unloaded and
-  loaded the other way, and slips back.
+Reference. A rigid block is at rest after v0/(mu g) = 0.509684 s and v0^2/(2 mu g) = 0.254842 m, and
+friction has dissipated all of m v0^2/2.
 
 What to see. The block comes to rest at most mu g h^2/8 short of the closed form, because one that
 is slower than mu g h/2 sticks; the rest of a difference is its elasticity: it stops shaking.
@@ -28,11 +21,11 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
@@ -46,32 +39,16 @@ SIZE, HEIGHT, DENSITY = 0.2, 0.05, 1000.0
 MASS = DENSITY * SIZE**2 * HEIGHT
 YOUNG = 5e7
 STEP = 2e-3
-#: Thrown on level ground: friction and speed; what rest takes.
+#: Coulomb's coefficient, initial speed [m/s], time until rest [s].
 ROUGH, SPEED = 0.2, 1.0
 STOP = SPEED / (ROUGH * GRAVITY)
-#: On the slope.
-ANGLE, SLIPPERY = math.radians(30), 0.3
-ACCELERATION = GRAVITY * (math.sin(ANGLE) - SLIPPERY * math.cos(ANGLE))
-#: Coefficient over tan(ANGLE) that holds the block and that does not; how long it is watched.
-STICKY, LOOSE, WATCHED = 1.001, 0.999, 0.2
-#: Pulled by a spring: friction, angular frequency [1/s], speed of the spring's end, slips.
-PULLED, FREQUENCY, PULL, SLIPS = 0.3, 20.0, 0.1, 3
-#: Times until the spring at rest holds the block no longer, and of a slip; the way of a slip.
-LOADING, SLIPPING = PULLED * GRAVITY / FREQUENCY**2 / PULL, 2 * math.pi / FREQUENCY
-JERK = PULL * SLIPPING
 Options = dict[str, Any]
 FLOORS = ("plane", "mesh", "elastic")
 INTEGRATORS = {"energy-momentum": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}
 CLOSED_FORM = {
-    "level: time [s]": STOP,
-    "level: way [m]": SPEED * STOP / 2,
-    "level: dissipation [J/kg]": SPEED**2 / 2,
-    "slope: way [m]": ACCELERATION / 2,
-    "slope: dissipation [J/kg]": SLIPPERY * GRAVITY * math.cos(ANGLE) * ACCELERATION / 2,
-    "mu = 1.001 tan: way [m]": 0.0,
-    "mu = 0.999 tan: way [m]": (1 - LOOSE) * GRAVITY * math.sin(ANGLE) * WATCHED**2 / 2,
-    "stick-slip: jerk [m]": JERK,
-    "stick-slip: dissipation [J/kg]": PULLED * GRAVITY * SLIPS * JERK,
+    "time [s]": STOP,
+    "way [m]": SPEED * STOP / 2,
+    "dissipation [J/kg]": SPEED**2 / 2,
 }
 
 
@@ -95,10 +72,10 @@ def system(
     angle: float = 0.0,
     speed: float = 0.0,
     held: bool = False,
-    spring: bool = False,
     young: float = YOUNG,
+    **forces: Any,
 ) -> nts.System:
-    """The block on its floor.
+    """Make the block on its floor.
 
     Args:
         mesh: Mesh of the block, the same for settling and sliding.
@@ -108,16 +85,11 @@ def system(
         angle: Slope of the floor along x [rad]; it is gravity that turns.
         speed: Initial speed along x [m/s].
         held: Hold the block against sliding, without friction, to let it settle.
-        spring: Pull at the block by the spring, whose end starts to move at t = 0.
-        young: Of the block [Pa].
+        young: Young's modulus of the block [Pa].
+        forces: More options of the block, such as a body force.
     """
     upstairs = nts.Dirichlet(lambda x: np.isclose(x[0], 0.0), components=(0,))
     aside = nts.Dirichlet(lambda x: np.isclose(x[1], 0.0), components=(1,))
-    pulled: dict[str, Any] = {}
-    if spring:
-        stiffness = DENSITY * FREQUENCY**2
-        pulled["body_force"] = lambda t: (stiffness * spring_end(t), 0.0, 0.0)
-        pulled["extra_form"] = lambda u, v, w, t: stiffness * u[0] * w[0] * ufl.dx
     block = nts.Continuum(
         mesh,
         nts.StVenantKirchhoff(young=young, poisson=0.0),
@@ -125,7 +97,7 @@ def system(
         velocity=(speed, 0, 0),
         bcs=[upstairs, aside] if held else [],
         name="block",
-        **pulled,
+        **forces,
     )
     bodies = [block]
     master: Any = nts.Plane(point=(0, 0, 0), normal=(0, 0, 1))
@@ -154,21 +126,6 @@ def system(
 
 def everywhere(x: np.ndarray) -> np.ndarray:
     return np.full(x.shape[1], True)
-
-
-def spring_end(t: float) -> float:
-    """Where the far end of the spring is [m]: to and fro, turning when a slip is over."""
-    stroke = 2 * LOADING + SLIPPING
-    number, part = divmod(t + LOADING, stroke)
-    return PULL * ((part if number % 2 == 0 else stroke - part) - LOADING)
-
-
-def jerky_way(t: np.ndarray) -> np.ndarray:
-    """Way of a rigid block behind the spring [m], shape (n,)."""
-    number, part = np.divmod(t + LOADING, 2 * LOADING + SLIPPING)
-    slip = np.maximum(part - 2 * LOADING, 0.0)
-    way = PULL * (slip - np.sin(FREQUENCY * slip) / FREQUENCY)
-    return np.where(number % 2 == 0, way, JERK - way)
 
 
 # ---- runs
@@ -225,6 +182,9 @@ def slide(
         folder: Where balance table, fields and a picture go.
         progress: Show a progress line.
         scene: Arguments of `system`.
+
+    Returns:
+        How its centre moves.
     """
     centre, scenery = Centre(), system(mesh, **scene)
     writers: list[nts.Writer] = [centre]
@@ -246,8 +206,8 @@ def slide(
     return Motion(time, way - way[0], speed, run)
 
 
-def level(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
-    """B4: time and way to rest and dissipation on level ground; the motion."""
+def stop(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
+    """Return time and way to rest and dissipation (benchmark B4), and the motion."""
     scene = {"friction": ROUGH} | floor
     settled = nts.equilibrium(system(mesh, held=True, **scene))
     motion = slide(mesh, settled, speed=SPEED, t_end=1.2 * STOP, **scene, **run)
@@ -255,73 +215,36 @@ def level(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Moti
     part = (motion.time > 0.2 * STOP) & (motion.time < 0.8 * STOP)
     slope, start = np.polyfit(motion.time[part], motion.speed[part], 1)
     return {
-        "level: time [s]": -start / slope,
-        "level: way [m]": motion.way[motion.time > 1.1 * STOP].mean(),
-        "level: dissipation [J/kg]": motion.dissipation[-1],
+        "time [s]": -start / slope,
+        "way [m]": motion.way[motion.time > 1.1 * STOP].mean(),
+        "dissipation [J/kg]": motion.dissipation[-1],
     }, motion
 
 
-def slope(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
-    """B5: way and dissipation in a second on the slope; the motion."""
-    scene = {"friction": SLIPPERY, "angle": ANGLE} | floor
-    settled = nts.equilibrium(system(mesh, held=True, **scene))
-    motion = slide(mesh, settled, t_end=1.0, **scene, **run)
-    return {
-        "slope: way [m]": motion.way[-1],
-        "slope: dissipation [J/kg]": motion.dissipation[-1],
-    }, motion
+def stopping_way(t: np.ndarray) -> np.ndarray:
+    """Way of a rigid block that is thrown [m], shape (n,)."""
+    t = np.minimum(t, STOP)
+    return SPEED * t - ROUGH * GRAVITY * t**2 / 2
 
 
-def verge(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
-    """Ways on the slope with friction a little above and below tan(ANGLE); the latter's motion."""
-    sticky, loose = (
-        {"friction": part * math.tan(ANGLE), "angle": ANGLE} | floor for part in (STICKY, LOOSE)
-    )
-    # Settled without friction it would start with a jerk, and shaking loosens a block on the verge.
-    settled = nts.equilibrium(system(mesh, **sticky))
-    stays = slide(mesh, settled, t_end=WATCHED, **sticky, **run)
-    motion = slide(mesh, settled, t_end=WATCHED, **loose, **run)
-    return {
-        "mu = 1.001 tan: way [m]": np.abs(stays.way).max(),
-        "mu = 0.999 tan: way [m]": motion.way[-1],
-    }, motion
-
-
-def stick_slip(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float], Motion]:
-    """Way of the last slip, dissipation of all; the motion."""
-    scene = {"friction": PULLED} | floor
-    settled = nts.equilibrium(system(mesh, held=True, **scene))
-    end = SLIPS * (2 * LOADING + SLIPPING) - LOADING
-    motion = slide(mesh, settled, spring=True, t_end=end, **scene, **run)
-    before = np.searchsorted(motion.time, end - SLIPPING - LOADING)
-    return {
-        "stick-slip: jerk [m]": abs(motion.way[-1] - motion.way[before]),
-        "stick-slip: dissipation [J/kg]": motion.dissipation[-1],
-    }, motion
-
-
-PARTS = {"level": level, "slope": slope, "verge": verge, "stick-slip": stick_slip}
-
-
+# ---- the page
 def main(
     comm: MPI.Comm = MPI.COMM_WORLD,
     *,
     floors: tuple[str, ...] = ("plane", "mesh"),
     integrators: tuple[str, ...] = ("energy-momentum",),
-    parts: tuple[str, ...] = tuple(PARTS),
     dt: float = STEP,
     cells: tuple[int, int, int] = (4, 4, 1),
     facets: int = 9,
     output: str | None = None,
     progress: bool = False,
 ) -> dict[str, dict[str, Any]]:
-    """Run the parts on each floor with each integrator, and print what came beside closed forms.
+    """Throw the block on each floor with each integrator, and print closed forms beside.
 
     Args:
         comm: MPI communicator.
         floors: Some of FLOORS.
         integrators: Some of INTEGRATORS.
-        parts: Some of PARTS.
         dt: Step [s].
         cells: Hexahedra of the block.
         facets: Facets of a meshed floor along its 1.8 m.
@@ -331,32 +254,72 @@ def main(
     Returns:
         {"floor, integrator": figures}: those of CLOSED_FORM, and `health` of the runs.
     """
+    return compare(
+        "sliding_block", {"thrown": (stop, stopping_way)}, CLOSED_FORM, comm,
+        floors=floors, integrators=integrators, dt=dt, cells=cells, facets=facets, output=output,
+        progress=progress,
+    )  # fmt: skip
+
+
+def compare(
+    name: str,
+    parts: dict[str, tuple[Callable[..., Any], Callable[[np.ndarray], np.ndarray]]],
+    closed_form: dict[str, float],
+    comm: MPI.Comm,
+    *,
+    floors: tuple[str, ...],
+    integrators: tuple[str, ...],
+    dt: float,
+    cells: tuple[int, int, int],
+    facets: int,
+    output: str | None,
+    progress: bool,
+) -> dict[str, dict[str, Any]]:
+    """Run the parts on each floor with each integrator, and print what came beside closed forms.
+
+    Args:
+        name: Name of the picture.
+        parts: {name: (function, way)}. The function runs a part and returns its figures and the
+            motion, as `stop` does; way(t) is that of a rigid block [m].
+        closed_form: {figure: value} of a rigid block.
+        comm: MPI communicator.
+        floors: Some of FLOORS.
+        integrators: Some of INTEGRATORS.
+        dt: Step [s].
+        cells: Hexahedra of the block.
+        facets: Facets of a meshed floor along its 1.8 m.
+        output: Folder for tables, pictures and fields, or None.
+        progress: Show a progress line.
+
+    Returns:
+        That of `main`.
+    """
     mesh = block_mesh(comm, cells)
     results: dict[str, dict[str, Any]] = {}
     motions: dict[str, dict[str, Motion]] = {part: {} for part in parts}
     for floor in floors:
-        for name in integrators:
-            label, found = f"{floor}, {name}", []
+        for integrator in integrators:
+            label, found = f"{floor}, {integrator}", []
             results[label] = {}
-            for part in parts:
-                folder = Path(output) / f"{part}_{floor}_{name}" if output else None
+            for part, (function, _) in parts.items():
+                folder = Path(output) / f"{part}_{floor}_{integrator}" if output else None
                 ground = {"floor": floor, "facets": facets}
-                options = {"dt": dt, "integrator": name, "folder": folder, "progress": progress}
-                figures, motion = PARTS[part](mesh, ground, **options)
+                options = {"dt": dt, "integrator": integrator, "folder": folder}
+                figures, motion = function(mesh, ground, progress=progress, **options)
                 results[label] |= figures
                 motions[part][label] = motion
                 found.append(motion.run)
             results[label] |= health(found)
     if comm.rank == 0:
-        report(results)
+        report(results, closed_form)
     if output:
-        file = Path(output) / "sliding_block.png"
-        write_on_root(comm, f"output={output!r}", lambda: plot(motions, file))
+        file, ways = Path(output) / f"{name}.png", {part: way for part, (_, way) in parts.items()}
+        write_on_root(comm, f"output={output!r}", lambda: plot(motions, ways, file))
     return results
 
 
 def health(runs: list[nts.Solution]) -> dict[str, Any]:
-    """What all runs must have: worst ledger and dissipation, over the energy that was turned."""
+    """Return the worst ledger and dissipation of all runs over the energy that was turned."""
     worst = {"ledger": 0.0, "least_dissipation": math.inf}
     for run in runs:
         table = run.balance
@@ -373,28 +336,25 @@ def health(runs: list[nts.Solution]) -> dict[str, Any]:
     }
 
 
-def report(results: dict[str, dict[str, Any]]) -> None:
+def report(results: dict[str, dict[str, Any]], closed_form: dict[str, float]) -> None:
     labels = list(results)
     print(f"{'':30}{'closed form':>14}" + "".join(f"{label:>26}" for label in labels))
     for row in results[labels[0]]:
-        exact = CLOSED_FORM.get(row)
+        exact = closed_form.get(row)
         values = [results[label][row] for label in labels]
         text = [f"{v:26.10g}" if exact is not None else f"{v!s:>26.26}" for v in values]
         print(f"{row:30}" + (f"{'':14}" if exact is None else f"{exact:14.6g}") + "".join(text))
 
 
-def plot(motions: dict[str, dict[str, Motion]], path: Path) -> None:
-    """Ways, speeds and dissipation over time beside the closed forms."""
+def plot(
+    motions: dict[str, dict[str, Motion]],
+    ways: dict[str, Callable[[np.ndarray], np.ndarray]],
+    path: Path,
+) -> None:
+    """Draw ways, speeds and dissipation over time beside those of a rigid block."""
     from matplotlib.figure import Figure
 
-    exact = {
-        "level": lambda t: SPEED * np.minimum(t, STOP)
-        - ROUGH * GRAVITY * np.minimum(t, STOP) ** 2 / 2,
-        "slope": lambda t: ACCELERATION * t**2 / 2,
-        "verge": lambda t: (1 - LOOSE) * GRAVITY * math.sin(ANGLE) * t**2 / 2,
-        "stick-slip": jerky_way,
-    }
-    figure = Figure(figsize=(3.4 * len(motions), 7.0), constrained_layout=True)
+    figure = Figure(figsize=(1.2 + 3.6 * len(motions), 7.0), constrained_layout=True)
     grid = figure.subplots(3, len(motions), sharex="col", squeeze=False)
     for column, (part, runs) in zip(grid.T, motions.items(), strict=True):
         column[0].set_title(part)
@@ -403,7 +363,7 @@ def plot(motions: dict[str, dict[str, Motion]], path: Path) -> None:
             for axes, values in zip(column, motion[1:3] + (motion.dissipation,), strict=True):
                 axes.plot(motion.time, values, **look)
         t = np.linspace(0, motion.time[-1], 1001)
-        way = exact[part](t)
+        way = ways[part](t)
         column[0].plot(t, way, "k--", linewidth=1, label="rigid block")
         column[1].plot(t, np.gradient(way, t), "k--", linewidth=1)
         column[2].set_xlabel("time [s]")
@@ -416,14 +376,18 @@ def plot(motions: dict[str, dict[str, Motion]], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", default="out/sliding_block", help="tables, pictures, fields")
+def command_line(description: str, name: str) -> dict[str, Any]:
+    """Return the options of `compare` from the command line."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--output", default=f"out/{name}", help="tables, pictures, fields")
     parser.add_argument("--floors", nargs="+", choices=FLOORS, default=("plane", "mesh"))
     chosen = ("energy-momentum",)
     parser.add_argument("--integrators", nargs="+", choices=INTEGRATORS, default=chosen)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=tuple(PARTS))
     parser.add_argument("--dt", type=float, default=STEP, help="step [s]")
     parser.add_argument("--facets", type=int, default=9, help="facets of a meshed floor")
     options = vars(parser.parse_args()).items()
-    main(progress=True, **{k: tuple(v) if isinstance(v, list) else v for k, v in options})
+    return {key: tuple(v) if isinstance(v, list) else v for key, v in options}
+
+
+if __name__ == "__main__":
+    main(progress=True, **command_line(__doc__.splitlines()[0], "sliding_block"))

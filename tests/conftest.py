@@ -11,7 +11,6 @@ Under mpirun every rank runs the same tests. After each test the ranks exchange 
 import gc
 import io
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -19,6 +18,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+import processes
 import pytest
 from mpi4py import MPI
 
@@ -171,26 +171,4 @@ def on_ranks():
     """
     if COMM.size > 1:
         pytest.skip("starts ranks of its own")
-    return _on_ranks
-
-
-def _on_ranks(ranks: int, *arguments: str, well: bool = True) -> str:
-    # This process is a rank itself; its own MPI variables would mislead the new ones.
-    own = ("OMPI_COMM", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PRTE_", "ORTE_")
-    own += ("OMPI_MCA_ess", "OMPI_MCA_orte", "OMPI_MCA_pmix")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(own)}
-    environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    environment |= {"OMP_NUM_THREADS": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
-    demos = str(Path(__file__).resolve().parents[1] / "demos")
-    environment["PYTHONPATH"] = demos
-    command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), sys.executable]
-    done = subprocess.run(
-        [*command, *arguments],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
-    assert (done.returncode == 0) == well, done.stdout + done.stderr
-    return done.stdout if well else done.stdout + done.stderr
+    return processes.on_ranks

@@ -9,17 +9,13 @@ import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from petsc4py import PETSc
+from rotations import rotation
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.surfaces import locate_facets
 
 COMM = MPI.COMM_WORLD
 MASS, SPEED, STEP = 2.5, 3.0, 0.02
-INTEGRATORS = {
-    "midpoint": nts.Midpoint(),
-    "energy-momentum": nts.EnergyMomentum(),
-    "gonzalez": nts.EnergyMomentum(contact_gradient="gonzalez"),
-}
 
 
 class PointMass(nts.Body):
@@ -66,6 +62,20 @@ class PointMass(nts.Body):
         self.u, self.v = u.copy(), v.copy()
 
 
+class Sledge(PointMass):
+    """A mass that is drawn along x; free to follow the surface in z."""
+
+    pace = 1.0
+    """How fast it is drawn [m/s]."""
+
+    def __init__(self, position):
+        super().__init__(COMM, 1.0, position, (self.pace, 0.0, 0.0), name="sledge")
+        self.fixed = np.arange(self.num_owned)[:2]
+
+    def prescribed(self, time):
+        return np.array([self.pace * time, 0.0])[: len(self.fixed)]
+
+
 class PointSurface(nts.Surface):
     """The mass as a slave surface: one point, no facets."""
 
@@ -84,9 +94,7 @@ class PointSurface(nts.Surface):
 
 
 def turn(angle=0.7):
-    axis = np.array([1.0, -2.0, 2.0]) / 3
-    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+    return rotation(angle, (1, -2, 2))
 
 
 def wall(turned=False):

@@ -13,14 +13,13 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import (
     CellType,
-    GhostMode,
-    create_box,
     create_unit_cube,
     create_unit_square,
     locate_entities_boundary,
     meshtags,
 )
 from mpi4py import MPI
+from scenes import CELLS, RUBBER, bottom, box, top
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -28,14 +27,8 @@ from dolfinx_nts.output import BalanceCSV, Fields
 from dolfinx_nts.output.pictures import picture
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
-CELLS = {"hexahedron": CellType.hexahedron, "tetrahedron": CellType.tetrahedron}
 
 pytestmark = pytest.mark.mpi
-
-
-def box(low=(0.0, 0.0, 0.0), high=(1.0, 1.0, 1.0), cells=(2, 2, 2), cell_type="hexahedron"):
-    return create_box(COMM, [low, high], cells, CELLS[cell_type], ghost_mode=GhostMode.shared_facet)
 
 
 def continuum(mesh=None, material=RUBBER, density=1e3, **options):
@@ -44,14 +37,6 @@ def continuum(mesh=None, material=RUBBER, density=1e3, **options):
 
 class Meshed(nts.Body):
     mesh = "a mesh"
-
-
-def top(x):
-    return x[2] > 1 - 1e-9
-
-
-def bottom(x):
-    return x[2] < 1e-9
 
 
 def stacked(gap=0.1, **upper):
@@ -402,7 +387,7 @@ def test_mesh_with_nan_on_one_rank():
 @pytest.mark.parametrize("kind", CELLS)
 def test_inverted_cell_on_one_rank(kind):
     """A corner node moved through its cells, which no other rank may hold."""
-    mesh = box(cell_type=kind)
+    mesh = box(cell=CELLS[kind])
     corner = np.flatnonzero((np.abs(mesh.geometry.x - 1) < 1e-9).all(axis=1))
     mesh.geometry.x[corner] = -0.9
     pattern = r"^mesh of 'body': .*inverted or (flat|overlapping) cells.*repair the mesh"
@@ -411,7 +396,7 @@ def test_inverted_cell_on_one_rank(kind):
 
 @pytest.mark.parametrize("kind", CELLS)
 def test_cells_turned_inside_out_as_a_whole(kind):
-    mesh = box(cells=(1, 1, 3), cell_type=kind)
+    mesh = box(cells=(1, 1, 3), cell=CELLS[kind])
     middle = np.abs(mesh.geometry.x[:, 2] - 1 / 3) < 1e-9
     mesh.geometry.x[middle, 2] = 0.9
     pattern = r"overlapping cells, whose volumes add up to .* encloses .*; repair the mesh"
@@ -518,7 +503,7 @@ def test_interior_facets():
 
 
 def test_facets_are_oriented_outward_whatever_their_numbering():
-    body = continuum(box(cell_type="tetrahedron"))
+    body = continuum(box(cell=CELLS["tetrahedron"]))
     surface = body.surface(lambda x: np.ones_like(x[0], dtype=bool))
     a, b, c = surface.reference[surface.facets].transpose(1, 0, 2)
     outward = np.einsum("ni,ni->n", np.cross(b - a, c - a), (a + b + c) / 3 - 0.5)

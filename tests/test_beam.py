@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
+from integrators import INTEGRATORS
 from mpi4py import MPI
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
@@ -228,7 +229,7 @@ def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
     assert off(coarse)[0] > 0.5 and "does not keep it" in coarse.status
 
 
-@pytest.mark.parametrize("rule", [EM, MID, nts.Newmark(), nts.GeneralizedAlpha()])
+@pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)
 @pytest.mark.slow
 def test_the_order_in_time_is_two(rule):
     coarse, middle, fine = (fly(rule, dt, 0.08)[1] for dt in (2e-3, 1e-3, 5e-4))

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
+from scenes import box, everywhere
 
 import dolfinx_nts as nts
 
@@ -14,17 +15,6 @@ DT = 1e-3
 YOUNG, DENSITY = 1e4, 1e3
 
 pytestmark = pytest.mark.mpi
-
-
-def box():
-    return create_box(
-        COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
-
-
-def everywhere(x):
-    return np.full(x.shape[1], True)
 
 
 def pulled(bcs=()):
@@ -70,7 +60,7 @@ class Count:
         pass
 
 
-@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 def test_a_load_that_it_changes(integrator):
     """The midpoint rule integrates a force linear in time exactly."""
     body, load = pulled()

@@ -20,8 +20,10 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType
+from integrators import INTEGRATORS, MID_STEP
 from mpi4py import MPI
+from scenes import box
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
@@ -37,30 +39,19 @@ from dolfinx_nts.output.state_file import (
 
 COMM = MPI.COMM_WORLD
 DT, STEPS, EVERY = 2e-3, 14, 9
-INTEGRATORS = {
-    "energy-momentum": nts.EnergyMomentum(),
-    "midpoint": nts.Midpoint(),
-    "generalized-alpha": nts.GeneralizedAlpha(),
-}
+RULES = MID_STEP | {"generalized-alpha": INTEGRATORS["generalized-alpha"]}
 HEX, TET = CellType.hexahedron, CellType.tetrahedron
 RUBBER = nts.NeoHookean(1e6, 0.3)
-
-
-def box(comm, low, high, n, cell=HEX):
-    return create_box(
-        comm, [np.array(low, float), np.array(high, float)], [n] * 3, cell,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
 
 
 def blocks(comm, cell=HEX, friction=0.3, cells=(2, 3), name="right"):
     """A spinning block thrown at a larger one, with friction."""
     left = nts.Continuum(
-        box(comm, (0, 0, 0), (1, 1, 1), cells[0], cell), RUBBER, density=1e3, name="left",
+        box((0, 0, 0), (1, 1, 1), cells[0], cell, comm), RUBBER, density=1e3, name="left",
         velocity=lambda x: np.array([3 + x[2], 1 + 0 * x[0], -x[0]]),
     )  # fmt: skip
     right = nts.Continuum(
-        box(comm, (1.04, -0.1, -0.1), (2.05, 1.1, 1.1), cells[1], cell), RUBBER, density=1e3,
+        box((1.04, -0.1, -0.1), (2.05, 1.1, 1.1), cells[1], cell, comm), RUBBER, density=1e3,
         name=name,
     )  # fmt: skip
     pair = nts.ContactPair(
@@ -74,12 +65,13 @@ def blocks(comm, cell=HEX, friction=0.3, cells=(2, 3), name="right"):
 def mechanism(comm):
     """An arm that turns more than once on a torsion spring; a bob on a cord; a cube tied to it."""
     arm = nts.RigidBody(
-        box(comm, (0, -0.1, -0.1), (1, 0.1, 0.1), 1), density=500.0, angular_velocity=(0, 0, 150),
+        box((0, -0.1, -0.1), (1, 0.1, 0.1), 1, comm=comm), density=500.0,
+        angular_velocity=(0, 0, 150),
         velocity=(0, 75, 0), name="arm",
     )  # fmt: skip
     bob = nts.RigidBody.from_inertia(2.0, (0.1, 0.2, 0.25), (0, 0, -2), name="bob", comm=comm)
     cube = nts.Continuum(
-        box(comm, (-0.5, -0.5, -3.2), (0.5, 0.5, -2.2), 2), RUBBER, density=10.0, name="cube"
+        box((-0.5, -0.5, -3.2), (0.5, 0.5, -2.2), 2, comm=comm), RUBBER, density=10.0, name="cube"
     )
     pivot = nts.Revolute(arm, None, point=(0, 0, 0), axis=(0, 0, 1))
     joints = [
@@ -96,7 +88,7 @@ def mechanism(comm):
 def floor(comm):
     """A rigid box that slides and tips on a rigid floor."""
     body = nts.RigidBody(
-        box(comm, (0, 0, 0.002), (1, 1, 1.002), 1), density=1e3, velocity=(2, 1, -0.5),
+        box((0, 0, 0.002), (1, 1, 1.002), 1, comm=comm), density=1e3, velocity=(2, 1, -0.5),
         angular_velocity=(0.3, 0, 1), name="box",
     )  # fmt: skip
     pair = nts.ContactPair(
@@ -107,7 +99,7 @@ def floor(comm):
 
 def loaded(comm):
     """Nodes on edges, a support that moves and a load that the script ramps up."""
-    mesh = box(comm, (0, 0, 0), (1, 1, 1), 2, TET)
+    mesh = box((0, 0, 0), (1, 1, 1), 2, TET, comm)
     load = fem.Constant(mesh, 0.0)
     held = nts.Dirichlet(lambda x: x[2] < 1e-9, lambda t: (0.01 * np.sin(300 * t), 0, 0))
     stiffness = fem.Constant(mesh, 1e6)
@@ -130,7 +122,7 @@ def ufl_ds(mesh):
 def sleepers(comm):
     system, _ = blocks(comm, friction=0.0)
     far = nts.Continuum(
-        box(comm, (5, 0, 0), (6, 1, 1), 2), RUBBER, density=1e3, name="far"
+        box((5, 0, 0), (6, 1, 1), 2, comm=comm), RUBBER, density=1e3, name="far"
     )  # fmt: skip
     return nts.System([*system.bodies, far], contacts=system.contacts), {"sleep": True}
 
@@ -160,7 +152,7 @@ def run(scene, integrator="energy-momentum", **options):
     system, own = scene
     t_end = options.pop("t_end", STEPS * DT)
     more = {"accuracy": "exact", "dt": DT, "t_end": t_end}
-    return nts.simulate(system, INTEGRATORS[integrator], **{**more, **own, **options})
+    return nts.simulate(system, RULES[integrator], **{**more, **own, **options})
 
 
 def arrays(state):
@@ -210,7 +202,7 @@ def distance(one, other):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", RULES)
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.fast(
     "blocks-energy-momentum",
@@ -222,7 +214,7 @@ def distance(one, other):
 def test_a_restarted_run_is_the_uninterrupted_one(scene, integrator, mpi_tmp_path):
     if scene == "adapted" and COMM.size > 1:
         pytest.skip("two uninterrupted runs differ there by 1e-9: their steps depend on rounding")
-    if scene == "restored" and INTEGRATORS[integrator].accelerations:
+    if scene == "restored" and RULES[integrator].accelerations:
         pytest.skip("is for integrators without accelerations")
     path, make = mpi_tmp_path / "deep" / "run.h5", SCENES[scene]
     whole = run(make(COMM), integrator)
@@ -236,7 +228,7 @@ def test_a_restarted_run_is_the_uninterrupted_one(scene, integrator, mpi_tmp_pat
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", RULES)
 @pytest.mark.parametrize("scene", ["blocks", "tetrahedra", "mechanism", "floor", "loaded"])
 @pytest.mark.fast(*(f"{s}-energy-momentum" for s in ("blocks", "mechanism")))
 @pytest.mark.fast_on_ranks("blocks-energy-momentum")
@@ -454,7 +446,7 @@ def test_fields_of_a_restart_that_fails_have_its_state(mpi_tmp_path):
 def test_fields_do_not_go_on_with_another_mesh(mpi_tmp_path):
     path, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "fields"
     run(floor(COMM), t_end=3 * DT, checkpoint=nts.Checkpoint(path, every=9))
-    other = nts.RigidBody(box(COMM, (0, 0, 0), (1, 1, 2), 1), density=1e3, name="box")
+    other = nts.RigidBody(box((0, 0, 0), (1, 1, 2), 1), density=1e3, name="box")
     run((nts.System([other]), {}), t_end=DT, output=[Fields(folder)])
     size = (folder / "box.h5").stat().st_size
     scene = floor(COMM)
@@ -635,7 +627,7 @@ def linked(point=(0, 0, 0.5), **changed):
         nts.Revolute(body, None, point=x, axis=given["axis"], angle=given["angle"]),
         nts.Universal(body, None, point=x, axes=given["arms"]),
     ]
-    mesh = box(COMM, (3, 0, 0), (4, 1, 1), 1)
+    mesh = box((3, 0, 0), (4, 1, 1), 1)
     cube = nts.RigidBody(mesh, density=1.0, name="cube")
     floor = nts.Plane((0, 0, given["height"]), (0, 0, 1), motion=given["motion"])
     ball = nts.Sphere((3.5, 0.5, -5), given["radius"])
@@ -868,7 +860,7 @@ def test_a_signal_without_checkpoint_leaves_the_solution():
 @pytest.mark.mpi
 def test_load_steps_end_on_a_signal():
     held = nts.Dirichlet(lambda x: x[2] < 1e-9)
-    cube = nts.Continuum(box(COMM, (0, 0, 0), (1, 1, 1), 2), RUBBER, density=1e3, bcs=[held])
+    cube = nts.Continuum(box((0, 0, 0), (1, 1, 1), 2), RUBBER, density=1e3, bcs=[held])
     system, calls = nts.System([cube], gravity=(0, 0, -9.81)), []
 
     def before(time, dt):

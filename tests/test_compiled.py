@@ -6,8 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from facet_kinds import CENTRE, FLAT, KINDS
+from measures import relative
 from mpi4py import MPI
-from test_nts import CENTRE, FLAT, KINDS, relative
 
 from dolfinx_nts.contact.facet_elements import FacetElements
 from dolfinx_nts.kernels import compiled, facets

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from integrators import INTEGRATORS
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
@@ -55,11 +56,7 @@ def exact(t):
     return found.y[0, -1]
 
 
-@pytest.mark.parametrize(
-    "rule",
-    [nts.EnergyMomentum(), nts.Midpoint(), nts.Newmark(), nts.GeneralizedAlpha(rho_inf=0.8)],
-    ids=["em", "mp", "newmark", "ga"],
-)
+@pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)
 def test_a_pendulum_swings_with_second_order(rule):
     errors, t = [], 0.4
     for dt in (0.02, 0.01):

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
+from scenes import box
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.surfaces import Surface
@@ -11,10 +11,6 @@ from dolfinx_nts.contact.surfaces import Surface
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e5, poisson=0.3)
 RHO = 1e3
-
-
-def box(low, high, cells):
-    return create_box(COMM, [np.array(low), np.array(high)], cells, CellType.hexahedron)
 
 
 def block(low, high, cells, name, rigid=False, **options):

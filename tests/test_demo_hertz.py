@@ -1,4 +1,4 @@
-"""Cylinders and spheres against Hertz, Cattaneo and Mindlin, and the mesh they are made of."""
+"""Cylinders and spheres against Hertz, and the mesh they are made of."""
 
 import functools
 
@@ -10,7 +10,6 @@ import pytest
 #: Published figures of the problems as prescribed.
 REFERENCE = {
     "cylinders": {"force": 10, "half_width": 0.680778, "peak": 9.351351},
-    "friction": {"force": 10, "half_width": 0.680778, "shear": 0.93616, "stick": 0.496511},
     "spheres": {"force": 117808.79, "half_width": 0.630179, "peak": 1.416416e5},
 }
 
@@ -27,8 +26,6 @@ def test_closed_form_gives_the_published_figures(name):
     problem = demo.PROBLEMS[name]
     for figure, value in REFERENCE[name].items():
         assert getattr(problem, figure) == pytest.approx(value, rel=2e-6)
-    if problem.shear:
-        assert problem.traction(problem.stick) == pytest.approx(1.279571, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", REFERENCE)
@@ -40,8 +37,6 @@ def test_closed_form_carries_the_load_at_any_scale(name):
     around = 2 * np.pi * x if problem.spheres else 2.0
     step = problem.half_width / 10000
     assert (around * problem.pressure(x)).sum() * step == pytest.approx(problem.force, rel=1e-5)
-    if problem.shear:
-        assert 2 * problem.traction(x).sum() * step == pytest.approx(problem.shear, rel=1e-5)
 
 
 # ---- mesh
@@ -83,15 +78,11 @@ def check(result, tolerance):
     assert result["status"] == "completed" and result["retries"] == 0
     for name, error in result["error"].items():
         assert abs(error) < tolerance, name
-    table = result["profile"]
-    if "traction" in table:
-        bound = 0.2 * table["pressure"]
-        assert (np.abs(table["traction"]) <= bound * (1 + 1e-6)).all()
 
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", REFERENCE)
-@pytest.mark.fast("friction")
+@pytest.mark.fast("cylinders")
 @pytest.mark.fast_on_ranks()
 def test_coarse_mesh_meets_the_closed_form(name):
     result = small(name, 0.8)
@@ -110,12 +101,11 @@ def test_what_the_prescribed_load_misses_is_strain():
 
 @pytest.mark.slow
 def test_profiles_and_picture_are_written(tmp_path):
-    demo.main(problems=("cylinders", "friction"), scales=(1.0,), refinement=0.5, output=tmp_path)
+    demo.main(problems=("cylinders",), scales=(1.0,), refinement=0.5, output=tmp_path)
     assert (tmp_path / "hertz.png").stat().st_size > 10_000
-    for name, columns in (("cylinders", 3), ("friction", 5)):
-        table = np.genfromtxt(tmp_path / f"{name}_1.csv", delimiter=",", names=True)
-        assert len(table.dtype.names) == columns
-        assert np.allclose(table["pressure"], table["exact_pressure"], rtol=0, atol=0.5)
+    table = np.genfromtxt(tmp_path / "cylinders_1.csv", delimiter=",", names=True)
+    assert len(table.dtype.names) == 3
+    assert np.allclose(table["pressure"], table["exact_pressure"], rtol=0, atol=0.5)
 
 
 @pytest.mark.slow
@@ -123,8 +113,7 @@ def test_the_mesh_of_the_demo_meets_the_closed_form():
     for name in REFERENCE:
         check(small(name, 1.0), 0.01)
     results = demo.main(scales=(1.0,))
-    for name in ("cylinders", "friction"):
-        check(results[name][1.0], 0.02)
+    check(results["cylinders"][1.0], 0.02)
     # An eighth of Young's modulus is no small strain: see the demo.
     error = results["spheres"][1.0]["error"]
     assert abs(error["a"]) < 0.02 and -0.05 < error["p0"] < 0.0
@@ -137,7 +126,3 @@ def test_figures_converge(name):
     runs = [small(name, r) for r in refinements]
     width = [abs(run["error"]["a"]) for run in runs]
     assert all(fine < 0.5 * coarse for coarse, fine in zip(width, width[1:], strict=False))
-    if name == "friction":
-        traction = [run["difference"]["traction"] for run in runs]
-        assert all(f < 0.7 * c for c, f in zip(traction, traction[1:], strict=False))
-        assert abs(runs[-1]["error"]["q_max"]) < 0.5 * abs(runs[0]["error"]["q_max"])

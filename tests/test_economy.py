@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType, create_box
+from integrators import MID_STEP
+from measures import difference
 from mpi4py import MPI
 from petsc4py import PETSc
-from test_friction import difference, rubbing_blocks
-from test_layout import in_fresh_python
+from processes import in_fresh_python
+from scenes import rubbing_blocks
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -20,13 +22,12 @@ from dolfinx_nts.study import economy, tradeoff
 
 COMM = MPI.COMM_WORLD
 FEATURE = {f.name: f for f in economy.FEATURES}
-INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
 
 
 def stepper(scene, name="energy-momentum", *, ledger=True, **newton):
     # One solver for all features, so that their rounding is the same.
     newton = {"linear_solver": "direct", **newton}
-    return nts.Stepper(scene, INTEGRATORS[name], newton=nts.Newton(**newton), ledger=ledger)
+    return nts.Stepper(scene, MID_STEP[name], newton=nts.Newton(**newton), ledger=ledger)
 
 
 def all_awake(monkeypatch):
@@ -117,7 +118,7 @@ def test_a_progress_line_and_a_table_without_a_ledger(capsys):
 # ---- far
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("midpoint-0.0", "energy-momentum-0.3")
 @pytest.mark.fast_on_ranks("energy-momentum-0.3")
 def test_far_bodies_have_neither_search_nor_contact_unknowns(monkeypatch, integrator, friction):
@@ -160,7 +161,7 @@ def test_apart_only_where_the_search_finds_nothing():
 # ---- idle candidates
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("midpoint-0.3", "energy-momentum-0.0")
 @pytest.mark.fast_on_ranks("energy-momentum-0.0")
 def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
@@ -195,7 +196,7 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.parametrize("scene", ["smooth", "frictional"])
 @pytest.mark.fast("frictional-energy-momentum")
 @pytest.mark.fast_on_ranks()
@@ -223,7 +224,7 @@ def test_an_impact_is_the_same_as_with_all_candidates_awake(monkeypatch, integra
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.parametrize("master", ["plane", "plate"])
 @pytest.mark.fast("plane-midpoint-0.3", "plate-midpoint-0.0", "plate-energy-momentum-0.3")
 @pytest.mark.fast_on_ranks("plate-energy-momentum-0.3")

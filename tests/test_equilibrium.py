@@ -5,48 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import ufl
-from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
 from point_mass import PointMass
+from scenes import LAME, MU, POISSON, RUBBER, YOUNG, at, box, quarter_cube, rubber_stress, symmetry
 from scipy.optimize import fsolve
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields
 
 COMM = MPI.COMM_WORLD
-YOUNG, POISSON = 1e6, 0.3
-MU, LAME = YOUNG / (2 * (1 + POISSON)), YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
-RUBBER = nts.NeoHookean(YOUNG, POISSON)
 GRAVITY, DENSITY = 10.0, 1e3
-
-
-def box(low, high, n, comm=COMM, cell=CellType.hexahedron):
-    return create_box(comm, [low, high], n, cell, ghost_mode=GhostMode.shared_facet)
-
-
-def at(axis, value, size=1.0):
-    return lambda x: np.abs(x[axis] - value) < 1e-9 * size
-
-
-def symmetry(size=1.0, axes=(0, 1)):
-    """No motion through the planes x = 0 and y = 0."""
-    return [nts.Dirichlet(at(a, 0.0, size), components=(a,)) for a in axes]
-
-
-def cube(bcs, traction=(), n=2, material=RUBBER, density=DENSITY):
-    return nts.Continuum(
-        box([0, 0, 0], [1, 1, 1], [n, n, n]),
-        material,
-        density=density,
-        bcs=[*symmetry(), *bcs],
-        traction=traction,
-        name="cube",
-    )
-
-
-def stress(stretch, log_j):
-    """First Piola-Kirchhoff stress of RUBBER along a principal direction [Pa]."""
-    return MU * (stretch - 1 / stretch) + LAME * log_j / stretch
 
 
 def stack(comm=COMM, gap=0.0, metre=1.0, n=(3, 2), lateral=True, name=None):
@@ -55,14 +24,14 @@ def stack(comm=COMM, gap=0.0, metre=1.0, n=(3, 2), lateral=True, name=None):
     young, density = YOUNG / m, DENSITY / m**3
     rubber = nts.NeoHookean(young, POISSON)
     lower = nts.Continuum(
-        box([0, 0, 0], [m, m, 0.5 * m], [n[1], n[1], 2], comm),
+        box([0, 0, 0], [m, m, 0.5 * m], [n[1], n[1], 2], comm=comm),
         rubber,
         density=density,
         bcs=[nts.Dirichlet(at(2, 0.0, m))],
         name="lower",
     )
     upper = nts.Continuum(
-        box([0, 0, (0.5 + gap) * m], [m, m, (1 + gap) * m], [n[0], n[0], 2], comm),
+        box([0, 0, (0.5 + gap) * m], [m, m, (1 + gap) * m], [n[0], n[0], 2], comm=comm),
         rubber,
         density=density,
         bcs=symmetry(m) if lateral else [],
@@ -81,13 +50,13 @@ def test_uniaxial_traction(load):
     """sigma_x = sigma_y = 0 and the nominal stress of the traction in the principal stretches."""
     support = nts.Dirichlet(at(2, 0.0), components=(2,))
     top = nts.Traction(at(2, 1.0), (0, 0, load))
-    run = nts.equilibrium(nts.System([cube([support], [top])]), load_steps=3)
+    run = nts.equilibrium(nts.System([quarter_cube([support], [top])]), load_steps=3)
     assert run.status == "completed" and run.retries == 0
 
     def balanced(stretches):
         side, up = stretches
         log_j = np.log(side**2 * up)
-        return stress(side, log_j) / YOUNG, (stress(up, log_j) - load) / YOUNG
+        return rubber_stress(side, log_j) / YOUNG, (rubber_stress(up, log_j) - load) / YOUNG
 
     side, up = fsolve(balanced, [1.0, 1.0], xtol=1e-14)
     assert max(map(abs, balanced([side, up]))) < 1e-14
@@ -115,10 +84,10 @@ def test_prescribed_motion_and_its_work():
     press = nts.Dirichlet(at(2, 1.0), value=lambda t: (0, 0, -0.3 * t), components=(2,))
     missing = []
     for steps in (4, 8):
-        run = nts.equilibrium(nts.System([cube([held, support, press])]), load_steps=steps)
+        run = nts.equilibrium(nts.System([quarter_cube([held, support, press])]), load_steps=steps)
         assert run.status == "completed"
         stretch = 1 - 0.3 * run.balance["time"]
-        force = stress(stretch, np.log(stretch))
+        force = rubber_stress(stretch, np.log(stretch))
         reactions = run.reactions["cube"]
         assert np.abs(reactions[:, 4, 2] - force).max() < 1e-11 * YOUNG
         assert np.abs(reactions[:, 3, 2] + force).max() < 1e-11 * YOUNG
@@ -136,7 +105,7 @@ def test_later_condition_carries_shared_nodes():
     """Two conditions on one face: the later one prescribes it, and its reaction is the weight."""
     face = at(2, 0.0)
     bcs = [nts.Dirichlet(face, value=(0, 0, 0.1)), nts.Dirichlet(face)]
-    system = nts.System([cube(bcs)], gravity=(0, 0, -GRAVITY))
+    system = nts.System([quarter_cube(bcs)], gravity=(0, 0, -GRAVITY))
     run = nts.equilibrium(system)
     assert np.abs(run.reactions["cube"][-1, 2]).max() == 0.0
     assert abs(run.reactions["cube"][-1, :, 2].sum() / (DENSITY * GRAVITY) - 1) < 1e-12
@@ -170,7 +139,8 @@ def test_loads_in_pseudo_time():
     bcs = [nts.Dirichlet(at(2, 0.0), components=(2,))]
     pull = nts.Traction(at(2, 1.0), lambda t: (0, 0, 100.0 * t**2))
     run = nts.equilibrium(
-        nts.System([cube(bcs, [pull])], gravity=(0, 0, -GRAVITY)), load_steps=[0.5, 1.0, 2.0]
+        nts.System([quarter_cube(bcs, [pull])], gravity=(0, 0, -GRAVITY)),
+        load_steps=[0.5, 1.0, 2.0],
     )
     weight = DENSITY * GRAVITY
     expected = [0.0, 0.5 * weight - 25.0, weight - 100.0, weight - 400.0]
@@ -213,7 +183,7 @@ def patch(slave, master, *, metre=1.0, strain=1e-4, comm=COMM):
     load = nts.Traction(at(2, m, m), (0, 0, -strain / metre))
     bodies = [
         nts.Continuum(
-            box([0, 0, z * m], [m, m, (z + 0.5) * m], [n, n, 2], comm),
+            box([0, 0, z * m], [m, m, (z + 0.5) * m], [n, n, 2], comm=comm),
             linear,
             density=1.0,
             bcs=symmetry(m) + ([] if z else [nts.Dirichlet(at(2, 0.0, m), components=(2,))]),
@@ -356,7 +326,7 @@ def test_a_body_that_nothing_holds_is_reported():
 @pytest.mark.parametrize("reuse", [False, True])
 def test_a_load_that_nothing_carries_is_no_equilibrium(reuse, above, material):
     """Even where Newton runs off to stiffnesses beside which the load is rounding."""
-    mesh = box([0, 0, 0], [0.2, 0.2, 0.1], [3, 3, 2], MPI.COMM_SELF)
+    mesh = box([0, 0, 0], [0.2, 0.2, 0.1], [3, 3, 2], comm=MPI.COMM_SELF)
     free = nts.Continuum(mesh, material, density=DENSITY)
     contacts = []
     if above is not None:
@@ -370,7 +340,7 @@ def test_a_load_that_nothing_carries_is_no_equilibrium(reuse, above, material):
 def test_a_body_that_falls_for_ever_is_reported():
     """Nothing below: the stabilization lets it down without end."""
     free = nts.Continuum(
-        box([0, 0, 0], [1, 1, 1], [1, 1, 1], MPI.COMM_SELF), RUBBER, density=DENSITY
+        box([0, 0, 0], [1, 1, 1], [1, 1, 1], comm=MPI.COMM_SELF), RUBBER, density=DENSITY
     )
     system = nts.System([free], gravity=(0, 0, -GRAVITY))
     run = nts.equilibrium(system, stabilization=0.1, newton=nts.Newton(max_retries=0))
@@ -384,7 +354,7 @@ def test_cut_back_ends_where_small_steps_do():
     press = nts.Dirichlet(at(2, 1.0), value=lambda t: (0, 0, -0.6 * t))
     runs = [
         nts.equilibrium(
-            nts.System([cube([nts.Dirichlet(at(2, 0.0)), press], n=4)]), load_steps=steps
+            nts.System([quarter_cube([nts.Dirichlet(at(2, 0.0)), press], n=4)]), load_steps=steps
         )
         for steps in (1, 10)
     ]
@@ -400,7 +370,7 @@ def test_cut_back_ends_where_small_steps_do():
 def test_failure_keeps_history(tmp_path, mpi_tmp_path):
     """Up to 0.5 all is well, then the load exceeds anything; what was computed stays."""
     pull = nts.Traction(at(2, 1.0), lambda t: (0, 0, -1e4 * t if t <= 0.5 else -1e30))
-    body = cube([nts.Dirichlet(at(2, 0.0), components=(2,))], [pull])
+    body = quarter_cube([nts.Dirichlet(at(2, 0.0), components=(2,))], [pull])
     table, fields = BalanceCSV(mpi_tmp_path / "table.csv"), Fields(mpi_tmp_path / "fields")
     run = nts.equilibrium(
         nts.System([body]),
@@ -447,8 +417,8 @@ def test_passing_by_a_facet_is_noticed():
 
 # ---- start of a dynamic run
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()])
-@pytest.mark.fast_on_ranks("integrator0")
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast_on_ranks("midpoint")
 def test_what_has_settled_stays(integrator):
     """Settled under gravity and left to itself nothing moves, and contact carries on."""
     system = stack()
@@ -492,7 +462,7 @@ def test_pulled_then_released():
 def test_prescribed_motion_goes_on_from_its_place():
     """One system through both phases; the support's rate at the start of the run is its own."""
     press = nts.Dirichlet(at(2, 1.0), lambda t: (0, 0, -0.1 * min(t, 1) - 0.5 * max(t - 1, 0)))
-    body = cube([nts.Dirichlet(at(2, 0.0)), press])
+    body = quarter_cube([nts.Dirichlet(at(2, 0.0)), press])
     system = nts.System([body])
     held = nts.equilibrium(system, load_steps=2)
     stepper = nts.Stepper(system, nts.EnergyMomentum(), start=held)
@@ -551,7 +521,7 @@ def test_the_time_it_is_given_is_checked(value):
 
 
 def held_cube(value, name="cube"):
-    body = cube([nts.Dirichlet(at(2, 0.0), value=value)])
+    body = quarter_cube([nts.Dirichlet(at(2, 0.0), value=value)])
     body.name = name
     return nts.System([body])
 
@@ -566,7 +536,7 @@ def test_start_is_checked():
         nts.simulate(held_cube((0, 0, 0)), rule, start=held, **times)
     with pytest.raises(ValueError, match=r"^start: has bodies \['cube'\], not \['other'\]"):
         nts.simulate(held_cube((0, 0, 0.1), "other"), rule, start=held, **times)
-    finer = nts.System([cube([nts.Dirichlet(at(2, 0.0), value=(0, 0, 0.1))], n=3)])
+    finer = nts.System([quarter_cube([nts.Dirichlet(at(2, 0.0), value=(0, 0, 0.1))], n=3)])
     with pytest.raises(ValueError, match=r"^start: body 'cube' has another mesh"):
         nts.simulate(finer, rule, start=held, **times)
     with pytest.raises(ValueError, match=r"^t_end=0.5: must lie after the start's time 1.0"):
@@ -605,7 +575,7 @@ def test_other_arguments_are_checked():
 # ---- joints that prescribe motion
 def pulled():
     """A block drawn by a point."""
-    body = cube([nts.Dirichlet(at(2, 0.0))])
+    body = quarter_cube([nts.Dirichlet(at(2, 0.0))])
     joint = nts.Spherical(
         body, None, point=(0.5, 0.5, 1.0), displacement=lambda t: (0.02 * t, 0, 0.05 * t)
     )
@@ -614,7 +584,7 @@ def pulled():
 
 def hauled():
     """A block drawn by a rod that gets shorter."""
-    body = cube([nts.Dirichlet(at(2, 0.0))])
+    body = quarter_cube([nts.Dirichlet(at(2, 0.0))])
     joint = nts.Distance(
         body, None, points=((0.5, 0.5, 1.0), (0.5, 0.7, 2.0)),
         length=lambda t: np.sqrt(1.04) - 0.05 * t,
@@ -780,7 +750,7 @@ class RatchetElements(nts.PointElements):
 @pytest.mark.parametrize("stabilization", [None, 0.1])
 def test_elements_of_ones_own_say_what_work_they_do(stabilization):
     """Also in the relaxations before the last one of a load step."""
-    body = cube([nts.Dirichlet(at(2, 0.0))])
+    body = quarter_cube([nts.Dirichlet(at(2, 0.0))])
     system = nts.System([body], joints=[Ratchet(body)], gravity=(0, 0, -1.0))
     run = nts.equilibrium(system, load_steps=2, stabilization=stabilization)
     bare = nts.equilibrium(

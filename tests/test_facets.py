@@ -2,25 +2,17 @@
 
 import numpy as np
 import pytest
+from facet_kinds import FLAT
+from rotations import random_rotation
 from scipy.optimize import minimize
 
 from dolfinx_nts.kernels import facets as fc
 
 KINDS = (3, 4)
-FLAT = {
-    3: np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]),
-    4: np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
-}
 
 
 def random_facets(rng, n, nc, warp):
     return FLAT[nc] + warp * rng.uniform(-1.0, 1.0, (n, nc, 3))
-
-
-def random_rotation(rng):
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q *= np.sign(np.diag(r))
-    return q * np.sign(np.linalg.det(q))
 
 
 def inside(rng, n, nc):

@@ -6,7 +6,10 @@ import math
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import CONTACT_RULES
+from measures import COLUMNS, difference
 from mpi4py import MPI
+from scenes import CELLS, rubbing_blocks
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact import contact_laws
@@ -16,14 +19,7 @@ from dolfinx_nts.kernels.nts_element import invariants, metric, projection
 from dolfinx_nts.step.convergence import ratios
 
 COMM = MPI.COMM_WORLD
-INTEGRATORS = {
-    "midpoint": nts.Midpoint(),
-    "energy-momentum": nts.EnergyMomentum(),
-    "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
-}
-CELLS = {"hexahedron": CellType.hexahedron, "tetrahedron": CellType.tetrahedron}
 TO_ROUNDING = nts.Newton(rtol=1e-14, max_iterations=60)
-COLUMNS = ("kinetic", "potential", "friction_dissipation", "contact_defect", "angular_momentum")
 
 
 # ---- the law
@@ -112,37 +108,8 @@ def test_projection_and_metric_derivatives(nc):
 
 
 # ---- two blocks
-def rubbing_blocks(friction, metre=1.0, turn=None, cell=CellType.hexahedron, cells=(3, 2)):
-    """A block thrown at a larger one with half its speed along the contact, turned as a whole."""
-    turn = np.eye(3) if turn is None else turn
-    rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
-    boxes = (([0, 0, 0], [1, 1, 1]), ([1.05, -0.1, -0.1], [2.05, 1.1, 1.1]))
-    bodies = []
-    for corners, n, name in zip(boxes, cells, ("left", "right"), strict=True):
-        low, high = metre * np.array(corners)
-        mesh = create_box(COMM, [low, high], [n] * 3, cell, ghost_mode=GhostMode.shared_facet)
-        mesh.geometry.x[:] = mesh.geometry.x @ turn.T
-        bodies.append((mesh, name))
-
-    def throw(x):
-        arm = (turn.T @ x) / metre - 0.5
-        v = np.array([2 + 0.5 * arm[2], 1 + 0 * arm[0], 0.3 - 0.5 * arm[0]])
-        return metre * turn @ v
-
-    left, right = (
-        nts.Continuum(mesh, rubber, density=1e3 / metre**3, name=name, velocity=v)
-        for (mesh, name), v in zip(bodies, (throw, (0, 0, 0)), strict=True)
-    )
-    pair = nts.ContactPair(
-        slave=left.surface(lambda x: (turn.T @ x)[0] > metre * (1 - 1e-9)),
-        master=right.surface(lambda x: (turn.T @ x)[0] < metre * (1.05 + 1e-9)),
-        friction=friction,
-    )
-    return nts.System([left, right], contacts=[pair])
-
-
 def run(system, integrator="energy-momentum", t_end=0.08, **options):
-    result = nts.simulate(system, INTEGRATORS[integrator], dt=2e-3, t_end=t_end, **options)
+    result = nts.simulate(system, CONTACT_RULES[integrator], dt=2e-3, t_end=t_end, **options)
     assert result.status == "completed"
     return result
 
@@ -159,19 +126,10 @@ def to_rounding(integrator):
     return run(rubbing_blocks(0.3), integrator, newton=TO_ROUNDING).balance
 
 
-def difference(a, b):
-    """Largest difference of the balance tables, over the energy or the momentum of the scene."""
-    worst = 0.0
-    for name in COLUMNS:
-        scale = a["energy"][0] if a[name].ndim == 1 else np.abs(a[name]).max()
-        worst = max(worst, float(np.abs(a[name] - b[name]).max() / scale))
-    return worst
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 @pytest.mark.parametrize("friction", [0.1, 0.3, math.inf])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast("energy-momentum-0.3-hexahedron")
 @pytest.mark.fast_on_ranks()
 def test_friction_keeps_the_momenta_and_the_ledger(integrator, friction, cell):
@@ -224,7 +182,7 @@ def test_result_does_not_depend_on_the_algorithmic_scale(integrator, factor, mon
 def test_a_solution_is_one_for_any_algorithmic_scale(integrator, monkeypatch):
     """Of every step, beyond the scales at which Newton finds it from afar: over eight decades."""
     stepper = nts.Stepper(
-        rubbing_blocks(0.3), INTEGRATORS[integrator], newton=nts.Newton(rtol=1e-14)
+        rubbing_blocks(0.3), CONTACT_RULES[integrator], newton=nts.Newton(rtol=1e-14)
     )
     problem, nominal = stepper.problem, contact_laws.TANGENTIAL_SCALE
     problem_rtol, both = problem.rtol, 0
@@ -340,14 +298,14 @@ def plane_strain_slider(friction, integrator, speed=0.0):
         friction=friction,
     )
     system = nts.System([block, plate], contacts=[pair], gravity=(0, -9.81, 0))
-    stepper = nts.Stepper(system, INTEGRATORS[integrator])
+    stepper = nts.Stepper(system, CONTACT_RULES[integrator])
     for _ in range(20):
         stepper.advance(1e-3)
     return stepper
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize(("friction", "speed"), [(math.inf, 0.0), (0.5, 0.0), (0.2, 1.0)])
 @pytest.mark.fast("inf-0.0-midpoint", "0.5-0.0-energy-momentum", "0.2-1.0-gonzalez contact")
 @pytest.mark.fast_on_ranks("inf-0.0-midpoint")

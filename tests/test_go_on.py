@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import INTEGRATORS, MID_STEP
 from mpi4py import MPI
-from test_friction import rubbing_blocks
+from scenes import rubbing_blocks
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.mpi
-INTEGRATORS = [nts.EnergyMomentum(), nts.Midpoint(), nts.Newmark(), nts.GeneralizedAlpha()]
 DT = 2e-3
 
 
 @pytest.mark.parametrize(("first_steps", "steps"), [(12, 20), (13, 23)], ids=["12", "13"])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.fast("integrator0-13", "integrator3-12")
+@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.fast("energy-momentum-13", "generalized-alpha-12")
 @pytest.mark.fast_on_ranks()
 def test_two_parts_are_the_whole(integrator, first_steps, steps):
     """With friction, in contact where the first one ends; on several ranks MUMPS rounds anew."""
@@ -37,8 +37,8 @@ def test_two_parts_are_the_whole(integrator, first_steps, steps):
     assert np.allclose(*slip, rtol=1e-9, atol=1e-15)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS[:2])
-@pytest.mark.fast_on_ranks("integrator0")
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast_on_ranks("energy-momentum")
 def test_forces_of_supports_and_contacts(integrator):
     """Impulses of supports, floor and gravity add up to the change of momentum."""
     mesh = create_box(

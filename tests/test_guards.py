@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType, create_box
+from integrators import MID_STEP
+from measures import OPEN, ledger_or_word
 from mpi4py import MPI
 from point_mass import STEP, PointMass, mass_on_wall
-from test_promises import OPEN, ledger_or_word
-from test_two_blocks import fung
+from scenes import fung
 
 import dolfinx_nts as nts
 from dolfinx_nts.step import balance
@@ -22,8 +23,8 @@ STEEP = ["b=1000", "b=300"]
 @pytest.mark.mpi
 @pytest.mark.parametrize(("steepness", "speed"), [(1000.0, 20.0), (300.0, 40.0)], ids=STEEP)
 @pytest.mark.parametrize("accuracy", ["balanced", "exact"])
-@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()], ids=["em", "mp"])
-@pytest.mark.fast("mp-exact-b=1000")
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast("midpoint-exact-b=1000")
 def test_momentum_is_not_reversed_by_a_very_steep_material(integrator, accuracy, steepness, speed):
     """A diverged iterate of stiffness 1e55 excused du = 0 by its rounding, so that v_1 = -v_0."""
     system = two_blocks.scene(COMM, cells=(3, 2), material=fung(steepness), speed=speed)

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
+from scenes import RUBBER
 
 import dolfinx_nts as nts
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.step.problem import StepProblem
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 #: Twist, skew and smoothing of `held_across`.
 SHAPES = [(0.0, 0.0, False), (0.2, 0.0, False), (0.0, 0.5, False), (0.2, 0.5, True)]
 
@@ -92,9 +93,9 @@ def test_sticking_nodes_feel_nothing_across(shape):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()])
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.parametrize("friction", [0.3, np.inf])
-@pytest.mark.fast("0.3-integrator1")
+@pytest.mark.fast("0.3-energy-momentum")
 @pytest.mark.fast_on_ranks()
 def test_dynamics_on_a_twisted_plate(integrator, friction):
     """Dragged on from equilibrium the block slides or sticks; the ledger closes."""

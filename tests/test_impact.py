@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
+from measures import drift
 from mpi4py import MPI
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
 FLOOR = nts.Plane((0, 0, 0), (0, 0, 1))
-INTEGRATORS = [nts.EnergyMomentum(), nts.Midpoint()]
 
 
 def grid(low, size, n):
@@ -38,15 +39,11 @@ def cubes(friction=None, gap=0.05, **speeds):
     return nts.System([left, right], contacts=[pair])
 
 
-def drift(table, name):
-    return np.ptp(table[name], axis=0).max() / np.abs(table[name]).max()
-
-
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS, ids=lambda i: type(i).__name__)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("height", [0.0137, 0.0151])
-@pytest.mark.fast_on_ranks("0.0137-0.5-EnergyMomentum", "0.0151-1.0-Midpoint")
+@pytest.mark.fast_on_ranks("0.0137-0.5-energy-momentum", "0.0151-1.0-midpoint")
 def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, height):
     """It leaves with e times its speed, wherever in a step its gap closes (by h v = 2 mm)."""
     block = nts.RigidBody(

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from scenes import bottom, box, everywhere, top
 
 import dolfinx_nts as nts
 
@@ -14,29 +14,12 @@ RUBBER = nts.StVenantKirchhoff(YOUNG, 0.0)
 pytestmark = pytest.mark.mpi
 
 
-def box(cells=(1, 1, 1), low=(0, 0, 0), high=(1, 1, 1)):
-    return create_box(
-        COMM, [low, high], cells, CellType.hexahedron, ghost_mode=GhostMode.shared_facet
-    )
-
-
-def bottom(x):
-    return x[2] < 1e-9
-
-
-def top(x):
-    return x[2] > 1 - 1e-9
-
-
-def everywhere(x):
-    return np.full(x.shape[1], True)
-
-
 def bar(displacement, **options):
     """A bar along z, held at its lower end, that moves along z alone."""
     bcs = [nts.Dirichlet(bottom), nts.Dirichlet(everywhere, components=(0, 1))]
     return nts.Continuum(
-        box((1, 1, CELLS)), RUBBER, density=DENSITY, bcs=bcs, displacement=displacement, **options
+        box(cells=(1, 1, CELLS)), RUBBER, density=DENSITY, bcs=bcs, displacement=displacement,
+        **options,
     )
 
 
@@ -77,7 +60,7 @@ def test_the_functions_of_dolfinx_hold_it_at_once():
 def test_prescribed_coordinates_start_where_they_are_said_to():
     held = nts.Dirichlet(bottom, lambda t: (0, 0, 0.02 + t), components=(2,))
     body = nts.Continuum(
-        box((2, 2, 2)), RUBBER, density=DENSITY, bcs=[held], displacement=(0.3, 0.2, 0.1)
+        box(), RUBBER, density=DENSITY, bcs=[held], displacement=(0.3, 0.2, 0.1)
     )
     u = nts.System([body]).initial_state().u[0].reshape(-1, 3)
     low = body.reference.reshape(-1, 3)[:, 2] < 1e-9
@@ -100,9 +83,9 @@ def test_what_it_must_not_be():
 @pytest.mark.parametrize("rise", [1.001, 0.7])
 def test_contact_looks_where_bodies_are(rise):
     """Two cubes of one mesh, one of them lifted onto the other, or too little."""
-    under = nts.Continuum(box((2, 2, 2)), RUBBER, density=DENSITY, name="under")
+    under = nts.Continuum(box(), RUBBER, density=DENSITY, name="under")
     over = nts.Continuum(
-        box((2, 2, 2)), RUBBER, density=DENSITY, name="over", displacement=(0, 0, rise)
+        box(), RUBBER, density=DENSITY, name="over", displacement=(0, 0, rise)
     )
     pair = nts.ContactPair(over.surface(bottom), under.surface(top))
     if rise < 1.0:
@@ -119,10 +102,10 @@ def test_contact_looks_where_bodies_are(rise):
 def test_a_displaced_master_is_where_contact_looks():
     """Far inside a master that has come over the slave; its surface is half a body away."""
     over = nts.Continuum(
-        box((2, 2, 2), (3, 0, 0), (4, 1, 1)), RUBBER, density=DENSITY, name="over",
+        box((3, 0, 0), (4, 1, 1)), RUBBER, density=DENSITY, name="over",
         displacement=(-3, 0, 0.5),
     )  # fmt: skip
-    small = box((1, 1, 1), (0.4, 0.4, 0.9), (0.6, 0.6, 1.0))
+    small = box((0.4, 0.4, 0.9), (0.6, 0.6, 1.0), 1)
     under = nts.Continuum(small, RUBBER, density=DENSITY, name="under")
     pair = nts.ContactPair(under.surface(top), over.surface(top))
     with pytest.raises(ValueError, match="4 slave nodes start inside the master"):

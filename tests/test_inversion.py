@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
+from measures import OPEN, PROMISED, ledger_or_word
 from mpi4py import MPI
 from point_mass import PointMass
-from test_form_body import energy, green
-from test_promises import OPEN, PROMISED, ledger_or_word
+from scenes import RUBBER, green, saint_venant
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -18,7 +19,6 @@ from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.upright import Upright
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 SENTENCE = "inside out, which W(C) cannot see: det F = "
 
 
@@ -34,7 +34,9 @@ def form_cube(n=2, **options):
         ghost_mode=GhostMode.shared_facet,
     )  # fmt: skip
     space = compat.vector_space(mesh, 1)
-    return nts.FormBody(space, energy, strain=green, density=1e3, name="cube", **options)
+    return nts.FormBody(
+        space, saint_venant(2e5, 0.3), strain=green, density=1e3, name="cube", **options
+    )
 
 
 def displace(body, motion):
@@ -295,9 +297,9 @@ def test_statics(allowed):
 # ---- bodies of a user's own forms
 @pytest.mark.mpi
 @pytest.mark.parametrize(
-    "integrator", [nts.EnergyMomentum(), nts.Midpoint()], ids=lambda i: type(i).__name__
+    "integrator", MID_STEP.values(), ids=MID_STEP
 )
-@pytest.mark.fast("Midpoint")
+@pytest.mark.fast("midpoint")
 def test_no_step_of_own_forms_ends_inside_out(integrator):
     watch = Watch()
     run = nts.simulate(

@@ -5,8 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType
+from integrators import GRADIENTS, MID_STEP
+from measures import STENCIL, block_errors, dense
 from mpi4py import MPI
+from scenes import box, rotated_state, smooth_motion
 
 import dolfinx_nts as nts
 from dolfinx_nts.integrators import Static
@@ -18,13 +21,7 @@ CELLS = {
 }
 #: Those whose master is smooth.
 SMOOTH = "smooth", "curved"
-RULES = {
-    "midpoint": nts.Midpoint(),
-    "energy-momentum": nts.EnergyMomentum(),
-    "mean-value stress": nts.EnergyMomentum(stress="mean-value"),
-    "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
-    "condensed": nts.EnergyMomentum(),
-}
+RULES = MID_STEP | GRADIENTS | {"condensed": MID_STEP["energy-momentum"]}
 #: The static rule, with a stabilization, shares the equations but not the steps.
 EQUATIONS = RULES | {"static": Static()}
 ACTIVE = ("none", "all", "mixed")
@@ -36,12 +33,6 @@ SCENES = [
     *itertools.product(("hex",), ("slip", "mixed", "stick"), ("all",)),
     *itertools.product(("tet",), ("none", "mixed"), ("mixed",)),
 ]
-#: Exact for polynomials up to degree 4.
-STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
-
-
-def box(low, high, n, cell):
-    return create_box(COMM, [low, high], [n, n, n], cell, ghost_mode=GhostMode.shared_facet)
 
 
 def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
@@ -63,34 +54,6 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
         friction=friction,
     )
     return nts.System([upper, lower], contacts=[pair])
-
-
-def smooth_motion(x, amplitude, phase):
-    """A displacement that does not depend on how the mesh is distributed."""
-    k = np.array([[1.1, 0.7, -0.4], [-0.6, 1.3, 0.8], [0.5, -0.9, 1.2]])
-    return amplitude * np.sin(x @ k.T + phase)
-
-
-def rotation(angle):
-    axis = np.array([1.0, 2.0, 3.0]) / np.sqrt(14)
-    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
-
-
-def rotated_state(system, angle=0.8, fixed=False):
-    """Both blocks turned in space, deformed, spinning and moving towards each other."""
-    turn, u, v = rotation(angle), [], []
-    for k, body in enumerate(system.bodies):
-        x = body.reference.reshape(-1, 3)
-        now = (x + smooth_motion(x, 0.03, k)) @ turn.T + [0.3, -0.2, 0.1]
-        velocity = np.cross([0.5, -0.8, 1.1], now) + smooth_motion(x, 0.4, 2.0 + k)
-        velocity += (0.5 - k) * -2.0 * turn[:, 2]
-        u.append((now - x).ravel())
-        v.append(velocity.ravel())
-        if fixed:
-            u[-1][body.fixed] = v[-1][body.fixed] = 0.0
-    start = system.initial_state()
-    return replace(start, u=tuple(u), v=tuple(v))
 
 
 def stepper_of(system, rule):
@@ -149,22 +112,6 @@ class Linearised:
     def blocks(self):
         fields = range(self.problem.unknowns.layout.counts.shape[1])
         return [self.problem.unknowns.layout.owned(f) for f in fields]
-
-
-def dense(a):
-    rows, cols = (np.arange(n, dtype=np.int32) for n in a.getSize())
-    return a.getValues(rows, cols)
-
-
-def block_errors(found, expected, blocks):
-    """Largest difference of each block over its largest entry; of all entries where it is zero."""
-    errors = {}
-    for i, rows in enumerate(blocks):
-        for j, cols in enumerate(blocks):
-            e, f = expected[rows, cols], found[rows, cols]
-            scale = np.abs(f if f.any() else found).max(initial=0.0)
-            errors[i, j] = np.abs(f - e).max(initial=0.0) / scale
-    return errors
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")

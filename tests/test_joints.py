@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
@@ -368,8 +369,8 @@ def test_a_planar_four_bar_with_four_revolutes(thick):
     assert abs(np.log2(ratio) - 2.0) < 0.1
 
 
-@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
-@pytest.mark.fast("integrator0")
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast("energy-momentum")
 def test_a_slider_crank(integrator):
     """Three revolutes and a prismatic joint, also redundant, on the closed kinematics."""
     angle, length, rate = 0.7, 0.8, 20.0

@@ -5,17 +5,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
+from integrators import CONTACT_RULES, MID_STEP
 from mpi4py import MPI
-from point_mass import INTEGRATORS as ALL
-from point_mass import MASS, PointMass, PointSurface
+from point_mass import MASS, PointMass, PointSurface, Sledge
 from scipy.integrate import solve_ivp
-from test_smoothing import SPEED, Sledge
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.surfaces import locate_facets
 
 COMM = MPI.COMM_WORLD
-INTEGRATORS = {name: ALL[name] for name in ("midpoint", "energy-momentum")}
 GRAVITY, MU, STEP = 9.81, 0.2, 0.01
 DOWN = np.array([0.0, 0.0, -GRAVITY])
 #: Newton down to rounding, so that nothing but the scheme differs from the closed form.
@@ -85,7 +83,7 @@ def scene(start, velocity, *masters, friction=MU, gravity=DOWN):
 
 def follow(system, integrator, steps, dt=STEP):
     """Advance and record; of several masters, the forces are added up."""
-    stepper = nts.Stepper(system, ALL[integrator], newton=FLOOR)
+    stepper = nts.Stepper(system, CONTACT_RULES[integrator], newton=FLOOR)
     rows = []
     for k in range(steps + 1):
         if k:
@@ -127,7 +125,7 @@ def assert_slides_straight(h, velocity, tolerance, mu=MU):
 
 # ---- over facets
 @pytest.mark.parametrize("facets", FACETS)
-@pytest.mark.parametrize("integrator", ALL)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast("energy-momentum-quads", "energy-momentum-triangles")
 def test_slip_and_traction_survive_changes_of_facet(integrator, facets):
     """Every facet starts at another corner than its neighbour."""
@@ -146,7 +144,7 @@ def test_slip_and_traction_survive_changes_of_facet(integrator, facets):
     ids=["along edges", "along diagonals and over corners", "over corners"],
 )
 @pytest.mark.parametrize("facets", ["squares", "diagonals"])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum-squares-along edges", "energy-momentum-diagonals-over corners")
 def test_along_edges_and_over_corners(integrator, facets, start, velocity):
     """Two to six facets are equally near all the time, or again and again."""
@@ -156,7 +154,7 @@ def test_along_edges_and_over_corners(integrator, facets, start, velocity):
 
 @pytest.mark.parametrize("place", [(0.1, 0.1), (0.25, 0.1), (0.25, 0.25)])
 @pytest.mark.parametrize("facets", ["squares", "diagonals"])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast(
     "midpoint-squares-place2", "energy-momentum-squares-place0", "energy-momentum-diagonals-place1",
 )  # fmt: skip
@@ -173,7 +171,7 @@ def test_stuck_inside_on_an_edge_and_on_a_corner(integrator, facets, place):
 
 @pytest.mark.parametrize("friction", [MU, np.inf])
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.0), (1.5, 0.7, 0.0)])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 def test_zero_gap_without_force_is_without_friction(integrator, velocity, friction):
     system = scene((-0.5, 0.25, 0.0), velocity, plate(), friction=friction, gravity=(0, 0, 0))
     h = follow(system, integrator, 10)
@@ -214,7 +212,7 @@ def on_saddle(height, place, velocity, end):
     return solve_ivp(rate, (0, end), [*place, *velocity], rtol=1e-12, atol=1e-13).y[:, -1]
 
 
-@pytest.mark.parametrize("integrator", ALL)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.slow
 def test_sliding_over_a_saddle_is_of_second_order(integrator):
     """Against the equations of motion on the surface, solved without this package."""
@@ -268,7 +266,7 @@ def settled_block(facets, friction):
 )
 def test_a_block_over_fifty_facets_has_no_switch_defect(integrator, facets, friction):
     system, settled = settled_block(facets, friction)
-    stepper, dt = nts.Stepper(system, INTEGRATORS[integrator], start=settled), 4e-3
+    stepper, dt = nts.Stepper(system, MID_STEP[integrator], start=settled), 4e-3
     passed = []
     for _ in range(100):
         stepper.advance(dt)
@@ -306,7 +304,7 @@ def assert_coulomb(h, acceleration, mu=MU):
 
 
 @pytest.mark.parametrize("facets", ["squares", "triangles"])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum-squares")
 def test_slides_off_and_lands_on_another_plate(integrator, facets):
     """Two masters, one lower and beside the other: slide, flight, bounces, slide."""
@@ -329,7 +327,7 @@ def test_slides_off_and_lands_on_another_plate(integrator, facets):
 
 
 @pytest.mark.parametrize("start", [-0.505, -0.5, -0.49])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum--0.5")
 def test_two_masters_side_by_side_are_one(integrator, start):
     """Over their seam the gap is closed twice, and carries once."""
@@ -353,7 +351,7 @@ class Crane(PointMass):
 
 
 @pytest.mark.parametrize("facets", ["squares", "triangles"])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum-squares")
 def test_leaves_the_surface_beyond_its_rim_and_comes_back(integrator, facets):
     body, face = plate(facets)
@@ -377,13 +375,13 @@ class Drawn(Sledge):
     def __init__(self, across, position):
         super().__init__(position)
         self.fixed = self.fixed[:1]
-        self.initial_velocity = np.array([SPEED, across, 0.0])[: self.num_owned]
+        self.initial_velocity = np.array([Sledge.pace, across, 0.0])[: self.num_owned]
 
     def prescribed(self, time):
-        return np.array([SPEED * time])[: len(self.fixed)]
+        return np.array([Sledge.pace * time])[: len(self.fixed)]
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 def test_friction_does_the_work_of_drawing(integrator):
     """Both directions of slip are prescribed: mu m g times the way goes in and is dissipated."""
     start = (-0.8, 0.13, 0.0)
@@ -391,19 +389,19 @@ def test_friction_does_the_work_of_drawing(integrator):
     pair = nts.ContactPair(PointSurface(mass, start), face, friction=MU)
     pair.slave.fixed[:, :2] = True
     h = follow(nts.System([mass, body], contacts=[pair], gravity=DOWN), integrator, 20)
-    work = MU * mass.mass * GRAVITY * SPEED * h.table["time"]
+    work = MU * mass.mass * GRAVITY * Sledge.pace * h.table["time"]
     np.testing.assert_allclose(h.table["friction_dissipation"], work, rtol=0, atol=1e-12)
     np.testing.assert_allclose(h.table["external_work"], work, rtol=0, atol=1e-12)
     np.testing.assert_allclose(h.tangential[1:, 0], -MU * mass.mass * GRAVITY, rtol=1e-12)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum")
 def test_drawn_along_it_loses_its_motion_across(integrator):
     """v_y' = -mu g v_y / |v| with v_x prescribed, at second order; one direction of slip is."""
     across, end, errors = 0.7, 0.4, []
     exact = solve_ivp(
-        lambda t, y: [y[1], -MU * GRAVITY * y[1] / np.hypot(SPEED, y[1])],
+        lambda t, y: [y[1], -MU * GRAVITY * y[1] / np.hypot(Sledge.pace, y[1])],
         (0, end), [0.0, across], rtol=1e-12, atol=1e-13,
     ).y[0, -1]  # fmt: skip
     for steps in (10, 20, 40):
@@ -421,7 +419,7 @@ def test_drawn_along_it_loses_its_motion_across(integrator):
 # ---- ranks and contacts without candidates
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum-True", "midpoint-False")
 @pytest.mark.fast_on_ranks("energy-momentum-True")
 def test_far_away_and_on_ranks_without_facets(integrator, condense):
@@ -433,7 +431,7 @@ def test_far_away_and_on_ranks_without_facets(integrator, condense):
     start, velocity = (-0.5, 0.1, 0.03), np.array([1.5, 0.4, 0.0])
     system = scene(start, velocity, near, far)
     stepper = nts.Stepper(
-        system, INTEGRATORS[integrator], newton=nts.Newton(rtol=1e-13, condense=condense)
+        system, MID_STEP[integrator], newton=nts.Newton(rtol=1e-13, condense=condense)
     )
     for _ in range(20):
         stepper.advance(STEP)

@@ -5,14 +5,16 @@ import functools
 import importlib.metadata
 import json
 import logging
-import os
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+from integrators import INTEGRATORS
+from processes import in_fresh_python
+
+import dolfinx_nts as nts
+from dolfinx_nts.integrators import Static
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "dolfinx_nts"
@@ -171,17 +173,6 @@ print(json.dumps({
 """
 
 
-def in_fresh_python(code):
-    """Run code in a new interpreter that does not believe to be an MPI rank of this one."""
-    mpi = ("OMPI_", "PMIX_", "PRTE_", "ORTE_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(mpi)}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, cwd="/", text=True, capture_output=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 @functools.cache
 def after(*modules):
     """What a new interpreter holds that has imported these."""
@@ -217,3 +208,15 @@ def test_version_is_stated_once():
         assert f'"{version}"' not in source(module), f"{module} states the version again"
     if "__init__" in PRESENT:
         assert ours()["version"] == version
+
+
+def test_the_list_of_integrators_in_the_tests_is_whole():
+    theirs = {kind for kind in vars(nts.integrators).values() if isinstance(kind, type)}
+    assert {type(rule) for rule in INTEGRATORS.values()} == theirs - {nts.Integrator, Static}
+
+
+def test_no_test_module_is_imported_by_another():
+    """Shared helpers stand in modules of their own; what runs on ranks may import itself."""
+    for path in (ROOT / "tests").glob("*.py"):
+        names = set(re.findall(r"\b(?:from|import) (?:tests\.)?(test_\w+)", path.read_text()))
+        assert not names - {path.stem}, f"{path.name} imports {sorted(names - {path.stem})}"

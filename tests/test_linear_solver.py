@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
+from measures import difference
 from mpi4py import MPI
 from petsc4py import PETSc
-from test_friction import difference
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat

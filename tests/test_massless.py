@@ -6,20 +6,17 @@ import bar_impact
 import numpy as np
 import pytest
 import two_blocks
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType
+from integrators import MID_STEP
+from measures import STENCIL, block_errors, dense, drift
 from mpi4py import MPI
-from test_jacobian import STENCIL, block_errors, dense, rotated_state
+from scenes import RUBBER, box, rotated_state
 
 import dolfinx_nts as nts
 from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.motion import motion_of
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
-
-
-def box(high, n, kind=CellType.hexahedron, low=(0, 0, 0)):
-    return create_box(COMM, [low, high], list(n), kind, ghost_mode=GhostMode.shared_facet)
 
 
 def linear_bar(elements, courant, closing, t_end=1.5):
@@ -83,7 +80,7 @@ def test_a_body_keeps_its_mass_centre_and_inertia(kind):
     bodies = []
     for mass in ("consistent", "redistributed"):
         body = nts.Continuum(
-            box((1.0, 0.7, 0.5), (6, 3, 6), kind), RUBBER, density=1e3,
+            box(high=(1.0, 0.7, 0.5), cells=(6, 3, 6), cell=kind), RUBBER, density=1e3,
             velocity=lambda x: np.array([2 + x[1], x[2] - x[0], 0.3 * x[0]]),
         )  # fmt: skip
         body.surface(lambda x: x[0] > 1 - 1e-9, mass=mass)
@@ -148,7 +145,7 @@ def test_bar_on_two_ranks():
 
 def test_what_makes_no_sense_is_refused():
     """With the argument and the remedy."""
-    mesh, end = box((1, 1, 1), (4, 2, 2)), {"marker": lambda x: x[0] > 1 - 1e-9}
+    mesh, end = box(cells=(4, 2, 2)), {"marker": lambda x: x[0] > 1 - 1e-9}
     options = {"density": 1e3, "name": "cube"}
 
     def cube():
@@ -157,7 +154,7 @@ def test_what_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match="mass='lumped': choose one of 'consistent', 'redistr"):
         cube().surface(**end, mass="lumped")
     with pytest.raises(ValueError, match="'cube': beside its.*a part without any other nodes; use"):
-        nts.Continuum(box((1, 1, 1), (4, 1, 1)), RUBBER, **options).surface(
+        nts.Continuum(box(cells=(4, 1, 1)), RUBBER, **options).surface(
             lambda x: x[1] > -1.0, mass="redistributed"
         )
     with pytest.raises(ValueError, match="'cube': beside.*fewer than four cells.* use a finer"):
@@ -174,15 +171,11 @@ def test_what_makes_no_sense_is_refused():
         pair = nts.ContactPair(slave=slave, master=wall, friction=friction)
         with pytest.raises(ValueError, match=f"mass='redistributed' of 'cube'.*{text}"):
             nts.Stepper(nts.System([body], contacts=[pair]), integrator, impact=impact)
-    mesh = box((2, 1, 1), (1, 1, 1), low=(1.1, 0, 0))
+    mesh = box((1.1, 0, 0), (2, 1, 1), 1)
     other = nts.Continuum(mesh, RUBBER, density=1e3, name="other")
     pair = nts.ContactPair(slave=other.surface(lambda x: x[0] < 1.1 + 1e-9), master=slave)
     with pytest.raises(ValueError, match="the master of contact 'other-cube' has such nodes"):
         nts.Stepper(nts.System([body, other], contacts=[pair]), nts.Midpoint())
-
-
-def drift(table, name):
-    return np.ptp(table[name], axis=0).max() / np.abs(table[name]).max()
 
 
 def impact(integrator, *, mass="redistributed", dt=2e-3, t_end=0.2, **options):
@@ -233,7 +226,7 @@ def test_small_blocks_lose_little(friction):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 def test_blocks(integrator, friction):
     """Benchmark B1: 5.1 % lost with consistent mass, in contact forces that alternate."""
     table, changes, rough = impact(integrator, friction=friction)
@@ -303,7 +296,7 @@ def bars(elements, mass, closing):
     gap, bodies = (10 - closing) * dt * speed, []
     for k, n in enumerate(elements):
         low = k * (length + gap)
-        mesh = box((low + length, 1, 1), (n, 1, 1), low=(low, 0, 0))
+        mesh = box((low, 0, 0), (low + length, 1, 1), (n, 1, 1))
         bodies.append(nts.Continuum(
             mesh, nts.StVenantKirchhoff(young=9e5, poisson=0.0), density=1e3,
             velocity=((1 - k) * speed, 0, 0), name=f"bar {k}",
@@ -348,14 +341,14 @@ def test_bars(elements):
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("friction", [0.0, 0.4])
-@pytest.mark.parametrize("rule", [nts.EnergyMomentum(), nts.Midpoint()])
-@pytest.mark.fast("rule0-0.4")
+@pytest.mark.parametrize("rule", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast("energy-momentum-0.4")
 def test_jacobian(rule, friction):
     """Of nodes that touch or leave with forces of the step before."""
     upper = nts.Continuum(
-        box((0.9, 0.9, 1.8), (1, 1, 4), low=(0.1, 0.1, 1)), RUBBER, density=1e3, name="upper"
+        box((0.1, 0.1, 1), (0.9, 0.9, 1.8), (1, 1, 4)), RUBBER, density=1e3, name="upper"
     )
-    lower = nts.Continuum(box((1, 1, 1), (2, 2, 2)), RUBBER, density=1e3, name="lower")
+    lower = nts.Continuum(box(cells=(2, 2, 2)), RUBBER, density=1e3, name="lower")
     pair = nts.ContactPair(
         slave=upper.surface(lambda x: x[2] < 1 + 1e-9, mass="redistributed"),
         master=lower.surface(lambda x: x[2] > 1 - 1e-9), friction=friction,
@@ -437,7 +430,7 @@ def test_a_start_off_balance_is_told():
         (lambda x: turn @ x - x, False),
     ):
         body = nts.Continuum(
-            box((1, 1, 1), (4, 2, 2)), RUBBER, density=1e3, displacement=displacement, name="cube"
+            box(cells=(4, 2, 2)), RUBBER, density=1e3, displacement=displacement, name="cube"
         )
         slave = body.surface(lambda x: x[0] > 1 - 1e-9, mass="redistributed")
         pair = nts.ContactPair(slave=slave, master=nts.Plane((3, 0, 0), (-1, 0, 0)))

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from dolfinx import mesh as dolfinx_mesh
 from mpi4py import MPI
+from scenes import RUBBER
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 
 
 def line_of_blocks(gmsh, kind="hexahedron"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
-from point_mass import PointMass
+from point_mass import PointMass, turn
 
 import dolfinx_nts as nts
 
@@ -14,11 +14,6 @@ CENTRE, SPIN, VELOCITY = np.array([10.0, -3.0, 2.0]), np.array([3.0, -1.0, 2.0])
 AXIS = np.array([1.0, -2.0, 2.0]) / 3
 
 pytestmark = pytest.mark.mpi
-
-
-def turn(angle=0.7):
-    k = np.array([[0, -AXIS[2], AXIS[1]], [AXIS[2], 0, -AXIS[0]], [-AXIS[1], AXIS[0], 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
 def box(kind=CellType.hexahedron, **options):

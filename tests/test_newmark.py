@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import ACCELERATED
 from mpi4py import MPI
 from point_mass import MASS, STEP, PointMass
-from test_order import flying_block, sliding_block
+from scenes import flying_block, sliding_block
 
 import dolfinx_nts as nts
 
@@ -123,7 +124,7 @@ def test_momenta_of_the_trapezoidal_rule():
     assert np.abs(kept - kept[0]).max() < 1e-10 * size
 
 
-@pytest.mark.parametrize("integrator", [nts.Newmark(), nts.GeneralizedAlpha()])
+@pytest.mark.parametrize("integrator", ACCELERATED.values(), ids=ACCELERATED)
 def test_the_start_accelerates(integrator):
     """A body under gravity falls from the first step on."""
     gravity = np.array([0.0, 0.0, -9.81])
@@ -143,7 +144,7 @@ def test_the_start_accelerates(integrator):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", [nts.Newmark(), nts.GeneralizedAlpha()])
+@pytest.mark.parametrize("integrator", ACCELERATED.values(), ids=ACCELERATED)
 def test_a_block_that_rests_stays_at_rest(integrator):
     """From equilibrium under the forces of contact: they are part of the first acceleration."""
     mesh = create_box(

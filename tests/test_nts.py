@@ -4,46 +4,20 @@ import math
 
 import numpy as np
 import pytest
+from facet_kinds import CENTRE, FLAT, KINDS, POWERS, RING
+from measures import differences, relative
+from rotations import random_rotation
 
 from dolfinx_nts.kernels import discrete_gradient, nts_element
 from dolfinx_nts.kernels import facets as fc
 
-#: Triangle, quadrilateral, patch over a quadrilateral and over a triangle.
-KINDS = (3, 4, 16, 15)
 NUM_INVARIANTS = {3: 12, 4: 17, 16: 155, 15: 138}
 RULES = ("mean-value", "gonzalez")
-FLAT = {
-    3: np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]),
-    4: np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
-}
-#: Corners, then the points beyond them, see `patches`.
-RING = np.array(
-    [
-        *[(0, 0), (1, 0), (1, 1), (0, 1)],
-        *[(-1, 0), (1, -1), (2, 1), (0, 2)],
-        *[(0, -1), (2, 0), (1, 2), (-1, 1)],
-        *[(-1, -1), (2, -1), (2, 2), (-1, 2)],
-    ]
-)
-FLAT[16] = np.column_stack([RING, np.zeros(16)])
-#: Powers of the corners' coordinates in the control points of degree 4 over a triangle.
-POWERS = np.array(
-    [
-        *[(4, 0, 0), (0, 4, 0), (0, 0, 4)],
-        *[(3, 1, 0), (3, 0, 1), (2, 2, 0), (2, 1, 1), (2, 0, 2), (1, 3, 0), (1, 2, 1), (1, 1, 2)],
-        *[(1, 0, 3), (0, 3, 1), (0, 2, 2), (0, 1, 3)],
-    ]
-)
-FLAT[15] = np.column_stack([POWERS[:, 1:] / 4, np.zeros(15)])
-CENTRE = {3: np.array([0.3, 0.4]), 4: np.array([0.2, -0.3])}
-CENTRE |= {16: CENTRE[4], 15: CENTRE[3]}
 SIDES = {3: 3, 4: 4, 16: 4, 15: 3}
 #: How far off f is, and what it moves by; polynomials of degree 4 grow fast beside their triangle.
 SPREAD, MOVED = {3: 0.5, 4: 0.5, 16: 0.5, 15: 0.1}, {3: 1.0, 4: 1.0, 16: 1.0, 15: 0.2}
 #: Part of the control points' distance that they are shifted by: 0.2 of corners.
 WARP = {3: 0.2, 4: 0.2, 16: 0.2, 15: 0.05}
-#: Differences with this stencil are exact for polynomials up to degree 4, whatever the step.
-STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 
 
 def shape(f, nc):
@@ -151,14 +125,6 @@ def complex_step(function, x):
     return np.stack(columns, axis=-1)
 
 
-def differences(function, x, step):
-    """Fourth-order central differences of a batched function, last axis = component of x (n, m)."""
-    columns = []
-    for e in np.eye(x.shape[1]):
-        columns.append(sum(w * function(x + k * step * e) for k, w in STENCIL) / step)
-    return np.stack(columns, axis=-1)
-
-
 def random_pairs(rng, n, nc):
     """Any state of the unknowns: warped facets, normals of any length, slaves anywhere near."""
     corners = FLAT[nc] + WARP[nc] * rng.uniform(-1, 1, (n, nc, 3))
@@ -176,20 +142,10 @@ def random_step(rng, n, nc, motion=0.2):
     return z0, z1, rng.normal(size=(n, 6))
 
 
-def random_rotation(rng):
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q *= np.sign(np.diag(r))
-    return q * np.sign(np.linalg.det(q))
-
-
 def rotated(z, rotation):
     """The same pairs after a rotation of space; f is no vector in space."""
     vectors = z[:, :-2].reshape(len(z), -1, 3) @ rotation.T
     return np.concatenate([vectors.reshape(len(z), -1), z[:, -2:]], axis=1)
-
-
-def relative(found, expected):
-    return np.abs(found - expected).max() / np.abs(expected).max()
 
 
 # ---- invariants and constraints

@@ -3,30 +3,26 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import CONTACT_RULES
+from measures import STENCIL
 from mpi4py import MPI
-from point_mass import INTEGRATORS, MASS, STEP, PointMass, PointSurface, turn
-from test_obstacles import (
+from point_mass import MASS, STEP, turn
+from scenes_obstacles import (
     ACCELERATION,
     CENTRE,
-    FLOOR,
+    DOWN,
     OBSTACLES,
-    STENCIL,
+    TO_ROUNDING,
     Pair,
     advance,
     block,
     changed,
+    sliding,
 )
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-DOWN = np.array([0.0, 0.0, -ACCELERATION])
-
-
-def sliding(master, friction, position, velocity, gravity=DOWN):
-    body = PointMass(COMM, MASS, position, velocity)
-    pair = nts.ContactPair(PointSurface(body, position), master, friction=friction)
-    return nts.System([body], contacts=[pair], gravity=gravity)
 
 
 def drift(time):
@@ -35,7 +31,7 @@ def drift(time):
 
 # ---- the equations of a step
 @pytest.mark.parametrize("state", ["stick", "slip", "off"])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_tangent_is_the_derivative_of_the_residual(name, integrator, state):
     friction = {"stick": np.inf, "slip": 0.3, "off": 0.3}[state]
@@ -54,7 +50,7 @@ def test_tangent_is_the_derivative_of_the_residual(name, integrator, state):
     np.testing.assert_allclose(part.tangent[0].T, expected, rtol=0, atol=1e-8 * MASS)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_work_of_friction_is_exact(name, integrator):
     """The tangential force on the relative path does -lambda_T . Df, and is along the surface."""
@@ -74,7 +70,7 @@ def test_work_of_friction_is_exact(name, integrator):
 
 # ---- closed forms
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast_on_ranks("energy-momentum")
 def test_a_mass_slides_down_an_incline(integrator):
     """B5: 30 degrees, mu = 0.3."""
@@ -93,9 +89,9 @@ def test_a_mass_slides_down_an_incline(integrator):
     assert rows["slip"][1:].all() and not rows["stick"].any()
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize("part", [0.999, 1.001, np.inf])
-@pytest.mark.fast("0.999-energy-momentum", "1.001-midpoint", "inf-gonzalez")
+@pytest.mark.fast("0.999-energy-momentum", "1.001-midpoint", "inf-gonzalez contact")
 def test_a_mass_sticks_if_mu_is_at_least_the_slope(integrator, part):
     angle = np.pi / 6
     normal, along = np.array([np.sin(angle), 0, np.cos(angle)]), [np.cos(angle), 0, -np.sin(angle)]
@@ -112,7 +108,7 @@ def test_a_mass_sticks_if_mu_is_at_least_the_slope(integrator, part):
         assert x[-1] @ along == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 def test_a_mass_slides_to_rest(integrator):
     """B4: what is left at the last whole step is at most half a step's loss of speed."""
     mu, speed = 0.2, 1.0
@@ -130,7 +126,7 @@ def test_a_mass_slides_to_rest(integrator):
     assert np.abs(rows["ledger_residual"]).max() < 1e-13 * energy
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize("name", ["sphere", "cylinder"])
 @pytest.mark.slow
 def test_a_bead_in_a_hoop_slows_down_as_an_exponential_of_its_angle(name, integrator):
@@ -142,7 +138,7 @@ def test_a_bead_in_a_hoop_slows_down_as_an_exponential_of_its_angle(name, integr
     mu, speed, end, errors = 0.3, 2.0, 2.0, []
     for steps in (40, 80, 160):
         system = sliding(hollow, mu, (0, 0, -1.0), (0, speed, 0), (0, 0, 0))
-        x, _, rows = advance(system, integrator, steps, end / steps, newton=FLOOR)
+        x, _, rows = advance(system, integrator, steps, end / steps, newton=TO_ROUNDING)
         phi = np.log(1 + mu * speed * end) / mu
         errors.append(np.arctan2(x[-1, 1], -x[-1, 2]) - (phi + np.pi) % (2 * np.pi) + np.pi)
         lost = 0.5 * MASS * speed**2 - rows["energy"][-1]
@@ -155,7 +151,7 @@ def test_a_bead_in_a_hoop_slows_down_as_an_exponential_of_its_angle(name, integr
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast_on_ranks("energy-momentum")
 def test_a_belt_works_twice_what_it_gives(integrator):
     """A mass put on a belt of speed V gets m V^2/2; as much is dissipated, the belt works m V^2."""
@@ -205,7 +201,7 @@ def shaken(name, scene=None, metre=1.0, integrator="energy-momentum", bounce=Fal
 @pytest.mark.parametrize("name", OBSTACLES)
 @pytest.mark.fast("plane-True", "bowl-True", "cylinder-False")
 def test_ledger(name, bounce):
-    _, _, rows = shaken(name, bounce=bounce, newton=FLOOR)
+    _, _, rows = shaken(name, bounce=bounce, newton=TO_ROUNDING)
     top = np.abs(rows["energy"]).max()
     assert rows["slip"].sum() >= 5 and (bounce or rows["stick"].any())
     assert np.abs(rows["external_work"]).max() > 0.1 * top
@@ -243,7 +239,7 @@ def test_units(name, integrator):
 
 # ---- bodies
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast("energy-momentum")
 @pytest.mark.fast_on_ranks()
 def test_a_block_slides_on_a_plane_as_on_a_plate(integrator):
@@ -265,7 +261,7 @@ def test_a_block_slides_on_a_plane_as_on_a_plate(integrator):
             master = bodies[1].surface(lambda x: x[2] > -1e-9)
         pair = nts.ContactPair(face, master, friction=0.3)
         system = nts.System(bodies, contacts=[pair], gravity=DOWN)
-        stepper = nts.Stepper(system, INTEGRATORS[integrator])
+        stepper = nts.Stepper(system, CONTACT_RULES[integrator])
         for _ in range(30):
             state = stepper.advance(2e-3)
         tables.append(stepper.solution.balance)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
-from test_equilibrium import YOUNG, at, cube, stress
+from scenes import YOUNG, at, quarter_cube, rubber_stress
 
 import dolfinx_nts as nts
 
@@ -16,13 +16,13 @@ def test_a_plane_presses_like_a_prescribed_face():
     """Laterally held: P = mu (s - 1/s) + lambda ln s / s, and the work of the mean force."""
     held = nts.Dirichlet(lambda x: np.full(x.shape[1], True), components=(0, 1))
     support = nts.Dirichlet(at(2, 0.0), components=(2,))
-    body = cube([held, support])
+    body = quarter_cube([held, support])
     press = nts.Plane((0, 0, 1), (0, 0, -1), motion=lambda t: (0, 0, -0.3 * t))
     pair = nts.ContactPair(body.surface(lambda x: x[2] > 1 - 1e-9), press)
     run = nts.equilibrium(nts.System([body], contacts=[pair]), load_steps=4)
     assert run.status == "completed"
     stretch = 1 - 0.3 * run.balance["time"]
-    force = stress(stretch, np.log(stretch))
+    force = rubber_stress(stretch, np.log(stretch))
     assert np.abs(run.contact_forces[:, 0, 2] - force).max() < 1e-11 * YOUNG
     assert np.abs(run.reactions["cube"][:, -1, 2] + force).max() < 1e-11 * YOUNG
     mean = 0.5 * (force[1:] + force[:-1]) * np.diff(stretch)

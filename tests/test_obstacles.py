@@ -5,54 +5,28 @@ import re
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import CONTACT_RULES
+from measures import STENCIL, differences
 from mpi4py import MPI
-from point_mass import INTEGRATORS, MASS, SPEED, STEP, PointMass, PointSurface, turn, wall
+from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, wall
+from scenes_obstacles import (
+    ACCELERATION,
+    CENTRE,
+    OBSTACLES,
+    TO_ROUNDING,
+    TURN,
+    Pair,
+    advance,
+    block,
+    changed,
+    point_on,
+)
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import Fields
 from dolfinx_nts.output.pictures import picture
 
 COMM = MPI.COMM_WORLD
-ACCELERATION = 9.81
-#: Newton down to rounding: its tolerance would add up to 1e-12 of the force's work in each step.
-FLOOR = nts.Newton(rtol=1e-15)
-TURN = turn(1.1)
-CENTRE = np.array([0.4, -0.3, 0.2])
-OBSTACLES = {
-    "plane": nts.Plane(CENTRE, TURN[:, 2]),
-    "sphere": nts.Sphere(CENTRE, 1.3),
-    "bowl": nts.Sphere(CENTRE, 1.3, inside=True),
-    "cylinder": nts.Cylinder(CENTRE, TURN[:, 2], 0.9),
-    "bore": nts.Cylinder(CENTRE, TURN[:, 2], 0.9, inside=True),
-}
-#: Exact for polynomials up to degree 4.
-STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
-
-
-def changed(master, **changes):
-    """The same obstacle with other arguments."""
-    fields = {f: getattr(master, f) for f in master.__dataclass_fields__ if f != "_"}
-    return type(master)(**fields | changes)
-
-
-def point_on(master, position, velocity, gravity=(0.0, 0.0, 0.0), mass=MASS):
-    body = PointMass(COMM, mass, position, velocity)
-    pair = nts.ContactPair(PointSurface(body, position), master)
-    return nts.System([body], contacts=[pair], gravity=gravity)
-
-
-def advance(system, integrator, steps, dt=STEP, newton=None):
-    """Positions and velocities (steps + 1, 3) of the first body, a mass, and the balance."""
-    stepper = nts.Stepper(system, INTEGRATORS[integrator], newton=newton)
-    rows = []
-    for k in range(steps + 1):
-        if k:
-            stepper.advance(dt)
-        x = system.bodies[0].reference + stepper.state.u[0]
-        rows.append(COMM.bcast(np.concatenate([x, stepper.state.v[0]])))
-    stepper.close()
-    rows = np.array(rows)
-    return rows[:, :3], rows[:, 3:], stepper.solution.balance
 
 
 # ---- kernels
@@ -72,15 +46,6 @@ def distance(name, x):
 def cloud(seed, n=40):
     rng = np.random.default_rng(seed)
     return CENTRE + rng.uniform(-2, 2, (n, 3))
-
-
-def differences(f, x, step=1e-3):
-    """df/dx of a function of points (n, 3), the last axis being x's."""
-    parts = []
-    for i in range(3):
-        e = step * np.eye(3)[i]
-        parts.append(sum(w / step * f(x + k * e) for k, w in STENCIL))
-    return np.stack(parts, axis=-1)
 
 
 @pytest.mark.parametrize("name", OBSTACLES)
@@ -121,39 +86,8 @@ def test_the_centre_is_far_from_the_surface_and_harmless(name):
 
 
 # ---- the equations of a step
-class Pair:
-    """Step equations of a mass near an obstacle, at chosen unknowns (x, lambda)."""
-
-    def __init__(self, name, integrator, motion=None, friction=0.0):
-        master, start = changed(OBSTACLES[name], motion=motion), self.start(name)
-        # Rank 0 owns the mass; a serial copy on every rank is all these tests need.
-        body = PointMass(MPI.COMM_SELF, MASS, start, (0.0, 0.0, 0.0))
-        pair = nts.ContactPair(PointSurface(body, start), master, friction=friction)
-        stepper = nts.Stepper(nts.System([body], contacts=[pair]), INTEGRATORS[integrator])
-        stepper.problem.begin(stepper.state, STEP)
-        problem = stepper.problem
-        (self.step,) = (c for c in (*problem.elements, *problem.contacts.idle) if c.num_elements)
-        stepper.close()
-        self.x = start + np.array([0.11, -0.07, 0.05])
-
-    @staticmethod
-    def start(name):
-        """A point 0.05 off the surface."""
-        direction = {"plane": TURN[:, 2]}.get(name, TURN @ [0.8, -0.6, 0.0])
-        radius = {"plane": 0.05, "sphere": 1.35, "bowl": 1.25, "cylinder": 0.95, "bore": 0.85}
-        return CENTRE + radius[name] * direction
-
-    def residual(self, unknowns):
-        return self.at(unknowns).residual
-
-    def at(self, unknowns):
-        x, multiplier = unknowns[None, None, :3], unknowns[None, 3:]
-        own = {"augmented": np.empty((1, 0)), "constraints": multiplier}
-        return self.step.evaluate(x - self.step.pair.origin, own)
-
-
 @pytest.mark.parametrize("active", [True, False])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_tangent_is_the_derivative_of_the_residual(name, integrator, active):
     pair = Pair(name, integrator, motion=lambda t: (0.3 * t, -t, 2.0 * t))
@@ -169,7 +103,7 @@ def test_tangent_is_the_derivative_of_the_residual(name, integrator, active):
     np.testing.assert_allclose(part.tangent[0].T, expected, rtol=0, atol=1e-9 * MASS)
 
 
-@pytest.mark.parametrize("integrator", ["energy-momentum", "gonzalez"])
+@pytest.mark.parametrize("integrator", ["energy-momentum", "gonzalez contact"])
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_work_of_the_force_is_the_change_of_the_gap(name, integrator):
     """Relative to a moving obstacle: f . (dx - dc) = -lambda (g_1 - g_0)."""
@@ -186,8 +120,8 @@ def test_work_of_the_force_is_the_change_of_the_gap(name, integrator):
 # ---- one mass
 @pytest.mark.mpi
 @pytest.mark.parametrize("theta", [0.0, 0.1, 0.49, 0.5, 0.51, 1.0])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.fast_on_ranks("midpoint-0.1", "energy-momentum-0.49", "gonzalez-1.0")
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
+@pytest.mark.fast_on_ranks("midpoint-0.1", "energy-momentum-0.49", "gonzalez contact-1.0")
 def test_rebound_from_a_plane(integrator, theta):
     """B6: the step that closes the gap leaves 2 theta - 1 of the speed."""
     start = TURN @ [0.3, 0.2, theta * STEP * SPEED]
@@ -202,7 +136,7 @@ def test_rebound_from_a_plane(integrator, theta):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast_on_ranks("energy-momentum")
 def test_a_plane_is_a_fixed_facet(integrator):
     """Bouncing obliquely under gravity: the same path as on the face of a fixed hexahedron."""
@@ -236,7 +170,7 @@ def test_sliding_in_a_bowl_keeps_the_energy(bowl, rule):
     start, velocity = np.array([0.0, 0.0, -1.0]), np.array([0.5, 8.0, 0.0])
     system = point_on(BOWLS[bowl], start, velocity, (0.0, 0.0, -ACCELERATION))
     integrator = {"mean-value": "energy-momentum"}.get(rule, rule)
-    x, v, rows = advance(system, integrator, 400, newton=FLOOR)
+    x, v, rows = advance(system, integrator, 400, newton=TO_ROUNDING)
     kinetic = 0.5 * MASS * velocity @ velocity
     energy = 0.5 * MASS * (v**2).sum(axis=1) + MASS * ACCELERATION * (x[:, 2] + 1)
     assert rows["active"][1:].all()
@@ -249,7 +183,7 @@ def test_sliding_in_a_bowl_keeps_the_energy(bowl, rule):
     assert x[:, 2].max() > 0.99
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast("energy-momentum")
 def test_without_gravity_a_mass_in_a_sphere_follows_a_great_circle(integrator):
     """A radial force has no moment: the plane of motion and the angular momentum stay."""
@@ -337,7 +271,7 @@ def test_far_away_obstacles(far):
 
 # ---- obstacles that move
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", ["energy-momentum", "gonzalez"])
+@pytest.mark.parametrize("integrator", ["energy-momentum", "gonzalez contact"])
 def test_a_rising_floor_lifts_a_mass(integrator):
     """The floor's work is the energy the mass gains, with gravity's."""
     rise, start = 0.5, (0.3, -0.2, 0.0)
@@ -366,7 +300,7 @@ def test_ledger_closes_with_a_shaking_obstacle(name):
     if name in ("bowl", "bore"):
         pull = -pull
     system = point_on(shaken, Pair.start(name), (0.2, -0.3, 0.1), pull)
-    _, v, rows = advance(system, "energy-momentum", 150, newton=FLOOR)
+    _, v, rows = advance(system, "energy-momentum", 150, newton=TO_ROUNDING)
     top = rows["energy"].max()
     assert rows["active"].sum() > 5
     assert np.abs(np.diff(rows["external_work"])).max() > 0.01 * top
@@ -384,19 +318,8 @@ def test_a_floor_that_flees_does_not_pull():
 
 
 # ---- bodies
-def block(low=(0.1, 0.1, 0.005), size=0.8, n=2, velocity=(0.3, 0.0, -1.0), name="block"):
-    low = np.array(low)
-    mesh = create_box(
-        COMM, [low, low + size], [n, n, n], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
-    )
-    body = nts.Continuum(
-        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e4, velocity=velocity, name=name
-    )
-    return body, body.surface(lambda x: x[2] < low[2] + 1e-9)
-
-
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast("midpoint")
 @pytest.mark.fast_on_ranks()
 def test_a_block_falls_on_a_plane_as_on_a_plate(integrator):
@@ -417,7 +340,7 @@ def test_a_block_falls_on_a_plane_as_on_a_plate(integrator):
         else:
             pair = nts.ContactPair(face, nts.Plane((0, 0, 0), (0, 0, 1)))
             system = nts.System([body], contacts=[pair], gravity=gravity)
-        stepper = nts.Stepper(system, INTEGRATORS[integrator])
+        stepper = nts.Stepper(system, CONTACT_RULES[integrator])
         for _ in range(40):
             state = stepper.advance(2e-3)
         tables.append(stepper.solution.balance)

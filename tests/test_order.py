@@ -2,32 +2,20 @@
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import GRADIENTS, INTEGRATORS
 from mpi4py import MPI
+from scenes import flying_block, sliding_block
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-INTEGRATORS = {
-    "midpoint": nts.Midpoint(),
-    "energy-momentum": nts.EnergyMomentum(),
-    "mean-value stress": nts.EnergyMomentum(stress="mean-value"),
-    "gonzalez contact": nts.EnergyMomentum(contact_gradient="gonzalez"),
-    "newmark": nts.Newmark(),
-    "generalised alpha": nts.GeneralizedAlpha(rho_inf=0.8),
-}
-FREE = [name for name in INTEGRATORS if name != "gonzalez contact"]
-
-
-def box(low, high, n=(1, 1, 1)):
-    return create_box(
-        COMM, [low, high], list(n), CellType.hexahedron, ghost_mode=GhostMode.shared_facet
-    )
+RULES = INTEGRATORS | GRADIENTS
+FREE = [name for name in RULES if name != "gonzalez contact"]
 
 
 def run(make_system, integrator, t_end, steps):
     """Final displacements and velocities of all bodies, and the Stepper."""
-    stepper = nts.Stepper(make_system(), INTEGRATORS[integrator])
+    stepper = nts.Stepper(make_system(), RULES[integrator])
     for k in range(1, steps + 1):
         stepper.advance(k * t_end / steps - stepper.state.time)
     stepper.close()
@@ -46,25 +34,6 @@ def rates(results):
     return np.log2(errors[:-1] / errors[1:]), errors
 
 
-def flying_block():
-    """A soft block that spins and is stretched while it flies."""
-
-    def velocity(x):
-        centre = np.array([[1.0], [0.5], [0.5]])
-        r = x - centre
-        spin = np.cross(np.array([1.0, 2.0, 3.0]), r.T).T
-        return spin + np.array([[1.5], [-0.8], [0.4]]) * r + np.array([[0.5], [0.2], [-0.1]])
-
-    body = nts.Continuum(
-        box([0, 0, 0], [2, 1, 1], (2, 1, 1)),
-        nts.NeoHookean(1e6, 0.3),
-        density=5e4,
-        velocity=velocity,
-        name="block",
-    )
-    return nts.System([body])
-
-
 @pytest.mark.parametrize("integrator", FREE)
 @pytest.mark.slow
 def test_free_flight(integrator):
@@ -74,38 +43,8 @@ def test_free_flight(integrator):
         assert np.abs(order - 2.0).max() < 0.1, (order, errors)
 
 
-def sliding_block(friction=0.0):
-    """A block pressed harder and harder onto a soft one that it slides over, within one facet.
-
-    The load starts from zero as t^2 does, so the four slave nodes carry from the first step on
-    and no node is ever activated or released.
-    """
-    rubber = nts.NeoHookean(20.0, 0.3)
-    upper = nts.Continuum(
-        box([0.2, 0.25, 1.0], [0.7, 0.75, 1.5]),
-        rubber,
-        density=1.0,
-        velocity=(0.3, -0.2, 0.0),
-        body_force=lambda t: (0.0, 0.0, -20.0 * t**2 * (3.0 - 2.0 * t)),
-        name="upper",
-    )
-    lower = nts.Continuum(
-        box([0, 0, 0], [1, 1, 1]),
-        rubber,
-        density=1.0,
-        bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9)],
-        name="lower",
-    )
-    pair = nts.ContactPair(
-        slave=upper.surface(lambda x: x[2] < 1 + 1e-9),
-        master=lower.surface(lambda x: x[2] > 1 - 1e-9),
-        friction=friction,
-    )
-    return nts.System([upper, lower], contacts=[pair])
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", RULES)
 def test_persistent_contact(integrator):
     results = []
     for n in (40, 80, 160):
@@ -118,7 +57,7 @@ def test_persistent_contact(integrator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum", "generalised alpha"])
+@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum", "generalized-alpha"])
 def test_sliding_with_friction(integrator):
     results = []
     for n in (40, 80, 160):

@@ -1,13 +1,14 @@
 """Files, plots and pictures: what is written is what was computed, on any number of ranks."""
 
 import re
-import xml.etree.ElementTree as ElementTree
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType
 from mpi4py import MPI
+from scenes import CELLS, RUBBER, box, meeting_blocks, thrown_block
+from xdmf import read_xdmf
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import pictures, plots
@@ -18,70 +19,17 @@ h5py = pytest.importorskip("h5py")
 image = pytest.importorskip("matplotlib.image")
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 mpi = pytest.mark.mpi
-CELLS = {"hexahedron": CellType.hexahedron, "tetrahedron": CellType.tetrahedron}
-
-
-def box(low, high, n, cell=CellType.hexahedron):
-    return create_box(
-        COMM, [np.array(low), np.array(high)], n, cell, ghost_mode=GhostMode.shared_facet
-    )
-
-
-def scene(cell=CellType.hexahedron):
-    """Two blocks, the left one about to hit the right one; contact from the second step of 1 ms."""
-    left = nts.Continuum(
-        box([0.0, 0, 0], [1.0, 1, 1], [2, 2, 2], cell),
-        RUBBER,
-        density=1e3,
-        velocity=lambda x: np.stack([2.0 + 0 * x[0], 0.1 * x[2], -0.1 * x[1]]),
-        name="left",
-    )
-    right = nts.Continuum(
-        box([1.001, -0.1, -0.1], [2.0, 1.1, 1.1], [2, 1, 1], cell),
-        RUBBER,
-        density=1e3,
-        name="the right one",
-    )
-    pair = nts.ContactPair(
-        slave=left.surface(lambda x: x[0] > 1 - 1e-9),
-        master=right.surface(lambda x: x[0] < 1.001 + 1e-9),
-    )
-    return nts.System([left, right], contacts=[pair])
 
 
 def stepper(**options):
-    return nts.Stepper(scene(**options), nts.EnergyMomentum())
+    return nts.Stepper(meeting_blocks(**options), nts.EnergyMomentum())
 
 
 def steps(run, writer, n, dt=1e-3):
     for _ in range(n):
         run.advance(dt)
         writer.write(run)
-
-
-def read(path):
-    """Times, points, cells and one dict of fields per time; follows the XDMF file's references."""
-    root = ElementTree.parse(path).getroot()
-    grids = root.findall("./Domain/Grid/Grid")
-    assert root.find("./Domain/Grid").get("CollectionType") == "Temporal"
-
-    def data(element):
-        item = element.find("DataItem")
-        name, dataset = item.text.split(":")
-        with h5py.File(path.parent / name, "r") as file:
-            values = file[dataset][()]
-        assert tuple(map(int, item.get("Dimensions").split())) == values.shape
-        return values
-
-    return SimpleNamespace(
-        times=[float(g.find("Time").get("Value")) for g in grids],
-        points=data(grids[0].find("Geometry")),
-        cells=data(grids[0].find("Topology")),
-        kind=grids[0].find("Topology").get("TopologyType"),
-        fields=[{a.get("Name"): data(a) for a in g.findall("Attribute")} for g in grids],
-    )
 
 
 def rows_at(points, x):
@@ -108,7 +56,7 @@ def test_fields_are_the_functions(cell, mpi_tmp_path):
     writer.start(run)
     steps(run, writer, 4)
     for body, name in zip(run.system.bodies, ("left", "the_right_one"), strict=True):
-        file = read(mpi_tmp_path / "new" / "folder" / f"{name}.xdmf")
+        file = read_xdmf(mpi_tmp_path / "new" / "folder" / f"{name}.xdmf")
         assert np.allclose(file.times, 1e-3 * np.arange(5), rtol=0, atol=1e-15)
         blocks, x = vertex_blocks(body)
         row = rows_at(file.points, x)
@@ -128,7 +76,7 @@ def test_contact_fields(mpi_tmp_path):
     run, writer = stepper(), output.Fields(mpi_tmp_path)
     writer.start(run)
     steps(run, writer, 4)
-    file = read(mpi_tmp_path / "left.xdmf")
+    file = read_xdmf(mpi_tmp_path / "left.xdmf")
     names = ("force", "pressure", "gap", "status", "force_mean", "pressure_mean")
     first, last = (
         {n: fields[f"contact_{n}_left-the_right_one"] for n in names}
@@ -152,7 +100,7 @@ def test_contact_fields(mpi_tmp_path):
     assert np.isnan(last["gap"][~surface]).all() and (last["status"][~surface] == -1).all()
     assert np.isnan(first["gap"]).all() and (first["status"][surface] == 0).all()
     load = "contact_load_left-the_right_one"
-    master = read(mpi_tmp_path / "the_right_one.xdmf").fields[-1]
+    master = read_xdmf(mpi_tmp_path / "the_right_one.xdmf").fields[-1]
     assert set(master) == {"displacement", "velocity", load}
     total = file.fields[-1][load].sum(axis=0)
     assert np.abs(total - run.solution.contact_forces[-1, 0]).max() < 1e-12 * np.abs(total).max()
@@ -192,7 +140,7 @@ def test_mean_force_of_two_steps():
 def test_cells_of_the_file_fill_the_body(cell, mpi_tmp_path):
     run, writer = stepper(cell=cell), output.Fields(mpi_tmp_path)
     writer.start(run)
-    file = read(mpi_tmp_path / "left.xdmf")
+    file = read_xdmf(mpi_tmp_path / "left.xdmf")
     corners = file.points[file.cells]
     if cell == CellType.hexahedron:
         assert file.kind == "Hexahedron"
@@ -217,7 +165,7 @@ def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
     )
     run = nts.Stepper(nts.System([body]), nts.Midpoint())
     output.Fields(mpi_tmp_path).start(run)
-    file = read(mpi_tmp_path / "body.xdmf")
+    file = read_xdmf(mpi_tmp_path / "body.xdmf")
     assert len(file.points) == np.prod(np.array(cells) + 1)
     assert np.allclose(file.fields[0]["velocity"], file.points[:, [1, 2, 0]], atol=1e-14)
     pictures.picture([body], mpi_tmp_path / "speed.png", width=2.0)
@@ -240,15 +188,15 @@ def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
 )
 def test_cadence(cadence, written, mpi_tmp_path):
     writer = output.Fields(mpi_tmp_path, **cadence)
-    nts.simulate(flying(), nts.Midpoint(), dt=1e-3, t_end=7e-3, output=[writer])
-    times = read(mpi_tmp_path / "body.xdmf").times
+    nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=7e-3, output=[writer])
+    times = read_xdmf(mpi_tmp_path / "body.xdmf").times
     assert np.allclose(times, 1e-3 * np.array(written), rtol=1e-12)
 
 
 def test_cadence_of_a_loop_that_writes_now_and_then(tmp_path):
     """Multiples that were passed since the last call count, also before t = 0."""
-    settled = nts.equilibrium(flying(held=True))
-    stepper = nts.Stepper(flying(), nts.Midpoint(), start=settled, start_time=-5e-3)
+    settled = nts.equilibrium(thrown_block(held=True))
+    stepper = nts.Stepper(thrown_block(), nts.Midpoint(), start=settled, start_time=-5e-3)
     writers = [
         output.Fields(tmp_path / "time", interval=2e-3), output.Fields(tmp_path / "count", every=4)
     ]  # fmt: skip
@@ -262,15 +210,8 @@ def test_cadence_of_a_loop_that_writes_now_and_then(tmp_path):
             writer.write(stepper)
     stepper.close()
     for folder, wanted in (("time", [-5, -2, 1, 4, 7]), ("count", [-5, 1, 4, 7])):
-        times = read(tmp_path / folder / "body.xdmf").times
+        times = read_xdmf(tmp_path / folder / "body.xdmf").times
         assert np.allclose(times, 1e-3 * np.array(wanted), rtol=0, atol=1e-12)
-
-
-def flying(held=False):
-    mesh = box([0.0, 0, 0], [1.0, 1, 1], [2, 1, 1])
-    bcs = [nts.Dirichlet(lambda x: x[0] < 1e-9)] if held else []
-    velocity = (1.0, 2.0, 3.0)
-    return nts.System([nts.Continuum(mesh, RUBBER, density=1e3, bcs=bcs, velocity=velocity)])
 
 
 class Dies:
@@ -291,20 +232,20 @@ class Dies:
 def test_a_run_that_dies_keeps_what_was_written(mpi_tmp_path):
     writers = [output.Fields(mpi_tmp_path), output.BalanceCSV(mpi_tmp_path / "b.csv"), Dies()]
     with pytest.raises(KeyboardInterrupt, match="power cut"):
-        nts.simulate(flying(), nts.Midpoint(), dt=1e-3, t_end=7e-3, output=writers)
-    file = read(mpi_tmp_path / "body.xdmf")
+        nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=7e-3, output=writers)
+    file = read_xdmf(mpi_tmp_path / "body.xdmf")
     assert len(file.times) == len(file.fields) == 4
     assert len((mpi_tmp_path / "b.csv").read_text().splitlines()) == 5
 
 
 @mpi
 def test_files_are_complete_after_every_step(mpi_tmp_path):
-    run = nts.Stepper(flying(), nts.Midpoint())
+    run = nts.Stepper(thrown_block(), nts.Midpoint())
     fields, table = output.Fields(mpi_tmp_path), output.BalanceCSV(mpi_tmp_path / "b.csv")
     fields.start(run)
     table.start(run)
     for k in range(3):
-        assert len(read(mpi_tmp_path / "body.xdmf").fields) == k + 1
+        assert len(read_xdmf(mpi_tmp_path / "body.xdmf").fields) == k + 1
         assert (mpi_tmp_path / "b.csv").read_text().count("\n") == k + 2
         COMM.Barrier()
         steps(run, fields, 1)
@@ -315,13 +256,14 @@ def test_files_are_complete_after_every_step(mpi_tmp_path):
 
 @mpi
 def test_a_failed_run_leaves_its_last_accepted_state(mpi_tmp_path):
-    run, writer = nts.Stepper(flying(), nts.Midpoint()), output.Fields(mpi_tmp_path, every=100)
+    run = nts.Stepper(thrown_block(), nts.Midpoint())
+    writer = output.Fields(mpi_tmp_path, every=100)
     writer.start(run)
     steps(run, writer, 3)
     run.solution.status = "no convergence"
     writer.close(run)
     writer.close(run)
-    assert np.allclose(read(mpi_tmp_path / "body.xdmf").times, [0, 3e-3])
+    assert np.allclose(read_xdmf(mpi_tmp_path / "body.xdmf").times, [0, 3e-3])
     run.close()
 
 
@@ -329,8 +271,8 @@ def test_a_failed_run_leaves_its_last_accepted_state(mpi_tmp_path):
 def test_a_second_run_replaces_the_files(mpi_tmp_path):
     writer = output.Fields(mpi_tmp_path)
     for end in (3e-3, 2e-3):
-        nts.simulate(flying(), nts.Midpoint(), dt=1e-3, t_end=end, output=[writer])
-    assert len(read(mpi_tmp_path / "body.xdmf").times) == 3
+        nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=end, output=[writer])
+    assert len(read_xdmf(mpi_tmp_path / "body.xdmf").times) == 3
 
 
 # ---- balance table
@@ -338,7 +280,8 @@ def test_a_second_run_replaces_the_files(mpi_tmp_path):
 def test_csv_is_the_balance(mpi_tmp_path):
     path = mpi_tmp_path / "new" / "balance.csv"
     run = nts.simulate(
-        scene(), nts.EnergyMomentum(), dt=1e-3, t_end=4e-3, output=[output.BalanceCSV(path)]
+        meeting_blocks(), nts.EnergyMomentum(), dt=1e-3, t_end=4e-3,
+        output=[output.BalanceCSV(path)],
     )
     header, *lines = path.read_text().splitlines()
     names = [re.fullmatch(r"(\w+) \[(.+)\]", cell).groups() for cell in header.split(",")]
@@ -357,7 +300,8 @@ def test_csv_is_the_balance(mpi_tmp_path):
 
 @mpi
 def test_csv_has_the_steps_between_two_calls(mpi_tmp_path):
-    run, writer = nts.Stepper(flying(), nts.Midpoint()), output.BalanceCSV(mpi_tmp_path / "b.csv")
+    run = nts.Stepper(thrown_block(), nts.Midpoint())
+    writer = output.BalanceCSV(mpi_tmp_path / "b.csv")
     writer.start(run)
     for _ in range(3):
         run.advance(1e-3)
@@ -372,7 +316,7 @@ def test_csv_has_the_steps_between_two_calls(mpi_tmp_path):
 # ---- plots
 def run_both():
     return {
-        name: nts.simulate(scene(), rule, dt=1e-3, t_end=4e-3)
+        name: nts.simulate(meeting_blocks(), rule, dt=1e-3, t_end=4e-3)
         for name, rule in (("energy-momentum", nts.EnergyMomentum()), ("midpoint", nts.Midpoint()))
     }
 
@@ -417,7 +361,7 @@ def coloured(pixels):
 @pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 @pytest.mark.fast("hexahedron-speed", "tetrahedron-stress")
 def test_picture(colour, cell, mpi_tmp_path):
-    system = scene(cell=cell)
+    system = meeting_blocks(cell=cell)
     for body in system.bodies:
         body.u.interpolate(lambda x: 0.1 * np.stack([x[1], x[2] ** 2, x[0]]))
     path = mpi_tmp_path / "new" / "picture.png"
@@ -482,14 +426,14 @@ def test_a_place_that_cannot_be_written_stops_before_any_step(mpi_tmp_path):
         (output.Fields(blocked), "folder"),
         (output.BalanceCSV(blocked / "b.csv"), "path"),
     ):
-        system = flying()
+        system = thrown_block()
         with pytest.raises(OSError, match=f"{name}='.*file.*cannot be written.*pass a place"):
             nts.simulate(system, nts.Midpoint(), dt=1e-3, t_end=1e-3, output=[writer])
         assert not system.bodies[0].u.x.array.any()
     with pytest.raises(OSError, match="path='.*file.*cannot be written"):
-        pictures.picture(flying().bodies, blocked / "p.png")
+        pictures.picture(thrown_block().bodies, blocked / "p.png")
     with pytest.raises(RuntimeError, match="path='.*p.xyz'.*not supported"):
-        pictures.picture(flying().bodies, mpi_tmp_path / "p.xyz", width=1.0)
+        pictures.picture(thrown_block().bodies, mpi_tmp_path / "p.xyz", width=1.0)
 
 
 def test_fields_of_bodies_without_a_mesh(tmp_path):
@@ -508,7 +452,7 @@ def test_a_body_name_is_no_path(name, file, mpi_tmp_path):
     folder = mpi_tmp_path / "inner"
     run = nts.simulate(system, nts.Midpoint(), dt=1e-3, t_end=1e-3, output=[output.Fields(folder)])
     assert run.status == "completed"
-    assert len(read(folder / f"{file}.xdmf").times) == 2
+    assert len(read_xdmf(folder / f"{file}.xdmf").times) == 2
     assert {p.name for p in folder.iterdir()} == {f"{file}.xdmf", f"{file}.h5"}
     assert [p.name for p in mpi_tmp_path.iterdir()] == ["inner"]
 
@@ -535,7 +479,7 @@ def test_body_names_that_give_one_file(mpi_tmp_path):
 )
 def test_bad_picture_options(options, message, mpi_tmp_path):
     with pytest.raises(ValueError, match=message):
-        pictures.picture(flying().bodies, mpi_tmp_path / "p.png", **options)
+        pictures.picture(thrown_block().bodies, mpi_tmp_path / "p.png", **options)
 
 
 def test_pictures_of_what_has_no_mesh(tmp_path):

@@ -7,7 +7,9 @@ import logging
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
+from rotations import random_rotation
 from scipy import ndimage
 
 import dolfinx_nts as nts
@@ -17,18 +19,11 @@ from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.kernels import facets
 
 COMM = MPI.COMM_WORLD
-INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
 #: Cyclic facets of a cube of 8 corners as in `CORNERS`, seen from outside.
 CUBE = np.array(
     [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 )
-
-
-def rotation(rng):
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q *= np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
 
 
 def well_joined(filled):
@@ -48,7 +43,7 @@ class Heap:
             self.filled = rng.random((n, n, n)) < 0.6
             if self.filled.any() and well_joined(self.filled):
                 break
-        self.n, self.h, self.turn, self.centre = n, h, rotation(rng), centre
+        self.n, self.h, self.turn, self.centre = n, h, random_rotation(rng), centre
         quads = (np.argwhere(self.filled)[:, None] + CORNERS)[:, CUBE].reshape(-1, 4, 3)
         number = quads @ [(n + 1) ** 2, n + 1, 1]
         _, inverse, count = np.unique(
@@ -232,7 +227,7 @@ def test_a_body_wholly_inside_is_found():
 @pytest.mark.parametrize("distance", [-0.5, -1e-3, 0.0, 1e-3])
 def test_touching_faces_are_no_overlap(metre, distance):
     """Nodes of both halfway between each other's, up to rounding or a little inside."""
-    turn, shift = rotation(np.random.default_rng(3)), np.array([5.0, -3.0, 2.0])
+    turn, shift = random_rotation(np.random.default_rng(3)), np.array([5.0, -3.0, 2.0])
 
     def placed(*arguments):
         body = box(*arguments)
@@ -303,13 +298,13 @@ def test_edges_that_cross_are_told_with_place_and_depth():
     assert all(text in found.text for text in ("'upper'", "'lower'", "finer mesh of the slave"))
 
 
-def fly(t_end=0.06, scene=None, integrator=INTEGRATORS["energy-momentum"], **options):
+def fly(t_end=0.06, scene=None, integrator=MID_STEP["energy-momentum"], **options):
     """Free flight until then: no node has touched anything, and the edges cross by 0.11 m."""
     return nts.simulate(scene or edge_on_edge(), integrator, dt=5e-3, t_end=t_end, **options)
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 def test_a_run_in_which_edges_cross_says_so(integrator, caplog):
     caplog.set_level(logging.CRITICAL)
     run = fly(integrator=integrator)
@@ -587,7 +582,7 @@ def test_facets_in_obstacles_are_as_deep_as_their_distance_tells(nc, metre):
     rng, found_any = np.random.default_rng(nc), 0
     shape = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float)[:nc]
     for _ in range(4):
-        turned = np.array([shape @ rotation(rng).T for _ in range(30)])
+        turned = np.array([shape @ random_rotation(rng).T for _ in range(30)])
         c = turned + 0.2 * rng.normal(size=(30, nc, 3)) + 2 * rng.normal(size=(30, 1, 3))
         for obstacle, lowest in obstacles(rng):
             limit, true = np.full(len(c), 0.05), -lowest(c)
@@ -668,7 +663,7 @@ def test_an_obstacle_between_the_nodes_is_told_with_place_and_depth(master, up, 
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.parametrize("moving", ["plate", "ball"])
 def test_a_run_in_which_a_ball_comes_through_a_facet_says_so(moving, integrator, caplog):
     """A ball of radius 0.4 between four nodes of a facet of 1: nothing holds them apart."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import ACCELERATED
 from mpi4py import MPI
 
 import dolfinx_nts as nts
@@ -320,9 +321,9 @@ def test_a_start_that_violates_a_joint_of_ones_own_is_refused():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(
-    "rule", [nts.Newmark(), nts.GeneralizedAlpha()], ids=lambda rule: type(rule).__name__
+    "rule", ACCELERATED.values(), ids=ACCELERATED
 )
-@pytest.mark.fast("GeneralizedAlpha")
+@pytest.mark.fast("generalized-alpha")
 def test_first_accelerations_keep_a_joint_of_ones_own(rule):
     """A point that is drawn at 0.1 m/s and 3 m/s^2 out of a cube that flies at 0.1 m/s."""
     x = np.array([0.3, 0.4, 0.6])

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from facet_kinds import LINE
 
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels import patches
 
-LINE = np.linspace(-1.0, 1.0, 9)
 #: Ends of edge k, from corner k to k + 1.
 CORNER = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
 

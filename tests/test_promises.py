@@ -7,6 +7,8 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
+from measures import PROMISED
 from mpi4py import MPI
 from point_mass import PointMass
 
@@ -15,22 +17,6 @@ from dolfinx_nts.output import BalanceCSV
 from dolfinx_nts.step.promises import Promises
 
 COMM = MPI.COMM_WORLD
-#: What the ledger may miss of the largest energy without a word, by accuracy, where a rule closes
-#: it, and where none does (README).
-PROMISED, OPEN = {"exact": 1e-11, "balanced": 1e-8, "fast": 1e-5}, 1e-2
-
-
-def ledger_or_word(run, promised=1e-8):
-    """What the ledger misses of the largest energy; more than `promised` is told.
-
-    Args:
-        run: A run, complete or not.
-        promised: Of the integrator and accuracy; OPEN of one that does not close the ledger.
-    """
-    table, names = run.balance, ("kinetic", "potential", "external_work", "friction_dissipation")
-    missing = np.abs(table["ledger_residual"]) / max(np.abs(table[name]).max() for name in names)
-    assert missing.max() <= promised or "ledger" in run.warnings
-    return missing.max()
 
 
 def limited(c):
@@ -146,9 +132,9 @@ def test_a_broken_promise_is_told(part, accuracy, mpi_tmp_path):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint()])
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
-@pytest.mark.fast_on_ranks("exact-integrator0")
+@pytest.mark.fast_on_ranks("exact-energy-momentum")
 def test_a_closed_ledger_says_nothing(integrator, accuracy):
     run = nts.simulate(
         nts.System([Sprung(1.0)]), integrator, dt=0.05, t_end=1.5, accuracy=accuracy

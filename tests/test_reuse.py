@@ -3,20 +3,21 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
+from measures import difference
 from mpi4py import MPI
-from test_friction import difference, rubbing_blocks
+from scenes import rubbing_blocks
 
 import dolfinx_nts as nts
 from dolfinx_nts.step.accuracy import ACCURACY
 
 COMM = MPI.COMM_WORLD
-INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
 
 
 def run(integrator, dt=2e-3, steps=30, system=None, **newton):
     """Balance table of a collision, and how often the bodies' matrices were assembled."""
     stepper = nts.Stepper(
-        system or rubbing_blocks(0.3), INTEGRATORS[integrator], newton=nts.Newton(**newton)
+        system or rubbing_blocks(0.3), MID_STEP[integrator], newton=nts.Newton(**newton)
     )
     assembled, problem = [], stepper.problem
     body_tangents = problem.body_tangents
@@ -29,7 +30,7 @@ def run(integrator, dt=2e-3, steps=30, system=None, **newton):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("solver", ["direct", "krylov"])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum-krylov")
 def test_reuse_changes_no_solution(integrator, solver):
     table, every = run(integrator, linear_solver=solver, condense=True)

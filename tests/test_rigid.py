@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import INTEGRATORS
 from mpi4py import MPI
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -12,12 +13,6 @@ from dolfinx_nts.output import Fields
 from dolfinx_nts.output.pictures import picture
 
 COMM = MPI.COMM_WORLD
-RULES = {
-    "energy-momentum": nts.EnergyMomentum(),
-    "midpoint": nts.Midpoint(),
-    "newmark": nts.Newmark(),
-    "generalized-alpha": nts.GeneralizedAlpha(rho_inf=0.8),
-}
 
 
 def box(low=(0, 0, 0), size=(1, 1, 1), n=(1, 1, 1), turn=None, kind=CellType.hexahedron, **options):
@@ -66,13 +61,13 @@ def test_a_free_body_errs_as_an_independent_program_does(dt, figure):
     assert np.abs(body.rotation.T @ body.rotation - np.eye(3)).max() < 1e-13
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", INTEGRATORS)
 def test_all_rules_are_of_second_order(rule):
     """First accelerations know the forces of the directors' constraints."""
     exact, errors = euler(MOMENTS, SPIN, 4.0), []
     for dt in (0.1, 0.05):
         body = nts.RigidBody.from_inertia(1.0, MOMENTS, angular_velocity=SPIN)
-        nts.simulate(nts.System([body]), RULES[rule], dt=dt, t_end=4.0)
+        nts.simulate(nts.System([body]), INTEGRATORS[rule], dt=dt, t_end=4.0)
         errors.append(np.abs(body.rotation - exact).max())
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
 
@@ -147,7 +142,7 @@ def test_a_torque_turns_and_its_work_is_in_the_ledger(rule):
     errors = []
     for dt in (0.1, 0.05):
         body = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), torque=(0, 0, 1.5), force=(1, 0, 0))
-        run = nts.simulate(nts.System([body]), RULES[rule], dt=dt, t_end=2.0)
+        run = nts.simulate(nts.System([body]), INTEGRATORS[rule], dt=dt, t_end=2.0)
         turned = Rotation.from_rotvec([0, 0, 0.5 * 1.5 / 2.5 * 2.0**2]).as_matrix()
         errors.append(np.abs(body.rotation - turned).max())
         assert body.angular_velocity == pytest.approx([0, 0, 1.5 * 2 / 2.5], abs=1e-9)
@@ -163,7 +158,7 @@ def test_the_impulse_of_a_torque_is_exact_at_any_turn(rule, spin, torque):
     body = nts.RigidBody.from_inertia(
         2.0, (1, 2, 3), angular_velocity=(0, 0, spin), torque=(0, 0, torque)
     )
-    run = nts.simulate(nts.System([body]), RULES[rule], dt=0.1, t_end=1.0)
+    run = nts.simulate(nts.System([body]), INTEGRATORS[rule], dt=0.1, t_end=1.0)
     change = run.balance["angular_momentum"][-1] - run.balance["angular_momentum"][0]
     assert change == pytest.approx([0, 0, torque], rel=1e-9, abs=1e-9)
     assert run.balance["newton_iterations"].max() <= 8

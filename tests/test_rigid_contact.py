@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
+from scenes import everywhere
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipk
 
@@ -36,10 +38,6 @@ def below(body, z=0.0):
 
 def above(body, z):
     return body.surface(lambda x: x[2] > z - 1e-9)
-
-
-def everywhere(x):
-    return np.full(x.shape[1], True)
 
 
 def energies(table):
@@ -160,7 +158,7 @@ def test_a_tower_of_five_stands_for_ten_seconds():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(
-    "rule", [nts.EnergyMomentum(), nts.Midpoint()], ids=["energy-momentum", "midpoint"]
+    "rule", MID_STEP.values(), ids=MID_STEP
 )
 @pytest.mark.parametrize("slave", ["rigid", "soft"])
 @pytest.mark.fast("rigid-energy-momentum")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rotations import random_rotation
 
 from dolfinx_nts.contact.search import ROUNDING, closest_facets
 from dolfinx_nts.kernels import compiled
@@ -55,11 +56,6 @@ def patch(cells, nc=4, wave=0.0, stretch=1.0):
     quads = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2)
     quads = quads.reshape(-1, 4, 3)
     return quads if nc == 4 else np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-
-
-def rotation(rng):
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q * np.sign(np.diag(r))
 
 
 def special_points(rng, corners, n):
@@ -134,7 +130,7 @@ def test_ties_go_to_the_lowest_facet(nc, offset):
     for height in (0.0, 0.3, -2.0):
         points = np.column_stack([grid, np.full(len(grid), height)])
         for _ in range(5):
-            turn, shift = rotation(rng), offset * rng.normal(size=3)
+            turn, shift = random_rotation(rng), offset * rng.normal(size=3)
             found = closest_facets(points @ turn.T + shift, flat @ turn.T + shift, reach=5.0)
             assert np.array_equal(found.facet, expected)
 
@@ -156,7 +152,7 @@ def test_ridge_seen_from_outside_is_a_tie():
 @pytest.mark.parametrize("nc", [3, 4])
 def test_units_do_not_matter(nc):
     rng = np.random.default_rng(5)
-    corners = patch(8, nc, wave=0.3) @ rotation(rng).T
+    corners = patch(8, nc, wave=0.3) @ random_rotation(rng).T
     points = corners.mean(axis=1)[rng.integers(len(corners), size=500)]
     points = points + rng.normal(scale=0.4, size=points.shape)
     current = rng.integers(-1, len(corners), 500)

@@ -6,32 +6,18 @@ import textwrap
 import numpy as np
 import pytest
 import two_blocks
-from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
+from scenes import RUBBER, bottom, box, fail_once, top
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-INTEGRATORS = [nts.Midpoint(), nts.EnergyMomentum()]
-
-
-def fail_once(stepper, at_call):
-    """Make one solve of the stepper fail, after it has spoilt whatever a solve may spoil."""
-    solve, calls = stepper.solver.solve, []
-
-    def failing():
-        calls.append(None)
-        step = solve()
-        if len(calls) == at_call:
-            raise nts.StepFailedError("on purpose")
-        return step
-
-    stepper.solver.solve = failing
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.fast("integrator1")
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast("energy-momentum")
 def test_a_cut_back_step_equals_the_small_steps(integrator):
     """Nothing of a rejected step survives: the thirds are those of a run that never tried."""
     tried, plain = (nts.Stepper(two_blocks.scene(COMM), integrator) for _ in range(2))
@@ -127,24 +113,7 @@ def test_a_closed_stepper_goes_on():
 
 
 def block(**options):
-    mesh = create_box(
-        COMM,
-        [[0, 0, 0], [1, 1, 1]],
-        [2, 2, 2],
-        CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )
-    return nts.Continuum(
-        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, name="block", **options
-    )
-
-
-def bottom(x):
-    return x[2] < 1e-9
-
-
-def top(x):
-    return x[2] > 1 - 1e-9
+    return nts.Continuum(box(), RUBBER, density=1e3, name="block", **options)
 
 
 @pytest.mark.mpi
@@ -172,8 +141,8 @@ def test_the_work_of_loads_and_supports_closes_the_ledger(options):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.fast_on_ranks("integrator0")
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast_on_ranks("midpoint")
 def test_driven_nodes_have_the_velocity_of_their_support(integrator):
     """They start with it and do not alternate about it; exact for motion at constant speed."""
     speed = np.array([0.5, -0.2, 0.3])
@@ -199,7 +168,7 @@ def test_driven_nodes_have_the_velocity_of_their_support(integrator):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 def test_free_fall(integrator):
     """Closed form: work of gravity m g s, momentum m g t, and both integrators are exact."""
     gravity, time, mass = 9.81, 0.1, 1e3

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
+from integrators import CONTACT_RULES
 from mpi4py import MPI
-from point_mass import INTEGRATORS, MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall
+from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall
 
 import dolfinx_nts as nts
 
@@ -15,7 +16,7 @@ COMM = MPI.COMM_WORLD
 
 def run(system, integrator, steps, **newton):
     """Velocities of the mass after each step, shape (steps + 1, 3), and the Stepper."""
-    stepper = nts.Stepper(system, INTEGRATORS[integrator], newton=nts.Newton(**newton))
+    stepper = nts.Stepper(system, CONTACT_RULES[integrator], newton=nts.Newton(**newton))
     v = [COMM.bcast(stepper.state.v[0])]
     for _ in range(steps):
         stepper.advance(STEP)
@@ -29,7 +30,7 @@ def run(system, integrator, steps, **newton):
     "theta",
     [0.0, 0.1, 0.25, 0.49, 0.51, 0.99, 1.0] + [pytest.param(0.75, marks=pytest.mark.mpi)] + [0.5],
 )
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast_on_ranks("midpoint-0.75-True", "energy-momentum-0.75-False")
 def test_rebound(integrator, theta, turned):
     system, q = mass_on_wall(theta * STEP * SPEED, turned=turned)
@@ -53,7 +54,7 @@ def test_rebound(integrator, theta, turned):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 def test_rebound_with_the_solver_of_large_scenes(integrator):
     """Whose storage in blocks of nodes is not for bodies of the user's own."""
     theta = 0.25
@@ -63,7 +64,7 @@ def test_rebound_with_the_solver_of_large_scenes(integrator):
     assert np.allclose(v @ q[:, 2] / SPEED, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 def test_contact_force_and_momentum(integrator):
     theta = 0.3
     system, _ = mass_on_wall(theta * STEP * SPEED, velocity=(0.4, -0.7, -SPEED))
@@ -76,12 +77,12 @@ def test_contact_force_and_momentum(integrator):
     assert np.allclose(momentum[1] - momentum[0], [0, 0, STEP * force], rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 def test_free_flight_under_gravity(integrator):
     """v exact, x exact for a parabola by both rules; the work of gravity is external."""
     mass = PointMass(COMM, MASS, (1.0, 2.0, 3.0), (0.5, 0.0, 1.0))
     gravity = np.array([0.0, -1.0, -9.81])
-    stepper = nts.Stepper(nts.System([mass], gravity=gravity), INTEGRATORS[integrator])
+    stepper = nts.Stepper(nts.System([mass], gravity=gravity), CONTACT_RULES[integrator])
     for k in range(1, 6):
         stepper.advance(STEP)
         t = k * STEP

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from scenes import RUBBER
 
 import dolfinx_nts as nts
 from dolfinx_nts.kernels import facets as fc
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 
 
 def cube(cells, low, name, cell_type=CellType.hexahedron, material=RUBBER, **options):

@@ -5,13 +5,13 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
 from point_mass import PointMass
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
 DT = 2e-3
 
 
@@ -56,7 +56,7 @@ def row(metre=1.0, friction=(0.0, 0.0, 0.0), gaps=(0.025, 0.015, 0.3), **options
 
 def run(system, steps, *, sleep, integrator="energy-momentum", dt=DT, **newton):
     """Stepper after some steps, and of each which bodies were awake."""
-    s = nts.Stepper(system, INTEGRATORS[integrator], newton=nts.Newton(**newton), sleep=sleep)
+    s = nts.Stepper(system, MID_STEP[integrator], newton=nts.Newton(**newton), sleep=sleep)
     awake = []
     for _ in range(steps):
         s.advance(dt)
@@ -101,7 +101,7 @@ def assert_same(a, b, dt=DT):
     [{}, {"condense": True, "linear_solver": "krylov", "reuse": True}],
     ids=["exact", "reuse"],
 )
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum-reuse")
 def test_cubes_sleep_until_they_are_reached(integrator, newton):
     a, b, awake = both(row, 12, integrator=integrator, **newton)
@@ -301,7 +301,7 @@ def test_gravity_keeps_awake_what_can_fall():
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("energy-momentum")
 def test_an_obstacle_wakes_what_it_reaches(integrator):
     """A wall that touches, and sets out later."""
@@ -329,7 +329,7 @@ def pushed(gap, force):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("midpoint")
 def test_a_motion_that_was_not_predicted_wakes_in_the_same_step(integrator):
     """The step is solved again with the sleeper, whose candidates were idle."""

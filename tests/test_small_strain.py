@@ -7,7 +7,9 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box, create_unit_cube
+from integrators import MID_STEP
 from mpi4py import MPI
+from scenes import RUBBER
 from ufl.algorithms.apply_derivatives import apply_derivatives
 
 import dolfinx_nts as nts
@@ -172,9 +174,6 @@ def test_floor_of_short_steps_is_rounding(dt):
     assert np.abs(table["ledger_residual"]).max() < 5e-13 * table["energy"][0]
 
 
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
-
-
 def impact(speed, gap, away=0.0, material=RUBBER):
     """A cube flies squarely into another one, which lies `away` from the origin in x, y and z."""
     low = np.full(3, away)
@@ -229,7 +228,7 @@ def test_ledger_of_an_energy_of_c_far_from_the_origin():
 @pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
-@pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()], ids=["mp", "em"])
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.parametrize("meshed", [False, True])
 def test_ledger_of_a_cube_that_hardly_weighs(meshed, integrator, accuracy):
     """At 1e-6 g a cube of rubber sinks by 1e-8 of its edge: energies of 1e-10 J of 1e6 Pa."""

@@ -4,28 +4,17 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from mpi4py import MPI
-from point_mass import PointMass, PointSurface
+from point_mass import PointSurface, Sledge
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.surfaces import locate_facets
 
 COMM = MPI.COMM_WORLD
-FACETS, RADIUS, SPEED, WEIGHT = 16, 1.0, 1.0, 1e3
+FACETS, RADIUS, WEIGHT = 16, 1.0, 1e3
 #: Half the length of the way and of the surface.
 WAY, END = 0.33, 0.48
 VARIANTS = ("start", "middle", "smooth")
 BENT = {"convex": 1.0, "concave": -1.0, "flat": 0.0, "dome": 1.0}
-
-
-class Sledge(PointMass):
-    """A mass that is drawn along x; free to follow the surface in z."""
-
-    def __init__(self, position):
-        super().__init__(COMM, 1.0, position, (SPEED, 0.0, 0.0), name="sledge")
-        self.fixed = np.arange(self.num_owned)[:2]
-
-    def prescribed(self, time):
-        return np.array([SPEED * time, 0.0])[: len(self.fixed)]
 
 
 def plate(shape, facets, uneven, triangles=False):
@@ -102,9 +91,9 @@ def slide(
     # The weight is large: what 1e-13 leaves of it, times the way, is 1e-11 of the energy.
     newton = nts.Newton(rtol=1e-14)
     stepper = nts.Stepper(system, integrator or nts.EnergyMomentum(), newton=newton)
-    dt = part * 2 * END / (facets * SPEED)
+    dt = part * 2 * END / (facets * Sledge.pace)
     facet, changes, others, before = [], [], [], 0.0
-    for step in range(int(2 * WAY / (SPEED * dt)) - 1):
+    for step in range(int(2 * WAY / (Sledge.pace * dt)) - 1):
         state = stepper.advance(dt)
         facet.append(COMM.bcast(state.contacts[0].facet.copy())[0])
         loss = stepper.solution.rows[-1]["contact_defect"]

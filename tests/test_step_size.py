@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
 from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall, wall
-from test_friction import rubbing_blocks
-from test_simulate import fail_once
+from scenes import fail_once, rubbing_blocks
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
@@ -141,9 +141,9 @@ def test_free_flight_takes_the_largest_steps_and_ends_on_time():
 # ---- gaps
 @pytest.mark.mpi
 @pytest.mark.parametrize("theta", [0.1, 0.5, 0.75])
-@pytest.mark.parametrize("integrator", [nts.Midpoint(), nts.EnergyMomentum()])
-@pytest.mark.fast("integrator0-0.1", "integrator1-0.75")
-@pytest.mark.fast_on_ranks("integrator0-0.1")
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.fast("midpoint-0.1", "energy-momentum-0.75")
+@pytest.mark.fast_on_ranks("midpoint-0.1")
 def test_a_mass_rebounds_from_a_wall_without_loss(integrator, theta):
     """Fixed steps leave |1 - 2 theta| of the speed; a step that ends at the wall leaves it all."""
     system, _ = mass_on_wall((3 + theta) * STEP * SPEED)

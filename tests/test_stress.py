@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import io
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType
 from mpi4py import MPI
+from scenes import CELLS, RUBBER, box
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
-CELLS = {"hexahedron": CellType.hexahedron, "tetrahedron": CellType.tetrahedron}
 SHEAR = np.array([[1.0, 0.3, 0.0], [0.0, 1.1, 0.0], [0.0, 0.1, 0.9]])
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
@@ -20,14 +19,9 @@ pytestmark = pytest.mark.mpi
 each_cell = pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 
 
-def box(cell, cells=(2, 1, 2)):
-    return create_box(
-        COMM, [[0, 0, 0], [1, 2, 1]], cells, cell, ghost_mode=GhostMode.shared_facet
-    )
-
-
 def homogeneous(material, degree, cell=CellType.hexahedron, gradient=SHEAR):
-    body = nts.Continuum(box(cell), material, density=1.0, degree=degree)
+    mesh = box(high=(1, 2, 1), cells=(2, 1, 2), cell=cell)
+    body = nts.Continuum(mesh, material, density=1.0, degree=degree)
     body.u.interpolate(lambda x: (gradient - np.eye(3)) @ x)
     return body
 
@@ -87,7 +81,7 @@ def test_cells_have_means():
     Cells are 1 long in x and y and have two Gauss points in each direction.
     """
     body = nts.Continuum(
-        box(CellType.hexahedron, (1, 2, 1)),
+        box(high=(1, 2, 1), cells=(1, 2, 1)),
         lambda c: 0.5 * ufl.tr(c) - 0.5 * ufl.ln(ufl.det(c)),
         density=1.0,
     )

@@ -8,13 +8,13 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
 SHEAR = 1e6 / 2.6
-LAWS = [nts.Midpoint(), nts.EnergyMomentum()]
 
 pytestmark = pytest.mark.mpi
 
@@ -54,9 +54,9 @@ def test_silent_without_stress(caplog):
     assert told(caplog) == 0.0
 
 
-@pytest.mark.parametrize("integrator", LAWS)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.parametrize("part", [1e-4, 0.3])
-@pytest.mark.fast("0.0001-integrator0", "0.3-integrator0")
+@pytest.mark.fast("0.0001-midpoint", "0.3-midpoint")
 def test_the_size_of_the_stress(part, integrator, caplog):
     """Closed form for a cube: stress part mu in three directions beside (2 + part) mu in two."""
     stepper = nts.Stepper(nts.System([block(part)]), integrator)

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import CONTACT_RULES, MID_STEP
+from measures import PROMISED, ledger_or_word
 from mpi4py import MPI
-from point_mass import INTEGRATORS, MASS, turn
-from test_obstacle_friction import sliding
-from test_promises import PROMISED, ledger_or_word
+from point_mass import MASS, turn
+from scenes_obstacles import sliding
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
 GRAVITY = 9.81
-SCHEMES = [nts.Midpoint(), nts.EnergyMomentum()]
 
 
 def box(low, high, parts, name, velocity=(0, 0, 0), bcs=()):
@@ -144,9 +144,9 @@ def test_a_cube_that_touches_as_far_as_coordinates_tell_falls_freely(meshed, fri
 
 # ---- no normal force that friction could be in proportion to
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize("name", ["sphere", "cylinder"])
-@pytest.mark.fast("sphere-midpoint", "cylinder-energy-momentum", "cylinder-gonzalez")
+@pytest.mark.fast("sphere-midpoint", "cylinder-energy-momentum", "cylinder-gonzalez contact")
 @pytest.mark.fast_on_ranks("cylinder-energy-momentum")
 def test_a_bead_at_the_side_of_a_ring_hangs_by_infinite_friction(name, integrator):
     """v_t = sqrt(g R / mu) is the speed at which m v^2 / R carries it: zero without bound."""
@@ -156,13 +156,13 @@ def test_a_bead_at_the_side_of_a_ring_hangs_by_infinite_friction(name, integrato
     }[name]
     gravity = (0, 0, -GRAVITY)
     system = sliding(ring, np.inf, (1, 0, 0), (0, 0, 0), gravity)
-    run = nts.simulate(system, INTEGRATORS[integrator], dt=1e-2, t_end=0.2)
+    run = nts.simulate(system, CONTACT_RULES[integrator], dt=1e-2, t_end=0.2)
     assert run.status == "completed" and run.retries == 0
     assert run.balance["energy"][-1] < 1e-9 * MASS * GRAVITY
     assert np.linalg.norm(run.balance["linear_momentum"][-1]) < 1e-4 * MASS
 
 
-@pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.slow
 def test_strong_friction_has_a_limit(integrator):
     """A soft disc released at the side of a ring, whose nodes press next to nothing there."""
@@ -198,7 +198,7 @@ def _disc(friction, integrator):
 @pytest.mark.mpi
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("gap", [0.05, 0.0499])
-@pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast("energy-momentum-0.05-exact")
 @pytest.mark.fast_on_ranks()
 def test_cubes_that_meet_at_the_end_of_a_step(integrator, gap, accuracy):
@@ -252,7 +252,7 @@ def test_one_large_element_stands_on_small_facets(place, friction):
 @pytest.mark.mpi
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.3, np.inf])
-@pytest.mark.parametrize("integrator", SCHEMES, ids=["midpoint", "energy-momentum"])
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 def test_one_large_element_presses_a_plate_of_400_facets(integrator, friction):
     """20 steps, in which the facets under its node give way: it neither stops nor is told of."""
     system = large_on_small(0.0, friction, 20)

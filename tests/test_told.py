@@ -5,6 +5,7 @@ import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from point_mass import MASS, SPEED, STEP, mass_on_wall
+from scenes import box
 
 import dolfinx_nts as nts
 
@@ -12,16 +13,9 @@ COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.mpi
 
 
-def box(layers):
-    return create_box(
-        COMM, [np.zeros(3), np.ones(3)], [2, 2, layers], CellType.hexahedron,
-        ghost_mode=GhostMode.shared_facet,
-    )  # fmt: skip
-
-
 def cube(layers=2, **options):
     return nts.Continuum(
-        box(layers), nts.NeoHookean(1e6, 0.3), density=1e3, name="cube", **options
+        box(cells=(2, 2, layers)), nts.NeoHookean(1e6, 0.3), density=1e3, name="cube", **options
     )
 
 
@@ -92,7 +86,7 @@ def test_crushed_cells(low):
 def test_load_steps_that_are_too_few_for_the_ledger(load_steps):
     """Pulled to twice its length: W = E^2/2 with E = 3/2, the work of one step 1/2 F E."""
     material = nts.StVenantKirchhoff(1.0, 0.0)
-    body = nts.Continuum(box(1), material, density=1.0, bcs=stretched(1.0))
+    body = nts.Continuum(box(cells=(2, 2, 1)), material, density=1.0, bcs=stretched(1.0))
     run = nts.equilibrium(nts.System([body]), load_steps=load_steps)
     assert run.status == "completed"
     missed = run.balance["ledger_residual"][-1]
@@ -115,7 +109,7 @@ def test_a_stiff_body_on_a_soft_one_is_held(young):
         mesh, nts.NeoHookean(young, 0.3), density=1e3, name="pad",
         bcs=[nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)],
     )  # fmt: skip
-    steel = nts.Continuum(box(2), nts.NeoHookean(2e11, 0.3), density=1e-3, name="steel")
+    steel = nts.Continuum(box(), nts.NeoHookean(2e11, 0.3), density=1e-3, name="steel")
     pair = nts.ContactPair(
         steel.surface(lambda x: x[2] < 1e-9), pad.surface(lambda x: x[2] > -1e-9), friction=np.inf
     )

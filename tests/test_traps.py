@@ -6,15 +6,15 @@ A cube of one cell stands on, hits or leaves a plate of 2 x 2 facets whose top i
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
 from mpi4py import MPI
 from petsc4py import PETSc
+from scenes import RUBBER, everywhere
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": nts.EnergyMomentum()}
 ROUND_OFF = 1e-12
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
 #: Lower left corner of the cube (edge 0.5): its four slaves lie inside facets, on edges of the
 #: plate's facets, on their corners.
 PLACES = {"inside": (0.2, 0.3), "edge": (0.5, 0.3), "corner": (0.5, 0.5), "across": (0.25, 0.25)}
@@ -23,13 +23,9 @@ pytestmark = pytest.mark.mpi
 rubbing = pytest.mark.parametrize("friction", [0.0, 0.3])
 
 
-@pytest.fixture(params=INTEGRATORS)
+@pytest.fixture(params=MID_STEP)
 def integrator(request):
-    return INTEGRATORS[request.param]
-
-
-def everywhere(x):
-    return np.ones_like(x[0], dtype=bool)
+    return MID_STEP[request.param]
 
 
 def scene(
@@ -70,7 +66,7 @@ def run(system, integrator, dt=2e-3, steps=8):
     # No shorter step may be needed for what these scenes contain.
     assert len(table["time"]) == steps + 1
     scale = max(np.abs(table[k]).max() for k in ("energy", "external_work", "kinetic"))
-    if integrator == INTEGRATORS["energy-momentum"]:
+    if integrator == MID_STEP["energy-momentum"]:
         assert np.abs(table["ledger_residual"]).max() <= ROUND_OFF * scale
     assert table["min_gap"].min() >= -ROUND_OFF
     if not COMM.allreduce(sum(len(b.fixed) for b in system.bodies)) and not system.gravity.any():
@@ -118,7 +114,7 @@ def test_pressed_from_zero_gap(place, integrator):
     table = run(scene(place, velocity=(0.0, 0.0, -1.0)), integrator)
     assert table["active"][1] == 4
     assert table["linear_momentum"][:, 2] == pytest.approx(-1250.0, rel=1e-11)
-    if integrator == INTEGRATORS["energy-momentum"]:
+    if integrator == MID_STEP["energy-momentum"]:
         assert np.abs(table["contact_defect"]).max() <= ROUND_OFF * table["energy"][0]
 
 

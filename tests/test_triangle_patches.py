@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from facet_kinds import LINE
 from scipy.spatial import ConvexHull, Delaunay
-from test_patches import LINE
 
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels import patches

@@ -2,23 +2,17 @@
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import CONTACT_RULES
+from measures import OPEN, PROMISED, ledger_or_word
 from mpi4py import MPI
-from point_mass import INTEGRATORS, MASS, PointMass, PointSurface
+from point_mass import MASS, PointMass, PointSurface
+from scenes import RUBBER, box
 from scipy.interpolate import LinearNDInterpolator
-from test_promises import OPEN, PROMISED, ledger_or_word
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact import search
 
 COMM = MPI.COMM_WORLD
-RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)
-
-
-def box(low, high, cells):
-    kind, ghosts = CellType.hexahedron, GhostMode.shared_facet
-    ends = [np.array(low, float), np.array(high, float)]
-    return create_box(COMM, ends, cells, kind, ghost_mode=ghosts)
 
 
 def plate(value=(0.0, 0.0, 0.0), *, width=4.0, thickness=0.02, cells=8):
@@ -180,7 +174,7 @@ def test_first_hits_of_facets_that_turn_against_all_pairs(corners):
 
 # ---- masses
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize("obstacle", [False, True])
 @pytest.mark.fast_on_ranks("False-energy-momentum", "True-midpoint")
 def test_a_mass_at_rest_that_falls_far_in_a_step(obstacle, integrator):
@@ -189,7 +183,7 @@ def test_a_mass_at_rest_that_falls_far_in_a_step(obstacle, integrator):
     master = nts.Plane((0, 0, 0), (0, 0, 1)) if obstacle else top
     bodies = [] if obstacle else [body]
     system = shot((0.3, 0.2, 0.2), (0, 0, 0), master, bodies, gravity=(0, 0, -9.81))
-    run = nts.simulate(system, INTEGRATORS[integrator], dt=0.5, t_end=0.5)
+    run = nts.simulate(system, CONTACT_RULES[integrator], dt=0.5, t_end=0.5)
     assert run.status == "completed" and run.balance["active"].tolist() == [0, 1]
     # It ends on the plate: v_1 = 2 du/h - v_0, and what the gap costs is force x gap.
     speed = COMM.bcast(system.bodies[0].v)[2]
@@ -199,9 +193,9 @@ def test_a_mass_at_rest_that_falls_far_in_a_step(obstacle, integrator):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.parametrize("aim", [(0.0, 0.0), (150.0, 60.0), (-290.0, 10.0)])
-@pytest.mark.fast_on_ranks("aim0-energy-momentum", "aim1-midpoint", "aim2-gonzalez")
+@pytest.mark.fast_on_ranks("aim0-energy-momentum", "aim1-midpoint", "aim2-gonzalez contact")
 def test_a_shot_at_a_thin_plate(aim, integrator):
     """Through several facets a step, from beside the plate, too: it bounces as at a plane (B6)."""
     speed, dt = 300.0, 0.01
@@ -210,7 +204,7 @@ def test_a_shot_at_a_thin_plate(aim, integrator):
     start = (0.3 - 0.2 * dt * aim[0], 0.1 - 0.2 * dt * aim[1], height)
     body, top = plate()
     system = shot(start, (*aim, -speed), top, [body])
-    run = nts.simulate(system, INTEGRATORS[integrator], dt=dt, t_end=2 * dt)
+    run = nts.simulate(system, CONTACT_RULES[integrator], dt=dt, t_end=2 * dt)
     assert run.status == "completed" and run.balance["active"].tolist() == [0, 1, 0]
     v = COMM.bcast(system.bodies[0].v)
     assert np.allclose(v, [*aim, (1 - 2 * 0.2) * speed], rtol=0, atol=1e-9 * speed)
@@ -240,7 +234,7 @@ def test_a_shot_at_a_small_obstacle(obstacle):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast_on_ranks("energy-momentum")
 def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator):
     """It passes the plate's edge, sinks below its top, and the plate moves over it and away."""
@@ -250,7 +244,7 @@ def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator)
     body, top = plate(sideways, thickness=1.0, width=4.0, cells=4)
     start = (2.3, 0.1, 0.02)
     system = shot(start, (0.0, 0.0, -0.2), top, [body])
-    run = nts.simulate(system, INTEGRATORS[integrator], dt=0.02, t_end=1.0)
+    run = nts.simulate(system, CONTACT_RULES[integrator], dt=0.02, t_end=1.0)
     table = run.balance
     v = COMM.bcast(system.bodies[0].v)
     assert np.allclose(v, [0, 0, -0.2], rtol=0, atol=1e-12)
@@ -283,7 +277,7 @@ def test_cubes_off_centre_win_no_energy(integrator, accuracy, dt, n):
         master=bodies[1].surface(lambda x: x[0] < 1.05 + 1e-9),
     )
     system = nts.System(bodies, contacts=[pair])
-    rule = INTEGRATORS[integrator]
+    rule = CONTACT_RULES[integrator]
     run = nts.simulate(system, rule, dt=dt, t_end=0.12, accuracy=accuracy)
     table, energy = run.balance, run.balance["energy"]
     assert run.status == "completed" and table["active"].max() == n * n
@@ -348,7 +342,7 @@ def over(meshed, young=1e6, velocity=(0.0, 0.0, 0.0), gravity=9.81, gap=0.2):
 @pytest.mark.parametrize("meshed", [False, True])
 def test_a_block_at_rest_that_falls_far_in_a_step(meshed, young, gravity, dt, integrator, accuracy):
     """0.2 m above the floor, and by 1.2 or 0.5 m lower after a step of free fall."""
-    system, seen, rule = over(meshed, young, gravity=gravity), Touches(), INTEGRATORS[integrator]
+    system, seen, rule = over(meshed, young, gravity=gravity), Touches(), CONTACT_RULES[integrator]
     run = nts.simulate(system, rule, dt=dt, t_end=4 * dt, accuracy=accuracy, output=[seen])
     table, scale = run.balance, np.abs(run.balance["external_work"]).max()
     assert run.status.startswith("completed") and table["active"].max() == 9
@@ -372,7 +366,7 @@ def test_no_first_contact_wins_energy(integrator, meshed):
     straight and aslant, through up to ten facets in a step, the nodes are outside at the start and
     at the end, what is lost is the sum of p g_0, and that is positive.
     """
-    random, rule = np.random.default_rng(3), INTEGRATORS[integrator]
+    random, rule = np.random.default_rng(3), CONTACT_RULES[integrator]
     met = 0
     for _ in range(8):
         gap, dt = 10.0 ** random.uniform(-6, -0.3), 10.0 ** random.uniform(-3.5, -1)
@@ -417,7 +411,7 @@ def test_a_shot_at_a_thin_flexible_plate(speed, integrator, accuracy):
     pair = nts.ContactPair(
         block.surface(lambda x: x[2] < gap + 1e-9), sheet.surface(lambda x: x[2] > -1e-9)
     )
-    system, rule = nts.System([block, sheet], contacts=[pair]), INTEGRATORS[integrator]
+    system, rule = nts.System([block, sheet], contacts=[pair]), CONTACT_RULES[integrator]
     run = nts.simulate(system, rule, dt=dt, t_end=4 * dt, accuracy=accuracy)
     table = run.balance
     # Of a hard block the corners alone may meet a plate that gives way.
@@ -454,7 +448,7 @@ def test_a_block_at_rest_over_a_soft_plate(integrator):
         master=floor.surface(lambda x: x[2] > -1e-9),
     )
     system = nts.System([block, floor], contacts=[pair], gravity=(0, 0, -9.81))
-    run = nts.simulate(system, INTEGRATORS[integrator], dt=0.05, t_end=0.25)
+    run = nts.simulate(system, CONTACT_RULES[integrator], dt=0.05, t_end=0.25)
     assert run.status == "completed" and run.balance["active"].max() == 9
     lowest = float((block.reference + block.u.x.array[: block.num_owned])[2::3].min(initial=1.0))
     assert COMM.allreduce(lowest, op=MPI.MIN) > -1e-3 * size

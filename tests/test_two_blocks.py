@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 import two_blocks
-import ufl
 from dolfinx.mesh import CellType
+from integrators import MID_STEP
 from mpi4py import MPI
+from scenes import fung
 
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-ENERGY_MOMENTUM = nts.EnergyMomentum()
-INTEGRATORS = {"midpoint": nts.Midpoint(), "energy-momentum": ENERGY_MOMENTUM}
+ENERGY_MOMENTUM = MID_STEP["energy-momentum"]
 #: Energy lost to activation in B1 (benchmarks.md).
 REFERENCE_LOSS = 0.051
 
@@ -44,18 +44,6 @@ def test_demo_reaches_the_reference_figures():
     assert midpoint["angular_momentum"] <= 1e-12
     assert midpoint["min_gap"] >= -1e-10
     assert midpoint["ledger"] > 1e-6
-
-
-def fung(steepness):
-    """Rubber that stiffens exponentially, small strains as the neo-Hookean one's."""
-    mu, lam = 1e6 / 2.6, 1e6 * 0.3 / (1.3 * 0.4)
-
-    def energy(c):
-        volume = ufl.ln(ufl.det(c))
-        stretch = (ufl.exp(steepness * (ufl.tr(c) - 3)) - 1) / steepness
-        return mu / 2 * (stretch - volume) + lam / 8 * volume**2
-
-    return energy
 
 
 VARIANTS = {
@@ -133,7 +121,7 @@ def test_bodies_of_a_micrometre():
 
 @pytest.mark.slow
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 def test_metres_millimetres_micrometres(integrator):
     """Mass in kg and time in s stay; lengths, and with them pressure and density, are converted."""
     runs = [
@@ -193,7 +181,7 @@ def assert_same_as_serial(integrator, t_end, **scene):
 @pytest.mark.slow
 @pytest.mark.mpi
 @pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
-@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 def test_ranks_agree_with_a_serial_run(integrator):
     assert_same_as_serial(integrator, 0.2)
 
@@ -242,7 +230,7 @@ def test_field_split_finds_the_same_solution():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
-@pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast("energy-momentum-True")
 @pytest.mark.fast_on_ranks()
 def test_krylov_follows_the_direct_solver(integrator, condense):

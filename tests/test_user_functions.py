@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
+from scenes import bottom, top
 
 import dolfinx_nts as nts
 from dolfinx_nts import validation
@@ -20,14 +21,6 @@ DT = 1e-3
 LATE = 2.2e-3
 
 pytestmark = pytest.mark.mpi
-
-
-def bottom(x):
-    return x[2] < 1e-9
-
-
-def top(x):
-    return x[2] > 1 - 1e-9
 
 
 def raises(t):

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
-from test_output import flying, read, scene
+from scenes import meeting_blocks, thrown_block
+from xdmf import read_xdmf
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import pictures
@@ -131,13 +132,14 @@ def test_a_full_disk_ends_the_run_with_whole_fields(mpi_tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (size + 2000, hard))
 
         writers = [Happens(3, fill), output.Fields(mpi_tmp_path), output.BalanceCSV(table)]
-        run = nts.simulate(scene(), nts.EnergyMomentum(), dt=1e-3, t_end=6e-3, output=writers)
+        system = meeting_blocks()
+        run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=6e-3, output=writers)
     assert run.status.startswith("output[1] (Fields): write at t=0.003 raised OSError(")
     assert "File too large" in run.status and "with space and write permission" in run.status
     assert run.status.count("OSError") == 1 and len(run.rows) == 4
     COMM.Barrier()
     for name in ("left", "the_right_one"):
-        file = read(mpi_tmp_path / f"{name}.xdmf")
+        file = read_xdmf(mpi_tmp_path / f"{name}.xdmf")
         assert file.times == [0.0, 1e-3, 2e-3] and len(file.fields) == 3
         assert all(np.isfinite(f["displacement"]).all() for f in file.fields)
     assert np.array_equal(np.loadtxt(table, delimiter=",", skiprows=1)[:, 0], run.balance["time"])
@@ -150,10 +152,10 @@ from dolfinx_nts import dolfinx_compat
 dolfinx_compat.C_FLAGS[0] = "-O1"
 sys.path.insert(0, {tests!r})
 import dolfinx_nts as nts
-from test_output import flying
+from scenes import thrown_block
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, resource.RLIM_INFINITY))
-system, fields, dt = flying(), nts.output.Fields({folder!r}), 1e-3
+system, fields, dt = thrown_block(), nts.output.Fields({folder!r}), 1e-3
 if {loop}:
     run = nts.Stepper(system, nts.Midpoint())
     fields.start(run)
@@ -176,7 +178,7 @@ def test_a_script_ends_by_an_exception_where_the_disk_is_full(loop, tmp_path):
     )
     assert done.returncode == 1, done.stderr
     assert "File too large" in done.stderr and "with space and write permission" in done.stderr
-    file = read(tmp_path / "body.xdmf")
+    file = read_xdmf(tmp_path / "body.xdmf")
     assert len(file.times) == len(file.fields) > 2
     assert np.allclose(file.times, 1e-3 * np.arange(len(file.times)), rtol=1e-12)
     for time, fields in zip(file.times, file.fields, strict=True):
@@ -186,7 +188,7 @@ def test_a_script_ends_by_an_exception_where_the_disk_is_full(loop, tmp_path):
 @mpi
 def test_fields_go_on_where_there_is_space_again(mpi_tmp_path):
     """Of the step that failed the body's numbers are there, but not their list."""
-    run, writer = nts.Stepper(flying(), nts.Midpoint()), output.Fields(mpi_tmp_path)
+    run, writer = nts.Stepper(thrown_block(), nts.Midpoint()), output.Fields(mpi_tmp_path)
     writer.start(run)
     run.advance(1e-3)
     listing = mpi_tmp_path / "body.xdmf"
@@ -199,7 +201,7 @@ def test_fields_go_on_where_there_is_space_again(mpi_tmp_path):
     run.advance(1e-3)
     writer.write(run)
     COMM.Barrier()
-    file = read(listing)
+    file = read_xdmf(listing)
     assert file.times == [0.0, 2e-3]
     assert np.allclose(file.fields[1]["displacement"], [2e-3, 4e-3, 6e-3], rtol=1e-12)
     run.close()
@@ -216,7 +218,7 @@ def test_a_folder_that_is_gone_ends_the_run(kind, mpi_tmp_path):
 
     writer = output.Fields(folder) if kind == "fields" else output.BalanceCSV(folder / "b.csv")
     writers = [Happens(2, remove), writer]
-    run = nts.simulate(flying(), nts.Midpoint(), dt=1e-3, t_end=6e-3, output=writers)
+    run = nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=6e-3, output=writers)
     assert "write at t=0.002 raised OSError(" in run.status and "No such file" in run.status
     assert run.status.count("OSError") == 1 and len(run.rows) == 3
 
@@ -226,7 +228,7 @@ def test_a_full_disk_ends_the_run_with_a_whole_table(mpi_tmp_path):
     path = mpi_tmp_path / "b.csv"
     with largest_file(1000):
         writers = [output.BalanceCSV(path)]
-        run = nts.simulate(flying(), nts.Midpoint(), dt=1e-3, t_end=20e-3, output=writers)
+        run = nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=20e-3, output=writers)
     assert run.status.startswith("output[0] (BalanceCSV): write at")
     assert run.status.count("File too large") == 1
     COMM.Barrier()
@@ -240,7 +242,7 @@ def test_a_full_disk_ends_the_run_with_a_whole_table(mpi_tmp_path):
 @pytest.mark.fast("picture")
 @pytest.mark.fast_on_ranks()
 def test_an_old_picture_outlives_a_full_disk(kind, mpi_tmp_path):
-    run = nts.simulate(flying(), nts.Midpoint(), dt=1e-3, t_end=2e-3)
+    run = nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=2e-3)
     path = mpi_tmp_path / "picture.png"
     draw = run.plot if kind == "plot" else lambda p: pictures.picture(run.system.bodies, p)
     draw(str(path))

@@ -1,0 +1,85 @@
+"""What several test modules measure: differences, derivatives, ledgers, entries of matrices."""
+
+import numpy as np
+import pytest
+
+#: Offsets and weights of differences that are exact for polynomials up to degree 4, whatever the
+#: step.
+STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
+#: What the ledger may miss of the largest energy without a word, by accuracy, where a rule closes
+#: it, and where none does (README).
+PROMISED, OPEN = {"exact": 1e-11, "balanced": 1e-8, "fast": 1e-5}, 1e-2
+#: Columns of the balance table that say whether two runs are the same.
+COLUMNS = ("kinetic", "potential", "friction_dissipation", "contact_defect", "angular_momentum")
+
+
+# ---- derivatives and arrays
+def differences(function, x, step=1e-3):
+    """Return the derivative of a batched function of x (n, m); its last axis is x's component."""
+    columns = []
+    for e in np.eye(x.shape[1]):
+        columns.append(sum(w * function(x + k * step * e) for k, w in STENCIL) / step)
+    return np.stack(columns, axis=-1)
+
+
+def relative(found, expected):
+    """Return the largest difference over the largest expected value."""
+    return np.abs(found - expected).max() / np.abs(expected).max()
+
+
+def dense(a):
+    """Return all entries of a PETSc matrix."""
+    rows, cols = (np.arange(n, dtype=np.int32) for n in a.getSize())
+    return a.getValues(rows, cols)
+
+
+def block_errors(found, expected, blocks):
+    """Largest difference of each block over its largest entry; of all entries where it is zero."""
+    errors = {}
+    for i, rows in enumerate(blocks):
+        for j, cols in enumerate(blocks):
+            e, f = expected[rows, cols], found[rows, cols]
+            scale = np.abs(f if f.any() else found).max(initial=0.0)
+            errors[i, j] = np.abs(f - e).max(initial=0.0) / scale
+    return errors
+
+
+# ---- balance tables
+def difference(a, b):
+    """Largest difference of the balance tables, over the energy or the momentum of the scene."""
+    worst = 0.0
+    for name in COLUMNS:
+        scale = a["energy"][0] if a[name].ndim == 1 else np.abs(a[name]).max()
+        worst = max(worst, float(np.abs(a[name] - b[name]).max() / scale))
+    return worst
+
+
+def drift(table, name):
+    """Range of a column of a balance table over its largest value."""
+    return np.ptp(table[name], axis=0).max() / np.abs(table[name]).max()
+
+
+def ledger_or_word(run, promised=1e-8):
+    """Return what the ledger misses of the largest energy; more than `promised` must be told.
+
+    Args:
+        run: A run, complete or not.
+        promised: Of the integrator and accuracy; OPEN of one that does not close the ledger.
+    """
+    table, names = run.balance, ("kinetic", "potential", "external_work", "friction_dissipation")
+    missing = np.abs(table["ledger_residual"]) / max(np.abs(table[name]).max() for name in names)
+    assert missing.max() <= promised or "ledger" in run.warnings
+    return missing.max()
+
+
+# ---- figures of demos
+def assert_as_coulomb_says(figures, closed_form):
+    """Check figures of a block on a floor, and that friction never gives energy back."""
+    for name, exact in closed_form.items():
+        if exact:
+            assert figures[name] == pytest.approx(exact, rel=1e-3), name
+        else:
+            assert abs(figures[name]) < 1e-12
+    assert figures["status"] == "completed"
+    assert figures["least_dissipation"] > -1e-15
+    assert figures["iterations"] < 3
