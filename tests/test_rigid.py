@@ -178,6 +178,28 @@ def test_a_turn_of_a_radian_in_a_step_is_told(spin, told):
         assert found.count == 5 and "body 'top' turns by 1.1 rad in a step" in found.text
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("turn", [0.9, 1.1, 5.5, 2 * np.pi, 7.0, 10 * np.pi])
+@pytest.mark.parametrize("given", ["vector", "matrix"])
+def test_a_prescribed_turn_counts_whole_turns(turn, given):
+    """The places at both ends of a step do not tell them: the energy of 12 rad a step was 67 J."""
+
+    def rotation(t):
+        vector = np.array([0.0, 0.0, turn / 0.05 * t])
+        return vector if given == "vector" else Rotation.from_rotvec(vector).as_matrix()
+
+    wheel = nts.RigidBody.from_inertia(
+        1.0, (1, 1, 1), motion=(0, 0, 0), rotation=rotation, name="wheel"
+    )
+    run = nts.simulate(nts.System([wheel]), nts.EnergyMomentum(), dt=0.05, t_end=0.1)
+    assert run.status == "completed" and ("turns" in run.warnings) is (turn > 1.0)
+    if turn > 1.0:
+        assert run.warnings["turns"].count == 2
+        assert "body 'wheel' turns by" in run.warnings["turns"].text
+    if turn < np.pi:
+        assert wheel.prescribed_turn(0.0, 0.05) == pytest.approx(turn, rel=1e-12)
+
+
 def test_tangent_of_a_torque_is_its_derivative():
     body = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), torque=(0.3, -0.5, 1.5), motion=(0, 0, 0))
     rng = np.random.default_rng(1)

@@ -231,6 +231,13 @@ class Body:
         """
         return 0.0
 
+    def prescribed_turn(self, start: float, end: float) -> float:
+        """Turn of prescribed directors between two times [rad], any number of turns. Collective.
+
+        What `turn` cannot tell from their places at both times.
+        """
+        return 0.0
+
     def parameters(self) -> FloatArray:
         """Values of the material that a caller may change during a run, shape (n,)."""
         return np.empty(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,8 @@ VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
 _LENT = 1e-8
 #: Part of a torque along an axis without inertia that counts as none.
 _ALONG = 1e-6
+#: Parts of a step at which a prescribed rotation is asked for how far it turns.
+_ASKED = (0.0, 0.30, 0.57, 1.0)
 
 
 @known_options
@@ -70,7 +73,8 @@ class RigidBody(Body):
             function of time, where the body starts, too; its work is external work. None: the
             centre is free.
         rotation: Rotation from the reference, as a rotation vector [rad], a matrix (3, 3), or a
-            function of time to one of them, likewise. None: the body is free to turn.
+            function of time to one of them, likewise. None: the body is free to turn. A run warns
+            of more than a radian in a step, whole turns included.
         name: Name in messages and files.
 
     Attributes:
@@ -531,6 +535,18 @@ class RigidBody(Body):
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""
         return largest_turn(self.reference + u0, self.reference + u1)
+
+    def prescribed_turn(self, start: float, end: float) -> float:
+        """Turn that `rotation` prescribes between two times [rad], at least. Collective.
+
+        Its function is also asked at times between that share no period: rates below a hundred
+        turns in this time that look slow at all of them are slow.
+        """
+        if not callable(self._turn):
+            return 0.0
+        turned = [self._rotation_at(start + part * (end - start)) for part in _ASKED]
+        cosines = [0.5 * float((a * b).sum()) - 0.5 for a, b in pairwise(turned)]
+        return float(np.arccos(np.clip(cosines, -1.0, 1.0)).sum())
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""

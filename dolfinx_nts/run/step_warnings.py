@@ -60,13 +60,16 @@ def _tell_turns(solution: Solution, system: System, old: State, new: State) -> N
     turning = [k for k, body in enumerate(system.bodies) if body.oriented]
     if not turning:
         return
-    turns = np.array([system.bodies[k].turn(old.u[k], new.u[k]) for k in turning])
-    turns = global_max(system.comm, turns)
+    bodies = [system.bodies[k] for k in turning]
+    driven = [body.prescribed_turn(old.time, new.time) for body in bodies]
+    seen = [body.turn(old.u[k], new.u[k]) for k, body in zip(turning, bodies, strict=True)]
+    turns = global_max(system.comm, np.maximum(seen, driven))
     worst = int(turns.argmax())
     if turns[worst] > _FAR:
-        name, turn = system.bodies[turning[worst]].name, float(turns[worst])
+        name, turn = bodies[worst].name, float(turns[worst])
+        by = "by" if turn < np.pi else "by at least"
         solution.warn(
             "turns", new.time, turn,
-            f"body {name!r} turns by {turn:.2g} rad in a step, too far for how it turns to be "
+            f"body {name!r} turns {by} {turn:.2g} rad in a step, too far for how it turns to be "
             "right, though energy and momenta may be kept; use a smaller dt",
         )  # fmt: skip
