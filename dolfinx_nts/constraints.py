@@ -19,13 +19,18 @@ from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import EveryStep, PointElements, Step
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kinematics import OFF, Kinematics
+from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.validation import StepFailedError
 
 if TYPE_CHECKING:
+    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
+#: From nodal vectors at the end of a step (n, k, 3) and the times of both its ends [s].
+Upright = Callable[[FloatArray, tuple[float, ...]], FloatArray]
 
 #: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies,
 #: beside their gap times their curvature. Equations that repeat others agree at the solution;
@@ -62,12 +67,14 @@ class ConstraintPart(NamedTuple):
         tangent: Its derivative.
         multiplier: Factor of the step times lambda [kg m], shape (n, m).
         gap: g - c at t_{n+1} [m], shape (n, m).
+        end: Nodal vectors at t_{n+1} [m], shape (n, k, 3).
     """
 
     residual: FloatArray
     tangent: FloatArray
     multiplier: FloatArray
     gap: FloatArray
+    end: FloatArray
 
     @property
     def status(self) -> BoolArray:
@@ -160,7 +167,7 @@ class ConstraintElements(PointElements):
         if self.lent:
             rows = np.arange(last, last + m)
             tangent[:, rows, rows] = -scale * (self.lent + np.abs(gap) * self._bent)
-        return ConstraintPart(residual, tangent, multiplier, gap)
+        return ConstraintPart(residual, tangent, multiplier, gap, x)
 
     def largest(self, part: ConstraintPart) -> list[float]:
         """The largest row of its constraints [m], and its extent."""
@@ -189,6 +196,8 @@ class Constraints(EveryStep):
         driven: Equations for some times, and c at each of them [m], shape (times, n, m); None:
             nothing is prescribed. Collective.
         redundant: Whether they may repeat others.
+        upright: Numbers that are positive unless directions have turned over, which solves the
+            equations, too. Collective.
     """
 
     def __init__(
@@ -200,6 +209,7 @@ class Constraints(EveryStep):
         driven: Callable[[tuple[float, ...]], tuple[Equations, FloatArray]] | None = None,
         *,
         redundant: bool = True,
+        upright: Upright | None = None,
     ) -> None:
         super().__init__(bodies, self._elements, lambda part: part.multiplier / self._factor)
         self._name, self._sides, self._equations = name, tuple(sides), equations
@@ -208,6 +218,7 @@ class Constraints(EveryStep):
         self._rest = np.concatenate([s.reference for s in self._sides], axis=1)
         self._curvature = kernel.curvature(equations.weights)
         self._driven, self._force = driven, np.zeros_like(equations.value)
+        self._upright = upright
 
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
         self._factor = step.factor
@@ -238,6 +249,28 @@ class Constraints(EveryStep):
         if self._driven is not None:
             return self._driven(times)
         return self._equations, np.array([self._equations.value] * len(times))
+
+    def misses(
+        self, e: Evaluation, parts: Sequence[ConstraintPart], motion: FloatArray
+    ) -> bool:
+        """Nothing is missed. Collective.
+
+        Raises:
+            StepFailedError: Directions have turned over.
+        """
+        if self._upright is None or self._begun is None:
+            return False
+        (part,), (step, _) = parts, self._begun
+        along = self._upright(part.end, (step.state.time, step.state.time + step.dt))
+        raise_together(
+            self._sides[0].body.comm,
+            None if (along > 0.0).all() else (
+                f"step from t={step.state.time:.6g} with dt={step.dt:.3g}: {self._name!r} ends "
+                "with directions turned over, which solves its equations, too; use a smaller dt"
+            ),
+            StepFailedError,
+        )  # fmt: skip
+        return False
 
     def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
         """As of `JointCoupling`, in closed form but for what is prescribed."""

@@ -773,21 +773,96 @@ def test_only_loops_are_looked_at_for_joints_that_repeat_each_other(joints, tree
     assert least_norm.form_tree(joints) is tree
 
 
+def motor(angle, rate=0.0):
+    """A body that a hinge about z turns by an angle."""
+    body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), angular_velocity=(0, 0, rate), name="rotor")
+    hinge = nts.Revolute(
+        body, None, point=(0, 0, 0), axis=(0, 0, 1), angle=angle, name="motor"
+    )
+    return body, nts.System([body], joints=[hinge])
+
+
+def turned(angle):
+    """Rotation about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
 @pytest.mark.mpi
-def test_half_a_turn_in_a_step_is_refused():
+@pytest.mark.parametrize("adapt", [None, nts.Adapt(tolerance=1e9)])
+def test_steps_of_half_a_turn_are_cut_from_the_first_one_on(adapt):
     """It cannot be told from half a turn the other way: a motor of 80 rad/s ran at -91."""
+    body, system = motor(lambda t: 80.0 * t, 80.0)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.05, t_end=0.2, adapt=adapt)
+    assert run.status == "completed" and run.retries > 0
+    assert np.abs(body.rotation - turned(16.0)).max() < 1e-9
+    assert np.diff(run.balance["time"]).max() * 80.0 < np.pi
 
-    def motor(rate):
-        body = nts.RigidBody.from_inertia(1.0, (1, 1, 1))
-        hinge = nts.Revolute(
-            body, None, point=(0, 0, 0), axis=(0, 0, 1), angle=lambda t: rate * t, name="motor"
-        )
-        return body, nts.System([body], joints=[hinge])
 
-    run = nts.simulate(motor(80.0)[1], nts.EnergyMomentum(), dt=0.05, t_end=0.2)
+@pytest.mark.mpi
+@pytest.mark.parametrize("jump", [0.0, 0.12])
+def test_a_jump_of_half_a_turn_stops_a_run(jump):
+    """However short the step; in the first one, too."""
+    _, system = motor(lambda t: 4.0 * (t > jump))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.05, t_end=0.2)
     assert "the angle of 'motor' changes by 4 rad, half a turn or more; use a sm" in run.status
-    body, system = motor(7.0)
+    assert jump - 0.05 < run.balance["time"][-1] <= jump
+
+
+@pytest.mark.mpi
+def test_load_steps_of_half_a_turn_are_cut():
+    body, system = motor(lambda t: 7.0 * t)
     assert nts.equilibrium(system).status == "completed"
-    turned = [[np.cos(7), -np.sin(7), 0], [np.sin(7), np.cos(7), 0], [0, 0, 1]]
     # Newton's tolerance times the motion of the directors.
-    assert np.abs(body.rotation - turned).max() < 1e-11
+    assert np.abs(body.rotation - turned(7.0)).max() < 1e-11
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("turn", [1.6, 2.2])
+def test_the_angle_of_a_hinge_is_no_mirror_image(turn):
+    """Its sine about the middle of the step has two angles; Newmark's steps found the other one."""
+    body, system = motor(lambda t: turn / 0.05 * t, turn / 0.05)
+    run = nts.simulate(system, nts.Newmark(), dt=0.05, t_end=0.5)
+    assert run.status.startswith("completed") and run.retries > 0
+    assert np.abs(body.rotation - turned(10.0 * turn)).max() < 1e-9
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("rule", "spins"),
+    [
+        (nts.Newmark(), [(-16, 17, 11), (9, 1, 16)]),
+        (nts.GeneralizedAlpha(), [(-19, 4, -48), (7, 7, 47)]),
+    ],
+)
+def test_no_step_turns_directions_over(rule, spins):
+    """Bodies became mirror images, and axes of a hinge opposite: both solve the equations."""
+    a = nts.RigidBody.from_inertia(1.0, (1, 2, 2.5), angular_velocity=spins[0], name="a")
+    b = nts.RigidBody.from_inertia(
+        0.3, (0.1, 0.2, 0.25), centre=(1, 0, 0), angular_velocity=spins[1], name="b"
+    )
+    hinge = nts.Revolute(a, b, point=(0.5, 0, 0), axis=(0, 0, 1))
+    start = [body.rotation.T @ (0, 0, 1) for body in (a, b)]
+    stepper = nts.Stepper(nts.System([a, b], joints=[hinge]), rule, project_start=True)
+    for _ in range(10):
+        stepper.advance(0.05)
+        axes = [body.rotation @ n for body, n in zip((a, b), start, strict=True)]
+        assert axes[0] @ axes[1] == pytest.approx(1.0, abs=1e-8)
+        for body in (a, b):
+            assert np.linalg.det(body.rotation) == pytest.approx(1.0, abs=1e-8)
+    assert stepper.solution.retries > 0
+
+
+@pytest.mark.mpi
+def test_a_run_goes_on_from_within_its_first_step():
+    """The rest of that step is as long as it is: it was solved with the whole one's length."""
+    jump = [4.0]
+    body, system = motor(lambda t: jump[0] * (t > 0.03))
+    loose = nts.RigidBody.from_inertia(1.0, (1, 1, 1), velocity=(1, 0, 0), name="loose")
+    system = nts.System([body, loose], joints=system.declared_joints)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.05, t_end=0.2)
+    assert 0.0 < run.balance["time"][-1] < 0.05
+    jump[0] = 0.0
+    again = nts.simulate(system, nts.EnergyMomentum(), dt=0.05, t_end=0.2, start=run)
+    assert again.status == "completed" and again.balance["time"][-1] == 0.2
+    assert loose.position == pytest.approx([0.2, 0, 0], abs=1e-12)

@@ -49,7 +49,10 @@ class Triads:
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run."""
-        return Constraints(self.name, bodies, [self._side], self._equations, redundant=False)
+        return Constraints(
+            self.name, bodies, [self._side], self._equations, redundant=False,
+            upright=lambda y, _: np.linalg.det(y[:, 1:]),
+        )  # fmt: skip
 
 
 def largest_turn(y0: FloatArray, y1: FloatArray) -> float:

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.constraints import Constraints, Equations, rank_of
+from dolfinx_nts.constraints import Constraints, Equations, Upright, rank_of
+from dolfinx_nts.kernels import quadratic
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import (
     UserFunctionError,
@@ -179,6 +180,13 @@ class Between(ABC):
     def products(self, times: Times) -> Iterable[Product]:
         """Its constraints at times within a step, the same on all ranks. Collective."""
 
+    def upright(self, times: Times) -> Iterable[Product]:
+        """Products that are positive unless directions have turned over. Collective.
+
+        `products` that are zero at right angles do not tell directions from opposite ones.
+        """
+        return ()
+
     def meet(self, *values: FloatArray) -> Iterator[Product]:
         """p_A - p_B = c, which is given at each of the times, (3,), or 0."""
         each = zip(*values, strict=True) if values else ((),) * 3
@@ -191,9 +199,27 @@ class Between(ABC):
 
     def _in_step(self, times: Times) -> tuple[Equations, FloatArray]:
         """Equations of this rank's element, if it is here, and c at each of the times."""
-        found, prescribed = assemble(list(self.products(times)), len(times))
+        return self._here_of(self.products(times), times)
+
+    def _here_of(
+        self, products: Iterable[Product], times: Times
+    ) -> tuple[Equations, FloatArray]:
+        found, prescribed = assemble(list(products), len(times))
         n = self._here
         return Equations(*(a[:n] for a in found)), prescribed[:, :n]
+
+    def _kept_upright(self) -> Upright | None:
+        """What `Constraints` take for `upright`, if there is any. Collective."""
+        products = list(self.upright((0.0,)))
+        if not products:
+            return None
+        known, _ = self._here_of(products, (0.0,))
+
+        def upright(y: FloatArray, times: Times) -> FloatArray:
+            now = self._here_of(self.upright(times), times)[0] if self.motion else known
+            return quadratic.value(quadratic.factors(now.weights, now.constants, y))
+
+        return upright
 
     @property
     def _here(self) -> int:
@@ -227,8 +253,9 @@ class Between(ABC):
         sides = [side.part(slice(self._here)) for side in self._sides]
         equations, _ = self._in_step((0.0,))
         return Constraints(
-            self.name, bodies, sides, equations, self._in_step if self.motion else None
-        )
+            self.name, bodies, sides, equations, self._in_step if self.motion else None,
+            upright=self._kept_upright(),
+        )  # fmt: skip
 
 
 def named(kind: str, ends: Sequence[Any], name: str | None) -> str:

@@ -101,6 +101,10 @@ class _WithAxis(Between):
         yield self.square(self.n_a, self.m1_b)
         yield self.square(self.n_a, self.m2_b)
 
+    def upright(self, times: Times) -> Iterator[Product]:
+        """The axes: n_A . n_B."""
+        yield Product(self.n_a, self.n_b)
+
     def on_axis(self) -> Iterator[Product]:
         """B's point on A's axis: m1_A . (p_B - p_A) = 0, m2_A . (p_B - p_A) = 0."""
         yield Product(self.m1_a, self.p_b - self.p_a)
@@ -160,6 +164,13 @@ class Revolute(_WithAxis):
             value = self.length * np.sin(angles - middle)
             yield Product(self.length * self.m1_a, b, value.tolist())
 
+    def upright(self, times: Times) -> Iterator[Product]:
+        """Axes, and the cosine of the angle less t, whose sine has two angles."""
+        yield from super().upright(times)
+        if self.motion is not None:
+            middle = np.mean([self.motion.since_start(t) for t in times])
+            yield Product(self.m1_a, np.cos(middle) * self.m1_b + np.sin(middle) * self.m2_b)
+
 
 @known_options
 class Cylindrical(_WithAxis):
@@ -210,6 +221,11 @@ class Prismatic(_WithAxis):
         if self.motion is not None:
             value = [self.motion.since_start(t) for t in times]
             yield Product(self.n_a, self.p_a - self.p_b, value)
+
+    def upright(self, times: Times) -> Iterator[Product]:
+        """Axes, and the directions at right angles to them."""
+        yield from super().upright(times)
+        yield Product(self.m1_a, self.m1_b)
 
 
 @known_options
@@ -285,6 +301,11 @@ class Fixed(Between):
         yield from self.meet()
         for i, j in ((0, 1), (1, 2), (2, 0)):
             yield self.square(self.m_a[i], self.m_b[j])
+
+    def upright(self, times: Times) -> Iterator[Product]:
+        """X, y and z of A and B."""
+        for a, b in zip(self.m_a, self.m_b, strict=True):
+            yield Product(a, b)
 
 
 @known_options

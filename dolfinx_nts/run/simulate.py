@@ -195,7 +195,7 @@ def simulate(
         # The steps of the whole run, to the bit, if it had the same and stopped at the end of one.
         whole = _equal_steps(start.rows[0]["time"], end, dt)
         left = [step for step in whole if step[1] > begin]
-        if len(left) == len(whole) or whole[-len(left) - 1][1] == begin:
+        if left and any(time == begin for _, time in whole):
             equal = left
     return run(
         stepper, equal, output, progress=progress, remedy=remedy, checkpoint=checkpoint

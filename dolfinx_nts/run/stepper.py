@@ -6,6 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -333,13 +334,15 @@ class Stepper:
             now = self.state.time
             left = end - now
             dt = pace.propose(left)
-            self._begin(dt)
-            part = pace.first_touch(self.problem)
-            if part < 1.0:
-                dt *= part
-                self._begin(dt)
             try:
+                self._begin(dt)
+                part = pace.first_touch(self.problem)
+                if part < 1.0:
+                    dt *= part
+                    self._begin(dt)
                 trial = self._attempt(dt, end if dt == left else now + dt)
+            except UserFunctionError:
+                raise
             except StepFailedError as failure:
                 if retries == self.newton.max_retries:
                     raise
@@ -378,6 +381,33 @@ class Stepper:
         if self.restart is not None:
             self._resume(self.restart, dt)
             return
+        for retry in count():
+            try:
+                state = self._fitting(dt)
+                break
+            except UserFunctionError:
+                raise
+            except StepFailedError as failure:
+                if retry == self.newton.max_retries:
+                    raise
+                # The first step will be cut for the same reason.
+                dt /= 3.0
+                logger.info("%s; starting with dt=%.3g", failure, dt)
+        self._accept(state)
+        self._started = True
+        missing, text = off_balance(self.problem, state, dt)
+        if text:
+            self.solution.warn("massless nodes", state.time, missing, text)
+        self.solution.rows = Table([self._first_row()])
+        # Where bodies were before the first step, for one that carries them through each other.
+        self.look()
+
+    def _fitting(self, dt: float) -> State:
+        """The start with rates of prescribed motion and accelerations, which fits the joints.
+
+        Raises:
+            StepFailedError: A joint refuses a step of this length.
+        """
         self._call_before(dt)
         # What the first call sets is what the run begins with.
         self._materials.changed()
@@ -388,14 +418,7 @@ class Stepper:
         if self.problem.integrator.accelerations and not state.a:
             carried = with_resting_forces(self.system, state, dt, self.newton, self._given)
             state = replace(state, a=consistent.accelerations(self.problem, carried, dt))
-        self._accept(state)
-        self._started = True
-        missing, text = off_balance(self.problem, state, dt)
-        if text:
-            self.solution.warn("massless nodes", state.time, missing, text)
-        self.solution.rows = Table([self._first_row()])
-        # Where bodies were before the first step, for one that carries them through each other.
-        self.look()
+        return state
 
     @property
     def _continues(self) -> bool:
