@@ -43,6 +43,20 @@ def stack(comm=COMM, gap=0.0, metre=1.0, n=(3, 2), lateral=True, name=None):
     return nts.System([lower, upper], contacts=[pair], gravity=(0, 0, -GRAVITY * m))
 
 
+@pytest.mark.mpi
+def test_the_promise_of_the_ledger_is_as_strict_in_the_tenth_cycle():
+    """A press that comes and goes: its work adds up with its sign, so each peak misses alike."""
+    body = nts.RigidBody.from_inertia(
+        1.0, (1, 1, 1), centre=(1, 0, 0), motion=lambda t: (0.5 - 0.5 * np.cos(np.pi * t), 0, 0),
+        rotation=(0, 0, 0),
+    )  # fmt: skip
+    hardens = nts.Spring(body, None, [(1, 0, 0), (0, 0, 0)], energy=lambda x: (x - 1.0) ** 4)
+    run = nts.equilibrium(nts.System([body], joints=[hardens]), load_steps=np.arange(1.0, 21.0))
+    # Of V = x^4 the mean of the forces 0 and 4 x^3 at both ends of a step takes 2 x^4 for the work.
+    assert run.balance["ledger_residual"] == pytest.approx([0.0] + 10 * [-1.0, 0.0], abs=1e-12)
+    assert run.warnings["ledger"].count == 10
+
+
 # ---- closed forms
 @pytest.mark.mpi
 @pytest.mark.parametrize("load", [-6e5, 9e5])

@@ -65,6 +65,32 @@ def test_a_step_without_an_impulse_keeps_its_momentum():
 
 
 @pytest.mark.mpi
+def test_a_reversed_momentum_is_seen_beside_stiff_springs():
+    """Two that pull with 1e8 N each cancel each other, and excuse no more than their rounding."""
+    mass = nts.RigidBody.from_inertia(1.0, (1, 1, 1), velocity=(0, 1, 0), name="mass")
+    springs = [
+        nts.Spring(mass, None, [(0, 0, 0), (x, 0, 0)], stiffness=1e9, length=0.9, name=f"at {x}")
+        for x in (-1.0, 1.0)
+    ]
+    stepper = nts.Stepper(nts.System([mass], joints=springs), nts.EnergyMomentum())
+    stepper.start(STEP)
+    stepper.problem.begin(stepper.state, STEP)
+    step, before = stepper.solver.solve(), stepper.solution.rows[-1]
+    good = stepper._accepted(step, STEP, STEP)
+    speed = abs(good.v[0][1]) if mass.num_owned else 0.0
+    speed = COMM.allreduce(speed, op=MPI.MAX)
+    check_momentum(stepper.problem, step, good, before, balance.measure(stepper.system, good))
+    reversed_ = replace(good, v=(-good.v[0],))
+    with pytest.raises(
+        nts.StepFailedError, match=f"linear momentum changes by {2 * speed:.3g} more than"
+    ):
+        check_momentum(
+            stepper.problem, step, reversed_, before, balance.measure(stepper.system, reversed_)
+        )
+    stepper.close()
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("ledger", [True, False])
 def test_the_guard_is_on_in_every_run(ledger, monkeypatch):
     """Velocities that an integrator turns round at the end of a step end the run."""

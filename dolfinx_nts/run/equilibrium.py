@@ -102,7 +102,9 @@ class _LoadStepper(Stepper):
         super().__init__(system, Static(), **options)
         self._stabilization = stabilization
         self._solved: Evaluation | None = None
-        self._worked = 0.0
+        #: Work of each load, support, joint and contact so far [J], and the largest energy.
+        self._worked: FloatArray | float = 0.0
+        self._largest = 0.0
         self._rates = [np.zeros_like(u) for u in self.state.u]
         self._forces = [np.zeros_like(u) for u in self.state.u]
         self._accept(replace(self.state, v=tuple(self._rates)))
@@ -153,8 +155,10 @@ class _LoadStepper(Stepper):
         rows.append(row | forces_now)
         self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
         # A drive that lifts a weight does the work that the weight takes.
-        self._worked += sum(map(abs, works))
-        missing, size = abs(row["ledger_residual"]), max(abs(row["potential"]), self._worked)
+        self._worked = self._worked + np.array(works)
+        worked = float(np.abs(self._worked).sum())
+        self._largest = max(self._largest, abs(row["potential"]), worked)
+        missing, size = abs(row["ledger_residual"]), self._largest
         loads = sum(float(np.abs(t.external).sum()) for t in step.bodies)
         pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
         pressed += self.system.comm.allreduce(loads)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -24,10 +24,10 @@ def ratios(problem: StepProblem, e: Evaluation) -> dict[str, float]:
 
     Collective.
     """
-    both = zip(problem.system.bodies, e.bodies, strict=True)
-    residuals = [free(body, t.residual) for body, t in both]
+    bodies = problem.system.bodies
+    residuals = {k: free(bodies[k], e.bodies[k].residual) for k in problem.awake}
     of_bodies = _over_limits(problem, e, residuals, problem.rounding.forces)
-    ratio = dict(zip((b.name for b in problem.system.bodies), of_bodies, strict=True))
+    ratio = dict(zip((b.name for b in bodies), of_bodies, strict=True))
     if problem.laid.own:
         ratio |= _of_elements(problem, e)
     return ratio
@@ -38,17 +38,17 @@ def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
 
     Collective.
     """
-    both = zip(problem.system.bodies, e.bodies, strict=True)
-    held = [problem.stabilization.of(body) * t.du for body, t in both]
+    bodies = problem.system.bodies
+    held = {k: problem.stabilization.of(bodies[k]) * e.bodies[k].du for k in problem.awake}
     found = _over_limits(problem, e, held, problem.rounding.at(problem.displacement(e)))
     k = int(np.argmax(found))
-    return found[k], problem.system.bodies[k].name
+    return found[k], bodies[k].name
 
 
 def _over_limits(
-    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
+    problem: StepProblem, e: Evaluation, forces: Mapping[int, FloatArray], rounding: FloatArray
 ) -> list[float]:
-    """A force on each body over that which counts as zero there. Collective.
+    """A force on each body over that which counts as zero there; asleep 0. Collective.
 
     It is measured by the largest of its inertial, internal, external and coupling forces. Of
     elements' forces that cancel each other, as on a body without mass of note between two springs,
