@@ -551,3 +551,65 @@ def test_a_start_remembers_of_a_spring_only_what_is_its_own():
         start=ended,
     )  # fmt: skip
     assert abs(run.balance["potential"]).max() < 1e-12
+
+
+def told(joints, *bodies, rule=None, dt=1e-2):
+    """How many times too fast for the step the first accepted state finds a spring, and what."""
+    system = nts.System(bodies, joints=joints)
+    stepper = nts.Stepper(system, rule or nts.EnergyMomentum(), project_start=True)
+    stepper.start(dt)
+    found = stepper.solution.warnings.get("unresolved")
+    stepper.close()
+    assert found is None or not found.grave
+    return (0.0, "") if found is None else (found.worst, found.text)
+
+
+@pytest.mark.mpi
+def test_a_spring_that_steps_do_not_resolve_is_told():
+    """Omega h, with the mass that the spring moves: of two bodies, at an arm, about a hinge."""
+
+    def body(mass=1.0, inertia=(1, 2, 2.5), centre=(1, 0, 0), **options):
+        return nts.RigidBody.from_inertia(mass, inertia, centre=centre, **options)
+
+    one, ends = body(), [(1, 0, 0), (0, 0, 0)]
+    worst, text = told([nts.Spring(one, None, ends, stiffness=1e6)], one)
+    assert worst == pytest.approx(10.0, rel=1e-9)
+    assert "of 1e+06 N/m on 1 kg is not resolved, omega h = 10:" in text and "0.001 s" in text
+    assert told([nts.Spring(one, None, ends, stiffness=0.99e4)], one) == (0.0, "")
+    own = nts.Spring(one, None, ends, energy=lambda x: 5e5 * (x - 1) ** 2 + (x - 1) ** 4)
+    assert told([own], one)[0] == pytest.approx(10.0, rel=1e-6)
+    two = body(3.0, centre=(0, 0, 0), name="two")
+    worst, _ = told([nts.Spring(one, two, ends, stiffness=1e6)], one, two)
+    assert worst == pytest.approx(10.0 * np.sqrt(1 + 1 / 3), rel=1e-9)
+    arm = nts.Spring(one, None, [(1, 1, 0), (0, 1, 0)], stiffness=1e6)
+    assert told([arm], one)[0] == pytest.approx(10.0 * np.sqrt(1 + 1 / 2.5), rel=1e-9)
+    hinge = nts.Revolute(one, None, point=(0, 0, 0), axis=(0, 0, 1))
+    worst, text = told([hinge, nts.TorsionSpring.about(hinge, stiffness=1e6)], one)
+    assert worst == pytest.approx(10.0 / np.sqrt(3.5), rel=1e-9) and "on 3.5 kg m^2" in text
+    # A light bracket on a heavy body moves with it.
+    light = body(1e-3, (1e-3,) * 3, name="light")
+    heavy = body(1e3, (1e3,) * 3, centre=(0, 0, 0), name="heavy")
+    joints = [
+        nts.Fixed(light, heavy, point=(1, 0, 0)),
+        nts.Spring(light, None, [(1, 0, 0), (2, 0, 0)], stiffness=1e6),
+    ]
+    assert told(joints, light, heavy) == (0.0, "")
+    driven = body(motion=(0, 0, 0), rotation=(0, 0, 0))
+    assert told([nts.Spring(driven, None, ends, stiffness=1e6)], driven) == (0.0, "")
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("rule", [nts.EnergyMomentum(), nts.Newmark()], ids=["em", "newmark"])
+def test_a_damper_that_steps_do_not_resolve_is_told(rule):
+    """At c h/m = 100 a step keeps 96 % of the velocity, turned round, where nothing should be."""
+    body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), centre=(1, 0, 0), velocity=(1, 0, 0))
+    damper = nts.Damper(body, None, [(1, 0, 0), (0, 0, 0)], damping=1e4)
+    run = nts.simulate(nts.System([body], joints=[damper]), rule, dt=1e-2, t_end=1e-2)
+    assert body.velocity[0] == pytest.approx((1 - 50) / (1 + 50), rel=1e-3)
+    assert run.warnings["unresolved"].worst == pytest.approx(50.0, rel=1e-9)
+    assert "c h/m = 100" in run.warnings["unresolved"].text
+    slow = nts.Damper(body, None, [(1, 0, 0), (0, 0, 0)], damping=199.0)
+    assert told([slow], body, rule=rule) == (0.0, "")
+    hinge = nts.Revolute(body, None, point=(0, 0, 0), axis=(0, 0, 1))
+    worst, text = told([hinge, nts.TorsionDamper.about(hinge, damping=1e4)], body, rule=rule)
+    assert worst == pytest.approx(25.0, rel=1e-9) and "on 2 kg m^2" in text

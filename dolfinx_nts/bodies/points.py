@@ -80,6 +80,21 @@ class Points:
         found: npt.NDArray[Any] = table[index]
         return found
 
+    def gathered(self, values: FloatArray) -> FloatArray:
+        """Sums at this rank's owned coordinates, (num_owned,), of values at nodes. Collective.
+
+        For few points of small bodies: the whole body travels.
+
+        Args:
+            values: At the nodes of all points, shape (n, k, 3).
+        """
+        comm, owned = self.body.comm, self.body.num_owned
+        first, total = comm.scan(owned) - owned, comm.allreduce(owned)
+        whole = np.zeros(total)
+        np.add.at(whole, self.flat().ravel(), values.ravel())
+        found: FloatArray = comm.allreduce(whole)[first : first + owned]
+        return found
+
     def extent(self, origin: FloatArray) -> float:
         """Largest length whose rounding is in a point's position relative to an origin (3,) [m]."""
         arms = self.reference - np.where(self.places[:, :, None], origin, 0.0)

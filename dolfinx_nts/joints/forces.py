@@ -117,6 +117,9 @@ class Force(Protocol):
     def pull(self, move: Move) -> tuple[FloatArray, FloatArray]:
         """D, shape (n,), and its derivative by the vectors at t_{n+1}, shape (n, 3 v)."""
 
+    def slopes(self, at: FloatArray) -> tuple[float, float]:
+        """Derivatives of D by the coordinate and by its rate on this rank. Collective."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SpringElements(PointElements):
@@ -229,6 +232,30 @@ class Between:
         y = self._way.reference() + self._way.nodal(u)
         return y, self._way.coordinate.value(self._way.vectors(y), history)
 
+    def slopes(
+        self, u: Sequence[FloatArray], history: FloatArray
+    ) -> tuple[list[FloatArray], float, float]:
+        """Gradient of the coordinate, and derivatives of the force. Collective.
+
+        Args:
+            u: Owned displacements of each of its bodies [m].
+            history: The coordinate there.
+
+        Returns:
+            By the owned coordinates of each body; by the coordinate [N/m] or [N m], and by its rate
+            [N s/m] or [N m s], the same on all ranks.
+        """
+        y, at = self._at(u, history)
+        p = self._way.vectors(y)
+        mean = self._way.coordinate.gradient(p, p, at, at).mean.reshape(p.shape)
+        along = np.einsum("va,nvi->nai", self._way.weights, mean)
+        gradients, first = [], 0
+        for side in self._way.sides:
+            here = slice(first, first := first + side.nodes.shape[1])
+            gradients.append(side.gathered(along[:, here]))
+        stiffness, damping = self.comm.allreduce(np.array(self._force.slopes(at))).tolist()
+        return gradients, stiffness, damping
+
     def coupling(self, bodies: tuple[int, ...]) -> EveryStep:
         """What makes its elements in a run, and remembers the coordinate."""
         way, still = self._way, [np.zeros(body.num_owned) for body in self.bodies]
@@ -333,6 +360,11 @@ class Stiff:
         mean, change = self._ask(self._energy.quotient, *move.ends)
         return mean, move.share * change[:, None] * move.gradient.end
 
+    def slopes(self, at: FloatArray) -> tuple[float, float]:
+        """V'' and none. Collective."""
+        _, change = self._ask(self._energy.quotient, at, at)
+        return 2.0 * float(change.sum()), 0.0
+
 
 class Viscous(NamedTuple):
     """Force of a damper.
@@ -357,6 +389,10 @@ class Viscous(NamedTuple):
         rate = np.einsum("nz,nz->n", gradient.mean, move.speed)
         bend = move.share * np.einsum("nz,nzy->ny", move.speed, gradient.change)
         return self.damping * rate, self.damping * (bend + move.rate * gradient.mean)
+
+    def slopes(self, at: FloatArray) -> tuple[float, float]:
+        """None and c."""
+        return 0.0, self.damping * len(at)
 
 
 def _pair(name: str, value: Any) -> list[FloatArray]:

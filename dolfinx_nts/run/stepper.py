@@ -37,6 +37,7 @@ from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.promises import MaterialWatch, Promises
 from dolfinx_nts.step.resting import with_resting_forces
+from dolfinx_nts.step.unresolved import tell_unresolved
 from dolfinx_nts.system import State, System, is_like
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -398,6 +399,9 @@ class Stepper:
         missing, text = off_balance(self.problem, state, dt)
         if text:
             self.solution.warn("massless nodes", state.time, missing, text)
+        fast = tell_unresolved(self.problem, state, dt)
+        if fast:
+            self.solution.warn("unresolved", state.time, *fast)
         self.solution.rows = Table([self._first_row()])
         # Where bodies were before the first step, for one that carries them through each other.
         self.look()

@@ -100,6 +100,29 @@ def projection(problem: StepProblem, state: State, dt: float) -> tuple[FloatArra
     return tuple(v + dv for v, dv in zip(state.v, change, strict=True))
 
 
+def mobility(
+    problem: StepProblem, state: State, force: Sequence[FloatArray], dt: float
+) -> float:
+    """One over the mass that a unit force along a coordinate moves [1/kg]. Collective.
+
+    Args:
+        problem: Equations of the first step, after `begin`.
+        state: At the start.
+        force: Gradient of the coordinate by each body's coordinates, (num_owned,) each.
+        dt: First step [s].
+    """
+    none = [np.zeros_like(v) for v in state.v]
+    still = replace(state, v=tuple(none))
+    held = []
+    for body, f in zip(problem.system.bodies, force, strict=True):
+        held.append(f.copy())
+        held[-1][body.fixed] = 0.0
+    # What joints prescribe moves bodies without the force, too.
+    with_, without = (_solve(problem, still, forces, 0, dt) for forces in (held, none))
+    local = sum(float(f @ (a - b)) for f, a, b in zip(held, with_, without, strict=True))
+    return float(problem.system.comm.allreduce(local))
+
+
 def _constraints(
     problem: StepProblem, state: State, dt: float
 ) -> list[tuple[Any, tuple[int, ...], Kinematics]]:
