@@ -553,6 +553,26 @@ def test_a_start_remembers_of_a_spring_only_what_is_its_own():
     assert abs(run.balance["potential"]).max() < 1e-12
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("turn", [2.5, 4.0, 7.0])
+def test_a_torsion_spring_follows_a_prescribed_rotation(turn):
+    """Steps of half a turn are cut: that of 7 rad held 0.5 J in place of 49."""
+
+    def scene(rate):
+        body = nts.RigidBody.from_inertia(
+            1.0, (1, 1, 1), motion=(0, 0, 0), rotation=lambda t: (0, 0, rate * t)
+        )
+        spring = nts.TorsionSpring(body, None, axis=Z, stiffness=2.0)
+        return nts.System([body], joints=[spring])
+
+    settled = nts.equilibrium(scene(turn))
+    run = nts.simulate(scene(turn / 0.1), nts.EnergyMomentum(), dt=0.1, t_end=0.1)
+    for found in (settled, run):
+        assert found.status == "completed"
+        assert found.balance["potential"][-1] == pytest.approx(turn**2, rel=1e-9)
+        assert (found.retries > 0) is (turn > np.pi)
+
+
 def told(joints, *bodies, rule=None, dt=1e-2):
     """How many times too fast for the step the first accepted state finds a spring, and what."""
     system = nts.System(bodies, joints=joints)

@@ -21,7 +21,7 @@ from dolfinx_nts.elements import EveryStep, PointElements, Step
 from dolfinx_nts.integrators.rule import taken_at
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
-from dolfinx_nts.validation import require_same, vector
+from dolfinx_nts.validation import StepFailedError, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -223,6 +223,9 @@ class Between:
         """The turns of an angle begin with none."""
         return np.zeros(self._here)
 
+    def _check(self, step: Step) -> None:
+        """Raise where its coordinate cannot be followed through a step. Collective."""
+
     def potential(self, u: Sequence[FloatArray], history: FloatArray) -> float:
         """None [J]."""
         return 0.0
@@ -261,6 +264,7 @@ class Between:
         way, still = self._way, [np.zeros(body.num_owned) for body in self.bodies]
 
         def make(step: Step, history: FloatArray) -> SpringElements:
+            self._check(step)
             y0, near = self._at([step.state.u[b] for b in bodies], history)
             drift = [step.moments[b].drift for b in bodies]
             velocity = [none if v is None else v for v, none in zip(drift, still, strict=True)]
@@ -317,6 +321,16 @@ class AboutAxis(Between):
                 weights[self.bodies.index(body)] = body.directions(m).weights[0]
             rows.append((np.concatenate(weights), m if body is None else np.zeros(3)))
         self._lay(kernel.Angle, sides, rows)
+
+    def _check(self, step: Step) -> None:
+        """Raise where prescribed rotations may change the angle by half a turn. Collective."""
+        start, end = step.state.time, step.state.time + step.dt
+        turn = sum(body.prescribed_turn(start, end) for body in self.bodies)
+        if turn >= np.pi:
+            raise StepFailedError(
+                f"step from t={start:.6g}: prescribed rotations may change the angle of "
+                f"{self.name!r} by {turn:.3g} rad, half a turn or more; use a smaller dt"
+            )
 
     @classmethod
     def about(cls, joint: Any, **options: Any) -> Any:

@@ -67,7 +67,8 @@ def simulate(
         system: The scene.
         integrator: `EnergyMomentum()`, `Midpoint()`, `Newmark()`, `GeneralizedAlpha()`, or one of
             the user's own with the `Integrator` protocol.
-        dt: Largest step [s], > 0; t_end is reached in equal steps unless `adapt` is given.
+        dt: Largest step [s], > 0; t_end is reached in equal steps unless `adapt` is given. Loads
+            given as functions of time are asked once in each: shorter ones may be missed.
         t_end: End of the run [s], > 0.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix, e.g. {"pc_type":
