@@ -126,6 +126,6 @@ def _sentence(fast: _Fast, mobility: float, dt: float, most: float) -> str:
     phase = float(np.sqrt(fast.stiffness * mobility)) * dt
     return (
         f"spring {fast.joint.name!r} of {fast.stiffness:.3g} {unit} on {mass} is not resolved, "
-        f"omega h = {phase:.3g}: how it vibrates comes out too slow, though its energy may be "
-        f"kept; use a dt below {most:.2g} s if it matters"
+        f"omega h = {phase:.3g}: where it vibrates, it does so too slowly, though energy may be "
+        f"kept; use a dt below {most:.2g} s if that matters"
     )
