@@ -121,8 +121,7 @@ class System:
             for role, body in zip(("slave", "master"), pair.bodies, strict=False):
                 if not any(body is b for b in self.bodies):
                     raise ValueError(
-                        f"contacts: the {role} body {body.name!r} is not among "
-                        f"bodies={names}; add it"
+                        f"contacts: the {role} body {body.name!r} {_missing(body, names)}"
                     )
         self.declared_joints = self.joints
         own = (joint for body in self.bodies for joint in body.joints)
@@ -140,8 +139,8 @@ class System:
             for body in joint.bodies:
                 if not any(body is b for b in self.bodies):
                     raise ValueError(
-                        f"joints: {joint.name!r} holds body {body.name!r}, which is not among "
-                        f"bodies={names}; add it"
+                        f"joints: {joint.name!r} holds body {body.name!r}, which "
+                        f"{_missing(body, names)}"
                     )
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
@@ -313,3 +312,13 @@ class System:
                 f"({point(found.place)}) {found.depth:.3g} m from the boundary; move the two "
                 "apart, or give the mesh a hole there"
             )
+
+
+def _missing(body: Body, names: Sequence[str]) -> str:
+    """Why a body is none of those of these names, and what to do."""
+    if body.name in names:
+        return (
+            f"is another object than the one of that name among bodies={names}; make each body "
+            "once, and pass that one to both"
+        )
+    return f"is not among bodies={names}; add it"
