@@ -12,6 +12,8 @@ from mpi4py import MPI
 
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.contact.contact_elements import ContactHistory
+from dolfinx_nts.contact.crossings import point
+from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.elements import Joint
 from dolfinx_nts.parallel import raise_together, same_kernels
@@ -82,8 +84,8 @@ class System:
     Raises:
         TypeError: An item is no body or no contact.
         ValueError: No body, equal names, several communicators, `gravity` is not three numbers, a
-            contact of a body that is not in the system, or initial penetration beyond one part in a
-            hundred of the facet size.
+            contact of a body that is not in the system, initial penetration beyond one part in a
+            hundred of the facet size, or an obstacle inside a body.
     """
 
     def __init__(
@@ -119,8 +121,7 @@ class System:
             for role, body in zip(("slave", "master"), pair.bodies, strict=False):
                 if not any(body is b for b in self.bodies):
                     raise ValueError(
-                        f"contacts: the {role} body {body.name!r} is not among "
-                        f"bodies={names}; add it"
+                        f"contacts: the {role} body {body.name!r} {_missing(body, names)}"
                     )
         self.declared_joints = self.joints
         own = (joint for body in self.bodies for joint in body.joints)
@@ -138,8 +139,8 @@ class System:
             for body in joint.bodies:
                 if not any(body is b for b in self.bodies):
                     raise ValueError(
-                        f"joints: {joint.name!r} holds body {body.name!r}, which is not among "
-                        f"bodies={names}; add it"
+                        f"joints: {joint.name!r} holds body {body.name!r}, which "
+                        f"{_missing(body, names)}"
                     )
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
@@ -153,6 +154,7 @@ class System:
             # The search looks half a facet deep; this, the whole body.
             depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
         self._check_penetration(depths)
+        self._check_enclosed(start)
 
     def destroy(self) -> None:
         """Free the PETSc objects of its bodies, which are of no use then. Collective.
@@ -200,7 +202,7 @@ class System:
 
         Raises:
             ValueError: A body has no counterpart, stands off its prescribed displacement, or lies
-                in a master.
+                in a master or around an obstacle.
         """
         index = {b.name: k for k, b in enumerate(other.bodies)}
         missing = [b.name for b in self.bodies if b.name not in index]
@@ -230,6 +232,7 @@ class System:
             start = replace(start, v=v, a=a)
         if not moving:
             self._check_penetration(self.penetration(start))
+            self._check_enclosed(start)
         return start
 
     @staticmethod
@@ -299,3 +302,23 @@ class System:
                     f"up to {depth.max():.3g} of a facet (allowed {INITIAL_PENETRATION}), nodes "
                     f"{np.sort(pair.slave.original[deep])[:10].tolist()}; move the bodies apart"
                 )
+
+    def _check_enclosed(self, state: State) -> None:
+        """Raise on every rank, with the place, if an obstacle starts inside a body."""
+        for found in OverlapWatch(self).enclosed(state.u, state.time):
+            name, obstacle = found.bodies
+            raise ValueError(
+                f"contact '{name}-{obstacle}': {obstacle!r} starts inside {name!r} as a whole, at "
+                f"({point(found.place)}) {found.depth:.3g} m from the boundary; move the two "
+                "apart, or give the mesh a hole there"
+            )
+
+
+def _missing(body: Body, names: Sequence[str]) -> str:
+    """Why a body is none of those of these names, and what to do."""
+    if body.name in names:
+        return (
+            f"is another object than the one of that name among bodies={names}; make each body "
+            "once, and pass that one to both"
+        )
+    return f"is not among bodies={names}; add it"

@@ -34,14 +34,28 @@ class UserFunctionError(StepFailedError, ValueError):
 
 
 def known_options(target: T) -> T:
-    """Decorate a function or class: an unknown keyword raises with the list of known ones."""
+    """Decorate a function or class: what is passed by an unknown name or without one raises.
+
+    It says which names are known, or that of the first option that is passed by its name only.
+    """
     wrapped: Any = target
     is_class = isinstance(target, type)
     function = wrapped.__init__ if is_class else wrapped
-    known = [p for p in inspect.signature(function).parameters if p not in ("self", "cls")]
+    parameters = inspect.signature(function).parameters
+    known = [p for p in parameters if p not in ("self", "cls")]
+    places = [n for n, p in parameters.items() if p.kind == p.POSITIONAL_OR_KEYWORD]
+    named = [n for n, p in parameters.items() if p.kind == p.KEYWORD_ONLY]
+    several = any(p.kind == p.VAR_POSITIONAL for p in parameters.values())
 
     @functools.wraps(function)
     def checked(*args: Any, **options: Any) -> Any:
+        if len(args) > len(places) and named and not several:
+            first = next((n for n in named if n not in options), named[0])
+            without = ", ".join(n for n in places if n in known)
+            raise TypeError(
+                f"{first}={args[len(places)]!r}: {wrapped.__name__} takes no more than {without} "
+                f"without names; pass other arguments by theirs, e.g. {first}=..."
+            )
         for name in options:
             if name not in known:
                 raise TypeError(

@@ -314,12 +314,8 @@ def test_velocity_that_raises_on_one_rank():
 
 
 def test_loads():
-    traction = nts.Traction(top, (1.0, 0.0))
-    pattern = (
-        r"^Traction.value of traction\[0\] of 'body'=\(1.0, 0.0\): pass three finite components "
-        r"\[Pa\]"
-    )
-    raises(ValueError, pattern, lambda: continuum(traction=[traction]))
+    pattern = r"^Traction.value=\(1.0, 0.0\): pass three finite components \[Pa\], or a function"
+    raises(ValueError, pattern, lambda: nts.Traction(top, (1.0, 0.0)))
     pattern = r"^traction=Traction\(.*: pass a sequence of Traction"
     raises(TypeError, pattern, lambda: continuum(traction=nts.Traction(top, (1, 0, 0))))
     pattern = r"^traction\[0\]='push': pass a sequence of Traction"
@@ -357,8 +353,9 @@ def test_conditions():
     pattern = r"^bcs\[0\]=.*: pass a sequence of Dirichlet"
     raises(TypeError, pattern, lambda: continuum(bcs=[top]))
     raises(TypeError, r"^bcs=Dirichlet.*sequence", lambda: continuum(bcs=nts.Dirichlet(top)))
-    pattern = r"^Dirichlet.value of bcs\[0\] of 'body'=\(0, 0\): pass three finite components \[m\]"
-    raises(ValueError, pattern, lambda: continuum(bcs=[nts.Dirichlet(top, (0, 0))]))
+    pattern = r"^Dirichlet.value=.*: pass three finite components \[m\], or a function of time"
+    for value in ((0, 0), 0.0, None, (0, 0, np.nan), "fixed"):
+        raises(ValueError, pattern, lambda v=value: nts.Dirichlet(top, v))
     pattern = r"^Dirichlet.value of bcs\[0\] of 'body' at t=0.0=\(0, nan, 0\): pass three finite"
     moving = nts.Dirichlet(top, lambda t: (0, np.nan, 0))
     raises(ValueError, pattern, lambda: continuum(bcs=[moving]))
@@ -541,6 +538,9 @@ def test_contact_of_a_body_that_is_not_in_the_system():
     low, high, pair = stacked()
     pattern = r"^contacts: the slave body 'high' is not among bodies=\['low'\]; add it"
     raises(ValueError, pattern, lambda: nts.System([low], contacts=[pair]))
+    alike = stacked()[:2]
+    pattern = r"^contacts: the slave body 'high' is another object than the one of that name among"
+    raises(ValueError, pattern, lambda: nts.System(alike, contacts=[pair]))
     raises(TypeError, r"^contacts=<.*sequence", lambda: nts.System([low, high], contacts=pair))
     pattern = r"^contacts\[0\]='pair': pass a sequence of ContactPair"
     raises(TypeError, pattern, lambda: nts.System([low, high], contacts=["pair"]))
@@ -622,6 +622,21 @@ def test_slaves_behind_the_master_body_are_not_inside():
 def test_unknown_option(action, known):
     pattern = rf"^colour='red': unknown option of \w+; choose from .*{known}"
     raises(TypeError, pattern, lambda: action({"colour": "red"}))
+
+
+@pytest.mark.parametrize(
+    ("action", "pattern"),
+    [
+        (lambda: nts.Continuum(box(), RUBBER, 1e3), "density=1000.0: Continuum .*mesh, mat"),
+        (lambda: nts.RigidBody(box(), 1e3), "density=1000.0: RigidBody takes no more than m"),
+        (lambda: nts.System([], []), r"contacts=\[\]: System takes no more than bodies without"),
+        (lambda: nts.Plane((0, 0, 0), (0, 0, 1), 3), "motion=3: Plane .*than point, normal with"),
+        (lambda: nts.ContactPair(None, None, 0.3), "friction=0.3: ContactPair .*slave, master wi"),
+    ],
+    ids="Continuum RigidBody System Plane pair".split(),
+)
+def test_options_without_names(action, pattern):
+    raises(TypeError, rf"^{pattern}.*pass other arguments by theirs", action)
 
 
 def test_unknown_rule():

@@ -541,6 +541,19 @@ def held_cube(value, name="cube"):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("floor", [None, -0.5], ids=["alone", "over a floor"])
+def test_a_body_that_nothing_holds_is_named_and_not_its_material(floor):
+    body = nts.Continuum(box([0, 0, 0], [1, 1, 1], [2, 2, 2]), RUBBER, density=DENSITY, name="cube")
+    contacts = []
+    if floor is not None:
+        plane = nts.Plane((0, 0, floor), (0, 0, 1))
+        contacts = [nts.ContactPair(body.surface(at(2, 0.0)), plane)]
+    run = nts.equilibrium(nts.System([body], contacts=contacts, gravity=(0, 0, -GRAVITY)))
+    assert run.status.startswith("nothing resists body 'cube' moving along (")
+    assert "where the step starts: hold it by a Dirichlet condition, a joint or con" in run.status
+
+
+@pytest.mark.mpi
 def test_start_is_checked():
     held = nts.equilibrium(held_cube(lambda t: (0, 0, 0.1 * t)))
     rule, times = nts.EnergyMomentum(), {"dt": 0.1, "t_end": 2.0}

@@ -533,6 +533,9 @@ class Ball(Obstacle):
     def width(self):
         return self._width
 
+    def about(self, origin):
+        return Ball(self.centre - origin, self.radius, self._width)
+
     def gap(self, x):
         y = x - self.centre
         r = np.linalg.norm(y, axis=1)
@@ -599,6 +602,25 @@ def test_facets_in_obstacles_are_as_deep_as_their_distance_tells(nc, metre):
             assert np.allclose(depth[deep], true[deep], rtol=0.011)
             assert np.allclose(-obstacle.gap(place[deep]).value, depth[deep], rtol=0.011)
             found_any += deep.sum()
+    assert found_any > 100
+
+
+@pytest.mark.parametrize("nc", [3, 4])
+@pytest.mark.parametrize("known", [True, False], ids=["width", "no width"])
+def test_a_ball_between_nodes_is_found_by_its_gap_alone(nc, known):
+    """Also one that no side of the facet meets, so that samples tell nothing of those."""
+    rng = np.random.default_rng(0)
+    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float)[None, :nc]
+    found_any = 0
+    for _ in range(300):
+        x, y = np.sort(rng.uniform(0.1, 0.9, 2))[::-1]
+        centre, r = np.array((x, y, rng.uniform(-0.1, 0.1))), rng.uniform(0.02, 0.4)
+        depth, limit = r - abs(centre[2]), 0.2 * r
+        if depth > 1.02 * limit:
+            ball = Ball(centre, r, width=r if known else np.inf)
+            _, found = intrusion.sunk(ball, corners, np.array([limit]))
+            assert abs(found[0] - depth) < 0.011 * depth
+            found_any += 1
     assert found_any > 100
 
 
@@ -756,8 +778,10 @@ def test_obstacles_are_looked_at_as_rarely_as_the_motion_allows(monkeypatch):
         looks.clear()
         return done
 
+    # First at what starts in the ball.
+    assert look(30.0) == 1
     # Some node is within a facet of the ball from a height of 0.6 on.
-    assert sum(look(z) for z in np.linspace(30.0, 1.0, 30)) == 0
+    assert sum(look(z) for z in np.linspace(29.0, 1.0, 29)) == 0
     # The way is longer than the ball: its ends, four places on the last 0.6 m, and where it is.
     assert look(0.0) == 2 + 4 + 1
     assert [look(-z) for z in (0.05, 0.12, 0.12, 0.12, 0.13)] == [0, 0, 0, 1, 0]
@@ -800,3 +824,179 @@ def test_nodes_that_another_contact_holds_or_that_start_in_an_obstacle_are_not_t
     assert found.kind == "facet in an obstacle"
     wall = above(nts.Plane((0, 0, 0.25), (0, 0, -1)))
     assert overlap.OverlapWatch(wall).look(moved(wall, (0, 0, -0.2))) == []
+
+
+def unit_cube(master, where=lambda x: x[2] < 1e-9, *, rigid=True, cells=1, metre=1.0, **options):
+    """A unit cube of which a part, or all, is the slave of an obstacle."""
+    mesh = create_box(
+        COMM, [np.zeros(3), metre * np.ones(3)], [cells] * 3, CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    options = {"density": 1e3, "name": "cube"} | options
+    if rigid:
+        body = nts.RigidBody(mesh, **options)
+    else:
+        body = nts.Continuum(mesh, nts.NeoHookean(young=1e6, poisson=0.3), **options)
+    return nts.System([body], contacts=[nts.ContactPair(slave=body.surface(where), master=master)])
+
+
+def everywhere(x):
+    return x[0] > -np.inf
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("shape", ["sphere", "roller"])
+@pytest.mark.parametrize("moving", ["rigid", "flexible", "obstacle"])
+def test_an_obstacle_that_comes_in_where_no_contact_is_says_so(shape, moving, caplog):
+    """Through the side x = 1 of a cube of one cell, whose bottom is the slave, in many steps."""
+    caplog.set_level(logging.CRITICAL)
+    path = (lambda t: (-3.0 * t, 0.0, 0.0)) if moving == "obstacle" else None
+    master = nts.Sphere((2.0, 0.5, 0.5), 0.45, motion=path)
+    if shape == "roller":
+        master = nts.Cylinder((2.0, 0.5, 0.5), (0, 1, 0), 0.45, motion=path)
+    velocity = (0, 0, 0) if moving == "obstacle" else (3.0, 0, 0)
+    for t_end in (0.25, 1.2):
+        system = unit_cube(master, rigid=moving != "flexible", velocity=velocity)
+        run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=t_end)
+        assert run.balance["active"].max() == 0
+        assert run.status.startswith("completed, but the facet of nodes")
+        found = run.warnings["facet in an obstacle"]
+        assert found.grave and "no contact is declared of it with" in found.text
+        # It began 0.55 m away.
+        if t_end == 0.25:
+            assert abs(found.worst - 0.2) < 0.011 * 0.2
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("metre", [1.0, 1e-6])
+@pytest.mark.parametrize("step", [0.03, 0.3, 1.5, 3.0])
+def test_an_obstacle_that_gets_inside_a_body_is_told(step, metre):
+    """On a way of 3 m over a ball, which is inside the cube for 0.6 m, in steps of any length."""
+    r, told = 0.2 * metre, []
+    for ball in (nts.Sphere(metre * np.array((2, 0.5, 0.5)), r),
+                 Ball(metre * np.array((2, 0.5, 0.5)), r, width=r)):  # fmt: skip
+        system = unit_cube(ball, rigid=False, metre=metre)
+        watch, found = overlap.OverlapWatch(system), {}
+        for way in np.arange(0.0, 3.0 + step / 2, step):
+            for f in watch.look(moved(system, (metre * way, 0, 0))):
+                assert f.bodies == ("cube", ball.name) and f.grave
+                found.setdefault(f.kind, []).append(f.depth / metre)
+        assert set(found) == {"facet in an obstacle", "obstacle in a body"}
+        assert max(found["facet in an obstacle"]) < 0.2 * 1.011
+        # The centre is 0.5 m deep at most, and points half as far from it as the surface 0.6 m.
+        assert 0.2 < max(found["obstacle in a body"]) < 0.6
+        told.append({kind: len(depths) for kind, depths in found.items()})
+    assert told[0] == told[1]
+
+
+@pytest.mark.mpi
+def test_an_obstacle_of_unknown_width_inside_a_body_is_told():
+    """What is known by its gap alone is found next to nodes, a fifth of a facet deep or more."""
+    system = unit_cube(Ball((2.0, 0.5, 0.5), 0.2), rigid=False)
+    watch = overlap.OverlapWatch(system)
+    assert watch.look(moved(system, (0, 0, 0))) == []
+    (found,) = watch.look(moved(system, (1.5, 0, 0)))
+    assert found.kind == "obstacle in a body" and found.text.startswith("'ball' lies inside 'cube'")
+    x = found.place - (1.5, 0, 0)
+    assert abs(found.depth - min(x.min(), 1 - x.max())) < 1e-12 and found.depth > 0.2
+    assert np.linalg.norm(found.place - (2.0, 0.5, 0.5)) < 0.2
+
+
+@pytest.mark.mpi
+def test_a_roller_that_begins_between_nodes_of_the_rest_is_told_but_not_as_grave(caplog):
+    """It has no end, but what it stands for may have; a facet that it begins in is left out."""
+    caplog.set_level(logging.CRITICAL)
+    roller = nts.Cylinder((0.5, 0.5, 0.5), (0, 1, 0), 0.2)
+    run = nts.simulate(
+        unit_cube(roller, velocity=(1.0, 0, 0)), nts.EnergyMomentum(), dt=0.01, t_end=0.02
+    )
+    (kind,) = run.warnings
+    assert run.status == "completed" and not run.warnings[kind].grave
+    assert kind == "facet starts in an obstacle" and abs(run.warnings[kind].worst - 0.2) < 0.0022
+    assert "it is not looked at" in run.warnings[kind].text
+
+
+@pytest.mark.mpi
+def test_what_is_in_an_obstacle_where_the_scene_starts_is_left_out_not_where_the_mesh_is():
+    """A cube whose mesh is in the floor, and which starts 0.7 m higher, 0.2 m over it."""
+    floor = nts.Plane((0, 0, 0.5), (0, 0, 1))
+    top, lifted = (lambda x: x[2] > 1 - 1e-9), (lambda x: np.tile([[0], [0], [0.7]], len(x[0])))
+    system = unit_cube(floor, top, rigid=False, displacement=lifted)
+    watch = overlap.OverlapWatch(system)
+    assert watch.look(moved(system, (0, 0, 0.7))) == []
+    (found,) = watch.look(moved(system, (0, 0, 0.2)), last=True)
+    assert found.kind == "node in an obstacle" and abs(found.depth - 0.3) < 1e-12
+
+
+def with_a_hole(through):
+    """A body of cubic cells of 1, without the one in the middle of 3 x 3 x 1 or 3 x 3 x 3."""
+    shape = (3, 3, 1 if through else 3)
+    number = np.arange(np.prod(np.add(shape, 1))).reshape(np.add(shape, 1))
+    middle = (1, 1, 0) if through else (1, 1, 1)
+    corner = [c for c in np.ndindex(*shape) if c != middle]
+    order = [(i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1)]
+    cells = np.array([[number[tuple(np.add(c, o))] for o in order] for c in corner])
+    x = np.array(list(np.ndindex(*number.shape)), dtype=float)
+    if COMM.rank:
+        cells, x = cells[:0], x[:0]
+    mesh = compat.create_mesh(COMM, cells, x, "hexahedron")
+    return nts.RigidBody(mesh, density=1e3, velocity=(0.2, 0.1, 0.05), name="holed")
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("through", "obstacle"),
+    [
+        (True, nts.Sphere((1.5, 1.5, 0.5), 0.4)),
+        (True, nts.Cylinder((1.5, 1.5, 0.0), (0, 0, 1), 0.45)),
+        (True, nts.Cylinder((1.5, 1.5, 0.0), (0.1, 0, 1), 0.3)),
+        (False, nts.Sphere((1.5, 1.5, 1.5), 0.49)),
+        (False, nts.Sphere((1.5, 1.5, 1.5), 0.01)),
+        (False, nts.Sphere((1.5, 1.5, 1.5), 9.0, inside=True)),
+        (False, nts.Cylinder((1.5, 1.5, 0.0), (0, 0, 1), 9.0, inside=True)),
+        (False, nts.Plane((1.5, 1.5, 0.0), (0, 0, 1))),
+        (False, nts.Plane((1.5, 1.5, -1e-3), (1e-3, 0, 1))),
+        (False, nts.Sphere((1.5, 1.5, -50.0), 50.0)),
+        (False, nts.Sphere((1.5, 1.5, -0.02), 0.02)),
+    ],
+)
+@pytest.mark.parametrize("where", [everywhere, lambda x: x[2] < 1e-9], ids=["all", "bottom"])
+def test_what_is_in_a_hole_or_around_or_below_is_not_inside(through, obstacle, where):
+    body = with_a_hole(through)
+    pair = nts.ContactPair(slave=body.surface(where), master=obstacle)
+    run = nts.simulate(
+        nts.System([body], contacts=[pair]), nts.EnergyMomentum(), dt=0.01, t_end=0.03
+    )
+    assert run.status == "completed" and not run.warnings
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("where", [everywhere, lambda x: x[2] < 1e-9], ids=["all", "bottom"])
+@pytest.mark.parametrize("through", [True, False])
+@pytest.mark.parametrize("place", [(0.5, 1.5, 0.5), (2.6, 2.4, 0.5), (0.5, 0.5, 0.1)])
+def test_a_start_around_an_obstacle_is_refused(place, through, where):
+    body, r = with_a_hole(through), 0.09
+    for ball in (nts.Sphere(place, r), Ball(place, r, width=r)):
+        pair = nts.ContactPair(slave=body.surface(where), master=ball)
+        message = (
+            rf"^contact 'holed-{ball.name}': '{ball.name}' starts inside 'holed' as a whole, at "
+            r"\(.*\) 0\.\d+ m from the boundary; move the two apart"
+        )
+        with pytest.raises(ValueError, match=message):
+            nts.System([body], contacts=[pair])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("cells", [1, 4])
+def test_a_start_from_another_run_around_an_obstacle_is_refused(cells, caplog):
+    """A settled block and one that moves, in a scene to which a ball is added where it is now."""
+    caplog.set_level(logging.CRITICAL)
+    free = unit_cube(nts.Plane((0, 0, -9.0), (0, 0, 1)), cells=cells, velocity=(2.0, 0, 0))
+    run = nts.simulate(free, nts.EnergyMomentum(), dt=0.25, t_end=1.0)
+    ball = nts.Sphere((2.5, 0.5, 0.5), 0.2)
+    start = unit_cube(ball, cells=cells, velocity=(2.0, 0, 0))
+    with pytest.raises(ValueError, match="^contact 'cube-sphere': 'sphere' starts inside 'cube'"):
+        start.state_from(free, run.state, moving=False)
+    options = {"dt": 1e-3, "t_end": run.state.time + 2e-3, "start": run}
+    told = nts.simulate(start, nts.EnergyMomentum(), **options)
+    assert told.status.startswith("completed, but 'sphere' lies inside 'cube'")

@@ -12,7 +12,7 @@ from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import locate_facets
-from dolfinx_nts.validation import is_whole, items, known_options, vector_in_time
+from dolfinx_nts.validation import is_whole, items, known_options, vector, vector_in_time
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -32,7 +32,7 @@ class Dirichlet:
         components: Which of x, y, z are prescribed.
 
     Raises:
-        ValueError: Unknown component.
+        ValueError: Unknown component, or `value` is neither three finite numbers nor a function.
     """
 
     where: Any
@@ -44,6 +44,7 @@ class Dirichlet:
         listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
         if not listed or not given:
             raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
+        _check_value("Dirichlet.value", self.value, "m")
 
 
 @known_options
@@ -54,10 +55,22 @@ class Traction:
     Attributes:
         where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
         value: Force per reference area [Pa]: a vector, or a function of time.
+
+    Raises:
+        ValueError: `value` is neither three finite numbers nor a function.
     """
 
     where: Any
     value: VectorInTime
+
+    def __post_init__(self) -> None:
+        _check_value("Traction.value", self.value, "Pa")
+
+
+def _check_value(name: str, value: Any, unit: str) -> None:
+    """Raise ValueError unless it is a vector or may be a function of time."""
+    if not callable(value):
+        vector(name, value, unit, or_else="a function of time that returns them")
 
 
 def facets_of(mesh: Any, where: Any, what: str) -> IntArray:

@@ -28,14 +28,15 @@ class Finding(NamedTuple):
     """The worst of what a look found of a kind.
 
     Attributes:
-        kind: "edge through a body", "node inside a body", "facet in an obstacle" or "node in an
-            obstacle".
+        kind: "edge through a body", "node inside a body", "facet in an obstacle", "node in an
+            obstacle", "obstacle in a body" or "facet starts in an obstacle".
         depth: Of the deepest point [m].
         size: The same in facet sizes [-].
         place: Where it is [m], shape (3,).
         bodies: Name of the body it belongs to, and of the body or obstacle it is in.
         nodes: Input numbers of the edge's ends, of the node, or of the facet's corners.
         text: Sentence with all this and a remedy.
+        grave: Whether the result may be wrong.
     """
 
     kind: str
@@ -45,6 +46,7 @@ class Finding(NamedTuple):
     bodies: tuple[str, str]
     nodes: tuple[int, ...]
     text: str
+    grave: bool = True
 
 
 class Pause(NamedTuple):

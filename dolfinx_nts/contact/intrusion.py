@@ -401,10 +401,14 @@ def sunk(
         one, two = (p[facet] + s[:, None] * (q - p)[facet] for p, q in ((a, d), (b, c)))
         return one, two
 
-    start = -np.column_stack([obstacle.lowest_gap(a, b), obstacle.lowest_gap(d, c)])
-    at, depth = highest(
-        lambda facet, s, _: -obstacle.lowest_gap(*line(facet, s)), start, length, limit
+    # Bounds, because a line that is taken for less deep than it is hides those beside it.
+    start = np.column_stack(
+        [obstacle.depth_bound(a, b, limit), obstacle.depth_bound(d, c, limit)]
     )
+    at, depth = highest(
+        lambda facet, s, _: obstacle.depth_bound(*line(facet, s), limit[facet]),
+        start, length, limit,
+    )  # fmt: skip
     place: FloatArray = corners.mean(axis=1)
     deep = np.flatnonzero(depth > limit)
     if deep.size:

@@ -26,6 +26,8 @@ Motion = Callable[[float], Vector]
 
 #: Depth that matters on a path, as part of its length and of the obstacle's width.
 _OF_PATH = 0.05
+#: How deep points are taken in an obstacle: part of its width, or of the distance from it.
+_BELOW, _BEHIND = 0.5, 1e-6
 
 
 class Obstacle:
@@ -78,6 +80,18 @@ class Obstacle:
         """Radius of what a node could pass within a step [m]; infinite where it cannot."""
         return np.inf
 
+    def inner_points(self, x: FloatArray) -> FloatArray:
+        """Points inside the obstacle [m], (m, 3), each behind its surface next to one of x (n, 3).
+
+        They are half the width behind it, or only just without a finite one. Where the gap is not
+        negative there, which only that of no true distance is, there is none: m <= n.
+        """
+        gap = self.gap(x)
+        finite = np.isfinite(self.width)
+        below = _BELOW * self.width if finite else _BEHIND * np.abs(gap.value)
+        inner: FloatArray = x - (gap.value + below)[:, None] * gap.gradient[:, 0]
+        return inner[self.gap(inner).value < 0.0]
+
     def lowest_gap(self, x0: FloatArray, x1: FloatArray) -> FloatArray:
         """Smallest gap on straight paths from x0 to x1 [m], (n, 3) each -> (n,).
 
@@ -85,15 +99,32 @@ class Obstacle:
         is right to one part in a hundred where it is above a twentieth of its length or of the
         width.
         """
+        length = np.linalg.norm(x1 - x0, axis=1)
+        return -self._sampled(x0, x1, _OF_PATH * np.minimum(length, self.width))
+
+    def depth_bound(self, x0: FloatArray, x1: FloatArray, limit: FloatArray) -> FloatArray:
+        """What no point of straight paths is deeper than [m], (n, 3) each -> (n,).
+
+        Above the limit (n,) it is the depth of the deepest point. An obstacle that is sampled is
+        not known better below it.
+        """
+        if type(self).lowest_gap is not Obstacle.lowest_gap:
+            return -self.lowest_gap(x0, x1)
+        length = np.linalg.norm(x1 - x0, axis=1)
+        between = 0.5 * (length - self.gap(x0).value - self.gap(x1).value)
+        bound: FloatArray = np.maximum(self._sampled(x0, x1, limit), np.minimum(between, limit))
+        return bound
+
+    def _sampled(self, x0: FloatArray, x1: FloatArray, limit: FloatArray) -> FloatArray:
+        """Largest depth on straight paths [m], (n,), to one part in a hundred above the limit."""
         path = x1 - x0
-        length = np.linalg.norm(path, axis=1)
         _, depth = highest(
             lambda k, s, _: -self.gap(x0[k] + s[:, None] * path[k]).value,
             -np.column_stack([self.gap(x0).value, self.gap(x1).value]),
-            length,
-            _OF_PATH * np.minimum(length, self.width),
+            np.linalg.norm(path, axis=1),
+            limit,
         )
-        return -depth
+        return depth
 
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Discrete gradient of the gap in the invariant y . y, and its derivative by x1.

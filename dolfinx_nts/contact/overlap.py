@@ -44,13 +44,13 @@ class _Looked:
 class OverlapWatch:
     """Looks whether bodies that are in a contact with each other end up inside each other.
 
-    Also whether obstacles end up inside facets of a slave that they are the master of, or nodes of
-    its body's remaining boundary in them. Bodies of which no contact is declared may pass through
-    each other. A look is due when the two have moved relative to each other so far that they can
-    touch; then by a quarter of a facet since the last one, and four steps or a facet. The radius of
-    a small obstacle counts as a facet, and so does the thickness of the thicker one of two bodies.
-    Where they have moved by more than that thickness between two looks, the straight way is looked
-    at, too.
+    Also whether obstacles end up inside facets of a slave that they are the master of, inside those
+    or over nodes of its body's remaining boundary, or inside the body. Bodies of which no contact
+    is declared may pass through each other. A look is due when the two have moved relative to each
+    other so far that they can touch; then by a quarter of a facet since the last one, and four
+    steps or a facet. The radius of a small obstacle counts as a facet, and so does the thickness of
+    the thicker one of two bodies. Where they have moved by more than that thickness between two
+    looks, the straight way is looked at, too.
 
     Args:
         system: The scene.
@@ -59,13 +59,20 @@ class OverlapWatch:
     def __init__(self, system: Any) -> None:
         self._comm, self._bodies = system.comm, system.bodies
         self._surfaces: dict[int, Surface] = {}
+
+        def start() -> tuple[FloatArray, ...]:
+            at_start: tuple[FloatArray, ...] = system.initial_state().u
+            return at_start
+
         between: dict[tuple[int, ...], list[Any]] = {}
         self._pairs: list[BodyPair | ObstacleContact] = []
         for contact, bodies in zip(system.contacts, system.contact_bodies, strict=True):
             if len(contact.bodies) == 1 and len(contact.slave.facets):
                 alike = [c.slave for c in system.contacts if _same_obstacle(contact, c)]
                 slaves = [s for s in alike if len(s.facets)]
-                self._pairs.append(ObstacleContact(contact, bodies[0], slaves, self._boundary))
+                self._pairs.append(
+                    ObstacleContact(contact, bodies[0], slaves, self._boundary, start)
+                )
             elif len(contact.bodies) == 2 and all(b.mesh is not None for b in contact.bodies):
                 between.setdefault(tuple(sorted(bodies)), []).append(contact)
         self._pairs += [BodyPair(k, c, self._boundary) for k, c in between.items()]
@@ -95,6 +102,16 @@ class OverlapWatch:
             if f.kind not in worst or f.size > worst[f.kind].size:
                 worst[f.kind] = f
         return list(worst.values())
+
+    def enclosed(self, u: Sequence[FloatArray], time: float) -> list[Finding]:
+        """Obstacles inside bodies that a contact is to hold out of them. Collective.
+
+        Args:
+            u: Owned displacements of all bodies [m].
+            time: At which they are so [s].
+        """
+        pairs = [pair for pair in self._pairs if isinstance(pair, ObstacleContact)]
+        return [found for pair in pairs for found in pair.inside(pair.where(u, time))]
 
     def _due(self, now: list[list[FloatArray]], last: bool) -> list[tuple[int, float]]:
         """Pairs that have moved enough, and how far [m]. Collective."""

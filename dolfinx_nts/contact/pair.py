@@ -121,7 +121,7 @@ class ContactPair:
     def __init_subclass__(cls, master: type) -> None:
         ContactPair._kinds[master] = cls
 
-    def __new__(cls, slave: Any = None, master: Any = None, **_: Any) -> ContactPair:
+    def __new__(cls, slave: Any = None, master: Any = None, *_: Any, **__: Any) -> ContactPair:
         """Make a pair of the kind that the master asks for."""
         kinds = (pair for kind, pair in cls._kinds.items() if isinstance(master, kind))
         return super().__new__(next(kinds, cls))

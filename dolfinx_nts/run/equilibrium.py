@@ -241,10 +241,11 @@ class _LoadStepper(Stepper):
                     self._check_missed(reached)
                 except UserFunctionError:
                     raise
-                except StepFailedError:
+                except StepFailedError as failure:
                     # Bodies in search of each other move by load over stabilization, whatever dt.
                     if not 0.0 < problem.stabilization.share < _STIFFEST:
-                        raise
+                        unheld = self._unheld(state, dt)
+                        raise StepFailedError(f"{unheld}{failure}") from failure
                     problem.stabilization.share /= _RELIEF
                     continue
                 iterations += step.iterations
@@ -267,6 +268,21 @@ class _LoadStepper(Stepper):
         raise StepFailedError(
             f"step from t={kept.time:.6g}: body {restless!r} is not at rest after {_RELAXATIONS} "
             "relaxations; nothing holds it, or it hops from facet to facet"
+        )
+
+    def _unheld(self, state: State, dt: float) -> str:
+        """What nothing resists where a failed load step starts, or nothing. Collective."""
+        if self.problem.stabilization.share:
+            return ""
+        self.problem.begin(state, dt)
+        self.solver.prepare()
+        start = self.problem.evaluate(self.problem.x)
+        found = free_motion(self.problem, self.solver, start)
+        if not found:
+            return ""
+        return (
+            f"{found}, where the step starts: hold it by a Dirichlet condition, a joint or contact "
+            "that touches there, or pass stabilization=0.1; "
         )
 
     def _solve(self, state: State, dt: float, search: bool) -> Evaluation:

@@ -441,7 +441,7 @@ class Stepper:
         if self._overlap is not None:
             for found in self._overlap.look(self.state.u, self.state.time, last=last):
                 self.solution.warn(
-                    found.kind, self.state.time, found.depth, found.text, grave=True
+                    found.kind, self.state.time, found.depth, found.text, grave=found.grave
                 )
 
     def _first_row(self) -> dict[str, Any]:
