@@ -43,13 +43,13 @@ def until_late(fails, ranks):
 
 def scene(what=None, function=None):
     """A block that flies above a floor, with a function of time somewhere."""
-    options = {
-        "Dirichlet": {
-            "bcs": [nts.Dirichlet(bottom, components=(0,)), nts.Dirichlet(top, function)]
-        },
-        "Traction": {"traction": [nts.Traction(top, function)]},
-        "body_force": {"body_force": function},
-    }.get(what, {})
+    options = {}
+    if what == "Dirichlet":
+        options["bcs"] = [nts.Dirichlet(bottom, components=(0,)), nts.Dirichlet(top, function)]
+    elif what == "Traction":
+        options["traction"] = [nts.Traction(top, function)]
+    elif what == "body_force":
+        options["body_force"] = function
     low, high = [0, 0, 0], [1, 1, 1]
     mesh = create_box(
         COMM, [low, high], [2, 2, 2], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
