@@ -17,13 +17,13 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import EveryStep, PointElements, Step
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kinematics import OFF, Kinematics
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import StepFailedError
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]

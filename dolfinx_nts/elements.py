@@ -12,13 +12,13 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.kinematics import Kinematics, differenced, has_constraints, unknown
 
 if TYPE_CHECKING:
     from dolfinx_nts.contact.surfaces import Surface
-    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]

@@ -14,7 +14,7 @@ from point_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.step.promises import Promises
+from dolfinx_nts.run.promises import Promises
 
 COMM = MPI.COMM_WORLD
 

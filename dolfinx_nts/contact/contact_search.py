@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +15,9 @@ from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.elements import Step
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.validation import StepFailedError
-
-if TYPE_CHECKING:
-    from dolfinx_nts.step.evaluation import Evaluation
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
@@ -21,7 +22,6 @@ from dolfinx_nts.step import balance, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
 from dolfinx_nts.step.convergence import unrest
-from dolfinx_nts.step.evaluation import Evaluation
 from dolfinx_nts.step.free_motion import free_motion
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import (

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.step.evaluation import Evaluation
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import known_options

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinx_nts.bodies.inversion import describe, smallest_dets
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
-from dolfinx_nts.step.evaluation import Evaluation
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import State, System
 

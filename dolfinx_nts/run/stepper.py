@@ -14,7 +14,9 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.overlap import OverlapWatch
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.run.promises import MaterialWatch, Promises
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
     check_restart,
@@ -29,13 +31,11 @@ from dolfinx_nts.run.table import Table
 from dolfinx_nts.step import balance, consistent, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
-from dolfinx_nts.step.evaluation import Evaluation
 from dolfinx_nts.step.guards import check_momentum
 from dolfinx_nts.step.impact import IMPACTS, Impact, restored
 from dolfinx_nts.step.massless import check_massless, off_balance
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.step.promises import MaterialWatch, Promises
 from dolfinx_nts.step.resting import with_resting_forces
 from dolfinx_nts.step.unresolved import tell_unresolved
 from dolfinx_nts.system import State, System, is_like

@@ -11,10 +11,10 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts.bodies.inversion import smallest_dets
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.system import State, System
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]

@@ -12,10 +12,10 @@ from mpi4py import MPI
 
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.system import State, System
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]

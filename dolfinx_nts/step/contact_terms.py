@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.elements import Step
+from dolfinx_nts.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.step.assembly import StepMatrix
-from dolfinx_nts.step.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.system import State, System
 from dolfinx_nts.validation import StepFailedError, is_finite

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.elements import over
+from dolfinx_nts.evaluation import Evaluation, free
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.step.evaluation import Evaluation, free
 from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from dolfinx_nts.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.step.convergence import ratios
-from dolfinx_nts.step.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.step.problem import StepProblem
 
 

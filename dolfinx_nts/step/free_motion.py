@@ -9,10 +9,10 @@ import numpy.typing as npt
 import scipy.linalg
 from mpi4py import MPI
 
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.step.newton import StepSolver
     from dolfinx_nts.step.problem import StepProblem
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.step.evaluation import Evaluation
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import State
 from dolfinx_nts.validation import StepFailedError

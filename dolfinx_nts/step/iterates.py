@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.step.evaluation import Evaluation
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.problem import StepProblem
 
 IntArray = npt.NDArray[np.signedinteger[Any]]

@@ -6,7 +6,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from dolfinx_nts.step.evaluation import Evaluation
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.problem import StepProblem
 
 #: Relative difference of the factors of two equal steps of a caller whose lengths are rounded.

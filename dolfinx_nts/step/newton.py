@@ -12,11 +12,11 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.convergence import ratios
 from dolfinx_nts.step.diagnosis import diagnosis
-from dolfinx_nts.step.evaluation import Evaluation
 from dolfinx_nts.step.iterates import Iterates
 from dolfinx_nts.step.kept import KeptTangents
 from dolfinx_nts.step.least_norm import NullSpace, form_tree

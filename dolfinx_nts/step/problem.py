@@ -23,8 +23,8 @@ from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.elements import Coupling, JointCoupling, Step
+from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.step.evaluation import BodyTerms, Evaluation, free
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.stabilization import Stabilization

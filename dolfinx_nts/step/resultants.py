@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
-    from dolfinx_nts.step.evaluation import Evaluation
     from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]

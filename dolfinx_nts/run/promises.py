@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.step import balance
+from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import System
-
-if TYPE_CHECKING:
-    from dolfinx_nts.run.solution import Solution
-    from dolfinx_nts.step.evaluation import Evaluation
-    from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 
