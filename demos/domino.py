@@ -180,7 +180,7 @@ def impacts(dominoes, friction):
 
 
 def speed(times):
-    """Of the wave over sqrt(g H), in the mean over the later half of the impacts."""
+    """Return the speed of the wave over sqrt(g H), the mean of the later half of the impacts."""
     part = times[min(len(times) // 2, len(times) - 2) :]
     return PITCH * (len(part) - 1) / (part[-1] - part[0]) / np.sqrt(GRAVITY * HEIGHT)
 

@@ -75,7 +75,7 @@ def ball_mesh(comm, cells):
 
 
 def reach(cells):
-    """From the centre to the tip [m]: a node, or the middle of a facet with its corners outside."""
+    """Return the way from the centre to the tip [m]: to a node, or to the middle of a facet."""
     corner = np.array([1.0, *(2 * [1.0 / cells])])
     return RADIUS * (1.0 if cells % 2 == 0 else 1.0 / np.linalg.norm(corner))
 

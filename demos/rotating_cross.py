@@ -64,7 +64,7 @@ def scene(comm, refine=1):
 
 
 def figures(run):
-    """How far the run came and what it kept."""
+    """Return how far the run came and what it kept."""
     b = run.balance
     spin = b["angular_momentum"]
     return {

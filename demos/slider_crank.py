@@ -80,7 +80,7 @@ def rigid_rod(comm):
 
 
 def flexible_rod(comm, cells):
-    """As of `rigid_rod`, with a pin tied to each end."""
+    """Make a rod as `rigid_rod` does, with a pin tied to each end."""
     low = LEFT - [0, *np.multiply(SECTION, 0.5)]
     rod = nts.Continuum(
         box(comm, low, (LENGTH, *SECTION), (cells, 1, 1)),
@@ -197,7 +197,7 @@ def unexplained(run):
 
 
 def figures(run, path):
-    """What the run says: lengths in m, forces in N, energies over that at the start."""
+    """Return what the run says: lengths in m, forces in N, energies over that at the start."""
     b = run.balance
     start = b["energy"][0]
     pressed = np.flatnonzero(run.contact_forces[:, 0, 0])

@@ -48,7 +48,7 @@ CLOSED_FORM = {"jerk [m]": JERK, "dissipation [J/kg]": FRICTION * GRAVITY * SLIP
 
 
 def spring_end(t: float) -> float:
-    """Where the far end of the spring is [m]: to and fro, turning when a slip is over."""
+    """Return where the far end of the spring is [m]: to and fro, turning when a slip is over."""
     stroke = 2 * LOADING + SLIPPING
     number, part = divmod(t + LOADING, stroke)
     return PULL * ((part if number % 2 == 0 else stroke - part) - LOADING)

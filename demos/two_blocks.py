@@ -89,7 +89,7 @@ def scene(
 
 
 def figures(run: nts.Solution) -> dict[str, Any]:
-    """What the run kept and lost, relative to the energy and momenta it started with."""
+    """Return what the run kept and lost, relative to the energy and momenta it started with."""
     table = run.balance
     energy, momentum, spin = (table[k] for k in ("energy", "linear_momentum", "angular_momentum"))
     lost, defect = 1 - energy[-1] / energy[0], table["contact_defect"][-1] / energy[0]

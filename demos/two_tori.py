@@ -103,7 +103,7 @@ class Pictures:
 
 
 def figures(run):
-    """What the run kept and what happened in it."""
+    """Return what the run kept and what happened in it."""
     b = run.balance
     energy, p, spin = b["energy"], b["linear_momentum"], b["angular_momentum"]
     # The path runs almost through the origin, so J_0 is small beside p R and no scale for itself.
@@ -144,7 +144,7 @@ def report(result, integrator, refinement, dt):
 
 
 def writers(output):
-    """What a run leaves in the folder, if there is one."""
+    """Return what a run leaves in the folder, if there is one."""
     if output is None:
         return []
     from dolfinx_nts.output import BalanceCSV, Fields

@@ -142,7 +142,7 @@ class Recorder:
 
 
 def unexplained(run, path):
-    """Of all and of the carriage: change of momentum per step less impulses [kg m/s], (n, 3)."""
+    """Return the change of momentum per step less impulses [kg m/s], of all and of the carriage."""
     step = np.diff(path.time)[:, None]
     weight = np.array([0.0, 0.0, -GRAVITY])
     mass = sum(nts.motion_of(body).mass for body in run.system.bodies[:3])

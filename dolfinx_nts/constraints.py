@@ -273,7 +273,7 @@ class Constraints(EveryStep):
         return False
 
     def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
-        """As of `JointCoupling`, in closed form but for what is prescribed."""
+        """Do as `JointCoupling`, in closed form but for what is prescribed."""
         (batch,) = self.elements
         gap, off = self._gap(state)
         first, second, doubt = self._rates(state, dt)

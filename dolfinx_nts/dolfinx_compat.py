@@ -204,7 +204,7 @@ def cells_at(msh: Any, x: FloatArray) -> IntArray:
 
 
 def with_ghosts(space: Any, chosen: IntArray) -> npt.NDArray[np.bool_]:
-    """Which coordinates of this rank's nodes and ghosts are among chosen owned ones, (b, 3)."""
+    """Return which coordinates of nodes and ghosts are among chosen owned ones, (b, 3)."""
     mark = fem.Function(space)
     mark.x.array[chosen] = 1.0
     mark.x.scatter_forward()
@@ -403,7 +403,7 @@ def _view(pointer: Any, count: int) -> Any:
 
 
 def option_used(name: str) -> bool:
-    """Whether PETSc has asked for an option of its global database."""
+    """Return whether PETSc has asked for an option of its global database."""
     used = ctypes.c_int(0)  # PetscBool is an enum, since 3.24 a C99 bool; zero is false in both
     if error := _petsc_library().PetscOptionsUsed(None, name.encode(), ctypes.byref(used)):
         raise PETSc.Error(error)

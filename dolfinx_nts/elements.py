@@ -111,7 +111,7 @@ class Elements(Protocol):
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Name for messages."""
 
     @property
     def num_elements(self) -> int:
@@ -144,7 +144,7 @@ class Elements(Protocol):
         """The same with -1 where they are prescribed."""
 
     def reference(self) -> FloatArray:
-        """What is added to the displacements of these coordinates [m], shape (n, k / 3, 3)."""
+        """Return what is added to the displacements of these coordinates [m], (n, k / 3, 3)."""
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Augmented unknowns that fit predicted positions, shape (n, augmented)."""
@@ -225,7 +225,7 @@ class Joint(Protocol):
     losses: tuple[str, ...]
 
     def start(self) -> Any:
-        """What it remembers at the start."""
+        """Return what it remembers at the start."""
 
     def potential(self, u: Sequence[FloatArray], history: Any) -> float:
         """Stored energy on this rank [J]. Collective.
@@ -236,7 +236,7 @@ class Joint(Protocol):
         """
 
     def coupling(self, bodies: tuple[int, ...]) -> JointCoupling:
-        """What makes its elements in a run.
+        """Return what makes its elements in a run.
 
         Args:
             bodies: Numbers of its bodies in the system.
@@ -302,7 +302,7 @@ class PointElements:
 
     @property
     def weights(self) -> FloatArray:
-        """Of the nodes in each side's point, shape (n, sides, nodes)."""
+        """Weights of the nodes in each side's point, shape (n, sides, nodes)."""
         zeros = [np.zeros_like(side.weights) for side in self.sides]
         rows = [
             np.concatenate([*zeros[:k], side.weights, *zeros[k + 1 :]], axis=1)
@@ -431,15 +431,15 @@ class EveryStep:
         return {}
 
     def history(self, parts: Sequence[Any]) -> Any:
-        """What is remembered of an accepted step."""
+        """Return what is remembered of an accepted step."""
         return self._remember(parts[0]) if self._remember else None
 
     def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
-        """What the elements' ledgers say."""
+        """Return what the elements' ledgers say."""
         return None
 
     def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
-        """From the residuals of the elements of steps up to this one.
+        """Take the kinematics from the residuals of the elements of steps up to this one.
 
         Raises:
             TypeError: These cannot say it: elements other than `PointElements`, or with unknowns
@@ -483,10 +483,10 @@ class Coupling(Protocol):
         """Numbers of the bodies that elements move, the same on all ranks. Collective."""
 
     def wake(self, u1: Sequence[FloatArray]) -> bool:
-        """Whether a solved step asks for more elements, which are made. Collective."""
+        """Return whether a solved step asks for more elements, which are made. Collective."""
 
     def misses(self, e: Evaluation, parts: Sequence[Any], motion: FloatArray) -> bool:
-        """Whether a solved step may have passed by something, so that it begins again. Collective.
+        """Return whether a step may have passed by something, so that it begins again. Collective.
 
         Args:
             e: Its solution.
@@ -522,7 +522,7 @@ class Coupling(Protocol):
         """
 
     def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
-        """What an accepted step did that its user may not have meant. Collective.
+        """Return what an accepted step did that its user may not have meant. Collective.
 
         Args:
             parts: Solution, of each of `elements`.
@@ -535,7 +535,7 @@ class Coupling(Protocol):
         """Minima of an accepted step on this rank, by columns of the balance table."""
 
     def history(self, parts: Sequence[Any]) -> Any:
-        """What is remembered of an accepted step.
+        """Return what is remembered of an accepted step.
 
         Args:
             parts: Solution, of each of `elements`.
@@ -561,7 +561,7 @@ class JointCoupling(Coupling, Protocol):
         """
 
     def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
-        """How the constraints change in time at a state, of each of `elements`. Collective.
+        """Return how the constraints change in time at a state, of each of `elements`. Collective.
 
         A start has to fit them, and first accelerations keep them. None, on all ranks alike, for
         elements without constraints, or with such as a start need not fit.

@@ -123,12 +123,12 @@ def _at_start(matrix: FloatArray, values: FloatArray, dt: float) -> FloatArray:
 
 
 def has_constraints(batch: Any) -> bool:
-    """Whether a batch of elements has constraints that hold always."""
+    """Return whether a batch of elements has constraints that hold always."""
     return bool(batch.bilateral and batch.widths["constraints"])
 
 
 def unknown(batch: Any) -> TypeError:
-    """What to raise where nobody knows how constraints change in time."""
+    """Return what to raise where nobody knows how constraints change in time."""
     return TypeError(
         f"joint {batch.name!r}: its elements have constraints, but nothing says how these change "
         "in time, which a start has to fit; give its coupling kinematics(state, dt), with None "

@@ -51,7 +51,7 @@ def raise_together(
 
 
 def on_root(comm: Any, work: Callable[[], T]) -> T | None:
-    """What `work` returns, on rank 0; what it raises, on every rank."""
+    """Run `work` on rank 0 and return its result there; what it raises is raised on every rank."""
     result, error = None, None
     if comm.rank == 0:
         try:

@@ -51,7 +51,7 @@ class State:
 
 
 def is_like(one: Joint, other: Joint) -> bool:
-    """Whether two joints are of one kind and name and join bodies of the same names.
+    """Return whether two joints are of one kind and name and join bodies of the same names.
 
     What the one remembers at the end of a run then fits the other.
     """
@@ -273,7 +273,7 @@ class System:
                     )
 
     def penetration(self, state: State) -> list[FloatArray]:
-        """How deep the slaves of each contact lie behind their facets, in facet sizes. Collective.
+        """Return how deep slaves lie behind their facets, in facet sizes, by contact. Collective.
 
         Returns:
             Of each contact, shape (points,), the same on all ranks; 0 outside and, but for

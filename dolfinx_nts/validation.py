@@ -72,12 +72,12 @@ def known_options(target: T) -> T:
 
 
 def is_finite(value: Any) -> TypeGuard[float]:
-    """Whether the value is a finite real number; text and truth values are none."""
+    """Return whether the value is a finite real number; text and truth values are none."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def is_whole(value: Any) -> TypeGuard[int]:
-    """Whether the value is a whole number; a truth value is none."""
+    """Return whether the value is a whole number; a truth value is none."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
@@ -169,7 +169,7 @@ def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tu
 def call_together(
     comm: Any, name: str, function: Callable[..., Any], *arguments: Any, shown: Any = None
 ) -> Any:
-    """What the user's function returns; what it raises on one rank raises on all.
+    """Call the user's function; what it raises on one rank is raised on all.
 
     Args:
         comm: MPI communicator.

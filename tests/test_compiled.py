@@ -39,7 +39,7 @@ def pairs(nc, friction, rule, condense=True):
 
 
 def test_the_library_is_there():
-    assert compiled._library() is not None
+    assert compiled.is_there()
 
 
 @pytest.mark.parametrize("rule", ["mean-value", "gonzalez", "direct"])

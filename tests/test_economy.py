@@ -275,7 +275,7 @@ def test_frictionless_contact_has_no_tangential_unknowns():
 
 @pytest.mark.mpi
 def test_mass_matrix_without_zeros_is_the_same():
-    body = economy.Economy(COMM, 2)._bodies["far"][0][0]
+    body = economy.Economy(COMM, 2).system(FEATURE["active"]).bodies[0]
     full = compat.create_matrix(body_mass := mass_form(body))
     compat.assemble_matrix(full, body_mass, (), 0.0)
     x, y = full.createVecs()

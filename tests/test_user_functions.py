@@ -7,9 +7,8 @@ import re
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
-from scenes import bottom, top
+from scenes import RUBBER, bottom, box, top
 
 import dolfinx_nts as nts
 from dolfinx_nts import validation
@@ -41,21 +40,21 @@ def until_late(fails, ranks):
     return lambda t: fails(t) if t > LATE and failing else (0, 0, -0.01 * t)
 
 
+def loads(what, function):
+    """Options of a body with a function of time in one of its loads, or none."""
+    if what == "Traction":
+        return {"traction": [nts.Traction(top, function)]}
+    return {"body_force": function} if what == "body_force" else {}
+
+
 def scene(what=None, function=None):
     """A block that flies above a floor, with a function of time somewhere."""
-    options = {}
+    options = loads(what, function)
     if what == "Dirichlet":
         options["bcs"] = [nts.Dirichlet(bottom, components=(0,)), nts.Dirichlet(top, function)]
-    elif what == "Traction":
-        options["traction"] = [nts.Traction(top, function)]
-    elif what == "body_force":
-        options["body_force"] = function
-    low, high = [0, 0, 0], [1, 1, 1]
-    mesh = create_box(
-        COMM, [low, high], [2, 2, 2], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
+    body = nts.Continuum(
+        box(), RUBBER, density=1e3, name="block", velocity=(0, 0, 0.1), **options
     )
-    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
-    body = nts.Continuum(mesh, rubber, density=1e3, name="block", velocity=(0, 0, 0.1), **options)
     motion = function if what == "motion" else None
     floor = nts.Plane((0, 0, -1e-3), (0, 0, 1), motion=motion, name="floor")
     return nts.System([body], contacts=[nts.ContactPair(body.surface(bottom), floor)])
@@ -138,9 +137,8 @@ def held(what, function, supports):
     """The block on a support, with a function of time in another place."""
     system = scene(what, function)
     body, floor = system.bodies[0], system.contacts[0].master
-    options = {"traction": body._traction, "body_force": body.body_force}
     block = nts.Continuum(
-        body.mesh, body.material, density=1e3, name="block", bcs=[supports], **options
+        body.mesh, RUBBER, density=1e3, name="block", bcs=[supports], **loads(what, function)
     )
     pair = nts.ContactPair(block.surface(top), floor) if what == "motion" else None
     return nts.System([block], contacts=[pair] if pair else [])

@@ -434,7 +434,7 @@ class Beam(Body):
 
     @cached_property
     def _diagonal(self) -> FloatArray:
-        """Of the stiffness in the reference [N/m]. Collective."""
+        """Return the diagonal of the stiffness in the reference [N/m]. Collective."""
         k = kernel.tangent(self._beams, self._rest, self._rest, 1.0)
         return self._gather(np.einsum("nii->ni", k))
 

@@ -316,5 +316,5 @@ _PROTOCOL = tuple(
 
 
 def is_body(given: Any) -> bool:
-    """Whether an object is a `Body` or has all that one has."""
+    """Return whether an object is a `Body` or has all that one has."""
     return isinstance(given, Body) or all(hasattr(given, name) for name in _PROTOCOL)

@@ -80,7 +80,7 @@ def principal(inertia: Any, axes: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def misfit_of_axes(axes: FloatArray) -> str | None:
-    """What is wrong with axes that should be columns of a right-handed orthonormal matrix."""
+    """Say what keeps axes from being columns of a right-handed orthonormal matrix."""
     fits = axes.shape == (3, 3) and np.isfinite(axes).all()
     if not fits or np.abs(axes.T @ axes - np.eye(3)).max() > ROUNDED:
         return "pass a matrix (3, 3) with orthonormal columns"

@@ -118,7 +118,7 @@ def forbidden(system: Any, dets: FloatArray) -> FloatArray:
 
 
 def describe(system: Any, u: Sequence[FloatArray], dets: FloatArray) -> str:
-    """Which body turns inside out most, and where; the same on all ranks. Collective.
+    """Return which body turns inside out most, and where; the same on all ranks. Collective.
 
     Args:
         system: Its bodies.

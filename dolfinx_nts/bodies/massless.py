@@ -153,7 +153,7 @@ def _polynomials(x: FloatArray, comm: Any) -> FloatArray:
 
 
 def _moments(affine: FloatArray, products: list[FloatArray], comm: Any) -> FloatArray:
-    """Of 1, x, y, z the moments of mass in the order of `_polynomials`, shape (10,). Collective."""
+    """Return the moments of mass in the order of `_polynomials`, shape (10,). Collective."""
     local = [float(affine[:, i] @ products[j]) for i in range(4) for j in range(i, 4)]
     total: FloatArray = comm.allreduce(np.array(local))
     return total

@@ -48,7 +48,7 @@ def _check_elastic(young: float, poisson: float) -> None:
 
 
 def misfit(expressions: Iterable[Any], domain: Any) -> str | None:
-    """What keeps UFL expressions from being compiled on a mesh, in words, if anything does.
+    """Return what keeps UFL expressions from being compiled on a mesh, in words, if anything does.
 
     Args:
         expressions: In UFL.

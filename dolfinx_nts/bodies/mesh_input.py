@@ -375,7 +375,7 @@ def _opened(gmsh: Any, path: str) -> Iterator[Any]:
 
 
 def _is_running(gmsh: Any) -> bool:
-    """Whether Gmsh is initialised."""
+    """Return whether Gmsh is initialised."""
     if hasattr(gmsh, "isInitialized"):
         return bool(gmsh.isInitialized())
     # 4.8 must be probed: an initialised one has a model. A finalised one prints errors when probed,

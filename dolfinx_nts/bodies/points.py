@@ -54,7 +54,7 @@ class Points:
         return numbers.reshape(len(self), 3 * self.nodes.shape[1])
 
     def part(self, chosen: Any) -> Points:
-        """Some of them, by numbers, a slice or a mask; the ranks may choose differently."""
+        """Return some of the points, chosen by numbers, a slice or a mask; ranks may differ."""
         arrays = (self.nodes, self.weights, self.reference, self.fixed, self.places)
         return Points(self.body, *(a[chosen] for a in arrays))
 
@@ -102,7 +102,7 @@ class Points:
         return float(sizes.max(initial=0.0))
 
     def divided(self, values: FloatArray) -> FloatArray:
-        """What the nodes' places have, such as mass, divided among the points, (n,). Collective.
+        """Divide what the nodes' places have, such as mass, among the points, (n,). Collective.
 
         Args:
             values: At this rank's owned coordinates, alike in all three directions.

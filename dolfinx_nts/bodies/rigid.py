@@ -199,7 +199,7 @@ class RigidBody(Body):
         motion: VectorInTime | None,
         rotation: Any,
     ) -> None:
-        """What both constructors share; `euler` are the principal moments of int rho x x^T dV."""
+        """Set up what both constructors share; `euler`: principal moments of int rho x x^T dV."""
         self.name, self.comm, self.mass = name, comm, mass
         linear = vector("velocity", velocity, "m/s")
         turning = vector("angular_velocity", angular_velocity, "rad/s")
@@ -461,7 +461,7 @@ class RigidBody(Body):
         return f.ravel()
 
     def _directors(self, u1: FloatArray) -> FloatArray:
-        """Where the forces of the step act [m], shape (3, 3)."""
+        """Return where the forces of the step act [m], shape (3, 3)."""
         u = self._u0 + self._theta * (u1 - self._u0)
         return (self.reference + u).reshape(4, 3)[1:]
 
@@ -516,7 +516,7 @@ class RigidBody(Body):
         return 0.0
 
     def reactions(self, residual: FloatArray) -> FloatArray:
-        """What prescribed motion needs on this rank: force [N], then moment of rotation [N m].
+        """Return what prescribed motion needs on this rank: force [N], then moment [N m].
 
         Shape (2, 3), (1, 3) if only one of them is prescribed, (0, 3) if none is.
         """

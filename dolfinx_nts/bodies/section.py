@@ -58,7 +58,7 @@ class Section:
 
     @property
     def radius(self) -> float:
-        """Of gyration about the axis [m]."""
+        """Radius of gyration about the axis [m]."""
         return float(np.sqrt(sum(self.rhoI) / self.rhoA))
 
     @property

@@ -52,7 +52,7 @@ class ContactHistory(NamedTuple):
 
     @classmethod
     def of_start(cls, n: int) -> ContactHistory:
-        """Of n nodes that have not touched yet."""
+        """Return the history of n nodes that have not touched yet."""
         off, none = np.zeros(n, dtype=bool), np.zeros(n)
         return cls(
             np.full(n, -1), none, np.full(n, np.inf), np.zeros((n, 3)), off, none.copy(), ~off
@@ -114,7 +114,7 @@ class ContactElements(ContactLaws):
     # ---- what they share
     @property
     def name(self) -> str:
-        """Of the contact, for messages."""
+        """Name for messages."""
         return self.pair.name
 
     @property
@@ -149,7 +149,7 @@ class ContactElements(ContactLaws):
         return 1.0
 
     def part(self, chosen: BoolArray) -> ContactElements:
-        """Some of the pairs, shape (n,)."""
+        """Return some of the pairs, chosen by a mask of shape (n,)."""
         found = self.candidates.part(chosen)
         return replace(
             self,
@@ -272,7 +272,7 @@ class ContactElements(ContactLaws):
         return part
 
     def _nothing(self) -> Contribution:
-        """Of no pairs."""
+        """Return the part of no pairs."""
         size = self.num_coordinates + self.num_augmented + self.num_constraints
         none, slip = np.zeros(0), np.zeros((0, self.num_tangential))
         off = none.astype(bool)
@@ -396,7 +396,7 @@ class ContactElements(ContactLaws):
         return gain
 
     def history(self, part: Contribution, factor: float, old: ContactHistory) -> ContactHistory:
-        """What the contact remembers of an accepted step."""
+        """Return what the contact remembers of an accepted step."""
         new = ContactHistory.of_start(len(old.force))
         node = self.candidates.node
         new.facet[node], new.gap[node] = self.candidates.facet, part.gap
@@ -416,7 +416,7 @@ class ContactElements(ContactLaws):
         return np.where(self._massless[:, None], at_end, of_step)
 
     def place(self, i: int) -> str:
-        """Where a pair is, for messages."""
+        """Return where a pair is, for messages."""
         return f"node {self.input_node(i)}"
 
     def describe(self, part: Contribution, flips: IntArray) -> tuple[float, str]:

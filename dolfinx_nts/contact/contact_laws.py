@@ -231,7 +231,7 @@ class ContactLaws:
     def _together(
         self, gap: FloatArray, slip: Slip | None, multiplier: FloatArray
     ) -> Together:
-        """What pairs that share nodes need to know of each other. Collective."""
+        """Return what pairs that share nodes need to know of each other. Collective."""
         if not self.pair.redundant:
             return Together(0.0, 0.0, 0.0)
         force = multiplier[:, 0]

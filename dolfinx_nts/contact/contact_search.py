@@ -71,7 +71,7 @@ class ContactSearch:
 
     @property
     def had_unknowns(self) -> list[BoolArray]:
-        """Of each contact, which of this rank's slave nodes have unknowns in the last step."""
+        """Which of this rank's slave nodes had unknowns in the last step, of each contact."""
         if not self.elements:
             return self._had
         both = zip(self._had, self.elements, strict=True)
@@ -187,7 +187,7 @@ class ContactSearch:
                     self._found[k] = c.part(~np.isin(np.arange(c.num_elements), there))
 
     def _may_touch(self, k: int, c: ContactElements, had: BoolArray) -> BoolArray:
-        """Which candidates need unknowns: all within reach, and who had them in the last step.
+        """Return which need unknowns: all within reach, and those that had them in the last step.
 
         In statics, where no motion bounds the next one, all do. Strong friction may hold nodes that
         free motion lets go (Painleve's paradox), and an iterate's errors would choose which: there
@@ -208,7 +208,7 @@ class ContactSearch:
 
     # ---- a solution
     def wake(self, u1: Sequence[FloatArray]) -> bool:
-        """Whether a solution closes gaps of idle candidates, which then get unknowns. Collective.
+        """Give unknowns to idle candidates whose gaps a solution closes, if any. Collective.
 
         Args:
             u1: Displacement of each body at t_{n+1} [m].
@@ -229,7 +229,7 @@ class ContactSearch:
     def misses(
         self, e: Evaluation, parts: Sequence[Contribution], motion: FloatArray
     ) -> bool:
-        """Whether a solved step may have passed by a contact that was no candidate. Collective.
+        """Return whether a step may have passed by a contact that was no candidate. Collective.
 
         Raises:
             StepFailedError: A node went through an obstacle and out of it again.
@@ -242,7 +242,7 @@ class ContactSearch:
         return missed
 
     def _passed(self, k: int, e: Evaluation, part: Contribution, reach: float) -> bool:
-        """Whether nodes have come through facets unseen, which are noted. Collective."""
+        """Return whether nodes have come through facets unseen, which are noted. Collective."""
         pair, bodies, path = self._pairs[k], self.bodies[k], self._paths[k]
         positions = pair.positions([self._step.state.u[b] for b in bodies])
         held = np.full(len(pair.slave.share), -1)
@@ -264,7 +264,7 @@ class ContactSearch:
         return bool(self._comm.allreduce(bool(new.any()), op=MPI.LOR))
 
     def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
-        """What each contact remembers of an accepted step."""
+        """Return what each contact remembers of an accepted step."""
         histories = []
         for k, (c, part) in enumerate(zip(self.elements, parts, strict=True)):
             new = c.history(part, self._step.factor, self._old[k])

@@ -106,7 +106,7 @@ class Watched:
         way: float,
         through: float,
     ) -> Iterator[Finding]:
-        """What was inside on the way between two looks.
+        """Return what was inside on the way between two looks.
 
         Args:
             before: Points of each of the surfaces `needed` at the last look [m], by its id.
@@ -125,7 +125,7 @@ class Watched:
             yield from self.look(x, True)[0]
 
     def look(self, positions: dict[int, FloatArray], both: bool) -> tuple[list[Finding], Pause]:
-        """What is inside, and how long nothing else may be.
+        """Return what is inside, and how long nothing else may be.
 
         Args:
             positions: Points of each of the surfaces `needed` [m], by its id.
@@ -160,7 +160,7 @@ class Watched:
         return findings, Pause(0.0, way, thickness)
 
     def _enclosed(self, found: Found, k: int, x: FloatArray) -> Found:
-        """Those that the body's whole boundary (p, 3) encloses beside the part they lie on.
+        """Choose what the body's whole boundary (p, 3) encloses beside the part it lies on.
 
         What is behind an open surface may as well be beyond the body. A point of the boundary sees
         less than a turn of it, and more than that where another part of the body encloses it.
@@ -219,7 +219,7 @@ class Watched:
 
 
 def places(way: float, through: float) -> int:
-    """At how many places a way is looked at.
+    """Return at how many places a way is looked at.
 
     Args:
         way: Relative motion [m].
@@ -252,7 +252,7 @@ def point(x: FloatArray) -> str:
 
 
 def belong(surface: Surface, declared: Sequence[Surface]) -> BoolArray:
-    """Which points of a surface belong to one of those declared of its body, shape (p,)."""
+    """Return which points of a surface belong to one of those declared of its body, shape (p,)."""
     result = np.zeros(len(surface.points), dtype=bool)
     for s in declared:
         if s.body is surface.body:
@@ -278,7 +278,7 @@ class BodyPair:
         self._bodies, self._contacts, self._boundary = bodies, contacts, boundary
 
     def where(self, u: Sequence[FloatArray], time: float) -> list[FloatArray]:
-        """What moves, each a displacement of its points [m], shape (3 n,)."""
+        """Return what moves, each a displacement of its points [m], shape (3 n,)."""
         return [u[k] for k in self._bodies]
 
     @cached_property
@@ -290,7 +290,7 @@ class BodyPair:
         return [Watched((one, two), self._contacts, None)]
 
     def look(self, where: list[FloatArray], both: bool) -> tuple[list[Finding], Pause]:
-        """What is inside, and how long nothing else may be. Collective.
+        """Return what is inside, and how long nothing else may be. Collective.
 
         Args:
             where: Of `where`.
@@ -304,7 +304,7 @@ class BodyPair:
     def passed(
         self, before: list[FloatArray], after: list[FloatArray], way: float, through: float
     ) -> list[Finding]:
-        """What was inside on the way from one look to the next. Collective.
+        """Return what was inside on the way from one look to the next. Collective.
 
         Args:
             before: Of `where`.

@@ -34,7 +34,7 @@ class FacetElements(ContactElements):
     master_scale: FloatArray
 
     def part(self, chosen: BoolArray) -> FacetElements:
-        """Some of the pairs, shape (n,)."""
+        """Return some of the pairs, chosen by a mask of shape (n,)."""
         return replace(
             self,
             candidates=self.candidates.part(chosen),
@@ -132,7 +132,7 @@ class FacetElements(ContactElements):
         return facets.frame(middle[:, 1:], self._projection(middle))[2]
 
     def place(self, i: int) -> str:
-        """Where a pair is, for messages."""
+        """Return where a pair is, for messages."""
         return f"{super().place(i)} on facet {int(self.candidates.facet[i])}"
 
     def _augmented(self, x: FloatArray) -> FloatArray:

@@ -71,16 +71,16 @@ class FacetPair(ContactPair, master=Surface):
 
     @property
     def master_name(self) -> str:
-        """Of the master's body."""
+        """Name of the master's body."""
         name: str = self.master.body.name
         return name
 
     def has_master_of(self, other: ContactPair) -> bool:
-        """Whether the masters of both have the same facets."""
+        """Return whether the masters of both have the same facets."""
         return np.array_equal(self.master.facets, other.master.facets)
 
     def shares_master(self, other: ContactPair) -> str | None:
-        """What both have for a master, if they share facets."""
+        """Return what both have for a master, if they share facets."""
         if not isinstance(other, FacetPair) or other.master.body is not self.master.body:
             return None
         one, two = (
@@ -90,7 +90,7 @@ class FacetPair(ContactPair, master=Surface):
         return f"the same facets of {self.master.body.name!r}" if one & two else None
 
     def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
-        """How deep slaves start inside the master's body, in facet sizes. Collective."""
+        """Return how deep slaves start inside the master's body, in facet sizes. Collective."""
         if self.slave.body is self.master.body:
             return 0.0
         depth: FloatArray = self.master.depth(self.slave.positions(u[0]), u[1])
@@ -197,7 +197,7 @@ class FacetPair(ContactPair, master=Surface):
         return slave, self.master.gather(paths[1])
 
     def is_long(self, reach: float) -> bool:
-        """Whether a motion may carry a node through a facet that is not the closest."""
+        """Return whether a motion may carry a node through a facet that is not the closest."""
         return reach > MARGIN * self._smallest
 
     @cached_property
@@ -241,7 +241,7 @@ class FacetPair(ContactPair, master=Surface):
         start: FloatArray,
         reach: float | None,
     ) -> tuple[Candidates, IntArray]:
-        """Those of the pairs (node, facet) that may touch, and nodes beyond the surface's edge.
+        """Choose the pairs (node, facet) that may touch, and nodes beyond the surface's edge.
 
         Projected from `start`; with reach None all may touch whose projection is found.
         """
@@ -309,7 +309,7 @@ class FacetPair(ContactPair, master=Surface):
     def _over_facet(
         self, facet: IntArray, xi: FloatArray, reach: FloatArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Whether pairs within `reach` (in facet sizes) may touch there; a facet is 2 xi wide.
+        """Return whether pairs within `reach` (facet sizes) may touch there; a facet is 2 xi wide.
 
         And whether they are beyond an edge that the surface ends at.
         """
@@ -320,7 +320,7 @@ class FacetPair(ContactPair, master=Surface):
         return inside, beyond
 
     def _movable(self, node: IntArray, patch: IntArray) -> BoolArray:
-        """Whether any coordinate of a pair is free; without one there is nothing to solve for."""
+        """Return whether any coordinate of a pair is free; else there is nothing to solve for."""
         slave = self.slave.fixed[self.slave.share[node]].all(axis=1)
         master = self.master.fixed[self.master.patches[patch]].all(axis=(1, 2))
         return ~(slave & master)

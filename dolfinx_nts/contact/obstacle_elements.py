@@ -80,7 +80,7 @@ class ObstacleElements(ContactElements):
 
     @property
     def extent(self) -> float:
-        """Of the slave, the obstacle and its path [m]."""
+        """Size of the slave, the obstacle and its path [m]."""
         extent: float = self.pair.extent + self.pair.obstacle.extent
         return extent + float(np.abs(self.displacement).max())
 

@@ -34,7 +34,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
         self.obstacle: Obstacle = self.master.about(self.origin)
 
     def has_master_of(self, other: ContactPair) -> bool:
-        """Whether the obstacles of both are equal."""
+        """Return whether the obstacles of both are equal."""
         return bool(self.master == other.master)
 
     def shares_master(self, other: ContactPair) -> str | None:

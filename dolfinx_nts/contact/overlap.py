@@ -144,6 +144,6 @@ class OverlapWatch:
 
 
 def _same_obstacle(one: Any, two: Any) -> bool:
-    """Whether two contacts are of the same body with the same obstacle."""
+    """Return whether two contacts are of the same body with the same obstacle."""
     same = one.slave.body is two.slave.body and one.shares_master(two) is not None
     return same and one.master.motion is two.master.motion

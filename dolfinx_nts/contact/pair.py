@@ -52,7 +52,7 @@ class Candidates(NamedTuple):
     length: FloatArray
 
     def part(self, chosen: IntArray | BoolArray) -> Candidates:
-        """Some of them, by number or by a mask."""
+        """Return some of the candidates, by number or by a mask."""
         return Candidates._make(a[chosen] for a in self)
 
 
@@ -187,16 +187,16 @@ class ContactPair:
 
     @property
     def master_name(self) -> str:
-        """For messages and files."""
+        """Name of the master for messages and files."""
         name: str = self.master.name
         return name
 
     def has_master_of(self, other: ContactPair) -> bool:
-        """Whether the masters of both are equal, also of different systems."""
+        """Return whether the masters of both are equal, also of different systems."""
         raise NotImplementedError
 
     def shares_master(self, other: ContactPair) -> str | None:
-        """What both have for a master, for messages, if that is so at least in part."""
+        """Return what both have for a master, for messages, if that is so at least in part."""
         raise NotImplementedError
 
     def path(self, start: float, end: float) -> FloatArray:
@@ -219,7 +219,7 @@ class ContactPair:
         return x
 
     def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
-        """How deep slaves start inside another body, in facet sizes, wherever. Collective.
+        """Return how deep slaves start inside another body, in facet sizes, wherever. Collective.
 
         Args:
             u: Owned displacements of each of `bodies` at the start [m].
@@ -293,7 +293,7 @@ class ContactPair:
         return f"{self.slave.body.name}-{self.master_name}"
 
     def is_like(self, other: ContactPair) -> bool:
-        """Whether both hold the same nodes of bodies of the same names out of the same master."""
+        """Return whether both hold the same nodes, of bodies of equal names, out of one master."""
         alike = type(self) is type(other) and self.name == other.name
         same_nodes = alike and np.array_equal(self.slave.points, other.slave.points)
         return same_nodes and self.has_master_of(other)

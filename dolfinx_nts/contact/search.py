@@ -176,7 +176,7 @@ def first_hits(
 
 
 def _passages(start: FloatArray, moved: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Where triangles pass over the origin with their fronts ahead, and when.
+    """Return where triangles pass over the origin with their fronts ahead, and when.
 
     Args:
         start: Corners at the start [m], shape (p, 3, 3).
@@ -228,7 +228,7 @@ def _height(start: FloatArray, moved: FloatArray) -> FloatArray:
 
 
 def _rises(cubic: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Where cubics rise through zero between `-_START` and 1.
+    """Return where cubics rise through zero between `-_START` and 1.
 
     Args:
         cubic: Coefficients, lowest power first, shape (n, 4).
@@ -284,7 +284,7 @@ def _near_paths(
 
 
 def apart(points: FloatArray, corners: FloatArray, reach: float) -> bool:
-    """Whether the boxes around points and facets are farther apart than the reach.
+    """Return whether the boxes around points and facets are farther apart than the reach.
 
     Then `closest_facets` would find nothing.
 
@@ -396,7 +396,7 @@ def _upper_bounds(
 
 
 def _slack(scene: _Scene, point: IntArray, radius: float, bound: FloatArray) -> FloatArray:
-    """What a bound must grow by so that no tie is lost to rounding [m], shape (k,)."""
+    """Return what a bound must grow by so that no tie is lost to rounding [m], shape (k,)."""
     finite = np.where(np.isfinite(bound), bound, 0.0)
     return 8.0 * ROUNDING * (np.abs(scene.points[point]).max(axis=1) + radius + finite)
 

@@ -67,7 +67,7 @@ def slave_and_master(a: Any, b: Any) -> tuple[Any, Any]:
 
 
 def _smaller(one: float, two: float) -> bool | None:
-    """Whether the first number is the smaller one; None where they are alike."""
+    """Return whether the first number is the smaller one; None where they are alike."""
     if abs(one - two) <= _ALIKE * max(one, two):
         return None
     return one < two

@@ -172,7 +172,7 @@ class Surface:
         return triangle_patches.PIECES * facet + triangle_patches.piece(xi)
 
     def control_points(self, x: FloatArray, patch: IntArray) -> FloatArray:
-        """What the surface in given patches is interpolated from [m], shape (n, nc, 3).
+        """Return what the surface in given patches is interpolated from [m], shape (n, nc, 3).
 
         Args:
             x: Positions of all points [m], shape (p, 3).
@@ -261,7 +261,7 @@ class Surface:
         return table[start : start + len(self.rows)]
 
     def depth(self, x: FloatArray, u: FloatArray) -> FloatArray:
-        """How deep points lie inside the whole body, in facet sizes. Collective.
+        """Return how deep points lie inside the whole body, in facet sizes. Collective.
 
         Outside, and less than a thousandth of a facet deep, the depth is 0.
 
@@ -345,7 +345,7 @@ def flux(corners: FloatArray) -> FloatArray:
 
 
 def winding(x: FloatArray, corners: FloatArray) -> float:
-    """How often facets (m, nc, 3) enclose a point: 1 inside a closed surface, 0 outside."""
+    """Return how often facets (m, nc, 3) enclose a point: 1 inside a closed surface, 0 outside."""
     total = 0.0
     for k in range(1, corners.shape[1] - 1):
         a, b, c = (corners[:, [0, k, k + 1]] - x).transpose(1, 0, 2)

@@ -22,7 +22,7 @@ def highest(
     length: FloatArray,
     limit: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Where functions of s in [0, 1] are highest, whose slope is at most the length.
+    """Return where functions of s in [0, 1] are highest, whose slope is at most the length.
 
     Args:
         value: Values (k,) of functions (k,) at s (k,); values below minus the third argument (k,)

@@ -123,7 +123,7 @@ def _library() -> Any:
 
 
 def is_there() -> bool:
-    """Whether the kernels are compiled, which is done here if it can be."""
+    """Return whether the kernels are compiled, which is done here if it can be."""
     return _library() is not None
 
 
@@ -175,7 +175,7 @@ def _facet(nc: int) -> tuple[Any, FloatArray]:
 
 @lru_cache
 def _limits() -> Any:
-    """What NumPy's kernels have, too."""
+    """Return the limits that NumPy's kernels have, too."""
     return _Limits(facets.LAST_STEP, 1e3 * facets.EPS, facets.COLLINEAR)
 
 
@@ -214,7 +214,7 @@ def closest_facets(
     rounding: float,
     out: tuple[IntArray, FloatArray, FloatArray],
 ) -> bool:
-    """What `search.closest_facets` finds before it prefers any, by the boxes of all pairs.
+    """Return what `search.closest_facets` finds before it prefers any, by the boxes of all pairs.
 
     Args:
         points: Points [m], shape (n, 3).

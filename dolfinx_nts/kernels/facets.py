@@ -124,7 +124,7 @@ def size(corners: FloatArray) -> FloatArray:
 
 
 def edge_excess(xi: FloatArray, nc: int) -> FloatArray:
-    """How far coordinates lie beyond each edge of the reference facet, in half facet widths.
+    """Return how far coordinates lie beyond each edge of the reference facet, in half facet widths.
 
     Args:
         xi: Convective coordinates [-], shape (n, 2).
@@ -430,7 +430,7 @@ def _least(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 
 
 def _is_convex(g: FloatArray) -> BoolArray:
-    """Whether |xbar - x|^2 is certainly convex over the reference square, shape (n,).
+    """Return whether |xbar - x|^2 is certainly convex over the reference square, shape (n,).
 
     Its second derivatives in s, in t, and the mixed one depend on t only, on s only, and are
     bilinear: their extremes are known exactly.

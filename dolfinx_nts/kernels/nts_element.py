@@ -352,7 +352,7 @@ def element(
         return constraint_gradient(pi, nc)
 
     def bend(pi: FloatArray) -> FloatArray:
-        """With as many copies of the multipliers as there are points."""
+        """Return the curvature with as many copies of the multipliers as there are points."""
         return constraint_curvature(pi, np.resize(force, (len(pi), NUM_CONSTRAINTS)), nc)
 
     mean = contact_gradient == "mean-value"

@@ -71,7 +71,7 @@ COEFFICIENTS = _coefficients()
 
 @lru_cache
 def _differences(first: int, second: int) -> FloatArray:
-    """From control points to those of a derivative by both coordinates, of a lower degree."""
+    """Return the map from control points to those of a derivative, of a lower degree."""
     out, old = np.eye(NUM_POINTS), _EXPONENTS
     for corner in [1] * first + [2] * second:
         at, degree = {e: i for i, e in enumerate(old)}, sum(old[0])
@@ -131,7 +131,7 @@ def along(xi: FloatArray, step: FloatArray) -> FloatArray:
 
 
 def piece(xi: FloatArray) -> IntArray:
-    """Which piece of a facet lies over xi (n, 2): that beside edge k (corner k to k + 1), (n,)."""
+    """Return which piece of a facet lies over xi (n, 2): that beside edge k, (n,)."""
     far = np.column_stack([1.0 - xi[:, 0] - xi[:, 1], xi]).argmin(axis=1)
     return (far + 1) % PIECES
 
@@ -174,7 +174,7 @@ class _Planes(NamedTuple):
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Of vectors in a plane, (..., 2)."""
+    """Return the cross product of vectors in a plane, (..., 2)."""
     product: FloatArray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return product
 
@@ -381,7 +381,7 @@ def _layers(rows: FloatArray, seconds: FloatArray, middles: FloatArray) -> Float
 
 @lru_cache
 def _beyond() -> FloatArray:
-    """From a piece's control points to those of its polynomial over the facet, (15, 15).
+    """Return the map (15, 15) from a piece's control points to those over the facet.
 
     The facet's corners are those of the edge and the one opposite, 3 centre - both.
     """
@@ -502,7 +502,7 @@ def _weights(d: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray
     one[np.arange(3), :, np.arange(3)] = 1.0
 
     def derivative(k: int, direction: FloatArray) -> FloatArray:
-        """By a direction (m, 2) in the plane of corner k, shape (m, q)."""
+        """Return the derivative by a direction (m, 2) in the plane of corner k, shape (m, q)."""
         result: FloatArray = np.einsum("ma,maq->mq", direction, d[:, k])
         return result
 

@@ -200,7 +200,7 @@ def _colour_scale(drawn: Sequence[_Drawn], colour: str, limits: Any) -> Any:
 
 
 def _painted(drawn: Sequence[_Drawn], scale: Any) -> Any:
-    """What faces the viewer, from back to front."""
+    """Return what faces the viewer, from back to front."""
     from matplotlib.collections import PolyCollection
 
     corners, values = (np.concatenate([d[k] for d in drawn]) for k in (1, 2))

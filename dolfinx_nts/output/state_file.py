@@ -64,7 +64,7 @@ _ROUNDED = 1e-9
 
 # ---- what is in the scene
 def describe(system: System) -> dict[str, Any]:
-    """What a system must have in common with the one of a checkpoint, for JSON. Collective."""
+    """Return what a system must share with the one of a checkpoint, for JSON. Collective."""
     comm, bodies = system.comm, system.bodies
     sizes = [[b.num_owned // 3, float(b.nodal_mass[::3].sum())] for b in bodies]
     total = comm.allreduce(np.array(sizes))
@@ -161,14 +161,14 @@ class Numbering:
         self.reference = self.to_file([b.reference for b in system.bodies])
 
     def to_file(self, values: Sequence[FloatArray]) -> list[FloatArray]:
-        """Of each body, values at all nodes, shape (nodes, 3), on rank 0. Collective."""
+        """Return the values of each body at all nodes, shape (nodes, 3), on rank 0. Collective."""
         gathered = [gather_on_root(self.comm, v.reshape(-1, 3)) for v in values]
         if self.comm.rank > 0:
             return gathered
         return [rows[order] for rows, order in zip(gathered, self._orders, strict=True)]
 
     def from_file(self, tables: Tables, name: str) -> tuple[FloatArray, ...]:
-        """Of each body, a field at this rank's coordinates. Collective."""
+        """Return a field of each body at this rank's coordinates. Collective."""
         found = []
         for k, (order, counts) in enumerate(zip(self._orders, self._counts, strict=True)):
             parts = None
@@ -242,7 +242,7 @@ class Numbering:
         )
 
     def nodal(self, tables: Tables, name: str) -> list[npt.NDArray[Any]]:
-        """Of each contact, an array at this rank's slave nodes. Collective."""
+        """Return an array of each contact at this rank's slave nodes. Collective."""
         found = []
         for k, pair in enumerate(self.system.contacts):
             rows = self._share(tables, f"contacts/{k}", ("number", name))
@@ -305,7 +305,7 @@ def _misfit(joint: Any, value: Any) -> str | None:
 
 
 def _repeated(whose: str, numbers: IntArray | None) -> str | None:
-    """What is wrong with ascending numbers of elements, if two are equal."""
+    """Return what is wrong with ascending numbers of elements, if two are equal."""
     twice = [] if numbers is None else numbers[1:][np.diff(numbers) == 0]
     if not len(twice):
         return None
@@ -317,7 +317,7 @@ def _repeated(whose: str, numbers: IntArray | None) -> str | None:
 
 # ---- files
 def previous(path: Path) -> Path:
-    """Where the checkpoint before the last one is."""
+    """Return where the checkpoint before the last one is."""
     return path.with_name(f"{path.name}.previous")
 
 

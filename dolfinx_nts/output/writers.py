@@ -282,7 +282,7 @@ class Fields:
             self._append(stepper)
 
     def _due(self, stepper: Stepper) -> bool:
-        """Whether the cadence asks for a state since the last call; the first one of a run is."""
+        """Return whether the cadence asks for this state; the first one of a run is due."""
         times = stepper.solution.rows.column("time")
         before, self._seen = self._seen, len(times)
         if not before:

@@ -152,7 +152,7 @@ class Saver:
 
 
 def restart(path: StrPath, system: System) -> Restart:
-    """What a checkpoint holds, as the `start` of a run that goes on from there. Collective.
+    """Return what a checkpoint holds, as the `start` of a run that goes on from there. Collective.
 
     The scene is made anew by the same script:
 

@@ -192,7 +192,7 @@ class _LoadStepper(Stepper):
         return works
 
     def look(self, *, last: bool = False) -> None:
-        """As of `Stepper`, and at the end for motions that nothing resists."""
+        """Look as `Stepper` does, and at the end for motions that nothing resists."""
         super().look(last=last)
         if last:
             self._tell_free_motion()

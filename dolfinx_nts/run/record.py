@@ -62,7 +62,7 @@ class Record:
 
     @property
     def reactions(self) -> dict[str, FloatArray]:
-        """Of each body, force of each `Dirichlet` condition on it [N], shape (rows, conditions, 3).
+        """Force of each `Dirichlet` condition on each body [N], shape (rows, conditions, 3).
 
         Of a rigid body those of its prescribed motion: force, then moment of rotation [N m].
 

@@ -86,7 +86,7 @@ class RunWarnings(Mapping[str, RunWarning]):
 
     @property
     def grave(self) -> list[RunWarning]:
-        """Those that may make the result wrong."""
+        """Warnings that may make the result wrong."""
         return [w for w in self._found.values() if w.grave]
 
     @property

@@ -66,7 +66,7 @@ class Adapt:
 
 
 def factor(error: float) -> float:
-    """By how much a step may change, from its error over the tolerance.
+    """Return by how much a step may change, from its error over the tolerance.
 
     Args:
         error: >= 0; a NaN counts as too large.
@@ -174,7 +174,7 @@ class Pace:
         return first * (1.0 - _BEFORE) if self._meets else 1.0
 
     def accepts(self, problem: StepProblem, step: Evaluation) -> bool:
-        """Whether a solved step is good enough; sets `dt` for what comes next. Collective.
+        """Return whether a solved step is good enough; sets `dt` for what comes next. Collective.
 
         Where a change of facet has left nodes behind their facets the step is taken as it is: a
         shorter one would only expel them faster.

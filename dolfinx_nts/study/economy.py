@@ -307,7 +307,7 @@ class Economy:
         return float(np.mean(iterations[_WARM:-1]))
 
     def run(self, feature: Feature, count: int, folder: str, turn: Turn) -> float:
-        """As `run_plain`, with this package; `folder` is for its output."""
+        """Do as `run_plain`, with this package; `folder` is for its output."""
         where = Path(folder) / feature.name
         writers = [output.Fields(where, every=feature.every)] if feature.every else []
         run = nts.simulate(
@@ -320,7 +320,7 @@ class Economy:
         return float(run.balance["newton_iterations"][1 + _WARM : -1].mean())
 
     def round(self, steps: int, folder: str, order: Any) -> dict[str, tuple[FloatArray, float]]:
-        """Of each row CPU and wall time of the steps [s], (steps, 2), and a step's iterations.
+        """Return CPU and wall time of each row's steps [s], (steps, 2), and a step's iterations.
 
         Args:
             steps: Steps that are timed.

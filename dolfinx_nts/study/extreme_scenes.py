@@ -60,7 +60,7 @@ class Case(NamedTuple):
 
 
 def _in_order(run: nts.Solution) -> bool:
-    """Whether the bodies' centres stand along x in the order of the bodies."""
+    """Return whether the bodies' centres stand along x in the order of the bodies."""
     centres = [nts.motion_of(body).centre[0] for body in run.system.bodies]
     return all(a < b for a, b in zip(centres, centres[1:], strict=False))
 

@@ -110,7 +110,7 @@ class Motion:
 
 
 def _affine(body: Any) -> tuple[FloatArray, float, float]:
-    """What u . M is multiplied with for the means of a body, shape (num_owned, 12); M; X . M X."""
+    """Return the factors of u . M for the means of a body, (num_owned, 12); M; X . M X."""
     place = body.places.astype(float)[:, None]
     x, one = body.reference.reshape(-1, 3), np.kron(place, np.eye(3))
     nodal = body.inertia(one[:, 0].copy())[::3]
@@ -257,7 +257,7 @@ def _options(given: dict[str, Any], choices: Mapping[str, Any]) -> dict[str, Any
 
 
 def check(scene: str, choices: Mapping[str, Sequence[Any]]) -> None:
-    """Whether there is such a scene and it has such choices.
+    """Check that there is such a scene and that it has such choices.
 
     Raises:
         TypeError, ValueError: No.
@@ -383,7 +383,7 @@ def recommend(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, Mapping[st
 
 
 def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What `recommend` picks, a line for each target."""
+    """Return what `recommend` picks, a line for each target."""
     return "\n".join(
         f"trajectory within {target:g}: "
         + (f"{row['run']}: {row['seconds']:.3g} s" if row else "none of these")
