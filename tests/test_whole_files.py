@@ -152,10 +152,11 @@ from dolfinx_nts import dolfinx_compat
 dolfinx_compat.C_FLAGS[0] = "-O1"
 sys.path.insert(0, {tests!r})
 import dolfinx_nts as nts
+from dolfinx_nts.output import Fields
 from scenes import thrown_block
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, resource.RLIM_INFINITY))
-system, fields, dt = thrown_block(), nts.output.Fields({folder!r}), 1e-3
+system, fields, dt = thrown_block(), Fields({folder!r}), 1e-3
 if {loop}:
     run = nts.Stepper(system, nts.Midpoint())
     fields.start(run)
