@@ -91,9 +91,18 @@ def wheel_mesh(comm, facets, rings):
     return create_mesh(comm, cells, points, "hexahedron")
 
 
-def scene(comm, facets, *, settle, smoothing=False):
-    """Wheel above the layer; while it settles, its hub may not move sideways."""
-    mesh = wheel_mesh(comm, facets, max(2, facets // 16))
+def ground_mesh(comm):
+    """One layer of hexahedra, z <= 0."""
+    cells = [round((END - START) / RADIUS * 12), 1, 1]
+    box = [[START, -0.6 * WIDTH, -LAYER], [END, 0.6 * WIDTH, 0.0]]
+    return create_box(comm, box, cells, CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
+
+
+def scene(mesh, ground, facets, *, settle, smoothing=False):
+    """Wheel above the layer; while it settles, its hub may not move sideways.
+
+    The meshes are those of the throw and of settling: ranks may share out another one otherwise.
+    """
     centre = RADIUS * np.cos(np.pi / facets)
     cell = 4 * RADIUS / facets
     hub = nts.Dirichlet(
@@ -108,9 +117,6 @@ def scene(comm, facets, *, settle, smoothing=False):
         bcs=[hub] if settle else [],
         name="wheel",
     )
-    cells = [round((END - START) / RADIUS * 12), 1, 1]
-    box = [[START, -0.6 * WIDTH, -LAYER], [END, 0.6 * WIDTH, 0.0]]
-    ground = create_box(comm, box, cells, CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
     layer = nts.Continuum(
         ground,
         nts.NeoHookean(young=5e6, poisson=0.0),
@@ -254,13 +260,14 @@ def main(
     Returns:
         {integrator: figures}; see `figures`.
     """
+    meshes = wheel_mesh(comm, facets, max(2, facets // 16)), ground_mesh(comm)
     settled = nts.equilibrium(
-        scene(comm, facets, settle=True, smoothing=smoothing), load_steps=4, progress=progress
+        scene(*meshes, facets, settle=True, smoothing=smoothing), load_steps=4, progress=progress
     )
     results, balances = {}, {}
     for name in integrators:
         wheel, clock = Recorder(), time.perf_counter()
-        system = scene(comm, facets, settle=False, smoothing=smoothing)
+        system = scene(*meshes, facets, settle=False, smoothing=smoothing)
         folder = output and Path(output) / name
         run = nts.simulate(
             system,
