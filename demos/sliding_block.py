@@ -228,37 +228,9 @@ def stopping_way(t: np.ndarray) -> np.ndarray:
 
 
 # ---- the page
-def main(
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    *,
-    floors: tuple[str, ...] = ("plane", "mesh"),
-    integrators: tuple[str, ...] = ("energy-momentum",),
-    dt: float = STEP,
-    cells: tuple[int, int, int] = (4, 4, 1),
-    facets: int = 9,
-    output: str | None = None,
-    progress: bool = False,
-) -> dict[str, dict[str, Any]]:
-    """Throw the block on each floor with each integrator, and print closed forms beside.
-
-    Args:
-        comm: MPI communicator.
-        floors: Some of FLOORS.
-        integrators: Some of INTEGRATORS.
-        dt: Step [s].
-        cells: Hexahedra of the block.
-        facets: Facets of a meshed floor along its 1.8 m.
-        output: Folder for tables, pictures and fields.
-        progress: Show a progress line.
-
-    Returns:
-        {"floor, integrator": figures}: those of CLOSED_FORM, and `health` of the runs.
-    """
-    return compare(
-        "sliding_block", {"thrown": (stop, stopping_way)}, CLOSED_FORM, comm,
-        floors=floors, integrators=integrators, dt=dt, cells=cells, facets=facets, output=output,
-        progress=progress,
-    )  # fmt: skip
+def main(comm: MPI.Comm = MPI.COMM_WORLD, **options: Any) -> dict[str, dict[str, Any]]:
+    """Throw the block on each floor with each integrator; options and result as of `compare`."""
+    return compare("sliding_block", {"thrown": (stop, stopping_way)}, CLOSED_FORM, comm, **options)
 
 
 def compare(
@@ -267,13 +239,13 @@ def compare(
     closed_form: dict[str, float],
     comm: MPI.Comm,
     *,
-    floors: tuple[str, ...],
-    integrators: tuple[str, ...],
-    dt: float,
-    cells: tuple[int, int, int],
-    facets: int,
-    output: str | None,
-    progress: bool,
+    floors: tuple[str, ...] = ("plane", "mesh"),
+    integrators: tuple[str, ...] = ("energy-momentum",),
+    dt: float = STEP,
+    cells: tuple[int, int, int] = (4, 4, 1),
+    facets: int = 9,
+    output: str | None = None,
+    progress: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Run the parts on each floor with each integrator, and print what came beside closed forms.
 
@@ -292,7 +264,7 @@ def compare(
         progress: Show a progress line.
 
     Returns:
-        That of `main`.
+        {"floor, integrator": figures}: those of `closed_form`, and `health` of the runs.
     """
     mesh = block_mesh(comm, cells)
     results: dict[str, dict[str, Any]] = {}

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from sliding_block import GRAVITY, STEP, Motion, Options, command_line, compare, slide, system
+from sliding_block import GRAVITY, Motion, Options, command_line, compare, slide, system
 
 import dolfinx_nts as nts
 
@@ -77,38 +77,10 @@ PARTS = {
 
 
 def main(
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    *,
-    floors: tuple[str, ...] = ("plane", "mesh"),
-    integrators: tuple[str, ...] = ("energy-momentum",),
-    parts: tuple[str, ...] = tuple(PARTS),
-    dt: float = STEP,
-    cells: tuple[int, int, int] = (4, 4, 1),
-    facets: int = 9,
-    output: str | None = None,
-    progress: bool = False,
+    comm: MPI.Comm = MPI.COMM_WORLD, *, parts: tuple[str, ...] = tuple(PARTS), **options: Any
 ) -> dict[str, dict[str, Any]]:
-    """Let the block go on each floor with each integrator, and print closed forms beside.
-
-    Args:
-        comm: MPI communicator.
-        floors: Some of "plane", "mesh", "elastic".
-        integrators: Some of "energy-momentum", "midpoint".
-        parts: Some of PARTS.
-        dt: Step [s].
-        cells: Hexahedra of the block.
-        facets: Facets of a meshed floor along its 1.8 m.
-        output: Folder for tables, pictures and fields.
-        progress: Show a progress line.
-
-    Returns:
-        {"floor, integrator": figures}: those of CLOSED_FORM and `sliding_block.health`.
-    """
-    return compare(
-        "slope", {name: PARTS[name] for name in parts}, CLOSED_FORM, comm,
-        floors=floors, integrators=integrators, dt=dt, cells=cells, facets=facets, output=output,
-        progress=progress,
-    )  # fmt: skip
+    """Run some of PARTS on each floor; options and result as of `sliding_block.compare`."""
+    return compare("slope", {name: PARTS[name] for name in parts}, CLOSED_FORM, comm, **options)
 
 
 if __name__ == "__main__":

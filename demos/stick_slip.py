@@ -27,7 +27,6 @@ from mpi4py import MPI
 from sliding_block import (
     DENSITY,
     GRAVITY,
-    STEP,
     Motion,
     Options,
     command_line,
@@ -83,37 +82,9 @@ def stick_slip(mesh: Any, floor: Options, **run: Any) -> tuple[dict[str, float],
     }, motion
 
 
-def main(
-    comm: MPI.Comm = MPI.COMM_WORLD,
-    *,
-    floors: tuple[str, ...] = ("plane", "mesh"),
-    integrators: tuple[str, ...] = ("energy-momentum",),
-    dt: float = STEP,
-    cells: tuple[int, int, int] = (4, 4, 1),
-    facets: int = 9,
-    output: str | None = None,
-    progress: bool = False,
-) -> dict[str, dict[str, Any]]:
-    """Pull the block on each floor with each integrator, and print closed forms beside.
-
-    Args:
-        comm: MPI communicator.
-        floors: Some of "plane", "mesh", "elastic".
-        integrators: Some of "energy-momentum", "midpoint".
-        dt: Step [s].
-        cells: Hexahedra of the block.
-        facets: Facets of a meshed floor along its 1.8 m.
-        output: Folder for tables, pictures and fields.
-        progress: Show a progress line.
-
-    Returns:
-        {"floor, integrator": figures}: those of CLOSED_FORM and `sliding_block.health`.
-    """
-    return compare(
-        "stick_slip", {"pulled": (stick_slip, jerky_way)}, CLOSED_FORM, comm,
-        floors=floors, integrators=integrators, dt=dt, cells=cells, facets=facets, output=output,
-        progress=progress,
-    )  # fmt: skip
+def main(comm: MPI.Comm = MPI.COMM_WORLD, **options: Any) -> dict[str, dict[str, Any]]:
+    """Pull the block on each floor; options and result as of `sliding_block.compare`."""
+    return compare("stick_slip", {"pulled": (stick_slip, jerky_way)}, CLOSED_FORM, comm, **options)
 
 
 if __name__ == "__main__":

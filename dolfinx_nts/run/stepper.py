@@ -420,7 +420,7 @@ class Stepper:
             self.problem, state, dt, continues=self._continues, project=self._project_start
         )
         if self.problem.integrator.accelerations and not state.a:
-            carried = with_resting_forces(self.system, state, dt, self.newton, self._given)
+            carried = with_resting_forces(self.problem, state, dt, self.newton, self._given)
             state = replace(state, a=consistent.accelerations(self.problem, carried, dt))
         return state
 

@@ -109,10 +109,14 @@ class ContactTerms:
         Args:
             x: PETSc vector of the unknowns.
         """
+        return self._forces(self._parts(x))
+
+    def _forces(self, parts: Sequence[Any]) -> list[FloatArray]:
+        """`forces` of an iterate's parts. Collective."""
         laid = self._layout
         if not laid.blocks:
             return [np.zeros_like(u) for u in self.state.u]
-        total = laid.forces(self._search.elements, self._parts(x))
+        total = laid.forces(self._search.elements, parts)
         return [-total[laid.of_body(k)] for k in range(len(self.state.u))]
 
     def residual(self, x: Any, forces: Sequence[FloatArray]) -> FloatArray:
@@ -125,14 +129,14 @@ class ContactTerms:
         Returns:
             Zero at `fixed` coordinates; then the constraints.
         """
-        laid, out = self._layout, np.zeros(len(x.array_r))
-        bodies = zip(self._system.bodies, forces, self.forces(x), strict=True)
+        laid, out, parts = self._layout, np.zeros(len(x.array_r)), self._parts(x)
+        bodies = zip(self._system.bodies, forces, self._forces(parts), strict=True)
         for k, (body, own, contact) in enumerate(bodies):
             rest = own - contact
             rest[body.fixed] = 0.0
             out[laid.of_body(k)] = rest
         if laid.own:
-            both = zip(self._search.elements, self._parts(x), strict=True)
+            both = zip(self._search.elements, parts, strict=True)
             rows = [c.rows(part, "constraints").ravel() for c, part in both]
             out[laid.of_elements("constraints")] = np.concatenate(rows)
         return out

@@ -17,8 +17,8 @@ from dolfinx_nts.integrators import Newmark
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State, System
-from dolfinx_nts.validation import StepFailedError
+from dolfinx_nts.system import State
+from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ _RESTS = 0.5
 
 
 def with_resting_forces(
-    system: System, state: State, dt: float, newton: Newton, options: Mapping[str, Any]
+    problem: StepProblem, state: State, dt: float, newton: Newton, options: Mapping[str, Any]
 ) -> State:
     """The state with the forces of contacts that carry from the start on. Collective.
 
@@ -45,7 +45,7 @@ def with_resting_forces(
     meet with a velocity have no forces before the impact.
 
     Args:
-        system: The scene.
+        problem: Equations of the run.
         state: At the start.
         dt: First step [s].
         newton: Tolerances.
@@ -53,25 +53,34 @@ def with_resting_forces(
 
     Returns:
         The state as it is where nothing touches, or that step is not solved.
+
+    Raises:
+        UserFunctionError: A function of the user's failed.
     """
+    system = problem.system
     known = any(contact.force.any() for contact in state.contacts)
     if not system.contacts or system.comm.allreduce(known, op=MPI.LOR):
         return state
-    still = tuple(np.zeros_like(v) for v in state.v)
-    rule = Newmark(beta=0.5, gamma=1.0)
-    problem = StepProblem(system, rule, rtol=newton.rtol, condense=newton.condense)
-    problem.begin(replace(state, a=still), _SHORT * dt)
+    start = replace(state, a=tuple(np.zeros_like(v) for v in state.v))
+    problem.begin(start, _SHORT * dt)
     batches = (*problem.contacts.elements, *problem.contacts.idle)
     touches = any(_closed(c).any() for c in batches)
-    if system.comm.allreduce(touches, op=MPI.LOR):
-        solver = StepSolver(problem, newton, newton.preset(system, True, options), options)
-        try:
-            state = _with_forces(problem, solver.solve(), state)
-        except StepFailedError as failure:
-            logger.info("no contact forces at the start: %s", failure)
+    if not system.comm.allreduce(touches, op=MPI.LOR):
+        return state
+    rule = Newmark(beta=0.5, gamma=1.0)
+    short = StepProblem(system, rule, rtol=newton.rtol, condense=newton.condense)
+    solver = StepSolver(short, newton, newton.preset(system, True, options), options)
+    try:
+        short.begin(start, _SHORT * dt)
+        return _with_forces(short, solver.solve(), state)
+    except UserFunctionError:
+        raise
+    except StepFailedError as failure:
+        logger.info("no contact forces at the start: %s", failure)
+        return state
+    finally:
         solver.destroy()
-    problem.destroy()
-    return state
+        short.destroy()
 
 
 def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:

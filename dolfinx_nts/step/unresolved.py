@@ -107,7 +107,8 @@ def _joined(system: System, bodies: Iterable[int]) -> set[int]:
 
 def _size(stiffness: float, damping: float, mobility: float, dt: float) -> float:
     """How many times a spring or damper is too fast for a step."""
-    phase = float(np.sqrt(max(stiffness, 0.0) * mobility)) * dt if stiffness > 0.0 else 0.0
+    # A mobility without mass is infinite, and nothing times that no number.
+    phase = float(np.sqrt(stiffness * mobility)) * dt if stiffness > 0.0 else 0.0
     decay = damping * mobility * dt if damping > 0.0 else 0.0
     return max(phase / _PHASE, decay / _DECAY)
 
