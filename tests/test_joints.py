@@ -819,6 +819,7 @@ def test_load_steps_of_half_a_turn_are_cut():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("turn", [1.6, 2.2])
+@pytest.mark.fast("2.2")
 def test_the_angle_of_a_hinge_is_no_mirror_image(turn):
     """Its sine about the middle of the step has two angles; Newmark's steps found the other one."""
     body, system = motor(lambda t: turn / 0.05 * t, turn / 0.05)

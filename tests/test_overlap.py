@@ -607,6 +607,7 @@ def test_facets_in_obstacles_are_as_deep_as_their_distance_tells(nc, metre):
 
 @pytest.mark.parametrize("nc", [3, 4])
 @pytest.mark.parametrize("known", [True, False], ids=["width", "no width"])
+@pytest.mark.fast("no width-3")
 def test_a_ball_between_nodes_is_found_by_its_gap_alone(nc, known):
     """Also one that no side of the facet meets, so that samples tell nothing of those."""
     rng = np.random.default_rng(0)
@@ -730,8 +731,9 @@ def test_what_lies_on_an_obstacle_is_not_warned_of():
 
 
 @pytest.mark.mpi
-@pytest.mark.mpi
 @pytest.mark.parametrize("shape", ["sphere", "cylinder"])
+@pytest.mark.fast("sphere")
+@pytest.mark.fast_on_ranks()
 def test_what_passes_between_two_looks_is_told(shape):
     """A thin obstacle that goes through a large facet in few steps, which no node of it meets."""
     ends = [np.zeros(3), np.ones(3)]

@@ -274,6 +274,7 @@ def test_equilibrium_names_a_rigid_body_that_may_slide():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_equilibrium_names_the_body_that_falls():
     """Of two, that which has no support."""
     brick = rigid((0, 0, 0), (0.2, 0.1, 0.05), (2, 2, 1), name="brick")

@@ -44,6 +44,8 @@ def test_a_box_at_rest_stays(rule, friction):
 
 @pytest.mark.mpi
 @by_rule
+@pytest.mark.fast("newmark")
+@pytest.mark.fast_on_ranks()
 def test_a_sliding_box_brakes_as_coulomb_says(rule):
     """v = v_0 - mu g t until it rests, at v_0^2 / (2 mu g)."""
     speed, friction, body = 1.0, 0.3, box((0, 0, 0), (1, 1, 0.2), velocity=(1.0, 0, 0))
