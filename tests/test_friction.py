@@ -12,7 +12,7 @@ from mpi4py import MPI
 from scenes import CELLS, rubbing_blocks
 
 import dolfinx_nts as nts
-from dolfinx_nts.contact import contact_laws
+from dolfinx_nts.contact import coulomb
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.kernels.friction import return_map
 from dolfinx_nts.kernels.nts_element import invariants, metric, projection
@@ -170,8 +170,8 @@ def test_stick_and_slip_occur_together_and_h_may_change():
 @pytest.mark.slow
 def test_result_does_not_depend_on_the_algorithmic_scale(integrator, factor, monkeypatch):
     expected = to_rounding(integrator)
-    nominal = contact_laws.TANGENTIAL_SCALE
-    monkeypatch.setattr(contact_laws, "TANGENTIAL_SCALE", factor * nominal)
+    nominal = coulomb.TANGENTIAL_SCALE
+    monkeypatch.setattr(coulomb, "TANGENTIAL_SCALE", factor * nominal)
     table = run(rubbing_blocks(0.3), integrator, newton=TO_ROUNDING).balance
     assert difference(expected, table) < 1e-9
     assert np.array_equal(expected["stick"], table["stick"])
@@ -184,7 +184,7 @@ def test_a_solution_is_one_for_any_algorithmic_scale(integrator, monkeypatch):
     stepper = nts.Stepper(
         rubbing_blocks(0.3), CONTACT_RULES[integrator], newton=nts.Newton(rtol=1e-14)
     )
-    problem, nominal = stepper.problem, contact_laws.TANGENTIAL_SCALE
+    problem, nominal = stepper.problem, coulomb.TANGENTIAL_SCALE
     problem_rtol, both = problem.rtol, 0
     for _ in range(40):
         stepper.advance(2e-3)
@@ -192,11 +192,11 @@ def test_a_solution_is_one_for_any_algorithmic_scale(integrator, monkeypatch):
         both += bool(own.stick.any() and (own.active & ~own.stick).any())
         problem.rtol = 1e-10
         for factor in 10.0 ** np.arange(-4, 5):
-            monkeypatch.setattr(contact_laws, "TANGENTIAL_SCALE", factor * nominal)
+            monkeypatch.setattr(coulomb, "TANGENTIAL_SCALE", factor * nominal)
             other = problem.evaluate(problem.x)
             assert np.array_equal(other.parts[0].stick, own.stick)
             assert max(ratios(problem, other).values()) <= 1.0
-        monkeypatch.setattr(contact_laws, "TANGENTIAL_SCALE", nominal)
+        monkeypatch.setattr(coulomb, "TANGENTIAL_SCALE", nominal)
         problem.rtol = problem_rtol
     stepper.close()
     assert both >= 3

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution, Slip
+from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution
+from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.elements import over
 from dolfinx_nts.kernels.vectors import cross
 

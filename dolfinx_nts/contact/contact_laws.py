@@ -1,4 +1,4 @@
-"""The laws of contact at an iterate: gap, active set, Coulomb's friction, what cannot slip.
+"""The laws of contact at an iterate: gap, active set, and friction by `coulomb`.
 
 Whatever the master is, a pair's gap, slip and contact force are known here, and what they must
 satisfy is written into its rows.
@@ -14,36 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.constraints import SHIFT
+from dolfinx_nts.contact.coulomb import STRONG, Coulomb, Slip, Together
 from dolfinx_nts.contact.pair import Candidates, ContactPair
-from dolfinx_nts.kernels import nts_element
-from dolfinx_nts.kernels.friction import length, return_map
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
-
-#: Algorithmic scale c of the return map over the scale of the active set. No result depends on it;
-#: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which
-#: with a consistent mass matrix is a small part of the nodal mass.
-TANGENTIAL_SCALE = 0.05
-#: The same where all points share nodes, as of rigid bodies, whose mass is divided among them.
-_OF_SHARED = 0.5
-#: Largest coefficient of friction in numbers: larger ones are this one, but for infinite friction.
-_LARGEST = 1e8
-#: Coefficient of infinite friction where it has a bound: sticking by more would be rounding's.
-_BOUND = 1e4
-#: Pull over friction that counts as none.
-_NO_PULL = 1e-8
-#: Coefficient from which on friction counts as strong.
-_STRONG = 1.0
-#: Pull over friction up to which a node that sticks is let slip before it is let go.
-_PULL = 0.01
-#: Square of the part of a motion that counts as none.
-_IMMOVABLE = 1e-12
-#: Prescribed slip over the size of the facet that counts as none.
-_STILL = 1e-10
-#: Largest ratio of normal forces by which friction of a rigid body's nodes is divided.
-_UNEVEN = 100.0
 
 
 class Contribution(NamedTuple):
@@ -83,32 +59,6 @@ class Contribution(NamedTuple):
     def status(self) -> BoolArray:
         """What Newton's method may flip: active and stick, shape (2, n)."""
         return np.stack([self.active, self.stick])
-
-
-class Together(NamedTuple):
-    """What all pairs of a contact have in common where they share nodes, as of rigid bodies.
-
-    The compliances are those that the matrix lends to what holds a pair, over that of the bodies;
-    they vanish with what is missed, see `constraints.SHIFT`, and are 0 where pairs share nothing.
-
-    Attributes:
-        force: Mean normal force [kg m].
-        normal: Compliance lent to gaps [-].
-        tangential: Compliance lent to sticking [-].
-    """
-
-    force: float
-    normal: float
-    tangential: float
-
-
-class Slip(NamedTuple):
-    """Slip and metric in facet sizes with their derivatives by the unknowns of the element."""
-
-    value: FloatArray
-    gradient: FloatArray
-    metric: FloatArray
-    metric_gradient: FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -224,10 +174,6 @@ class ContactLaws:
         gap: FloatArray = np.maximum(self.rounding, self.force_rounding / self._yielding)
         return gap
 
-    @property
-    def _tangential_scale(self) -> float:
-        return TANGENTIAL_SCALE if self.pair.yields else _OF_SHARED
-
     def _together(
         self, gap: FloatArray, slip: Slip | None, multiplier: FloatArray
     ) -> Together:
@@ -246,35 +192,6 @@ class ContactLaws:
         extent = self.pair.extent
         return Together(total / max(number, 1.0), *(SHIFT + ranks[:, 2:].max(axis=0) / extent))
 
-    def _lent_to_stick(
-        self, together: Together, force: FloatArray, stick: BoolArray
-    ) -> FloatArray:
-        """Compliance lent to pairs that stick, so that friction divides as normal forces do.
-
-        A brick at rest on a slope just below the limit needs that of all its nodes.
-        """
-        part = np.full(np.count_nonzero(stick), _UNEVEN)
-        np.divide(together.force, -force[stick], out=part, where=force[stick] < 0.0)
-        part = np.clip(part, 1.0 / _UNEVEN, _UNEVEN)
-        lent: FloatArray = together.tangential * part / self.scale[stick]
-        return lent
-
-    @property
-    def strong(self) -> bool:
-        """Whether friction may hold a node that free motion lets go (Painleve's paradox)."""
-        return self.pair.friction > _STRONG
-
-    @staticmethod
-    def no_pull(friction: FloatArray) -> FloatArray:
-        """Contact force that counts as none beside these friction forces (n, 3), in their unit."""
-        none: FloatArray = _NO_PULL * np.linalg.norm(friction, axis=1)
-        return none
-
-    @property
-    def _endless(self) -> bool:
-        """Whether friction has no bound."""
-        return bool(np.isinf(self.pair.friction)) and not self.bounded
-
     @cached_property
     def _free(self) -> BoolArray:
         """Coordinates of slaves and points that are not prescribed, shape (n, points + 1, 3)."""
@@ -291,70 +208,31 @@ class ContactLaws:
         together: FloatArray = self.scale / (1.0 + self.scale * self._ease)
         return together
 
+    @property
+    def strong(self) -> bool:
+        """Whether friction may hold a node that free motion lets go."""
+        return self.pair.friction > STRONG
+
     @cached_property
-    def _prescribed(self) -> BoolArray:
-        """Axes along which slave and foot move as prescribed, shape (n, 3)."""
+    def coulomb(self) -> Coulomb:
+        """Coulomb's law of the pairs."""
         square = np.column_stack([np.ones(self.num_elements), self.point_foot]) ** 2
-        part = np.einsum("nk,nki->ni", square, self._free)
-        still: BoolArray = part <= _IMMOVABLE * square.sum(axis=1)[:, None]
-        return still
-
-    @cached_property
-    def _blocked(self) -> FloatArray:
-        """Projector on the tangential parts of the prescribed axes, shape (n, 3, 3).
-
-        Forces there act on prescribed coordinates or along the normal: where the gap is closed, the
-        slip there is prescribed.
-        """
-        if not self._prescribed.any():
-            return np.zeros((self.num_elements, 3, 3))
-        normal = self.candidates.normal
-        along = np.eye(3) - normal[:, :, None] * normal[:, None]
-        part, vector = np.linalg.eigh(np.matmul(along * self._prescribed[:, None], along))
-        vector *= (part > _IMMOVABLE)[:, None]
-        projector: FloatArray = np.matmul(vector, vector.transpose(0, 2, 1))
-        return projector
-
-    @cached_property
-    def blocked(self) -> FloatArray:
-        """Projector on the part of lambda_T that acts on prescribed coordinates only, (n, 2, 2).
-
-        Sticking is no equation there, and lambda_T is set to zero.
-        """
-        tangents = self._tangents
-        metric = np.matmul(tangents, tangents.transpose(0, 2, 1))
-        dual = nts_element.solve(metric, tangents)
-        projector: FloatArray = np.matmul(
-            np.matmul(tangents, self._blocked), dual.transpose(0, 2, 1)
+        free: FloatArray = np.einsum("nk,nki->ni", square, self._free)
+        return Coulomb(
+            friction=self.pair.friction,
+            yields=self.pair.yields,
+            redundant=self.pair.redundant,
+            bounded=self.bounded,
+            x0=self.x0,
+            foot=self.foot,
+            normal=self.candidates.normal,
+            tangents=self._tangents,
+            size=self.candidates.length,
+            free=free / square.sum(axis=1)[:, None],
+            scale=self.scale,
+            yielding=self._yielding,
+            of_end=self._of_end,
         )
-        return projector
-
-    def _held(self, x: FloatArray) -> FloatArray:
-        """`blocked` where the slip prescribed there is zero, else zero, shape (n, 2, 2).
-
-        Nodes that slip leave this part of lambda_T out of the trial, too: Coulomb's law says
-        nothing about it, and at the edge of sticking the rows would be singular in it.
-        """
-        if not self._prescribed.any():
-            return self.blocked
-        motion = x - self.x0
-        motion = motion[:, 0] - np.einsum("nk,nki->ni", self.foot, motion[:, 1:])
-        slip = np.einsum("nij,nj->ni", self._blocked, motion * self._prescribed)
-        held: FloatArray = self.blocked.copy()
-        held[np.abs(slip).max(axis=1) > _STILL * self.candidates.length] = 0.0
-        return held
-
-    def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
-        """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
-        c = self._tangential_scale * self._yielding
-        if self._endless:
-            return c
-        moved = self.blocked.any(axis=(1, 2)) & ~held.any(axis=(1, 2))
-        s = slip.value[moved]
-        distance = np.sqrt(np.einsum("na,nab,nb->n", s, slip.metric[moved], s))
-        # Where solved, trial and slip are parallel, whatever c: the tangent needs no slope of c.
-        c[moved] = np.maximum(c[moved], 2.0 * bound[moved] / distance)
-        return c
 
     def _laws(
         self,
@@ -397,7 +275,9 @@ class ContactLaws:
             end=end,
         )
         if slip is not None:
-            part.stick[:] = self._coulomb(x, residual, tangent, slip, end, active, together)
+            part.stick[:] = self.coulomb.write(
+                x, residual, tangent, slip, end, active, together
+            )
             square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
             part.distance[active] = np.sqrt(square[active])
         return part
@@ -435,68 +315,9 @@ class ContactLaws:
         A touch without force has rounding in both, and with strong friction more than one solution
         (Painleve's paradox): so nodes carry where free motion would close their gaps, or did so in
         the last step. If no step comes of that (`lets_slip`), a small pull on a node that sticks
-        lets it slip, by the law continued beyond zero force, since letting it go would close its
-        gap again. A solved step never ends in such a state, so this adds no solution.
+        lets it slip. A solved step never ends in such a state, so this adds no solution.
         """
         none = self._yielding * self.gap_rounding
-        endless = self._endless
-        if slip is None or not (self.lets_slip or endless):
+        if slip is None or not (self.lets_slip or self.coulomb.endless):
             return none
-        t, s = multiplier[:, -2:], self._tangential_scale * self._yielding[:, None] * slip.value
-        friction = length(slip.metric, t)
-        resists = friction**2 + np.einsum("na,na->n", t, s) > 0.0
-        resists &= ~self.blocked.any(axis=(1, 2))
-        # Without bound a node may stick by no normal force at all, whose rounding has any sign.
-        return none - np.where(resists, (_NO_PULL if endless else _PULL) * friction, 0.0)
-
-    def _coulomb(
-        self,
-        x: FloatArray,
-        residual: FloatArray,
-        tangent: FloatArray,
-        slip: Slip,
-        multiplier: FloatArray,
-        active: BoolArray,
-        together: Together,
-    ) -> BoolArray:
-        """Write the rows of lambda_T [m]; returns which pairs stick.
-
-        Of a pair that carries nothing yet, the bound of strong friction, and that of a rigid body,
-        is mu times the force that its depth asks for, as in the active set: with none it would have
-        to slip at first, by the slope of the bound, which is mu for all active pairs. Points of a
-        rigid body that rest would go on so, by rounding and against each other.
-        """
-        endless = self._endless
-        largest = _BOUND if np.isinf(self.pair.friction) else _LARGEST
-        mu, t = min(self.pair.friction, largest), multiplier[:, -2:]
-        force, scale = multiplier[:, 0], self.scale[:, None, None]
-        normal = residual.shape[1] - self.num_constraints
-        new = active & (force >= 0.0) & (mu > _STRONG or self.pair.redundant)
-        bound = mu * np.where(active, -force if mu > _STRONG else np.maximum(-force, 0.0), 0.0)
-        bound[new] -= mu * self._yielding[new] * residual[new, normal]
-        bound[active & endless] = np.inf
-        held = self._held(x)
-        loose = np.eye(2) - held
-        trial = np.einsum("nab,nb->na", loose, t)
-        of_end = self._of_end[:, None, None]
-        law = return_map(trial, slip.value, slip.metric, bound, self._c(slip, bound, held))
-        stick = law.stick & active
-        rows = np.einsum("nab,nbz->naz", law.d_slip, slip.gradient)
-        rows += np.einsum("nabc,nbcz->naz", law.d_metric, slip.metric_gradient)
-        rows[:, :, -2:] += of_end * np.matmul(law.d_multiplier, loose)
-        rows[:, :, normal] -= mu * of_end[:, 0] * law.d_bound
-        by_gap = law.d_bound[new, :, None] * tangent[new, normal][:, None]
-        rows[new] -= mu * self._yielding[new, None, None] * by_gap
-        value, slipping = law.residual, ~stick
-        value[slipping] /= scale[slipping, 0]
-        rows[slipping] /= scale[slipping]
-        unsaid = np.where(stick[:, None, None], self.blocked, held) / scale
-        value += np.einsum("nab,nb->na", unsaid, t)
-        rows[:, :, -2:] += of_end * unsaid
-        if together.tangential:
-            lent = self._lent_to_stick(together, force, stick)
-            rows[stick, :, -2:] -= np.eye(2) * lent[:, None, None]
-        value[~active], rows[~active] = t[~active] / scale[~active, 0], 0.0
-        rows[~active, :, -2:] = of_end[~active] * np.eye(2) / scale[~active]
-        residual[:, -2:], tangent[:, -2:] = value, rows
-        return stick
+        return none - self.coulomb.pull(slip, multiplier)

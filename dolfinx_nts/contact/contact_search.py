@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
 from dolfinx_nts.contact.contact_laws import Contribution
+from dolfinx_nts.contact.coulomb import no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
@@ -199,7 +200,7 @@ class ContactSearch:
         force = self._old[k].force[node]
         if c.strong:
             closes = self._gap(k, c, self._step.first) < -_SURELY * reach
-            return closes | (force > c.no_pull(self._old[k].tangential[node]))
+            return closes | (force > no_pull(self._old[k].tangential[node]))
         # What goes to and fro at the limit would change the layout in every step.
         # Of nodes that rest all or none: whether rounding closes their gaps must not divide forces.
         near = reach + c.rounding if c.pair.redundant else reach

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact.contact_elements import ContactElements
-from dolfinx_nts.contact.contact_laws import Slip
+from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.kernels import compiled, facets, nts_element
 
 FloatArray = npt.NDArray[np.float64]

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.contact.contact_elements import ContactElements
-from dolfinx_nts.contact.contact_laws import Contribution, Slip
+from dolfinx_nts.contact.contact_laws import Contribution
+from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.contact.obstacles import inverse
 from dolfinx_nts.kernels.nts_element import Gap
 
