@@ -22,6 +22,7 @@ SMALL = {
     "slider_crank": {"rods": ("rigid", "flexible"), "t_end": 0.002, "cells": 4},
     "sliding_block": {"floors": ("plane",), "dt": 8e-3, "cells": (2, 2, 1)},
     "slope": {"floors": ("plane",), "parts": ("verge",), "cells": (2, 2, 1)},
+    "stability": {"steps": {"rubbing": 5}},
     "stick_slip": {"floors": ("plane",), "dt": 8e-3, "cells": (2, 2, 1)},
     "two_blocks": {"t_end": 0.01, "cells": (1, 1)},
     "two_tori": {"t_end": 0.1},
