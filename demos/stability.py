@@ -9,7 +9,8 @@ Reference. Energy beside all that is accounted for (work, friction, gaps that cl
 cannot grow: the ledger's residual is zero.
 
 What to see. With the same steps `Newmark` wins energy in impacts and in frictional contact until a
-cell turns inside out and the run stops. The energy-momentum scheme completes with its ledger at
+cell turns inside out and the run stops; when that is depends on rounding, so that on other ranks it
+may be later, at three times the energy. The energy-momentum scheme completes with its ledger at
 rounding. The midpoint rule completes, too: we found no scene of contact in which its drift ends a
 run that the energy-momentum scheme completes; without contact there is one (`flying_l_block.py`).
 Generalised alpha completes; when the cube bounces, 17 % of the energy has come from nowhere.
