@@ -59,7 +59,12 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
         for j, (m, y) in enumerate(modes):
             sizes[1, i, j] = x @ y if k == m else 0.0
     comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.SUM)
-    combination = scipy.linalg.eigh(sizes[0], sizes[1])[1][:, 0]
+    resistance, forces = np.sqrt(sizes.diagonal(axis1=1, axis2=2))
+    alone = np.flatnonzero(resistance <= _NONE * forces)
+    if alone.size:  # eigenvectors would mix the motions that are free as rounding has it
+        combination = np.eye(len(modes))[alone[0]]
+    else:
+        combination = scipy.linalg.eigh(sizes[0], sizes[1])[1][:, 0]
     # Its square knows half the digits.
     direction.set(0.0)
     for part, (k, mode) in zip(combination, modes, strict=True):
