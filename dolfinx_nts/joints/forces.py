@@ -17,10 +17,11 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
-from dolfinx_nts.elements import EveryStep, PointElements, Step
+from dolfinx_nts.elements import Step
 from dolfinx_nts.integrators.rule import taken_at
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
+from dolfinx_nts.point_elements import EveryStep, PointElements
 from dolfinx_nts.validation import StepFailedError, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]

@@ -39,10 +39,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.contact_elements import ContactHistory
+from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
+from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, resultants
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

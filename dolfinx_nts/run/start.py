@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Restart, Solution
+from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import is_finite
 
 FloatArray = npt.NDArray[np.float64]

@@ -28,6 +28,7 @@ from dolfinx_nts.run.start import (
 from dolfinx_nts.run.step_size import Pace
 from dolfinx_nts.run.step_warnings import tell_step
 from dolfinx_nts.run.table import Table
+from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, consistent, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
@@ -38,7 +39,7 @@ from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.resting import with_resting_forces
 from dolfinx_nts.step.unresolved import tell_unresolved
-from dolfinx_nts.system import State, System, is_like
+from dolfinx_nts.system import System, is_like
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,

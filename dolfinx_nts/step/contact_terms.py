@@ -13,9 +13,10 @@ from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import State
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.unknowns import Unknowns
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import StepFailedError, is_finite
 
 FloatArray = npt.NDArray[np.float64]

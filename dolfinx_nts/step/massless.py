@@ -8,9 +8,10 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import State
 from dolfinx_nts.step.consistent import accelerating_forces
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 
 #: Force on massless nodes over the body's internal forces that counts as balanced.
 _BALANCED = 1e-2

@@ -19,17 +19,19 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.body import Moment
-from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
+from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.elements import Coupling, JointCoupling, Step
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import State
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.stabilization import Stabilization
 from dolfinx_nts.step.unknowns import Unknowns
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

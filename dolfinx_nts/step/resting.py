@@ -14,10 +14,10 @@ from mpi4py import MPI
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Newmark
+from dolfinx_nts.state import State
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 logger = logging.getLogger(__name__)

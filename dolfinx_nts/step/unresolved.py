@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.joints.forces import AboutAxis, Between
+from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -1,0 +1,38 @@
+"""Everything that a step starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.history import ContactHistory
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Everything a step starts from; never changed, a step makes a new one.
+
+    Attributes:
+        time: t [s].
+        u: Owned displacements of each body [m].
+        v: Owned velocities of each body [m/s].
+        a: Owned accelerations of each body [m/s^2], where the integrator carries any; else empty.
+        histories: What each `Coupling` of the system remembers; that of the contacts comes first.
+    """
+
+    time: float
+    u: tuple[FloatArray, ...]
+    v: tuple[FloatArray, ...]
+    a: tuple[FloatArray, ...]
+    histories: tuple[Any, ...]
+
+    @property
+    def contacts(self) -> tuple[ContactHistory, ...]:
+        """What each contact remembers of its slave nodes."""
+        history: tuple[ContactHistory, ...] = self.histories[0]
+        return history
