@@ -25,6 +25,7 @@ from dolfinx_nts.elements import (
     Elements,
     Joint,
     JointCoupling,
+    Slopes,
     Step,
 )
 from dolfinx_nts.integrators import (
@@ -117,6 +118,7 @@ __all__ = [
     "RigidBody",
     "Saved",
     "Section",
+    "Slopes",
     "Solution",
     "Sphere",
     "Spherical",

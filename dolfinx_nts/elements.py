@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -200,6 +200,23 @@ class Elements(Protocol):
         """
 
 
+class Slopes(NamedTuple):
+    """What a force along a coordinate, a length or an angle, does near a state.
+
+    Attributes:
+        gradients: Of the coordinate, by the owned coordinates of each body of the joint.
+        stiffness: Change of the force with the coordinate [N/m], or [N m] of an angle, the same on
+            all ranks.
+        damping: The same with the coordinate's rate [N s/m] or [N m s].
+        about: Whether the coordinate is an angle.
+    """
+
+    gradients: Sequence[FloatArray]
+    stiffness: float
+    damping: float = 0.0
+    about: bool = False
+
+
 class Joint(Protocol):
     """What a System accepts beside contacts: joints, springs, ties; part of the scene.
 
@@ -213,6 +230,9 @@ class Joint(Protocol):
         settings: Numbers and texts by name, for JSON and the same on all ranks, that it was made
             with; a checkpoint goes on only with equal ones. It may be missing: then name and kind
             alone are compared.
+        slopes: Function of the arguments of `potential` that returns `Slopes`, for a force along
+            one coordinate; a run warns of one that is too fast for its steps. Collective. It may
+            be missing.
     """
 
     name: str

@@ -84,6 +84,19 @@ class Spring:
             parts.append(everywhere[side.nodes])
         return np.concatenate(parts, axis=1)
 
+    def slopes(self, u, history):
+        """For the warning of steps that do not resolve it."""
+        x = self._elements(None).reference() + self._gathered(u)
+        weight = self._elements(None).weights
+        r = np.einsum("na,nai->ni", weight[:, 0] - weight[:, 1], x)
+        r /= np.linalg.norm(r, axis=1)[:, None]
+        signs = (1.0, -1.0)
+        gradients = [
+            side.gathered(sign * side.weights[:, :, None] * r[:, None])
+            for sign, side in zip(signs, self._sides, strict=True)
+        ]
+        return nts.Slopes(gradients, self.stiffness, self.damping)
+
     def coupling(self, bodies):
         def make(step, history):
             u0 = [step.state.u[b] for b in bodies]
@@ -166,6 +179,61 @@ def test_two_stiff_cubes_vibrate_as_two_masses():
         way = COMM.allreduce(state.u[0].reshape(-1, 3)[:, 0].sum()) / 27
         assert abs(way - 0.1 / omega * np.sin(n * phase)) < 2e-3 * 0.1 / omega
     stepper.close()
+
+
+def masses():
+    """Two of 1 kg, 1 m apart, and a flexible cube beside them."""
+    a, b = (
+        nts.RigidBody.from_inertia(1.0, (1, 2, 2.5), centre=(x, 0, 0), name=name, comm=COMM)
+        for x, name in ((0, "a"), (1, "b"))
+    )
+    return a, b, cube((1.5, -0.5, -0.5), "flexible")
+
+
+def told(bodies, joints, dt=1e-2):
+    """How many times too fast a spring is said to be."""
+    stepper = nts.Stepper(nts.System(bodies, joints=joints), nts.EnergyMomentum())
+    stepper.start(dt)
+    found = stepper.solution.warnings.get("unresolved")
+    stepper.close()
+    return 0.0 if found is None else found.worst
+
+
+@pytest.mark.mpi
+def test_a_spring_of_ones_own_that_steps_do_not_resolve_is_told():
+    """Omega h as of the built-in twin, and c h/(2 m) of its damper."""
+    a, b, _ = masses()
+    ends = [(0, 0, 0), (1, 0, 0)]
+    omega = np.sqrt(2.0 * 1e6)
+    assert told((a, b), [Spring(a, b, ends, stiffness=1e6)]) == pytest.approx(1e-2 * omega)
+    assert told((a, b), [nts.Spring(a, b, ends, stiffness=1e6)]) == pytest.approx(1e-2 * omega)
+    damper = Spring(a, b, ends, stiffness=1.0, damping=1e4)
+    assert told((a, b), [damper]) == pytest.approx(100.0)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("tells", [True, False])
+def test_a_weak_spring_of_ones_own_holds_no_body(tells):
+    """A fast spring beside it is told, whether the own one says its slopes or not."""
+    a, b, block = masses()
+    weak = Spring(b, block, [(1, 0, 0), (2, 0, 0)], stiffness=1e-3, name="weak")
+    if not tells:
+        weak = Silent(weak)
+    fast = nts.Spring(a, b, [(0, 0, 0), (1, 0, 0)], stiffness=1e6)
+    found = told((a, b, block), [fast, weak])
+    assert found == pytest.approx(1e-2 * np.sqrt(2.0 * 1e6), rel=1e-9)
+
+
+class Silent:
+    """A joint that leaves out what may be left out."""
+
+    def __init__(self, joint):
+        self._joint = joint
+
+    def __getattr__(self, name):
+        if name == "slopes":
+            raise AttributeError(name)
+        return getattr(self._joint, name)
 
 
 @pytest.mark.mpi
