@@ -22,17 +22,13 @@ class State:
         u: Owned displacements of each body [m].
         v: Owned velocities of each body [m/s].
         a: Owned accelerations of each body [m/s^2], where the integrator carries any; else empty.
-        histories: What each `Coupling` of the system remembers; that of the contacts comes first.
+        contacts: What each contact remembers of its slave nodes.
+        joints: What each of `System.joints` remembers.
     """
 
     time: float
     u: tuple[FloatArray, ...]
     v: tuple[FloatArray, ...]
     a: tuple[FloatArray, ...]
-    histories: tuple[Any, ...]
-
-    @property
-    def contacts(self) -> tuple[ContactHistory, ...]:
-        """What each contact remembers of its slave nodes."""
-        history: tuple[ContactHistory, ...] = self.histories[0]
-        return history
+    contacts: tuple[ContactHistory, ...]
+    joints: tuple[Any, ...]

@@ -156,13 +156,13 @@ class System:
 
     def initial_state(self) -> State:
         """Bodies with their initial displacements and velocities at t = 0."""
-        contacts = tuple(ContactHistory.of_start(len(c.slave.share)) for c in self.contacts)
         return State(
             time=0.0,
             u=tuple(self._at_start(b) for b in self.bodies),
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
             a=(),
-            histories=(contacts, *(joint.start() for joint in self.joints)),
+            contacts=tuple(ContactHistory.of_start(len(c.slave.share)) for c in self.contacts),
+            joints=tuple(joint.start() for joint in self.joints),
         )
 
     def state_from(self, other: System, state: State, *, moving: bool) -> State:
@@ -195,12 +195,14 @@ class System:
             for j, known in enumerate(other.contacts):
                 if pair.is_like(known):
                     contacts[k] = state.contacts[j]
-        joints = list(found.histories[1:])
+        joints = list(found.joints)
         for k, joint in enumerate(self.joints):
-            for known, history in zip(other.joints, state.histories[1:], strict=True):
+            for known, history in zip(other.joints, state.joints, strict=True):
                 if is_like(joint, known):
                     joints[k] = history
-        start = replace(found, time=state.time, u=u, histories=(tuple(contacts), *joints))
+        start = replace(
+            found, time=state.time, u=u, contacts=tuple(contacts), joints=tuple(joints)
+        )
         if moving:
             v = tuple(state.v[index[b.name]].copy() for b in self.bodies)
             a = tuple(state.a[index[b.name]].copy() for b in self.bodies) if state.a else ()

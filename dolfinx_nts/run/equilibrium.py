@@ -184,7 +184,7 @@ class _LoadStepper(Stepper):
             new: At its end.
             told: What the ledgers of each joint's elements say, shape (joints,).
         """
-        histories, works = zip(old.histories[1:], new.histories[1:], strict=True), []
+        histories, works = zip(old.joints, new.joints, strict=True), []
         for joint, both, ledger in zip(
             self.problem.joints, histories, told.tolist(), strict=True
         ):
@@ -238,7 +238,7 @@ class _LoadStepper(Stepper):
                             slipped, state.contacts, reached.contacts, strict=True
                         )
                     )
-                    reached = replace(reached, histories=(contacts, *reached.histories[1:]))
+                    reached = replace(reached, contacts=contacts)
                     self._check_missed(reached)
                 except UserFunctionError:
                     raise

@@ -577,8 +577,10 @@ class Stepper:
                 # What has no momentum has no velocity of its own either.
                 massless = self.system.bodies[k].massless
                 v[k][massless] = step.bodies[k].du[massless] / dt
-        histories = [coupling.history(parts) for coupling, parts in self.problem.each(step)]
-        return State(time, tuple(u), tuple(v), tuple(a), tuple(histories))
+        contacts, *joints = (
+            coupling.history(parts) for coupling, parts in self.problem.each(step)
+        )
+        return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))
 
     def mean_force(self, k: int) -> FloatArray:
         """Contact force p_N of the last two steps in the mean over their time [N].

@@ -139,7 +139,7 @@ def measure(
         if last is None or last[0] is not u or last[1] is not v:
             known[body.name] = last = u, v, _of_body(body, u, v)
         local += last[2]
-    joints = zip(system.joints, system.joint_bodies, state.histories[1:], strict=True)
+    joints = zip(system.joints, system.joint_bodies, state.joints, strict=True)
     for joint, bodies, history in joints:
         local[1] += joint.potential([state.u[b] for b in bodies], history)
     total = np.empty_like(local)
@@ -214,7 +214,7 @@ def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
         step: Their solution.
     """
     work = np.zeros(len(problem.joints))
-    for k, (coupling, parts) in enumerate(list(problem.each(step))[1:]):
+    for k, (coupling, parts) in enumerate(problem.of_joints(step)):
         for batch, part in zip(coupling.elements, parts, strict=True):
             work[k] += batch.ledger(part, problem.factor).get("external_work", 0.0)
     return work

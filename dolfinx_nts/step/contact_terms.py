@@ -184,7 +184,7 @@ class ContactTerms:
             )
         u = tuple(t.u1 for t in terms)
         rest = tuple(np.zeros_like(a) for a in u)
-        self.state = State(self._time, u, rest, (), (self._search.history(parts),))
+        self.state = State(self._time, u, rest, (), self._search.history(parts), ())
 
     def destroy(self) -> None:
         """Free the PETSc objects of the step; its vectors and matrices are of no use then."""

@@ -164,7 +164,8 @@ class StepProblem:
             state, dt, self.factor, self.integrator, self.condense, self.first, way,
             motion, length, self.stabilization.stiffness, moments, self.rounding.of,
         )  # fmt: skip
-        for coupling, history in zip(self.couplings, state.histories, strict=True):
+        histories: tuple[Any, ...] = (state.contacts, *state.joints)
+        for coupling, history in zip(self.couplings, histories, strict=True):
             coupling.begin(step, history, again, search)
         self._asleep = self._find_asleep(np.maximum(motion, speed) == 0.0)
         self._lay_out()
@@ -181,8 +182,13 @@ class StepProblem:
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """Couplings with their parts of an evaluation."""
-        start = 0
-        for coupling in self.couplings:
+        yield self.contacts, e.parts[: len(self.contacts.elements)]
+        yield from self.of_joints(e)
+
+    def of_joints(self, e: Evaluation) -> Iterator[tuple[JointCoupling, tuple[Any, ...]]]:
+        """Those of `System.joints`."""
+        start = len(self.contacts.elements)
+        for coupling in self.joints:
             stop = start + len(coupling.elements)
             yield coupling, e.parts[start:stop]
             start = stop

@@ -95,7 +95,7 @@ def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:
         force = np.where(rests, new.force, 0.0)
         tangential = np.where(rests[:, None], new.tangential, 0.0)
         found.append(old._replace(force=force, tangential=tangential))
-    return replace(state, histories=(tuple(found), *state.histories[1:]))
+    return replace(state, contacts=tuple(found))
 
 
 def _closed(c: ContactElements) -> BoolArray:

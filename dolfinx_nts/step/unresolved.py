@@ -73,7 +73,7 @@ def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[floa
 def _suspects(problem: StepProblem, state: State, dt: float) -> list[_Fast]:
     """Springs and dampers that would be too fast if no constraint held the bodies. Collective."""
     found, system = [], problem.system
-    joints = zip(system.joints, system.joint_bodies, state.histories[1:], strict=True)
+    joints = zip(system.joints, system.joint_bodies, state.joints, strict=True)
     for joint, bodies, history in joints:
         if not hasattr(joint, "slopes"):
             continue
