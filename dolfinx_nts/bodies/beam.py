@@ -21,7 +21,6 @@ from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.section import Clamp, LineForce, PointForce, Section
 from dolfinx_nts.bodies.triad import Triads, largest_turn
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.integrators.rule import taken_at
 from dolfinx_nts.kernels import beam as kernel
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.validation import (
@@ -355,7 +354,7 @@ class Beam(Body):
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         self._y0 = self._vectors(moment.u0)
-        self._theta = taken_at(rule)
+        self._theta = rule.taken_at
         self._load = self._loads_at(moment.time, moment.ramp)
 
     def _loads_at(self, time: float, ramp: float) -> FloatArray:

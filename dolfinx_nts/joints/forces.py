@@ -18,7 +18,6 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.elements import Slopes, Step
-from dolfinx_nts.integrators.rule import taken_at
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
 from dolfinx_nts.point_elements import EveryStep, PointElements
@@ -146,7 +145,7 @@ class SpringElements(PointElements):
 
     def evaluate(self, x: FloatArray, own: Any) -> SpringPart:
         """Residual and tangent."""
-        way, theta, n = self.way, taken_at(self.step.integrator), len(x)
+        way, theta, n = self.way, self.step.integrator.taken_at, len(x)
         rate = self.step.moments[0].rate
         du = x - self.y0
         first, last = (self.y0, x) if theta is None else (self.y0 + theta * du,) * 2

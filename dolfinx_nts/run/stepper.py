@@ -159,7 +159,7 @@ class Stepper:
             raise ValueError(f"restitution={restitution!r}: must lie between 0 and 1")
         if impact == "published" and restitution != 1.0:
             raise ValueError(f"restitution={restitution!r}: pass impact='restored', too")
-        if impact != "published" and integrator.accelerations:
+        if impact != "published" and not integrator.keeps_energy:
             raise ValueError(
                 f"impact={impact!r}: {integrator!r} keeps no energy in contact that could be given "
                 "back; choose EnergyMomentum() or Midpoint()"

@@ -31,7 +31,7 @@ def check_massless(system: System, integrator: Any, impact: str) -> None:
     if not with_massless:
         return
     what = f"mass='redistributed' of {', '.join(map(repr, with_massless))}"
-    if integrator.accelerations or integrator.theta != 0.5:
+    if not integrator.keeps_energy:
         raise ValueError(
             f"{what}: contact forces of a step are the mean of its ends, which {integrator!r} does "
             "not take; choose EnergyMomentum() or Midpoint(), or mass='consistent'"
