@@ -88,7 +88,8 @@ class Part(Protocol):
     """What elements contribute at an iterate; axis 0 = element.
 
     Attributes:
-        residual: Rows of coordinates [kg m] (forces times `Step.factor`), then of own unknowns.
+        residual: Rows of the coordinates, minus the forces on the bodies times `Step.factor`
+            [kg m]; then rows of the own unknowns.
         tangent: Its derivative, shape (n, r, r).
         status: What Newton's method may flip from iterate to iterate, shape (states, n).
     """
@@ -127,6 +128,10 @@ class Elements(Protocol):
     @property
     def bilateral(self) -> bool:
         """Whether its constraints hold always and in both directions, as those of joints."""
+
+    @property
+    def extent(self) -> float:
+        """Length beside the displacements whose rounding is in its rows, on this rank [m]."""
 
     @property
     def force_scale(self) -> float:
@@ -233,6 +238,8 @@ class Joint(Protocol):
         slopes: Function of the arguments of `potential` that returns `Slopes`, for a force along
             one coordinate; a run warns of one that is too fast for its steps. Collective. It may
             be missing.
+        driven: Whether it moves bodies as prescribed by a function of time, which impacts that give
+            their energy back refuse. It may be missing where it does not.
     """
 
     name: str

@@ -300,10 +300,11 @@ class Drive:
     """A joint with the ground whose constraint depends on time: a way at an acceleration."""
 
     losses = ()
+    driven = True
 
     def __init__(self, body, x, speed, acceleration=0.0, name="drive"):
         self.name, self.bodies = name, (body,)
-        self.motion = (speed, acceleration)
+        self.rates = (speed, acceleration)
         side = body.points(x)
         self.side = side if COMM.rank == 0 else side.part(slice(0))
 
@@ -315,7 +316,7 @@ class Drive:
 
     def coupling(self, bodies):
         def make(step, history):
-            (speed, acceleration), t = self.motion, step.state.time + step.dt
+            (speed, acceleration), t = self.rates, step.state.time + step.dt
             return DriveElements(
                 name=self.name, sides=(self.side,), way=speed * t + 0.5 * acceleration * t**2
             )
@@ -338,6 +339,14 @@ def test_a_drive_moves_what_it_holds(newton):
     moved = found.weights[0] @ u[found.nodes[0]]
     assert abs(moved[0] - 5e-3) < 1e-14
     assert run.balance["newton_iterations"][1:].min() >= 1
+
+
+@pytest.mark.mpi
+def test_impacts_give_nothing_back_where_a_joint_of_ones_own_drives():
+    body = cube((0, 0, 0), "a")
+    system = nts.System([body], joints=[Drive(body, (0.3, 0.4, 0.6), 0.1)])
+    with pytest.raises(ValueError, match="impact='restored': joint 'drive' is driven"):
+        nts.Stepper(system, nts.EnergyMomentum(), impact="restored")
 
 
 @pytest.mark.mpi

@@ -169,6 +169,11 @@ class ContactPair:
         """Check the master and prepare the search."""
 
     @property
+    def driven(self) -> bool:
+        """Whether its master moves as prescribed by a function of time, apart from bodies."""
+        return False
+
+    @property
     def bodies(self) -> tuple[Any, ...]:
         """The slave's body, and the master's if it has one."""
         return (self.slave.body,)

@@ -65,13 +65,13 @@ def refuse_moved(system: System) -> None:
     The energy that an impact with it leaves depends on its motion.
     """
     for pair in system.contacts:
-        if getattr(pair.master, "motion", None) is not None:
+        if pair.driven:
             raise ValueError(
                 f"impact='restored': obstacle {pair.master.name!r} moves; use impact='published', "
                 "or let a heavy rigid body take its place"
             )
     for joint in system.joints:
-        if getattr(joint, "motion", None) is not None:
+        if getattr(joint, "driven", False):
             raise ValueError(
                 f"impact='restored': joint {joint.name!r} is driven; use impact='published'"
             )
