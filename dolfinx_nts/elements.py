@@ -14,7 +14,9 @@ from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kinematics import Kinematics
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
+from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -85,17 +87,18 @@ class Step:
 
 
 class Part(Protocol):
-    """What elements contribute at an iterate; axis 0 = element.
+    """What elements contribute at an iterate; axis 0 = element."""
 
-    Attributes:
-        residual: Rows of the coordinates, minus the forces on the bodies times `Step.factor`
-            [kg m]; then rows of the own unknowns.
-        tangent: Its derivative, shape (n, r, r).
-        status: What Newton's method may flip from iterate to iterate, shape (states, n).
-    """
+    @property
+    def residual(self) -> FloatArray:
+        """Rows of coordinates and own unknowns, shape (n, r).
 
-    residual: FloatArray
-    tangent: FloatArray
+        Those of the coordinates are minus the forces on the bodies times `Step.factor` [kg m].
+        """
+
+    @property
+    def tangent(self) -> FloatArray:
+        """Its derivative, shape (n, r, r)."""
 
     @property
     def status(self) -> BoolArray:
@@ -150,7 +153,9 @@ class Elements(Protocol):
         """Augmented unknowns that fit predicted positions, shape (n, augmented)."""
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Part:
-        """Residual and tangent; pure. All ranks call it.
+        """Residual and tangent; pure. All ranks call it, also those without elements.
+
+        What it raises on one rank ends the solution on all, see `evaluate_together`.
 
         Args:
             x: Reference plus displacement at t_{n+1} [m], shape (n, k / 3, 3).
@@ -205,6 +210,40 @@ class Elements(Protocol):
         """
 
 
+def evaluate_together(
+    comm: Any,
+    elements: Sequence[Any],
+    places: Sequence[FloatArray],
+    own: Sequence[Mapping[str, FloatArray]],
+) -> tuple[Any, ...]:
+    """What elements contribute at an iterate; what fails on one rank fails on all. Collective.
+
+    Args:
+        comm: MPI communicator.
+        elements: Batches of elements.
+        places: Of each, as of `Elements.evaluate`.
+        own: Of each, as of `Elements.evaluate`.
+
+    Raises:
+        UserFunctionError: One raised on some rank.
+        StepFailedError: It raised this.
+    """
+    parts: list[Any] = []
+    cause, problem = None, None
+    for batch, x, unknowns in zip(elements, places, own, strict=True):
+        try:
+            parts.append(batch.evaluate(x, unknowns))
+        except Exception as error:  # any: a rank that raises alone would leave the others waiting
+            if cause is None:
+                told = isinstance(error, UserFunctionError | StepFailedError)
+                what = str(error) if told else f"{batch.name!r}: its elements raised {error!r}"
+                cause, problem = error, (isinstance(error, StepFailedError), what)
+    if global_max(comm, np.array([float(cause is not None)]))[0]:
+        failed, text = next(filter(None, comm.allgather(problem)))
+        raise (StepFailedError if failed else UserFunctionError)(text) from cause
+    return tuple(parts)
+
+
 class Slopes(NamedTuple):
     """What a force along a coordinate, a length or an angle, does near a state.
 
@@ -224,6 +263,9 @@ class Slopes(NamedTuple):
 
 class Joint(Protocol):
     """What a System accepts beside contacts: joints, springs, ties; part of the scene.
+
+    All ranks call all its functions, also those without elements. What one raises must be raised on
+    all ranks, or the others wait for ever; `Elements.evaluate` alone may raise on some.
 
     Attributes:
         name: For messages.

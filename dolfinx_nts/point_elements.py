@@ -28,8 +28,8 @@ _EPS = float(np.finfo(float).eps)
 class PointElements:
     """What elements between points of bodies have in common, see `Elements`.
 
-    A kind of its own adds `evaluate`, and what else it has to say. Each element is to be on one
-    rank alone: what `body.points` gives is the same on all.
+    A subclass adds `evaluate`, which ranks without elements call, too. `body.points` gives the same
+    points on all ranks; keep each on one rank by `part`.
 
     Attributes:
         name: For messages.

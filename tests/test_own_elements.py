@@ -360,6 +360,63 @@ def test_a_step_with_a_joint_that_fails_is_cut():
     assert run.retries == 2 and "not solved after" in run.status
 
 
+class FailingElements(SpringElements):
+    """A spring that fails on one rank, but not at once."""
+
+    def evaluate(self, x, own):
+        if COMM.rank == COMM.size - 1 and self.step.state.time > 3e-3:
+            raise RuntimeError("no table")
+        return super().evaluate(x, own)
+
+
+class TooLongElements(FailingElements):
+    """A spring that fails on one rank where steps are long."""
+
+    def evaluate(self, x, own):
+        if COMM.rank == COMM.size - 1 and self.step.dt > 1e-3:
+            raise nts.StepFailedError("steps are too long for a spring; use a smaller dt")
+        return SpringElements.evaluate(self, x, own)
+
+
+class Failing(Spring):
+    """A spring whose elements raise on one rank alone."""
+
+    kind = FailingElements
+
+    def coupling(self, bodies):
+        def make(step, history):
+            x0 = self._elements(None).reference()
+            x0 = x0 + self._gathered([step.state.u[b] for b in bodies])
+            return self.kind(
+                name=self.name, sides=self._sides, stiffness=self.stiffness, damping=0.0,
+                length=self.length, step=step, x0=x0,
+            )  # fmt: skip
+
+        return nts.EveryStep(bodies, make)
+
+
+@pytest.mark.mpi
+def test_what_elements_raise_on_one_rank_ends_the_run_on_all():
+    a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b", velocity=(3.0, 1.0, 0))
+    spring = Failing(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e4)
+    stepper = nts.Stepper(nts.System([a, b], joints=[spring]), nts.EnergyMomentum())
+    with pytest.raises(nts.UserFunctionError, match=r"'spring': its elements raised .*no table"):
+        for _ in range(9):
+            stepper.advance(2e-3)
+    stepper.close()
+
+
+@pytest.mark.mpi
+def test_a_step_is_cut_where_elements_refuse_it_on_one_rank():
+    a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b", velocity=(3.0, 1.0, 0))
+    spring = Failing(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e4)
+    spring.kind = TooLongElements
+    stepper = nts.Stepper(nts.System([a, b], joints=[spring]), nts.EnergyMomentum())
+    stepper.advance(2e-3)
+    assert stepper.solution.retries == 1 and len(stepper.solution.rows) == 4
+    stepper.close()
+
+
 # ---- starts
 def at_point(body, x, values):
     """Nodal values at a material point, from all ranks."""

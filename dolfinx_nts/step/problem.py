@@ -23,7 +23,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.contact.history import ContactHistory
-from dolfinx_nts.elements import Coupling, JointCoupling, Step
+from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_together
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
@@ -375,12 +375,8 @@ class StepProblem:
         """
         values, laid, elements = x.array_r.copy(), self.laid, self.elements
         positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
-        parts = tuple(
-            c.evaluate(y, own)
-            for c, y, own in zip(
-                elements, positions, laid.own_values(values, elements), strict=True
-            )
-        )
+        own = laid.own_values(values, elements)
+        parts = evaluate_together(self.system.comm, elements, positions, own)
         force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
         bodies = dict(self._asleep)
         for k in self.awake:
