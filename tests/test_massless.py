@@ -356,7 +356,7 @@ def test_jacobian(rule, friction):
     system = nts.System([upper, lower], contacts=[pair])
     stepper, state = nts.Stepper(system, rule), rotated_state(system)
     problem, rng, dt = stepper.problem, np.random.default_rng(3), 1e-3
-    unit = upper.nodal_stiffness(rule).mean()
+    unit = rule.theta * upper.nodal_stiffness().mean()
     history = state.contacts[0]._replace(
         force=unit * np.array([0.3, 0.0, 0.2, 0.1]),
         tangential=0.05 * unit * rng.uniform(-1, 1, (4, 3)),
