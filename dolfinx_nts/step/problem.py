@@ -26,6 +26,7 @@ from dolfinx_nts.elements import Coupling, JointCoupling, Step
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.step.rounding import Rounding
+from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.stabilization import Stabilization
 from dolfinx_nts.step.unknowns import Unknowns
@@ -87,6 +88,7 @@ class StepProblem:
         self.awake: tuple[int, ...] = ()
         self._numbers: tuple[Any, ...] | None = None
         self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
+        self._shared = SharedWeight(system.comm, system.contacts, system.contact_bodies)
         both = zip(system.joints, system.joint_bodies, strict=True)
         self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
         self.couplings: list[Coupling] = [self.contacts, *self.joints]
@@ -372,6 +374,10 @@ class StepProblem:
             for c, y, own in zip(
                 elements, positions, laid.own_values(values, elements), strict=True
             )
+        )
+        touching = len(self.contacts.elements)
+        self._shared.divide(
+            self.contacts.elements, self.contacts.bodies, parts[:touching], positions[:touching]
         )
         force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
         bodies = dict(self._asleep)
