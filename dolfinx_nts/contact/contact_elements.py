@@ -380,13 +380,14 @@ class ContactElements(ContactLaws):
         """
         rows = part.tangent[on, self.gap_row, : self.num_coordinates] / self.scale[on, None]
         y, start, found = x[on], 0, []
+        force = rows.reshape(y.shape)
         for side in self._nodes:
             here = slice(start, start + side.nodes.shape[1])
-            force = rows.reshape(y.shape)[:, here] * ~side.fixed[on]
-            place = side.places[on][:, :, None]
-            arms = np.where(place, 0.0, y[:, here])
-            moment = cross(arms, force).sum(axis=1)
-            found.append(np.concatenate([(place * force).sum(axis=1), moment], axis=1))
+            if side.fixed.any():
+                force[:, here] *= ~side.fixed[on]
+            # The first node of a rigid body is its place, the others are directors.
+            moment = cross(y[:, start + 1 : here.stop], force[:, start + 1 : here.stop])
+            found.append(np.concatenate([force[:, start], moment.sum(axis=1)], axis=1))
             start = here.stop
         return found
 

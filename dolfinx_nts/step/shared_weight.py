@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
@@ -87,23 +86,17 @@ class SharedWeight:
 
     def _least_squares(self, g: FloatArray, v: FloatArray) -> FloatArray:
         """Motions of the bodies whose gaps g y fit some values v best. Collective."""
-        size = g.shape[1]
+        size, count = g.shape[1], v.shape[1]
         sums = self._comm.allreduce(g.T @ np.concatenate([g, v], axis=1))
         # Turns in the length that makes their gaps as large as those of translations.
-        square = np.diag(sums).reshape(-1, 2, 3).sum(axis=2)
-        unit = np.ones((len(self._place), 2, 3))
-        turns = square[:, 1] > 0.0
-        unit[turns, 1] = np.sqrt(square[turns, 0] / square[turns, 1])[:, None]
-        unit = unit.ravel()
-        on = np.repeat(square[:, 0] > 0.0, 6)
-        y = np.zeros((size, v.shape[1]))
-        if not on.any():
-            return y
-        a = (unit[:, None] * sums[:, :size] * unit)[np.ix_(on, on)]
-        b = (unit[:, None] * sums[:, size:])[on]
-        held = cho_factor(a + _NONE * np.diag(a).max() * np.eye(len(a)))
-        best = np.zeros_like(b)
+        square = sums.diagonal().reshape(-1, 2, 3).sum(axis=2)
+        unit = np.zeros((len(square), 2, 3))
+        on = square > 0.0
+        unit[on] = np.sqrt(square[:, :1] / np.where(on, square, 1.0))[on][:, None]
+        unit = unit.reshape(size, 1)
+        a, b = unit * sums[:, :size] * unit.T, unit * sums[:, size:]
+        near = np.linalg.inv(a + (_NONE * a.diagonal().max() or 1.0) * np.eye(size))
+        best = np.zeros((size, count))
         for _ in range(_PASSES):
-            best += cho_solve(held, b - a @ best)
-        y[on] = unit[on, None] * best
-        return y
+            best += near @ (b - a @ best)
+        return unit * best
