@@ -97,7 +97,7 @@ class StepProblem:
         self.centre, self._span = _box(system)
         self.stabilization = Stabilization(system, integrator, self._span)
         self.rounding = Rounding(
-            system.bodies, lambda k: self.body_tangent(k, self.state.u[k])
+            system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
 
     # ---- set-up of a step
@@ -425,6 +425,29 @@ class StepProblem:
         """
         self.rounding.length = np.maximum(self.rounding.length, self.displacement(e))
         self.rounding.measure(self.awake)
+        self.rounding.measure_springs()
+
+    def _springs(self) -> FloatArray:
+        """Stiffness at t_n of elements without unknowns of their own, of each body. Collective."""
+        laid, elements, start = self.laid, self.elements, self.x.duplicate()
+        local = np.zeros(len(self.system.bodies))
+        start.set(0.0)
+        for k in self.awake:
+            start.array_w[laid.of_body(k)] = self.state.u[k]
+        positions = laid.positions(start, elements)
+        own = laid.own_values(start.array_r, elements)
+        start.destroy()
+        for batch, numbers, x, mine in zip(elements, self.bodies, positions, own, strict=True):
+            if any(batch.widths.values()):
+                continue
+            stiffness, first = batch.evaluate(x, mine).tangent, 0
+            for k, dofs in zip(numbers, batch.dofs(), strict=True):
+                stop = first + dofs.shape[1]
+                along = stiffness[:, first:stop, first:stop].diagonal(axis1=1, axis2=2)
+                local[k] += float(np.linalg.norm(along[dofs >= 0]))
+                first = stop
+        found: FloatArray = self.system.comm.allreduce(local)
+        return found
 
     # ---- lengths and rounding
     def displacement(self, e: Evaluation) -> FloatArray:
