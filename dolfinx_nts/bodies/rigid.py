@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.bodies.triad import Triads, largest_turn
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets
 from dolfinx_nts.integrators import Integrator
@@ -242,9 +242,8 @@ class RigidBody(Body):
         self._fixed = fixed
         self.prescribed(0.0)
         held = self.points(centre).part(slice(0, int(here)))
-        self.joints = () if rotation is not None else (
-            Triads(self, held, self.length, np.arange(len(held))),
-        )  # fmt: skip
+        self._directors_held = Directors(self, held, self.length, np.arange(len(held)))
+        self.joints = () if rotation is not None else (self._directors_held,)
         self._matrix: Any = None
         self._reach = np.ones(4)
         if self.mesh is not None:
@@ -534,7 +533,7 @@ class RigidBody(Body):
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""
-        return largest_turn(self.reference + u0, self.reference + u1)
+        return self._directors_held.largest_turn(self.reference + u0, self.reference + u1)
 
     def prescribed_turn(self, start: float, end: float) -> float:
         """Turn that `rotation` prescribes between two times [rad], at least. Collective.
