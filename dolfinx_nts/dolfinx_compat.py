@@ -17,6 +17,8 @@ import ufl
 from dolfinx import cpp, fem, geometry, mesh
 from petsc4py import PETSc
 
+from dolfinx_nts.kernels.canonical import canonical
+
 VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
 #: UFL-owned elements, AdjacencyList dofmaps.
 _OLD = VERSION < (0, 8)
@@ -226,6 +228,7 @@ C_FLAGS = ["-O2", "-g0", "-fno-math-errno", "-fno-trapping-math"]
 
 def compile_forms(forms: Sequence[Any]) -> list[Any]:
     """Compile forms; signatures first because 0.5.2's depend on what was compiled before."""
+    forms = [canonical(f) for f in forms]
     for f in forms:
         if _OLD:
             # Compiling a form sets this on its mesh, and so would change the next one's signature.
