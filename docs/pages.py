@@ -25,7 +25,23 @@ ROOT = DOCS.parent
 MADE = DOCS / "made"
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: Options with which a demo's picture is made in less than about a minute on one core.
-SHORT: dict[str, str] = {}
+SHORT: dict[str, str] = {
+    "bar_impact": "--elements 50",
+    "domino": "--dominoes 6",
+    "flying_l_block": "--t-end 40",
+    "heavy_top": "--steps 4e-3 2e-3",
+    "hertz": "--problems cylinders",
+    "ironing": "--block 32 4 --die 8 4 --end 1.3",
+    "newtons_cradle": "--kinds 'rigid, touching' 'flexible, touching'",
+    "partial_slip": "--scales 1 --refinement 0.5",
+    "rolling": "--facets 32",
+    "slider_crank": "--cells 24",
+    "sliding_block": "--floors plane",
+    "slope": "--floors plane",
+    "stick_slip": "--floors plane",
+    "two_tori": "--dt 0.2",
+    "wheel": "--facets 24 --dt 4e-3",
+}
 #: Modules that users import themselves, by the page they are on.
 MORE = {
     "output": [f"dolfinx_nts.output.{name}" for name in ("writers", "pictures", "plots")],
@@ -111,7 +127,8 @@ def run(command: list[str], folder: Path, code: str = "") -> None:
     if done.returncode:
         raise SystemExit(f"{shlex.join(command)} in {folder} failed:\n{done.stdout[-3000:]}")
     said.write_text(f"{wanted}\n{done.stdout}")
-    print(f"{time.perf_counter() - began:6.1f} s  {folder.relative_to(MADE)}", flush=True)
+    seconds = time.perf_counter() - began
+    print(f"{seconds:6.1f} s  {folder.name}: {shlex.join(command[1:])}", flush=True)
 
 
 def run_block(block: Block, folder: Path) -> None:
