@@ -38,8 +38,9 @@ SHORT: dict[str, str] = {
     "slider_crank": "--cells 24",
     "sliding_block": "--floors plane",
     "slope": "--floors plane",
+    "stability": "--bouncing 300 --rubbing 800",
     "stick_slip": "--floors plane",
-    "two_tori": "--dt 0.2",
+    "two_tori": "--dt 0.2 --t-end 5",
     "wheel": "--facets 24 --dt 4e-3",
 }
 #: Modules that users import themselves, by the page they are on.
