@@ -27,7 +27,7 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Changes of one node's state in a step that are no search any more.
-_CYCLE = 8
+CYCLE = 8
 _EPS = float(np.finfo(float).eps)
 
 
@@ -438,11 +438,11 @@ class ContactElements(ContactLaws):
         text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
         if slide:
             text += f" and {slide} between stick and slip"
-        if max(touch, slide) >= _CYCLE:
+        if max(touch, slide) >= CYCLE:
             states = "stick and slip" if slide > touch else "contact and none"
-            text += (
-                f": it flips between {states} and settles in neither; try another dt"
-                f"{', a smaller coefficient of friction' if self.pair.friction else ''} or a finer "
-                "surface"
-            )
+            remedy = "try another dt"
+            if not self._free[i, 0].any():
+                # Several such nodes on one facet share the little that its nodes can give way.
+                remedy = "its motion is prescribed, so make its surface the master"
+            text += f": it flips between {states} and settles in neither; {remedy}"
         return float(weight[i]), text

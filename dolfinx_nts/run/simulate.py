@@ -184,7 +184,7 @@ def simulate(
     begin = stepper.state.time
     if not t_end > begin:
         raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
-    remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
+    remedy = "Try a smaller dt"
     end, dt = float(t_end), float(dt)
     stepper.solution.settings |= {"dt": dt, "t_end": end, "adapt": adapt and repr(adapt)}
     if adapt is not None:
@@ -245,7 +245,7 @@ def run(
         steps: Length and end of each [s], one after another; with `adapt` the largest and the end.
         output: Writers.
         progress: Show a progress line on rank 0.
-        remedy: What to do if a step fails, for `status`.
+        remedy: What to do if a step fails and says nothing better, for `status`.
         adapt: How to choose the steps between, each of which is written.
         checkpoint: Where and how often to write what `restart` needs.
     """
@@ -280,7 +280,7 @@ def _run(
         except UserFunctionError as failure:
             _stop(stepper, str(failure), failure.__cause__)
         except StepFailedError as failure:
-            _stop(stepper, f"{failure}. {remedy}")
+            _stop(stepper, str(failure) if failure.advises else f"{failure}. {remedy}")
         except BaseException:
             # Where one rank alone comes here, no other answers.
             _call(stepper, started, "close")
