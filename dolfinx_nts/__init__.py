@@ -10,9 +10,11 @@ from dolfinx_nts.bodies.form_body import FormBody
 from dolfinx_nts.bodies.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
+from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.rigid import RigidBody
-from dolfinx_nts.bodies.section import Circle, Clamp, LineForce, PointForce, Rectangle, Section
+from dolfinx_nts.bodies.section import Circle, Rectangle, Section
+from dolfinx_nts.bodies.shell import Shell
 from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.history import ContactHistory
@@ -98,6 +100,7 @@ __all__ = [
     "Joint",
     "JointCoupling",
     "LineForce",
+    "LineMoment",
     "Midpoint",
     "Moment",
     "MooneyRivlin",
@@ -110,6 +113,7 @@ __all__ = [
     "Plane",
     "PointElements",
     "PointForce",
+    "PointMoment",
     "PointPart",
     "Points",
     "Prismatic",
@@ -119,6 +123,7 @@ __all__ = [
     "RigidBody",
     "Saved",
     "Section",
+    "Shell",
     "Slopes",
     "Solution",
     "Sphere",

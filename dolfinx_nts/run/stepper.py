@@ -174,6 +174,8 @@ class Stepper:
             raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
         self._before_step = before_step
         self.newton = newton or Newton()
+        self._materials, self._material_change = MaterialWatch(system), 0.0
+        self._restated: dict[str, Any] | None = None
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
             system,
@@ -208,7 +210,6 @@ class Stepper:
         if self.restart is None:
             self.solution.rows = Table([self._first_row()])
         self._promises = Promises(self.solution, integrator, self.newton.rtol)
-        self._materials, self._material_change = MaterialWatch(system), 0.0
         self._last_step: tuple[float, float] | None = None
 
     @property
@@ -476,20 +477,21 @@ class Stepper:
             call_together(self.system.comm, name, self._before_step, time, dt)
 
     def _note_materials(self) -> None:
-        """Name in the ledger what changed parameters of materials do to the stored energy."""
+        """Name in the ledger what changed parameters of materials do to the energy."""
         names = self._materials.changed()
         if names:
             self.problem.forget_forces()
         if not names or not self._keeps_ledger:
             return
         self._measured.clear()
-        stored = balance.measure(self.system, self.state, self._measured)["potential"]
-        change = stored - self.solution.rows[-1]["potential"] - self._material_change
+        self._restated = balance.measure(self.system, self.state, self._measured)
+        now = self._restated["kinetic"] + self._restated["potential"]
+        change = now - self.solution.rows[-1]["energy"] - self._material_change
         self._material_change += change
         self.solution.warn(
             "material changed", self.state.time, abs(change),
             f"a changed parameter of the material of {', '.join(map(repr, names))} adds "
-            f"{change:.3g} J to the stored energy without work; see material_change in the balance",
+            f"{change:.3g} J to its energy without work; see material_change in the balance",
         )  # fmt: skip
 
     def _attempt(self, dt: float, time: float) -> Trial:
@@ -502,7 +504,7 @@ class Stepper:
         state = self._accepted(step, dt, time)
         impact = None
         if self._keeps_ledger:
-            before: Mapping[str, Any] = self.solution.rows[-1]
+            before: Mapping[str, Any] = self._restated or self.solution.rows[-1]
             measured: dict[str, Any] = balance.measure(self.system, state, self._measured)
         else:
             before, measured = (balance.momenta(self.system, s) for s in (self.state, state))
@@ -545,6 +547,7 @@ class Stepper:
             terms = balance.step_terms(self.problem, step) | known
             terms["impact_restored"] = 0.0 if impact is None else impact.energy
             terms["material_change"], self._material_change = self._material_change, 0.0
+            self._restated = None
             row = balance.next_row(rows[0], rows[-1], trial.measured, terms)
         else:
             row = balance.unknown_row(self.system) | known
