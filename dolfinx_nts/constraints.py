@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kinematics import OFF, Kinematics
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.point_elements import EveryStep, PointElements
+from dolfinx_nts.points import Points
 from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError
 

@@ -9,9 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import Moment
-from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.evaluation import Evaluation, Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
@@ -73,15 +71,16 @@ class Step:
         total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
         return float(total[0] / total[1])
 
-    def scale(self, surface: Surface) -> FloatArray:
-        """Force per motion of a surface's points in the units of the step, (p,). Collective.
+    def scale(self, surface: Any) -> FloatArray:
+        """Force per motion of a `Surface`'s points in the units of the step, (p,). Collective.
 
         Massless nodes have their stiffness for it: with more, Newton's method would go to and fro
         between contact and none, and stick and slip, in small steps.
         """
         massless = surface.massless
         if self.integrator.inertia and not massless.any():
-            return surface.mass
+            mass: FloatArray = surface.mass
+            return mass
         change = self.factor * self.integrator.theta
         stiff = change * surface.material.divided(self.stiffness(surface.body))
         return np.where(massless, stiff, surface.mass) if self.integrator.inertia else stiff

@@ -1,38 +1,21 @@
-"""What a System asks of a body, and what a body knows of a step."""
+"""What a System asks of a body."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.points import Points
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
-
-
-class Moment(NamedTuple):
-    """Where a step evaluates the forces of a body.
-
-    Attributes:
-        u0: Displacement at t_n [m], owned coordinates.
-        time: Of the loads [s].
-        ramp: Part of constant loads that acts.
-        rate: Change of the velocity there with u_1 [1/s]; 0 in statics.
-        drift: Velocity there for u_1 = u_0 [m/s]; None: zero.
-    """
-
-    u0: FloatArray
-    time: float
-    ramp: float = 1.0
-    rate: float = 0.0
-    drift: FloatArray | None = None
 
 
 class Body:

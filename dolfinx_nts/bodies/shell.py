@@ -12,9 +12,9 @@ from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.director_body import DirectorBody
 from dolfinx_nts.bodies.midsurface import check_midsurface, midsurface_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.kernels import shell as kernel
 from dolfinx_nts.kernels.quadratic_energy import Elements
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import (
     is_finite,
     known_options,

@@ -14,11 +14,11 @@ from mpi4py import MPI
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import no_pull
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.validation import StepFailedError
 
 FloatArray = npt.NDArray[np.float64]

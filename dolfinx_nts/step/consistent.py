@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State

@@ -18,15 +18,13 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_together
-from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
+from dolfinx_nts.evaluation import BodyTerms, Evaluation, Moment, free
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.state import State
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
