@@ -22,7 +22,7 @@ class Body:
     """A body with coordinates q = X + u and a constant mass matrix (39); what all bodies inherit.
 
     A body knows neither the step's length nor the name of its integrator, which is the `rule` that
-    tells how forces follow from two states. A body of one's own sets the first seven attributes and
+    tells how forces follow from two states. A body of one's own sets the first six attributes and
     has the first seven methods. All else has a default here, which is that of a body whose
     coordinates are the places of material points, free of conditions, without a mesh.
 
@@ -31,7 +31,6 @@ class Body:
         comm: MPI communicator.
         num_owned: Coordinates this rank owns; the global numbering is contiguous by rank.
         reference: X [m], shape (num_owned,).
-        initial_velocity: v at the start [m/s], shape (num_owned,).
         nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
         fixed: Positions of the prescribed coordinates among the owned ones.
         mesh: DOLFINx mesh whose nodes move with the body; None: it has none, hence no surface, no
@@ -54,7 +53,6 @@ class Body:
     comm: Any
     num_owned: int
     reference: FloatArray
-    initial_velocity: FloatArray
     nodal_mass: FloatArray
     fixed: IntArray
 
@@ -114,6 +112,11 @@ class Body:
     @cached_property
     def initial_displacement(self) -> FloatArray:
         """Displacement u at the start [m], shape (num_owned,)."""
+        return np.zeros(self.num_owned)
+
+    @cached_property
+    def initial_velocity(self) -> FloatArray:
+        """Velocity v at the start [m/s], shape (num_owned,)."""
         return np.zeros(self.num_owned)
 
     @cached_property
