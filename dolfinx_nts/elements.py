@@ -33,7 +33,7 @@ def over(value: float, limit: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A step as those know it who make its elements.
+    """What a step tells those who make its elements.
 
     Attributes:
         state: At t_n.
@@ -138,7 +138,7 @@ class Elements(Protocol):
 
     @property
     def force_scale(self) -> float:
-        """What a constraint's unknown is multiplied by to be a force, in the step's units."""
+        """Force, in the step's units, per unit of a constraint's unknown."""
 
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates of each body, shape (n, k) each."""
@@ -198,7 +198,7 @@ class Elements(Protocol):
     def ledger(self, part: Any, factor: float) -> dict[str, float]:
         """Sums of an accepted step on this rank, by columns of the balance table.
 
-        Of the same columns on all ranks; those that only a joint has are energies [J] that leave.
+        All ranks return the same columns. A column that only a joint has is energy [J] that leaves.
         """
 
     def describe(self, part: Any, flips: IntArray) -> tuple[float, str]:
@@ -272,8 +272,8 @@ class Joint(Protocol):
         bodies: Bodies of the system that it couples.
         losses: Columns of the balance table for energy that leaves through it, of its own names;
             its elements' `ledger` says how much.
-        numbers: Of each element on this rank, one that does not depend on the ranks; may be missing
-            where it remembers nothing that a checkpoint must hold.
+        numbers: One number per element on this rank, the same on any number of ranks. A joint that
+            remembers nothing may leave it out.
         settings: Numbers and texts by name, for JSON and the same on all ranks, that it was made
             with; a checkpoint goes on only with equal ones. It may be missing: then name and kind
             alone are compared.

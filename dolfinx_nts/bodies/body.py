@@ -42,8 +42,8 @@ class Body:
         rigid: Whether no motion changes distances in it, so that `directions` turn with it.
         oriented: Whether it has directors, and with them `length`, `directions_at` and `turn`.
         length: What its directors are multiples of [m].
-        rounded: Length [m], the same on all ranks, whose rounding the forces hold beside that of u;
-            None: that of the positions.
+        rounded: Length [m] whose rounding enters the forces in addition to that of u, the same on
+            all ranks; None: the size of the positions.
         allow_inversion: Whether steps are accepted that end with `smallest_det` <= 0.
         has_massless: Whether coordinates on any rank have no mass.
         destroyed: Whether `destroy` was called.

@@ -92,8 +92,8 @@ class Move(NamedTuple):
     Attributes:
         ends: Between which its gradient is taken, two of shape (n,).
         gradient: Its gradient.
-        share: Part of a change at t_{n+1} that is one of the second end, for what is the same if
-            both ends change places.
+        share: Derivative by the vectors at t_{n+1} over that by the second end, of what is
+            symmetric in both ends.
         speed: Of the vectors where forces are taken, shape (n, 3 v).
         rate: Its change with the vectors at t_{n+1} [1/s].
         time: Length of the step [s] if the ends are those of the step; else None.

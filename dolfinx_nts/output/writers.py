@@ -377,9 +377,11 @@ class BalanceCSV:
 class ForcesCSV(BalanceCSV):
     """Writes the forces of supports, joints and contacts: a row for the start and one per step.
 
-    Of each body the force of each of its conditions, of each joint force and moment on the first of
-    its bodies, about its point, of each contact force and moment about the origin on its slave; see
-    `Solution.reactions`, `Solution.contact_forces` and `Solution.contact_moments`.
+    - Of each body: the force or moment of each of its conditions.
+    - Of each joint: force, and moment about its point, on the first of its bodies.
+    - Of each contact: force, and moment about the origin, on its slave.
+
+    See `Solution.reactions`, `Solution.contact_forces` and `Solution.contact_moments`.
 
     Args:
         path: File; its folder is made if missing, an existing file is replaced.

@@ -262,7 +262,7 @@ class Stepper:
     def advance(self, dt: float, *, end: float | None = None) -> State:
         """Advance by dt; a step that is not solved is cut, up to `newton.max_retries` times.
 
-        What is left is then cut into one part more than twice as many.
+        Where n parts are left, they become 2 n + 1.
 
         Args:
             dt: Time to advance [s], > 0.
@@ -316,7 +316,7 @@ class Stepper:
                 yield not parts
 
     def _bind(self, retries: int) -> bool:
-        """Let couplings give way once cuts are of no use; tells whether any does anew."""
+        """After enough cuts, let couplings give way; return whether one newly does."""
         return retries >= _CUTS and self.problem.give_way()
 
     def paced(self, pace: Pace, end: float) -> Iterator[None]:

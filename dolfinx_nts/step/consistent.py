@@ -72,7 +72,7 @@ def accelerating_forces(
 
     Returns:
         Of each body the forces [N], less the inertia of its prescribed coordinates, and
-        accelerations that hold but those [m/s^2].
+        accelerations [m/s^2], zero except at prescribed coordinates.
     """
     still = tuple(np.zeros_like(v) for v in state.v)
     ramp = problem.integrator.ramp(state.time)

@@ -52,7 +52,7 @@ def form_tree(joints: Sequence[Sequence[int]]) -> bool:
 
 
 class NullSpace:
-    """Null space of what bilateral constraints of a solved step push the bodies with.
+    """Multipliers of bilateral constraints that exert no force on any body.
 
     Args:
         comm: MPI communicator.

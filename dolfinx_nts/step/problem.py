@@ -63,8 +63,8 @@ class StepProblem:
 
     Attributes:
         awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
-        contacts: What makes the elements of contacts. Asked by itself where contact is meant: by
-            `touching`, for when gaps close, and for what a checkpoint keeps of slave nodes.
+        contacts: What makes the elements of contacts. Used directly only for what contacts alone
+            have: `touching`, closing gaps, checkpoints.
         joints: What makes those of each joint.
         couplings: All that makes elements.
         unknowns: Their layout; made anew whenever the elements' coordinates change.
@@ -245,7 +245,7 @@ class StepProblem:
             coupling.let_slip()
 
     def give_way(self) -> bool:
-        """Limit forces that had no limit from the next step on; tells whether one had none."""
+        """From the next step on, limit forces that had no limit; return whether there was one."""
         return any([coupling.give_way() for coupling in self.couplings])
 
     def _touched(self) -> set[int]:
@@ -337,8 +337,8 @@ class StepProblem:
             flight: Free flight from t_n under the contact forces of the last step; else the
                 positions of t_n, which free flight of a fast turning or vibrating body may invert,
                 and no forces. Prescribed coordinates are at t_{n+1}.
-            carried: Take the contact forces of the last step as they were, whatever `flight` is,
-                also what is no good as a guess.
+            carried: Take the contact forces of the last step unchanged, whatever `flight` is, even
+                where they are a poor guess.
         """
         laid, elements = self.laid, self.elements
         with self.x as x:
