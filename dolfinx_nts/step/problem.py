@@ -19,12 +19,15 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.constraints import Constraints
 from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.elements import Coupling, JointCoupling, Step
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
+from dolfinx_nts.joints.forces import Between
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.step.least_norm import hanging
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
@@ -91,6 +94,7 @@ class StepProblem:
         self._shared = SharedWeight(system.comm, system.contacts, system.contact_bodies)
         both = zip(system.joints, system.joint_bodies, strict=True)
         self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
+        self._lend_less()
         self.couplings: list[Coupling] = [self.contacts, *self.joints]
         self.unknowns: Unknowns | None = None
         self.version = 0
@@ -99,6 +103,22 @@ class StepProblem:
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
+
+    def _lend_less(self) -> None:
+        """Lend no compliance to joints of rigid bodies that form no loop. Collective."""
+        system, found = self.system, []
+        of = zip(system.declared_joints, self.joints, system.joint_bodies, strict=False)
+        for joint, coupling, bodies in of:
+            alike = isinstance(coupling, Constraints) and all(b.rigid for b in joint.bodies)
+            # Springs hold nothing.
+            if not isinstance(joint, Between):
+                found.append((coupling if alike else None, bodies))
+        moved = system.comm.allreduce(np.array([b.fixed.any() for b in system.bodies]), op=MPI.LOR)
+        free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
+        alone = hanging([bodies for _, bodies in found], free)
+        for (coupling, _), hangs in zip(found, alone, strict=True):
+            if coupling is not None and hangs:
+                coupling.hold_alone()
 
     # ---- set-up of a step
     def begin(
