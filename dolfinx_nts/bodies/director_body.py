@@ -209,6 +209,14 @@ class DirectorBody(Body):
         order = self._skeleton.order
         return self._skeleton.x[order], self._skeleton.x[order] + moved[order]
 
+    def _cell_function(self, name: str, values: FloatArray) -> Any:
+        """DOLFINx Function of degree 0 from values (n, 3) or (n, 3, 3) in this rank's cells."""
+        make = compat.cell_vector_space if values.ndim == 2 else compat.tensor_space
+        function = fem.Function(make(self.mesh, "DG", 0), name=name)
+        function.x.array[: values.size] = values.ravel()
+        function.x.scatter_forward()
+        return function
+
     # ---- points
     def points(self, x: Any) -> Points:
         """Nodes as material points, for joints and springs. Collective.
@@ -294,6 +302,11 @@ class DirectorBody(Body):
     def _whole(self) -> Surface:
         """The whole skin. Collective."""
         return self._surface(np.ones(len(self._hull.facets), dtype=bool))
+
+    @property
+    def has_skin(self) -> bool:
+        """Whether it has one; a beam whose section has no outline has none."""
+        return bool(len(self._hull.facets))
 
     def boundary(self) -> Surface:
         """The whole skin. Collective."""

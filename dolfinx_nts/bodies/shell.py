@@ -143,6 +143,30 @@ class Shell(DirectorBody):
         chosen = self._marked(marker, self._hull.part == SIDES.index(side), x)
         return self._surface(chosen, smoothing)
 
+    def resultants(self) -> dict[str, Any]:
+        """Stress resultants in the middles of the cells, at the last accepted state. Collective.
+
+        Returns:
+            DOLFINx Functions of degree 0, 3 x 3 tensors in axes of the reference: "force" [N/m],
+            membrane forces and, in the rows and columns of the normal, transverse shear; "moment"
+            [N], bending and twisting moments.
+        """
+        y = self._vectors(self.last_accepted()[0])
+        middle = np.zeros((1, 2))
+        e = kernel.strains(y, self._rest, self.length, middle)[:, 0]
+        axes = kernel.axes(self._rest[:, ::2], middle)[0][:, 0]
+        c = kernel.stiffness(self.young, self.poisson, self.thickness)
+        local = np.zeros((2, len(e), 3, 3))
+        for k, stress in enumerate((e[:, :3] @ c.membrane, e[:, 3:6] @ c.bending)):
+            local[k, :, [0, 1, 0, 1], [0, 1, 1, 0]] = stress[:, [0, 1, 2, 2]].T
+        local[0, :, :2, 2] = local[0, :, 2, :2] = c.shear * e[:, 6:]
+        force, moment = np.einsum("npi,knpq,nqj->knij", axes, local, axes)
+        stem = self.u.name[:-2]
+        return {
+            "force": self._cell_function(f"{stem}_force", force),
+            "moment": self._cell_function(f"{stem}_moment", moment),
+        }
+
     def directions_at(self, direction: FloatArray, x: Any) -> Points:
         """The director of a node, for joints. Collective.
 
