@@ -21,7 +21,7 @@ from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
 from dolfinx_nts.bodies.points import Points, in_mesh
-from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.integrators.static import Static
@@ -162,7 +162,7 @@ class UflBody(Body):
                 f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
-        surface = Surface(self, found, smoothing)
+        surface = Surface(self, skin_of_mesh(self, found), smoothing)
         if mass == "redistributed":
             self._make_massless(surface)
         return surface
