@@ -7,6 +7,7 @@ DEMO ?= two_blocks
 export PYTEST_ARGS
 
 help:
+	@echo 'make setup          what the others do first: packages of Debian, .venv'
 	@echo 'make test           lint, the fast tests in serial, some cases of the parallel ones on 2 ranks'
 	@echo 'make test-all       what make test leaves out: the tests marked slow, likewise'
 	@echo '                    (.venv/bin/python -m pytest runs both in serial; -m "not slow" the fast)'

@@ -31,7 +31,7 @@ SHORT: dict[str, str] = {
     "flying_l_block": "--t-end 40",
     "heavy_top": "--steps 4e-3 2e-3",
     "hertz": "--problems cylinders",
-    "ironing": "--block 32 4 --die 8 4 --end 1.3",
+    "ironing": "--block 24 3 --die 6 2 --steps 10 50 --end 1.5",
     "newtons_cradle": "--kinds 'rigid, touching' 'flexible, touching'",
     "partial_slip": "--scales 1 --refinement 0.5",
     "rolling": "--facets 32",

@@ -83,6 +83,11 @@ def check_options(script, command):
         assert f'"{option}"' in text, f"{option} of {script.name}"
 
 
+@pytest.mark.parametrize("demo", pages.SHORT)
+def test_short_runs_have_options_of_their_demos(demo):
+    check_options(ROOT / "demos" / f"{demo}.py", f"{demo}.py {pages.SHORT[demo]}")
+
+
 @functools.cache
 def names_in(path):
     """Names of a file's tests and of their cases, as far as its text has them."""
