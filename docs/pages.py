@@ -97,22 +97,31 @@ def blocks() -> Iterator[Block]:
 
 
 # ---- runs
+def source(demo: Path) -> str:
+    """The text of a demo, and of other demos and meshes that it imports."""
+    text = demo.read_text()
+    for other in re.findall(r"^from (\w+) import", text, re.MULTILINE):
+        places = (ROOT / folder / f"{other}.py" for folder in ("demos", "meshes"))
+        text += "".join(path.read_text() for path in places if path.exists())
+    return text
+
+
 def fingerprint(*more: str) -> str:
-    """Of the package, the demos and what else a run depends on."""
-    sources = [*(ROOT / "dolfinx_nts").rglob("*.[pch]*"), *(ROOT / "demos").glob("*.py")]
+    """Of the package and of what else a run depends on."""
     summed = hashlib.sha256("\n".join(more).encode())
-    for path in sorted(p for p in sources if p.suffix != ".pyc" and p.is_file()):
-        summed.update(path.read_bytes())
+    for path in sorted((ROOT / "dolfinx_nts").rglob("*.*")):
+        if path.suffix in {".py", ".c", ".h"}:
+            summed.update(path.read_bytes())
     return summed.hexdigest()
 
 
-def run(command: list[str], folder: Path, code: str = "") -> None:
+def run(command: list[str], folder: Path, code: str) -> None:
     """Run a command in a folder unless it has been run there with the same sources.
 
     Args:
         command: What to run; what it prints is in the folder, too.
         folder: Where; made if it is missing.
-        code: What the command runs, if that is not a demo.
+        code: What the command runs.
     """
     folder.mkdir(parents=True, exist_ok=True)
     wanted = fingerprint(*command, code)
@@ -212,6 +221,7 @@ def main() -> None:
                 run,
                 [sys.executable, str(d), "--output", ".", *shlex.split(SHORT.get(d.stem, ""))],
                 MADE / "runs" / d.stem,
+                source(d),
             )
             for d in demos
         ]
