@@ -2,7 +2,8 @@
 
 `python docs/pages.py` (a part of `make docs`) runs every whole script of the pages and the demos,
 short, keeps what they write in docs/made/runs, and writes a page for each demo and for each folder
-of the package to docs/made. Runs whose sources have not changed are kept.
+of the package to docs/made. Runs whose sources have not changed are kept. With `--no-runs` it only
+writes pages, without the pictures that are not there.
 """
 
 from __future__ import annotations
@@ -150,6 +151,18 @@ def run_block(block: Block, folder: Path) -> None:
     run([sys.executable, script.name], folder, block.code)
 
 
+def demos() -> list[Path]:
+    """All demos."""
+    return sorted((ROOT / "demos").glob("*.py"))
+
+
+def run_demo(demo: Path) -> None:
+    """Run a demo, short; what it writes is in the folder of its name."""
+    options = shlex.split(SHORT.get(demo.stem, ""))
+    command = [sys.executable, str(demo), "--output", ".", *options]
+    run(command, MADE / "runs" / demo.stem, source(demo))
+
+
 def run_page(page: Path, scripts: list[Block]) -> None:
     """Run the scripts of a page one after another in one folder, as a reader does."""
     for block in scripts:
@@ -205,30 +218,27 @@ def api_page(title: str, names: list[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    """Run what has changed, on two cores, and write the pages that are made."""
-    MADE.mkdir(exist_ok=True)
-    for name, text in reference().items():
-        write(MADE / name, text)
+def run_all() -> None:
+    """Run what has changed of demos and scripts, on two cores."""
     scripts: dict[Path, list[Block]] = {}
     for block in blocks():
         if block.whole:
             scripts.setdefault(block.page, []).append(block)
-    demos = sorted((ROOT / "demos").glob("*.py"))
     with ThreadPoolExecutor(2) as pool:
-        jobs = [
-            pool.submit(
-                run,
-                [sys.executable, str(d), "--output", ".", *shlex.split(SHORT.get(d.stem, ""))],
-                MADE / "runs" / d.stem,
-                source(d),
-            )
-            for d in demos
-        ]
+        jobs = [pool.submit(run_demo, demo) for demo in demos()]
         jobs += [pool.submit(run_page, page, some) for page, some in scripts.items()]
         for job in jobs:
             job.result()
-    for demo in demos:
+
+
+def main() -> None:
+    """Run what has changed unless told not to, and write the pages that are made."""
+    MADE.mkdir(exist_ok=True)
+    if "--no-runs" not in sys.argv[1:]:
+        run_all()
+    for name, text in reference().items():
+        write(MADE / name, text)
+    for demo in demos():
         write(MADE / f"demo_{demo.stem}.md", demo_page(demo))
 
 
