@@ -19,7 +19,7 @@ from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
-from dolfinx_nts.contact.obstacles import Cylinder, Plane, Sphere
+from dolfinx_nts.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.elements import (
@@ -107,6 +107,7 @@ __all__ = [
     "NeoHookean",
     "Newmark",
     "Newton",
+    "Obstacle",
     "ObstaclePair",
     "Planar",
     "Plane",

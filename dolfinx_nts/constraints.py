@@ -257,9 +257,10 @@ class Constraints(EveryStep):
         Raises:
             StepFailedError: Directions have turned over.
         """
-        if self._upright is None or self._begun is None:
+        step = self.step
+        if self._upright is None or step is None:
             return False
-        (part,), (step, _) = parts, self._begun
+        (part,) = parts
         along = self._upright(part.end, (step.state.time, step.state.time + step.dt))
         raise_together(
             self._sides[0].body.comm,

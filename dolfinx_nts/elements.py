@@ -82,7 +82,8 @@ class Step:
         massless = surface.massless
         if self.integrator.inertia and not massless.any():
             return surface.mass
-        stiff = self.factor * surface.material.divided(self.stiffness(surface.body))
+        change = self.factor * self.integrator.theta
+        stiff = change * surface.material.divided(self.stiffness(surface.body))
         return np.where(massless, stiff, surface.mass) if self.integrator.inertia else stiff
 
 

@@ -354,7 +354,7 @@ class DirectorBody(Body):
         k = kernel.tangent(self._elements, self._rest, self._rest, 1.0)
         return self._gather(np.einsum("nii->ni", k))
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """Mean diagonal of the tangent at each node in the reference [N/m]. Collective."""
         mean = self._diagonal.reshape(-1, 3).mean(axis=1)
         return np.repeat(mean, 3)
@@ -363,7 +363,7 @@ class DirectorBody(Body):
         """Strain energy on this rank [J]. Collective."""
         return float(kernel.energy(self._elements, self._vectors(u)).sum())
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the places of each condition, this rank's part [N], (conditions, 3)."""
         return self._conditions.reactions(residual)
 

@@ -233,7 +233,6 @@ class RigidBody(Body):
         masses = np.array([mass, *(euler / self.length**2)])
         self.reference: FloatArray = y.ravel()[: self.num_owned]
         self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
-        self._held_at = y[1:]
         self._lent = np.zeros(self.num_owned)
         if np.count_nonzero(euler) < 2:
             self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * mass
@@ -456,8 +455,8 @@ class RigidBody(Body):
         f = self.weight(gravity).reshape(-1, 3)
         if self.num_owned:
             f[0] += self._load
-            self._held_at = directors = self._directors(u1)
             if self._couple.any():
+                directors = self._directors(u1)
                 f[1:] = cross(np.tile(self._turning(directors), (3, 1)), directors)
         return f.ravel()
 
@@ -508,7 +507,7 @@ class RigidBody(Body):
         self._matrix.assemble()
         return self._matrix
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """None [N/m]."""
         return np.zeros(self.num_owned)
 
@@ -516,7 +515,7 @@ class RigidBody(Body):
         """None [J]: loads do external work."""
         return 0.0
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Return what prescribed motion needs on this rank: force [N], then moment [N m].
 
         Shape (2, 3), (1, 3) if only one of them is prescribed, (0, 3) if none is.
@@ -524,7 +523,8 @@ class RigidBody(Body):
         rows = np.zeros((2, 3))
         if self.num_owned:
             forces = residual.reshape(4, 3)
-            rows[0], rows[1] = forces[0], cross(self._held_at, forces[1:]).sum(axis=0)
+            rows[0] = forces[0]
+            rows[1] = cross(self._directors(u1), forces[1:]).sum(axis=0)
         return rows[[self._motion is not None, self._turn is not None]]
 
     @property

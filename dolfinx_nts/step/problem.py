@@ -97,7 +97,7 @@ class StepProblem:
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.centre, self._span = _box(system)
-        self.stabilization = Stabilization(system, integrator, self._span)
+        self.stabilization = Stabilization(system, self._span)
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )

@@ -18,15 +18,14 @@ class Stabilization:
 
     Args:
         system: The scene.
-        integrator: Rules of the step.
         span: Size of the scene [m].
 
     Attributes:
         share: That part [-], zero in dynamics.
     """
 
-    def __init__(self, system: System, integrator: Any, span: float) -> None:
-        self._system, self._integrator, self._span = system, integrator, span
+    def __init__(self, system: System, span: float) -> None:
+        self._system, self._span = system, span
         self.share = 0.0
 
     def of(self, body: Any) -> FloatArray:
@@ -37,7 +36,7 @@ class Stabilization:
 
     def stiffness(self, body: Any) -> FloatArray:
         """Stiffness of each coordinate's surroundings [N/m]; where there is none, of the others."""
-        own: FloatArray = body.nodal_stiffness(self._integrator)
+        own: FloatArray = body.nodal_stiffness()
         return np.where(own > 0.0, own, self._mean)
 
     @cached_property
@@ -45,7 +44,7 @@ class Stabilization:
         """Of all flexible bodies [N/m], or weight over size where all are rigid. Collective."""
         local = np.zeros(3)
         for body in self._system.bodies:
-            own = body.nodal_stiffness(self._integrator)
+            own = body.nodal_stiffness()
             local += own.sum(), np.count_nonzero(own), body.nodal_mass.max(initial=0.0)
         total, number, mass = self._system.comm.allreduce(local).tolist()
         if number:
