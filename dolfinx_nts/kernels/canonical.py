@@ -17,7 +17,6 @@ from ufl.classes import Zero
 from ufl.core.multiindex import FixedIndex, Index, MultiIndex
 from ufl.corealg.multifunction import MultiFunction
 from ufl.corealg.traversal import traverse_unique_terminals
-from ufl.variable import Label
 
 #: Count of the first Constant that stands for another; a form has fewer than 900.
 _FIRST = 100
@@ -66,7 +65,6 @@ class _Renumber(MultiFunction):  # type: ignore[misc]
         super().__init__()
         self._stands = stands
         self._indices: dict[int, int] = {}
-        self._labels: dict[Any, Any] = {}
 
     expr = MultiFunction.reuse_if_untouched
 
@@ -77,10 +75,6 @@ class _Renumber(MultiFunction):  # type: ignore[misc]
     def constant(self, o: Any) -> Any:
         """What stands for a Constant."""
         return self._stands[o]
-
-    def label(self, o: Any) -> Any:
-        """A label numbered as it is met."""
-        return self._labels.setdefault(o, Label(len(self._labels)))
 
     def multi_index(self, o: Any) -> Any:
         """Its free indices, numbered as they are met."""
