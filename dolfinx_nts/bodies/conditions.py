@@ -71,7 +71,8 @@ class Dirichlet:
         if isinstance(self.value, fem.Constant | fem.Function):
             if self.value.ufl_shape != (3,):
                 raise ValueError(
-                    f"Dirichlet.value={self.value!s}: has shape {self.value.ufl_shape}; pass {_ELSE}"
+                    f"Dirichlet.value={self.value!s}: has shape {self.value.ufl_shape}; pass "
+                    f"{_ELSE}"
                 )
         else:
             _check_value("Dirichlet.value", self.value, "m", _ELSE)
