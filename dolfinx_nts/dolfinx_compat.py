@@ -183,6 +183,18 @@ def lagrange_degree(space: Any) -> int | None:
     return int(degree) if vectors and known else None
 
 
+def is_nodal(space: Any, msh: Any) -> bool:
+    """Return whether a space is of Lagrange elements with one block at each corner of a cell."""
+    element = space.ufl_element()
+    if _OLD:
+        scalar = (*element.sub_elements(), element)[0]
+        broken = scalar.family() not in ("Lagrange", "Q")
+    else:
+        broken = element.discontinuous
+    same = cell_dofs(space).shape[1] == geometry_dofmap(msh).shape[1]
+    return same and not broken
+
+
 def scalar_space(msh: Any, family: str, degree: int) -> Any:
     """Scalar space of the family ("Lagrange" or "DG")."""
     if _OLD:
