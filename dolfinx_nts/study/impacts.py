@@ -204,9 +204,9 @@ def sphere(comm: Any, mass: str, *, cells: int = 8, steps: int = 60) -> Problem:
 
 
 def two_tori(comm: Any, mass: str) -> Problem:
-    """B13, its first half: hollow tori collide."""
+    """B13: hollow tori collide."""
     system = load("two_tori").scene(comm, mass=mass)
-    return Problem(system, 0.1, 4.0, accuracy="balanced")
+    return Problem(system, 0.1, 8.0, accuracy="balanced")
 
 
 PROBLEMS: Mapping[str, Callable[[Any, str], Problem]] = {
