@@ -10,21 +10,20 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.elements import EveryStep, PointElements, Step
+from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kinematics import OFF, Kinematics
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.point_elements import EveryStep, PointElements
+from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError
-
-if TYPE_CHECKING:
-    from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

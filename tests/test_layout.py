@@ -25,7 +25,7 @@ LEVELS = [
     {"integrators"},
     {
         "bodies", "constraints", "contact", "elements", "evaluation", "joints", "kinematics",
-        "system",
+        "point_elements", "state", "system",
     },
     {"step"},
     {"output"},

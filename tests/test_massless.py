@@ -362,7 +362,7 @@ def test_jacobian(rule, friction):
         force=unit * np.array([0.3, 0.0, 0.2, 0.1]),
         tangential=0.05 * unit * rng.uniform(-1, 1, (4, 3)),
     )
-    state = replace(state, histories=((history,), *state.histories[1:]))
+    state = replace(state, contacts=(history,))
     problem.begin(state, dt)
     here = problem.of_constraints
     with problem.x as x:

@@ -77,10 +77,10 @@ def test_tangents_are_derivatives(item, rule, ground):
     state, h = stepper.state, 0.1
     if getattr(problem.integrator, "accelerations", False):
         a0 = tuple(rng.normal(size=v.shape) for v in state.v)
-        state = nts.State(state.time, state.u, state.v, a0, state.histories)
+        state = nts.State(state.time, state.u, state.v, a0, state.contacts, state.joints)
     # Rigid bodies have no stiffness that scales their constraints: these are left out in statics.
     problem.couplings = problem.couplings[:2]
-    state = nts.State(state.time, state.u, state.v, state.a, state.histories[:2])
+    state = nts.State(state.time, state.u, state.v, state.a, state.contacts, state.joints[:1])
     problem.begin(state, h)
     (batch,) = problem.elements
     shape = batch.reference().shape

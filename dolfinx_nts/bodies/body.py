@@ -242,6 +242,12 @@ class Body:
         """Values of the material that a caller may change during a run, shape (n,)."""
         return np.empty(0)
 
+    def take_parameters(self) -> None:
+        """Take over changed `parameters` where not all that is made of them is asked for anew.
+
+        Collective; a run calls it before its first step, and whenever `parameters` have changed.
+        """
+
     def file_order(self) -> IntArray:
         """Numbers of the nodes, counted rank after rank, in the order of files; on rank 0.
 

@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
+from dolfinx_nts.bodies.parameters import Parameter, is_number, require_positive_parameter
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.bodies.triad import Triads, largest_turn
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets
 from dolfinx_nts.integrators import Integrator
@@ -64,7 +65,7 @@ class RigidBody(Body):
 
     Args:
         mesh: 3D hexahedral or tetrahedral mesh.
-        density: [kg/m^3], > 0.
+        density: [kg/m^3], > 0: a number, or a Constant or Function on the mesh as it is now.
         velocity: Of the centre of mass at the start [m/s]; not beside `motion`.
         angular_velocity: At the start [rad/s]; not beside `rotation`.
         force: Dead force on the centre of mass [N]: a vector, or a function of time.
@@ -97,7 +98,7 @@ class RigidBody(Body):
         self,
         mesh: Any,
         *,
-        density: float,
+        density: Parameter,
         velocity: Any = (0.0, 0.0, 0.0),
         angular_velocity: Any = (0.0, 0.0, 0.0),
         force: VectorInTime = (0.0, 0.0, 0.0),
@@ -109,10 +110,11 @@ class RigidBody(Body):
         require_name("name", name)
         check_mesh(mesh, name)
         require_same(
-            mesh.comm, density=density, velocity=velocity, angular_velocity=angular_velocity,
-            force=force, torque=torque, motion=motion, rotation=rotation, name=name,
+            mesh.comm, density=density if is_number(density) else None, velocity=velocity,
+            angular_velocity=angular_velocity, force=force, torque=torque, motion=motion,
+            rotation=rotation, name=name,
         )  # fmt: skip
-        require_positive("density", density, "kg/m^3")
+        require_positive_parameter("density", density, "kg/m^3")
         self.mesh, self.density, self.degree = mesh, density, 1
         self.space = compat.vector_space(mesh, 1)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
@@ -242,9 +244,8 @@ class RigidBody(Body):
         self._fixed = fixed
         self.prescribed(0.0)
         held = self.points(centre).part(slice(0, int(here)))
-        self.joints = () if rotation is not None else (
-            Triads(self, held, self.length, np.arange(len(held))),
-        )  # fmt: skip
+        self._directors_held = Directors(self, held, self.length, np.arange(len(held)))
+        self.joints = () if rotation is not None else (self._directors_held,)
         self._matrix: Any = None
         self._reach = np.ones(4)
         if self.mesh is not None:
@@ -534,7 +535,7 @@ class RigidBody(Body):
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""
-        return largest_turn(self.reference + u0, self.reference + u1)
+        return self._directors_held.largest_turn(self.reference + u0, self.reference + u1)
 
     def prescribed_turn(self, start: float, end: float) -> float:
         """Turn that `rotation` prescribes between two times [rad], at least. Collective.

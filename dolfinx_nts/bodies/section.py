@@ -1,15 +1,13 @@
-"""Cross-sections of beams, what holds their nodes, and forces on them."""
+"""Cross-sections of beams."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.conditions import VectorInTime
 from dolfinx_nts.validation import floats, is_finite, known_options, require_positive
 
 FloatArray = npt.NDArray[np.float64]
@@ -181,44 +179,3 @@ def _section(
         rhoA=density * area,
         rhoI=(density * second[0], density * second[1]),
     )
-
-
-@known_options
-@dataclass(frozen=True)
-class Clamp:
-    """Nodes of a beam that neither move nor turn.
-
-    Attributes:
-        where: Function x (3, n) -> bool (n,).
-    """
-
-    where: Any
-
-
-@known_options
-@dataclass(frozen=True)
-class PointForce:
-    """Dead force on a node of a beam.
-
-    Attributes:
-        where: Function x (3, n) -> bool (n,) that is true at one node.
-        value: [N]: a vector, or a function of time.
-    """
-
-    where: Any
-    value: VectorInTime
-
-
-@known_options
-@dataclass(frozen=True)
-class LineForce:
-    """Dead force per length of a beam's reference.
-
-    Attributes:
-        value: [N/m]: a vector, or a function of time.
-        where: Function x (3, n) -> bool (n,): it acts between neighbours for which it is true;
-            None: everywhere.
-    """
-
-    value: VectorInTime
-    where: Any = None

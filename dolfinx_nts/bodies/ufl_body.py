@@ -12,7 +12,6 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body, Moment
@@ -20,12 +19,20 @@ from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
+from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
 from dolfinx_nts.bodies.points import Points, in_mesh
 from dolfinx_nts.contact.surfaces import Surface, locate_facets
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.parallel import gather_on_root, raise_together
-from dolfinx_nts.validation import at_points, require_bool, require_name, vector, vectors
+from dolfinx_nts.validation import (
+    UserFunctionError,
+    at_points,
+    require_bool,
+    require_name,
+    vector,
+    vectors,
+)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -256,27 +263,48 @@ class UflBody(Body):
 
     def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
         """Compile mass and energy in UFL and any loads, which are returned."""
-        integrands = [part.integrand() for part in energy.integrals()]
-        self._parameters = [
-            t
-            for t in dict.fromkeys(t for i in integrands for t in traverse_unique_terminals(i))
-            if isinstance(t, fem.Constant | fem.Function) and t is not self.u
-        ]
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+        mass = self._mass_form(v, w)
+        of_energy, of_mass = (
+            in_expressions((part.integrand() for part in form.integrals()), [self.u])
+            for form in (energy, mass)
+        )
+        self._mass_parameters = of_mass
+        self._parameters = [*of_energy, *of_mass]
         if self._extra_form is not None:
             self._check_extra_form(self._extra_form, w)
-        mass, *compiled, self._energy_form = compat.compile_forms(
-            [self._mass_form(v, w), *loads, energy]
+        self._mass_compiled, *compiled, self._energy_form = compat.compile_forms(
+            [mass, *loads, energy]
         )
-        full = compat.create_matrix(mass)
-        compat.assemble_matrix(full, mass, (), 0.0)
+        self._load = np.zeros(self.num_owned)
+        self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
+        self._make_mass()
+        return compiled
+
+    def _make_mass(self) -> None:
+        """Assemble the mass matrix. Collective."""
+        full = compat.create_matrix(self._mass_compiled)
+        compat.assemble_matrix(full, self._mass_compiled, (), 0.0)
+        if self._mass is not None:
+            self._mass.destroy()
         # Directions do not mix: two of three entries of the blocks are zero.
         self._mass = compat.without_zeros(full)
         full.destroy()
-        self._load = np.zeros(self.num_owned)
-        self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
         self.nodal_mass = self.inertia(np.ones(self.num_owned))
-        return compiled
+        self._mass_values = values_of(self._mass_parameters)
+
+    def _density(self, density: Any) -> Any:
+        """A density as the forms take it: bodies of any number share compiled forms.
+
+        Raises:
+            ValueError: It is on another mesh.
+        """
+        if is_number(density):
+            return fem.Constant(self.mesh, float(density))
+        problem = misfit([density], self.mesh.ufl_domain())
+        if problem:
+            raise ValueError(f"density={density!s} of {self.name!r}: {problem}")
+        return density
 
     def _check_extra_form(self, extra_form: ExtraForm, w: Any) -> None:
         # Sums, as those that it will be given.
@@ -461,11 +489,32 @@ class UflBody(Body):
             return self._determinants.smallest(here.array_r)
 
     def parameters(self) -> FloatArray:
-        """Values of the Constants and Functions in W(C), which a caller may change, shape (n,)."""
-        values = [
-            t.value if isinstance(t, fem.Constant) else t.x.array for t in self._parameters
-        ]
-        return np.concatenate([np.empty(0), *map(np.ravel, values)])
+        """Values of Constants and Functions in energy and mass, which a caller may change, (n,)."""
+        return values_of(self._parameters)
+
+    def take_parameters(self) -> None:
+        """Assemble the mass anew if what it is made of has changed. Collective.
+
+        Raises:
+            UserFunctionError: There is no mass left, or it has been moved between nodes.
+        """
+        if not self._mass_parameters:
+            return
+        changed = not np.array_equal(values_of(self._mass_parameters), self._mass_values)
+        if not self.comm.allreduce(changed, op=MPI.LOR):
+            return
+        if self.has_massless:
+            raise UserFunctionError(
+                f"density of {self.name!r}: has changed after mass='redistributed' of a surface "
+                "took it from its nodes; keep it, or use mass='consistent'"
+            )
+        self._make_mass()
+        total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
+        if not total > 0.0:
+            raise UserFunctionError(
+                f"density of {self.name!r}: its new values make a mass of {total:.3g} kg; it must "
+                "be positive"
+            )
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Write the accepted state into the dolfinx Functions u and v."""

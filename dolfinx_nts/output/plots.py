@@ -34,6 +34,10 @@ _ROUND_OFF = 0.1 * float(np.finfo(float).eps)
 _STYLES = ("-", "--", ":", "-.")
 
 
+#: Of a figure; to let matplotlib find them takes as long as to draw it.
+_MARGINS = {"left": 0.08, "right": 0.99, "bottom": 0.07, "top": 0.96, "hspace": 0.22, "wspace": 0.2}
+
+
 def _panels(balance: Balance, several: bool) -> list[_Panel]:
     missing = sorted(set(ledger.COLUMNS) - set(balance))
     if missing:
@@ -104,8 +108,8 @@ def compare_balances(balances: Mapping[str, Balance], path: StrPath) -> None:
 def _plot(balances: Mapping[str, Balance], path: StrPath) -> None:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.5, 7.5), constrained_layout=True)
-    grid = figure.subplots(3, 2, sharex=True)
+    figure = Figure(figsize=(9.5, 7.5))
+    grid = figure.subplots(3, 2, sharex=True, gridspec_kw=_MARGINS)
     runs = [(run, b["time"], _panels(b, len(balances) > 1)) for run, b in balances.items()]
     for k, axes in enumerate(grid.T.ravel()):
         for r, (run, time, panels) in enumerate(runs):
@@ -144,6 +148,7 @@ def _style(axes: Any, panel: _Panel) -> None:
     axes.set_axisbelow(True)
     if panel.floor is not None:
         axes.set_yscale("log")
+        axes.minorticks_off()
 
 
 def save_figure(figure: Any, path: Path, **options: Any) -> None:

@@ -11,6 +11,7 @@ from dolfinx_nts.parallel import first_problem
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.intercept import interceptable
 from dolfinx_nts.run.interrupts import Interrupts
+from dolfinx_nts.run.progress import progress_bar
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.stepper import Stepper
@@ -264,13 +265,13 @@ def _run(
 ) -> Solution:
     """`run` while signals are noted."""
     solution, root = stepper.solution, stepper.system.comm.rank == 0
-    bar = _progress_bar(None if adapt else len(steps), progress and root)
     started: list[Writer] = []
     saver = None
     try:
         try:
             saver = None if checkpoint is None else Saver(checkpoint, stepper)
-            signal = _march(stepper, steps, output, started, adapt, bar, saver, interrupts)
+            with progress_bar(None if adapt else len(steps), progress and root) as bar:
+                signal = _march(stepper, steps, output, started, adapt, bar, saver, interrupts)
             stepper.look(last=True)
             if signal is None:
                 solution.finish()
@@ -291,8 +292,6 @@ def _run(
             _stop(stepper, problem, cause)
     finally:
         stepper.close()
-        if bar is not None:
-            bar.close()
     return solution
 
 
@@ -405,11 +404,3 @@ def writers(output: Any) -> tuple[Writer, ...]:
     """The argument `output`, checked."""
     wanted = "writers of dolfinx_nts.output, or others with the Writer protocol"
     return items("output", output, _is_writer, wanted)
-
-
-def _progress_bar(steps: int | None, wanted: bool) -> Any:
-    if not wanted:
-        return None
-    from tqdm import tqdm
-
-    return tqdm(total=steps, unit="step")

@@ -70,7 +70,7 @@ class StepSolver:
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
         self._version, self._solved = -1, False
-        self._raised: UserFunctionError | None = None
+        self._raised: UserFunctionError | StepFailedError | None = None
         joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
         self._independent: bool | None = True if form_tree(joints) else None
         self.matrix: StepMatrix | None = None
@@ -184,9 +184,9 @@ class StepSolver:
         self._tangents.begin()
         if self._version != self.problem.version:
             self.destroy()
-            self._version = self.problem.version
             self.assemble(self.iterates.at(self.problem.x))
             self._configure()
+            self._version = self.problem.version
 
     def assemble(self, e: Evaluation) -> StepMatrix:
         """Nested Jacobian at an iterate, and what SNES sees of it. Every rank must call it.
@@ -245,7 +245,7 @@ class StepSolver:
     def _function(self, _snes: Any, x: Any, f: Any) -> None:
         try:
             f.array_w[:] = self.problem.residual(self.iterates.at(x))
-        except UserFunctionError as error:
+        except (UserFunctionError, StepFailedError) as error:
             self._raised = error
             raise
 

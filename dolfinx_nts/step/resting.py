@@ -14,10 +14,10 @@ from mpi4py import MPI
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Newmark
+from dolfinx_nts.state import State
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 logger = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:
         force = np.where(rests, new.force, 0.0)
         tangential = np.where(rests[:, None], new.tangential, 0.0)
         found.append(old._replace(force=force, tangential=tangential))
-    return replace(state, histories=(tuple(found), *state.histories[1:]))
+    return replace(state, contacts=tuple(found))
 
 
 def _closed(c: ContactElements) -> BoolArray:

@@ -65,11 +65,9 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     parts.append(np.reshape(forces, (len(contacts), 3)))
     moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
     parts.append(np.reshape(moments, (len(contacts), 3)))
-    held = list(problem.each(step))[1 : 1 + len(joints)]
-    first = [bodies[0] for bodies in problem.system.joint_bodies[: len(joints)]]
-    parts += [
-        _of_joint(problem, step, k, *each) for k, each in zip(first, held, strict=True)
-    ]
+    first = [bodies[0] for bodies in problem.system.joint_bodies]
+    held = list(zip(first, problem.of_joints(step), strict=True))[: len(joints)]
+    parts += [_of_joint(problem, step, k, *each) for k, each in held]
     total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     split = np.split(total, np.cumsum([len(part) for part in parts])[:-1])
