@@ -9,6 +9,7 @@ from dolfinx_nts.bodies.continuum import Continuum
 from dolfinx_nts.bodies.form_body import FormBody
 from dolfinx_nts.bodies.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.bodies.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
 from dolfinx_nts.bodies.rigid import RigidBody
@@ -147,7 +148,9 @@ __all__ = [
     "bodies_from_tags",
     "cauchy_stress",
     "equilibrium",
+    "extrude",
     "intercept",
+    "linear",
     "load",
     "motion_of",
     "restart",

@@ -219,6 +219,10 @@ class Constraints(EveryStep):
         self._driven, self._force = driven, np.zeros_like(equations.value)
         self._upright = upright
 
+    def hold_alone(self) -> None:
+        """They repeat no others: nothing is lent to them, which light bodies would feel."""
+        self._lent = 0.0
+
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
         self._factor = step.factor
         # A guess alone: a run may go on from one whose joint of this name had other equations.

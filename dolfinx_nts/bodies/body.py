@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.points import Points
@@ -293,6 +295,18 @@ class Body:
         prescribed = np.zeros(self.num_owned, dtype=bool)
         prescribed[self.fixed] = True
         return replace(points, fixed=points.nodal(prescribed))
+
+    def boundary(self) -> Surface:
+        """The whole boundary of a body with a mesh, for looks at what lies inside. Collective."""
+        return Surface(self, skin_of_mesh(self, compat.exterior_facets(self.mesh)))
+
+    def boundary_now(self, u: FloatArray) -> FloatArray:
+        """This rank's part of the whole boundary, corners of facets [m], (m, nc, 3). Collective.
+
+        Args:
+            u: Owned displacements [m].
+        """
+        return boundary_of_mesh(self, u)
 
     def at_mesh(self, values: FloatArray) -> FloatArray:
         """Values at the nodes of its mesh on this rank, as of its `space`. Collective.

@@ -21,7 +21,7 @@ from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.parameters import Parameter, is_number, require_positive_parameter
 from dolfinx_nts.constraints import rank_of
-from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
@@ -379,7 +379,7 @@ class RigidBody(Body):
                 f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
-        return Surface(self, found, smoothing)
+        return Surface(self, skin_of_mesh(self, found), smoothing)
 
     def motion_of_points(self, du: FloatArray) -> float:
         """Bound on the components of the motion of the mesh's points on this rank [m]."""

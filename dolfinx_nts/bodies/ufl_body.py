@@ -15,12 +15,12 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.conditions import Dirichlet, Supports
+from dolfinx_nts.bodies.conditions import Dirichlet, Supports, at_nodes
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
-from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
@@ -163,7 +163,7 @@ class UflBody(Body):
                 f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
-        surface = Surface(self, found, smoothing)
+        surface = Surface(self, skin_of_mesh(self, found), smoothing)
         if mass == "redistributed":
             self._make_massless(surface)
         return surface
@@ -252,15 +252,19 @@ class UflBody(Body):
             )
 
     def _interpolate(self, function: Any, name: str, given: Any, unit: str) -> None:
-        """Fill a Function from a vector or a callable x (3, n) -> (3, n)."""
+        """Fill a Function from another, a vector or a callable x (3, n) -> (3, n)."""
         values = function.x.array
-        if callable(given):
+        if isinstance(given, fem.Function) and given.ufl_shape == (3,):
+            what = f"{name}={given!s} of {self.name!r}"
+            values[:] = at_nodes(self.space, what, given).ravel()
+        elif callable(given) and not hasattr(given, "ufl_shape"):
             # The nodes of Lagrange elements are their interpolation points.
             x = self.space.tabulate_dof_coordinates().T
             found = at_points(self.comm, f"{name} of {self.name!r}", given, x, (3,))
             values[:] = found.T.ravel()
         else:
-            constant = vector(name, given, unit, or_else="a callable x (3, n) -> (3, n)")
+            else_ = "a callable x (3, n) -> (3, n), or a Function of vectors"
+            constant = vector(name, given, unit, or_else=else_)
             values[:] = np.tile(constant, len(values) // 3)
 
     def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:

@@ -55,7 +55,7 @@ def slave_and_master(a: Any, b: Any) -> tuple[Any, Any]:
         )
     if isinstance(a, Obstacle) or isinstance(b, Obstacle):
         return (b, a) if isinstance(a, Obstacle) else (a, b)
-    rigid = [not s.material.are_nodes for s in (a, b)]
+    rigid = [s.body.rigid for s in (a, b)]
     if rigid[0] != rigid[1]:
         return (b, a) if rigid[0] else (a, b)
     zones = _zones(a, b)

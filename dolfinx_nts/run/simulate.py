@@ -278,8 +278,10 @@ def _run(
             else:
                 _stop(stepper, _interrupted(stepper, signal, checkpoint))
         except UserFunctionError as failure:
+            _last_look(stepper)
             _stop(stepper, str(failure), failure.__cause__)
         except StepFailedError as failure:
+            _last_look(stepper)
             _stop(stepper, str(failure) if failure.advises else f"{failure}. {remedy}")
         except BaseException:
             # Where one rank alone comes here, no other answers.
@@ -293,6 +295,15 @@ def _run(
     finally:
         stepper.close()
     return solution
+
+
+def _last_look(stepper: Stepper) -> None:
+    """Warn if bodies are inside each other where a run stops, which may be why. Collective."""
+    try:
+        stepper.look(last=True)
+    except UserFunctionError:
+        # An obstacle whose motion raises again, as the status says.
+        logger.debug("no last look for overlaps", exc_info=True)
 
 
 def _march(
