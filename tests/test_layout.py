@@ -143,8 +143,14 @@ def test_level_0_knows_neither_mpi_nor_petsc(module):
     assert not siblings(module) & KNOW_RANKS
 
 
-@pytest.mark.parametrize("module", sorted(set(PRESENT) - {"step.assembly", "dolfinx_compat"}))
-def test_only_assembly_creates_petsc_matrices(module):
+#: What makes PETSc matrices.
+MATRICES = {
+    "step.assembly", "step.schur", "step.mass_solves", "step.model_problem", "dolfinx_compat",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("module", sorted(set(PRESENT) - MATRICES))
+def test_few_files_create_petsc_matrices(module):
     makes = re.findall(
         r"\bMat\(\)|\.create(?:Seq)?S?B?AIJ\(|\.createNest\(", code_without_text(module)
     )

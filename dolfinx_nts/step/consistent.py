@@ -13,7 +13,8 @@ from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
-from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
+from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.mass_solves import Saddle, solve_mass
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
 

@@ -24,7 +24,8 @@ from dolfinx_nts.constraints import SHIFT
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
-from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
+from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.mass_solves import Saddle, solve_mass
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.validation import StepFailedError
