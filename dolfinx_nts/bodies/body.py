@@ -152,7 +152,8 @@ class Body:
 
     def last_accepted(self) -> tuple[FloatArray, FloatArray]:
         """Owned u [m] and v [m/s] of the last accepted state, or of the start."""
-        return self._accepted or (self.initial_displacement, self.initial_velocity)
+        known = getattr(self, "_accepted", None)
+        return known or (self.initial_displacement, self.initial_velocity)
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of the sum of the places' momenta [kg m/s], shape (3,)."""

@@ -23,6 +23,7 @@ from dolfinx_nts.run.start import (
     consistent_start,
     first_state,
     refuse_moved,
+    refuse_overwritten,
     with_prescribed_rates,
 )
 from dolfinx_nts.run.step_size import Pace
@@ -199,6 +200,7 @@ class Stepper:
             "restitution": float(restitution),
             "ranks": system.comm.size,
         }
+        refuse_overwritten(system)
         state = first_state(system, start, start_time)
         if not integrator.accelerations:
             state = replace(state, a=())
