@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.axis import axis_of, check_line
 from dolfinx_nts.bodies.body import Body, Moment
-from dolfinx_nts.bodies.conditions import Dirichlet
+from dolfinx_nts.bodies.conditions import Dirichlet, Meetings
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.section import Clamp, LineForce, PointForce, Section
 from dolfinx_nts.bodies.triad import Triads, largest_turn
@@ -166,11 +166,13 @@ class Beam(Body):
         )  # fmt: skip
         owner = np.full((self.num_owned // 12, 12), -1)
         self._values: list[Any] = []
+        dofs = []
         for k, bc in enumerate(conditions):
             chosen = self._chosen(f"{type(bc).__name__}.where of bcs[{k}] of {self.name!r}", bc)
             clamped = isinstance(bc, Clamp)
             columns = np.arange(12) if clamped else np.array(bc.components)
             owner[np.ix_(chosen, columns)] = k
+            dofs.append((12 * chosen[:, None] + columns).ravel())
             self._values.append((0.0, 0.0, 0.0) if clamped else bc.value)
         self.driven = any(callable(value) for value in self._values)
         self.fixed: IntArray = np.flatnonzero(owner >= 0)
@@ -194,7 +196,9 @@ class Beam(Body):
                 if count != 1:
                     raise ValueError(f"{what}={load.where!r}: selects {count} nodes; select one")
             self._loads.append((type(load).__name__, weights, load.value, unit))
-        self.prescribed(0.0)
+        x = self._axis.x[self._first : self._first + len(owner)]
+        self._meetings = Meetings(self.comm, self.name, self._values, dofs, x, 12)
+        self._meetings.check(self._prescribed(0.0), 0.0, anew=False)
         self._loads_at(0.0, 1.0)
 
     def _lengths(self, chosen: IntArray | None) -> FloatArray:
@@ -369,12 +373,18 @@ class Beam(Body):
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
+        now = self._prescribed(time)
+        self._meetings.check(now, time)
+        found: FloatArray = now[self._condition, self.fixed % 12]
+        return found
+
+    def _prescribed(self, time: float) -> FloatArray:
+        """What each condition prescribes [m], shape (conditions, 12). Collective."""
         now = np.zeros((len(self._values), 12))
         for k, value in enumerate(self._values):
             what = f"Dirichlet.value of bcs[{k}] of {self.name!r}"
             now[k, :3] = vector_in_time(self.comm, what, value, time, "m")
-        found: FloatArray = now[self._condition, self.fixed % 12]
-        return found
+        return now
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]. Collective."""

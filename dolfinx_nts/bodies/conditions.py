@@ -9,15 +9,27 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import locate_facets
-from dolfinx_nts.validation import is_whole, items, known_options, vector, vector_in_time
+from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.validation import (
+    UserFunctionError,
+    is_whole,
+    items,
+    known_options,
+    vector,
+    vector_in_time,
+)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 VectorInTime = Vector | Callable[[float], Vector]
+
+#: Rounding of displacements over them and over the distance of the body from the origin.
+_ROUNDING = 64 * float(np.finfo(float).eps)
 
 
 @known_options
@@ -80,6 +92,72 @@ def facets_of(mesh: Any, where: Any, what: str) -> IntArray:
     return locate_facets(mesh, where, None, what)
 
 
+class Meetings:
+    """Coordinates that two conditions of a body prescribe, which must be of one mind. Collective.
+
+    Args:
+        comm: MPI communicator.
+        name: Of the body, for messages.
+        values: Of the conditions, as they were given.
+        dofs: Positions that each of them prescribes among this rank's coordinates.
+        x: Reference position of each node [m], shape (n, 3).
+        width: Coordinates of a node, of which the first three are its place.
+    """
+
+    def __init__(
+        self, comm: Any, name: str, values: Sequence[VectorInTime], dofs: Sequence[IntArray],
+        x: FloatArray, width: int = 3,
+    ) -> None:  # fmt: skip
+        self._comm, self._name = comm, name
+        owner = np.full(width * len(x), -1)
+        found: dict[tuple[int, int, int], tuple[float, ...]] = {}
+        for k, here in enumerate(dofs):
+            # Three conditions at one coordinate are of one mind if neighbours in the list are.
+            for dof in here[owner[here] >= 0].tolist():
+                key = int(owner[dof]), k, dof % width
+                place = tuple(x[dof // width].tolist())
+                found[key] = min(found.get(key, place), place)
+            owner[here] = k
+        self._places: dict[tuple[int, int, int], tuple[float, ...]] = {}
+        if len(dofs) > 1:
+            for key, place in sorted(i for part in comm.allgather(found) for i in part.items()):
+                self._places.setdefault(key, place)
+            self._size = float(comm.allreduce(np.abs(x).max(initial=0.0), op=MPI.MAX))
+        self._moving = any(
+            callable(value) for j, k, _ in self._places for value in (values[j], values[k])
+        )
+
+    def check(
+        self, now: Sequence[FloatArray] | FloatArray, time: float, *, anew: bool = True
+    ) -> None:
+        """Raise on every rank where two conditions prescribe different displacements.
+
+        Args:
+            now: Values of all conditions [m], shape (width,) each.
+            time: When [s].
+            anew: Whether those that do not depend on time were found to be of one mind.
+
+        Raises:
+            UserFunctionError: They do; not tried again in smaller steps.
+        """
+        if not self._places or (anew and not self._moving):
+            return
+        problem = None
+        for (j, k, c), place in self._places.items():
+            one, other = float(now[j][c]), float(now[k][c])
+            if abs(one - other) > _ROUNDING * max(self._size, abs(one), abs(other)):
+                near = _ROUNDING * self._size
+                where = ", ".join(f"{x if abs(x) > near else 0.0:.4g}" for x in place)
+                problem = (
+                    f"bcs[{j}] and bcs[{k}] of {self._name!r}: at t={time:.6g} they prescribe "
+                    f"{one:.6g} m and {other:.6g} m along {'xyz'[c % 3]} of the node at "
+                    f"X = ({where}); leave that place or component out of one of them, or give "
+                    "both one value"
+                )
+                break
+        raise_together(self._comm, problem, UserFunctionError)
+
+
 class Supports:
     """The `Dirichlet` conditions of a body. Collective.
 
@@ -97,15 +175,15 @@ class Supports:
 
     Raises:
         TypeError: An item is no condition.
-        ValueError: A condition selects no facet, or has no vector at t = 0.
+        ValueError: A condition selects no facet, or has no vector at t = 0, or two of them
+            prescribe different values of one coordinate.
     """
 
     def __init__(self, comm: Any, space: Any, bcs: Sequence[Dirichlet], name: str) -> None:
         self._comm, self._name = comm, name
         self._num_owned = 3 * space.dofmap.index_map.size_local
         bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")
-        for k, bc in enumerate(bcs):
-            self._value(k, bc.value, 0.0)
+        start = [self._value(k, bc.value, 0.0) for k, bc in enumerate(bcs)]
         self.masks: list[Any] = []
         self._parts: list[tuple[VectorInTime, list[tuple[int, IntArray]]]] = []
         owner, dim = np.full(self._num_owned, -1), space.mesh.topology.dim
@@ -124,8 +202,12 @@ class Supports:
         self.driven = any(callable(value) for value, _ in self._parts)
         still = [d for value, parts in self._parts if not callable(value) for _, d in parts]
         self.still: IntArray = np.concatenate([np.empty(0, dtype=int), *still])
-        # Where two conditions meet, the later one's value holds, so it carries the force.
+        # Where two conditions meet, the later one carries the force.
         self._condition = owner[self.fixed]
+        x = space.tabulate_dof_coordinates()[: self._num_owned // 3]
+        of_each = [np.concatenate([d for _, d in parts]) for _, parts in self._parts]
+        self._meetings = Meetings(comm, name, [bc.value for bc in bcs], of_each, x)
+        self._meetings.check(start, 0.0, anew=False)
 
     def _value(self, k: int, value: VectorInTime, time: float) -> FloatArray:
         what = f"Dirichlet.value of bcs[{k}] of {self._name!r}"
@@ -134,10 +216,11 @@ class Supports:
     def prescribed(self, time: float) -> FloatArray:
         """Displacements at a time, in the order of `fixed` [m]. Collective."""
         values = np.zeros(self._num_owned)
-        for k, (value, parts) in enumerate(self._parts):
-            now = self._value(k, value, time)
+        now = [self._value(k, value, time) for k, (value, _) in enumerate(self._parts)]
+        self._meetings.check(now, time)
+        for here, (_, parts) in zip(now, self._parts, strict=True):
             for component, dofs in parts:
-                values[dofs] = now[component]
+                values[dofs] = here[component]
         return values[self.fixed]
 
     def reactions(self, residual: FloatArray) -> FloatArray:
