@@ -329,7 +329,7 @@ def test_fields_and_pictures_show_the_mesh(mpi_tmp_path):
          "velocity of 'rigid'=[1.0, 0.0, 0.0]: motion= prescribes it; leave velocity out"),
         ({"rotation": lambda t: (0, 0, t), "angular_velocity": (0, 0, 1)},
          "angular_velocity of 'rigid'=[0.0, 0.0, 1.0]: rotation= prescribes it"),
-        ({"motion": lambda t: (1, 2)}, "motion of 'rigid' at t=0.0=(1, 2)"),
+        ({"motion": lambda t: (1, 2)}, "motion of 'rigid' at t=0.0: returned (1, 2)"),
         ({"name": ""}, "name=''"),
         ({"comm": 3}, "comm=3: pass an MPI communicator"),
         ({"comm": None}, "comm=None: pass an MPI communicator"),

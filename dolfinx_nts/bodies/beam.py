@@ -371,6 +371,12 @@ class Beam(Body):
             load[:, :3] += part * weights[:, None] * force
         return load.ravel()
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        loads = [value for _, _, value, _ in self._loads]
+        return {"section": self.section, "bcs": self._values, "forces": loads}
+
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
         now = self._prescribed(time)

@@ -239,6 +239,11 @@ class Body:
         """
         return 0.0
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Numbers and texts by the arguments that it was made of, which ranks have in common."""
+        return {}
+
     def parameters(self) -> FloatArray:
         """Values of the material that a caller may change during a run, shape (n,)."""
         return np.empty(0)

@@ -209,6 +209,11 @@ class Supports:
         self._meetings = Meetings(comm, name, [bc.value for bc in bcs], of_each, x)
         self._meetings.check(start, 0.0, anew=False)
 
+    @property
+    def settings(self) -> list[Any]:
+        """Of each condition value and components."""
+        return [(value, [c for c, _ in parts]) for value, parts in self._parts]
+
     def _value(self, k: int, value: VectorInTime, time: float) -> FloatArray:
         what = f"Dirichlet.value of bcs[{k}] of {self._name!r}"
         return vector_in_time(self._comm, what, value, time, "m")

@@ -460,6 +460,12 @@ class UflBody(Body):
         with self._in.localForm() as here:
             return self._determinants.smallest(here.array_r)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        constants = [t.value for t in self._parameters if isinstance(t, fem.Constant)]
+        return {"bcs": self._supports.settings, "constants in the material": constants}
+
     def parameters(self) -> FloatArray:
         """Values of the Constants and Functions in W(C), which a caller may change, shape (n,)."""
         values = [
