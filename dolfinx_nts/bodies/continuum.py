@@ -196,6 +196,13 @@ class Continuum(UflBody):
         return ufl.inner(rule.piola(self.law, h0, h1), ufl.grad(w)) * self._dx
 
     # ---- as of Body
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
+        own = {"material": self.material, "density": self.density, "degree": self.degree}
+        return own | loads | super().settings
+
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         if not self._seen_at_rest:

@@ -494,6 +494,12 @@ class UflBody(Body):
         with self._in.localForm() as here:
             return self._determinants.smallest(here.array_r)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        constants = [t.value for t in self._parameters if isinstance(t, fem.Constant)]
+        return {"bcs": self._supports.settings, "constants in the material": constants}
+
     def parameters(self) -> FloatArray:
         """Values of Constants and Functions in energy and mass, which a caller may change, (n,)."""
         return values_of(self._parameters)
