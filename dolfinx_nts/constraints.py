@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kinematics import OFF, Kinematics
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.point_elements import EveryStep, PointElements
+from dolfinx_nts.points import Points
 from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError
 
@@ -40,7 +40,7 @@ SHIFT = 1e-7
 
 
 def rank_of(name: str, comm: Any) -> int:
-    """Rank that has what is of one rank alone, evenly for many names, the same in every run."""
+    """Rank that holds an item that lives on one rank: the same in every run, spread by names."""
     return zlib.crc32(name.encode()) % int(comm.size)
 
 
@@ -128,8 +128,8 @@ class ConstraintElements(PointElements):
     def extent(self) -> float:
         """Length whose rounding enters its constraints on this rank [m].
 
-        That of what each vector is made of, times the other vector: nothing of nodes with weight 0,
-        such as the directors of a point, whose length is no length of the scene.
+        It is the size of the terms that make each vector, times the other vector. Nodes of weight 0
+        do not count, such as the directors of a point, whose length is no length of the scene.
         """
         weights, constants, _ = self.equations
         made_of = np.abs(weights) @ np.abs(self.rest)[:, None] + np.abs(constants)

@@ -13,11 +13,11 @@ from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.director_body import DirectorBody
 from dolfinx_nts.bodies.hull import Hull, of_beam
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.section import Section
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import beam as kernel
 from dolfinx_nts.kernels.quadratic_energy import Elements
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
 FloatArray = npt.NDArray[np.float64]

@@ -14,12 +14,12 @@ from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.materials import misfit, with_constants
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.ufl_body import UflBody
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.parallel import raise_together

@@ -15,17 +15,18 @@ from petsc4py import PETSc
 from scipy.spatial.transform import Rotation
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.parameters import Parameter, is_number, require_positive_parameter
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import gather_rows, raise_together
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import (
     UserFunctionError,
     agree,

@@ -13,11 +13,11 @@ from dolfinx_nts.bodies.director_body import DirectorBody
 from dolfinx_nts.bodies.hull import SIDES, Hull, of_shell
 from dolfinx_nts.bodies.midsurface import check_midsurface, midsurface_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.kernels import shell as kernel
 from dolfinx_nts.kernels.quadratic_energy import Elements
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import (
     is_finite,
     known_options,

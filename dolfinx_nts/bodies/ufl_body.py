@@ -14,18 +14,19 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports, at_nodes
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
-from dolfinx_nts.bodies.points import Points, in_mesh
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import gather_on_root, raise_together
+from dolfinx_nts.points import Points, in_mesh
 from dolfinx_nts.validation import (
     UserFunctionError,
     at_points,

@@ -18,15 +18,13 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_together
-from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
+from dolfinx_nts.evaluation import BodyTerms, Evaluation, Moment, free
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.state import State
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.step.least_norm import hanging
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.shared_weight import SharedWeight
@@ -66,8 +64,8 @@ class StepProblem:
 
     Attributes:
         awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
-        contacts: What makes the elements of contacts. Asked by itself where contact is meant: by
-            `touching`, for when gaps close, and for what a checkpoint keeps of slave nodes.
+        contacts: What makes the elements of contacts. Used directly only for what contacts alone
+            have: `touching`, closing gaps, checkpoints.
         joints: What makes those of each joint.
         couplings: All that makes elements.
         unknowns: Their layout; made anew whenever the elements' coordinates change.
@@ -266,7 +264,7 @@ class StepProblem:
             coupling.let_slip()
 
     def give_way(self) -> bool:
-        """Limit forces that had no limit from the next step on; tells whether one had none."""
+        """From the next step on, limit forces that had no limit; return whether there was one."""
         return any([coupling.give_way() for coupling in self.couplings])
 
     def _touched(self) -> set[int]:
@@ -358,8 +356,8 @@ class StepProblem:
             flight: Free flight from t_n under the contact forces of the last step; else the
                 positions of t_n, which free flight of a fast turning or vibrating body may invert,
                 and no forces. Prescribed coordinates are at t_{n+1}.
-            carried: Take the contact forces of the last step as they were, whatever `flight` is,
-                also what is no good as a guess.
+            carried: Take the contact forces of the last step unchanged, whatever `flight` is, even
+                where they are a poor guess.
         """
         laid, elements = self.laid, self.elements
         with self.x as x:
