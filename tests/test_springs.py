@@ -658,8 +658,9 @@ def test_stabilization_of_springs_is_that_of_the_springs(stiffness):
     """No gravity and no flexible body: in any unit the same number of relaxations."""
     iterations = []
     for unit in (1e-3, 1.0, 1e6):
+        load = 0.2 * stiffness * unit
         body = nts.RigidBody.from_inertia(
-            1.0, 3 * (unit**2,), (unit, 0, 0), force=lambda t, u=unit: (0.2 * stiffness * u * t, 0, 0)
+            1.0, 3 * (unit**2,), (unit, 0, 0), force=lambda t, load=load: (load * t, 0, 0)
         )
         ends = [(unit, 0, 0), (0, 0, 0)]
         joints = [

@@ -106,18 +106,19 @@ class StepProblem:
 
     def _lend_less(self) -> None:
         """Lend no compliance to joints of rigid bodies that form no loop. Collective."""
-        system, found = self.system, []
+        system = self.system
+        holding: list[tuple[JointCoupling, tuple[int, ...]]] = []
         of = zip(system.declared_joints, self.joints, system.joint_bodies, strict=False)
         for joint, coupling, bodies in of:
-            alike = isinstance(coupling, Constraints) and all(b.rigid for b in joint.bodies)
-            # Springs hold nothing.
-            if not isinstance(joint, Between):
-                found.append((coupling if alike else None, bodies))
-        moved = system.comm.allreduce(np.array([b.fixed.any() for b in system.bodies]), op=MPI.LOR)
+            if not isinstance(joint, Between):  # springs hold nothing
+                holding.append((coupling, bodies))
+        moved = system.comm.allreduce(np.array([b.fixed.sum() for b in system.bodies]))
         free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
-        alone = hanging([bodies for _, bodies in found], free)
-        for (coupling, _), hangs in zip(found, alone, strict=True):
-            if coupling is not None and hangs:
+        alone = hanging([bodies for _, bodies in holding], free)
+        for (coupling, bodies), hangs in zip(holding, alone, strict=True):
+            # Of a flexible body's points some may be held otherwise.
+            rigid = all(system.bodies[k].rigid for k in bodies)
+            if hangs and rigid and isinstance(coupling, Constraints):
                 coupling.hold_alone()
 
     # ---- set-up of a step
