@@ -141,7 +141,7 @@ def test_a_tumbling_pair(kind):
     for name in ("linear_momentum", "angular_momentum"):
         size = np.abs(table[name]).max()
         assert np.abs(table[name] - table[name][0]).max() < 1e-12 * size
-    assert COMM.allreduce(state.histories[1].size) == count
+    assert COMM.allreduce(state.joints[0].size) == count
     stepper.close()
 
 
@@ -425,7 +425,7 @@ def force_columns(stepper):
     """Columns of all constraints in the forces of the last step, and their multipliers [N]."""
     system, columns, multipliers = stepper.system, [], []
     couplings = zip(
-        stepper.problem.elements, system.joint_bodies, stepper.state.histories[1:], strict=True
+        stepper.problem.elements, system.joint_bodies, stepper.state.joints, strict=True
     )
     for batch, bodies, found in couplings:
         u1 = [stepper.state.u[b].reshape(1, 4, 3) for b in bodies]

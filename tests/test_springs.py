@@ -77,10 +77,10 @@ def test_tangents_are_derivatives(item, rule, ground):
     state, h = stepper.state, 0.1
     if getattr(problem.integrator, "accelerations", False):
         a0 = tuple(rng.normal(size=v.shape) for v in state.v)
-        state = nts.State(state.time, state.u, state.v, a0, state.histories)
+        state = nts.State(state.time, state.u, state.v, a0, state.contacts, state.joints)
     # Rigid bodies have no stiffness that scales their constraints: these are left out in statics.
     problem.couplings = problem.couplings[:2]
-    state = nts.State(state.time, state.u, state.v, state.a, state.histories[:2])
+    state = nts.State(state.time, state.u, state.v, state.a, state.contacts, state.joints[:1])
     problem.begin(state, h)
     (batch,) = problem.elements
     shape = batch.reference().shape
@@ -658,9 +658,9 @@ def test_stabilization_of_springs_is_that_of_the_springs(stiffness):
     """No gravity and no flexible body: in any unit the same number of relaxations."""
     iterations = []
     for unit in (1e-3, 1.0, 1e6):
-        load = 0.2 * stiffness * unit
+        pull = 0.2 * stiffness * unit
         body = nts.RigidBody.from_inertia(
-            1.0, 3 * (unit**2,), (unit, 0, 0), force=lambda t, load=load: (load * t, 0, 0)
+            1.0, 3 * (unit**2,), (unit, 0, 0), force=lambda t, f=pull: (f * t, 0, 0)
         )
         ends = [(unit, 0, 0), (0, 0, 0)]
         joints = [

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution
 from dolfinx_nts.contact.coulomb import Slip
+from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.elements import over
 from dolfinx_nts.kernels.vectors import cross
 
@@ -26,38 +27,8 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Changes of one node's state in a step that are no search any more.
-_CYCLE = 8
+CYCLE = 8
 _EPS = float(np.finfo(float).eps)
-
-
-class ContactHistory(NamedTuple):
-    """What a contact remembers from step to step, of each slave node in this rank's share.
-
-    Attributes:
-        facet: Facet in the last step, or -1, shape (n,).
-        force: Contact force p_N [N], >= 0.
-        gap: Gap [m], infinite where a node was no candidate.
-        tangential: Friction force [N], shape (n, 3).
-        stick: Whether it sticks.
-        slip: Distance that it has slipped since the start [m].
-        followed: Whether it is not known to have passed by the surface's edge.
-    """
-
-    facet: IntArray
-    force: FloatArray
-    gap: FloatArray
-    tangential: FloatArray
-    stick: BoolArray
-    slip: FloatArray
-    followed: BoolArray
-
-    @classmethod
-    def of_start(cls, n: int) -> ContactHistory:
-        """Return the history of n nodes that have not touched yet."""
-        off, none = np.zeros(n, dtype=bool), np.zeros(n)
-        return cls(
-            np.full(n, -1), none, np.full(n, np.inf), np.zeros((n, 3)), off, none.copy(), ~off
-        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -467,11 +438,11 @@ class ContactElements(ContactLaws):
         text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
         if slide:
             text += f" and {slide} between stick and slip"
-        if max(touch, slide) >= _CYCLE:
+        if max(touch, slide) >= CYCLE:
             states = "stick and slip" if slide > touch else "contact and none"
-            text += (
-                f": it flips between {states} and settles in neither; try another dt"
-                f"{', a smaller coefficient of friction' if self.pair.friction else ''} or a finer "
-                "surface"
-            )
+            remedy = "try another dt"
+            if not self._free[i, 0].any():
+                # Several such nodes on one facet share the little that its nodes can give way.
+                remedy = "its motion is prescribed, so make its surface the master"
+            text += f": it flips between {states} and settles in neither; {remedy}"
         return float(weight[i]), text

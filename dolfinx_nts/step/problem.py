@@ -19,21 +19,21 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.body import Moment
-from dolfinx_nts.constraints import Constraints
-from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.elements import Coupling, JointCoupling, Step
+from dolfinx_nts.contact.history import ContactHistory
+from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_together
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
-from dolfinx_nts.joints.forces import Between
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import State
 from dolfinx_nts.step.least_norm import hanging
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.stabilization import Stabilization
 from dolfinx_nts.step.unknowns import Unknowns
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -99,7 +99,7 @@ class StepProblem:
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.centre, self._span = _box(system)
-        self.stabilization = Stabilization(system, integrator, self._span)
+        self.stabilization = Stabilization(system, self._span)
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
@@ -107,19 +107,19 @@ class StepProblem:
     def _lend_less(self) -> None:
         """Lend no compliance to joints of rigid bodies that form no loop. Collective."""
         system = self.system
-        holding: list[tuple[JointCoupling, tuple[int, ...]]] = []
+        found: list[tuple[Any, tuple[int, ...]]] = []
         of = zip(system.declared_joints, self.joints, system.joint_bodies, strict=False)
         for joint, coupling, bodies in of:
-            if not isinstance(joint, Between):  # springs hold nothing
-                holding.append((coupling, bodies))
+            if hasattr(joint, "slopes"):  # a spring holds nothing
+                continue
+            rigid = all(body.rigid for body in joint.bodies)
+            found.append((getattr(coupling, "hold_alone", None) if rigid else None, bodies))
         moved = system.comm.allreduce(np.array([b.fixed.sum() for b in system.bodies]))
         free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
-        alone = hanging([bodies for _, bodies in holding], free)
-        for (coupling, bodies), hangs in zip(holding, alone, strict=True):
-            # Of a flexible body's points some may be held otherwise.
-            rigid = all(system.bodies[k].rigid for k in bodies)
-            if hangs and rigid and isinstance(coupling, Constraints):
-                coupling.hold_alone()
+        alone = hanging([bodies for _, bodies in found], free)
+        for (hold_alone, _), hangs in zip(found, alone, strict=True):
+            if hold_alone is not None and hangs:
+                hold_alone()
 
     # ---- set-up of a step
     def begin(
@@ -185,7 +185,8 @@ class StepProblem:
             state, dt, self.factor, self.integrator, self.condense, self.first, way,
             motion, length, self.stabilization.stiffness, moments, self.rounding.of,
         )  # fmt: skip
-        for coupling, history in zip(self.couplings, state.histories, strict=True):
+        histories: tuple[Any, ...] = (state.contacts, *state.joints)
+        for coupling, history in zip(self.couplings, histories, strict=True):
             coupling.begin(step, history, again, search)
         self._asleep = self._find_asleep(np.maximum(motion, speed) == 0.0)
         self._lay_out()
@@ -202,8 +203,13 @@ class StepProblem:
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """Couplings with their parts of an evaluation."""
-        start = 0
-        for coupling in self.couplings:
+        yield self.contacts, e.parts[: len(self.contacts.elements)]
+        yield from self.of_joints(e)
+
+    def of_joints(self, e: Evaluation) -> Iterator[tuple[JointCoupling, tuple[Any, ...]]]:
+        """Those of `System.joints`."""
+        start = len(self.contacts.elements)
+        for coupling in self.joints:
             stop = start + len(coupling.elements)
             yield coupling, e.parts[start:stop]
             start = stop
@@ -390,12 +396,8 @@ class StepProblem:
         """
         values, laid, elements = x.array_r.copy(), self.laid, self.elements
         positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
-        parts = tuple(
-            c.evaluate(y, own)
-            for c, y, own in zip(
-                elements, positions, laid.own_values(values, elements), strict=True
-            )
-        )
+        own = laid.own_values(values, elements)
+        parts = evaluate_together(self.system.comm, elements, positions, own)
         touching = len(self.contacts.elements)
         self._shared.divide(
             self.contacts.elements, self.contacts.bodies, parts[:touching], positions[:touching]

@@ -78,9 +78,16 @@ class Rounding:
         return bool((self._diagonal[list(bodies)] > 0.0).all())
 
     def measure(self, bodies: Iterable[int]) -> None:
-        """Measure it anew, for bodies that have stiffened. Collective."""
+        """Measure it anew, for bodies that have stiffened. Collective.
+
+        A director is rounded as its own length is, not as a position: the stiffness of thin bodies
+        against what turns it alone counts by that part.
+        """
         for k in bodies:
-            diagonal = self._tangent(k).getDiagonal()
+            body, diagonal = self._bodies[k], self._tangent(k).getDiagonal()
+            if body.oriented and not body.rigid:
+                of_nodes = np.where(body.places, 1.0, body.length / self._extent[k])
+                diagonal.array_w[:] *= np.repeat(of_nodes, 3)
             self._diagonal[k], self._of_factor[k] = diagonal.norm(), self._factor
             diagonal.destroy()
 

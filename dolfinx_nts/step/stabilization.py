@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.joints.forces import Between
 from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
@@ -19,15 +18,14 @@ class Stabilization:
 
     Args:
         system: The scene.
-        integrator: Rules of the step.
         span: Size of the scene [m].
 
     Attributes:
         share: That part [-], zero in dynamics.
     """
 
-    def __init__(self, system: System, integrator: Any, span: float) -> None:
-        self._system, self._integrator, self._span = system, integrator, span
+    def __init__(self, system: System, span: float) -> None:
+        self._system, self._span = system, span
         self.share = 0.0
 
     def of(self, body: Any) -> FloatArray:
@@ -38,7 +36,7 @@ class Stabilization:
 
     def stiffness(self, body: Any) -> FloatArray:
         """Stiffness of each coordinate's surroundings [N/m]; where there is none, of the others."""
-        own: FloatArray = body.nodal_stiffness(self._integrator)
+        own: FloatArray = body.nodal_stiffness()
         # Nothing moves what nothing pushes: any number does there.
         return np.where(own > 0.0, own, self._of_others or self._of_loads() or 1.0)
 
@@ -48,7 +46,7 @@ class Stabilization:
         system = self._system
         local = np.zeros(3)
         for body in system.bodies:
-            own = body.nodal_stiffness(self._integrator)
+            own = body.nodal_stiffness()
             local += own.sum(), np.count_nonzero(own), body.nodal_mass.max(initial=0.0)
         total, number, mass = system.comm.allreduce(local).tolist()
         if number:
@@ -59,9 +57,9 @@ class Stabilization:
         """Of all springs in the mean, as they are in the reference [N/m]. Collective."""
         found, comm = [], self._system.comm
         for joint in self._system.joints:
-            if isinstance(joint, Between):
+            if hasattr(joint, "slopes"):
                 still = [np.zeros(body.num_owned) for body in joint.bodies]
-                gradients, stiffness, _ = joint.slopes(still, joint.start())
+                gradients, stiffness, *_ = joint.slopes(still, joint.start())
                 slope = comm.allgather(max(np.abs(g).max(initial=0.0) for g in gradients))
                 found.append(abs(stiffness) * max(slope) ** 2)
         found = [stiffness for stiffness in found if stiffness]
