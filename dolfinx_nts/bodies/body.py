@@ -191,7 +191,7 @@ class Body:
                 "make it anew, or destroy it later"
             )
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """Stiffness of each node's neighbourhood at rest [N/m], shape (num_owned,).
 
         What the nodal mass is in dynamics, a scale, is this in statics, which alone asks for it.
@@ -202,11 +202,12 @@ class Body:
         """
         raise self._missing("nodal_stiffness")
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultant of a force [N] on the coordinates of each condition, this rank's part.
 
         Args:
-            residual: Force on all owned coordinates, shape (num_owned,).
+            residual: Force of the step on all owned coordinates, shape (num_owned,).
+            u1: Displacement at the end of the step, from which moments take their arms [m].
 
         Returns:
             Shape (conditions, 3).
@@ -216,7 +217,8 @@ class Body:
     @property
     def reaction_labels(self) -> list[tuple[str, str]]:
         """Name and unit of each row of `reactions`."""
-        count = len(self.reactions(np.zeros(self.num_owned)))
+        zero = np.zeros(self.num_owned)
+        count = len(self.reactions(zero, zero))
         return [(str(k), "N") for k in range(count)]
 
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
@@ -243,6 +245,12 @@ class Body:
     def parameters(self) -> FloatArray:
         """Values of the material that a caller may change during a run, shape (n,)."""
         return np.empty(0)
+
+    def take_parameters(self) -> None:
+        """Take over changed `parameters` where not all that is made of them is asked for anew.
+
+        Collective; a run calls it before its first step, and whenever `parameters` have changed.
+        """
 
     def file_order(self) -> IntArray:
         """Numbers of the nodes, counted rank after rank, in the order of files; on rank 0.

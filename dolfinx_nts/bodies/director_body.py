@@ -24,7 +24,6 @@ from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.skeleton import Skeleton
 from dolfinx_nts.contact.surfaces import Skin, Surface, in_order
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.integrators.rule import taken_at
 from dolfinx_nts.kernels import quadratic_energy as kernel
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.validation import at_points, vector, vectors
@@ -331,7 +330,7 @@ class DirectorBody(Body):
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         self._u0, self._y0 = moment.u0, self._vectors(moment.u0)
-        self._theta, self._held_at = taken_at(rule), rule.theta
+        self._theta, self._held_at = rule.taken_at, rule.theta
         self._load, self._couple = self._conditions.loads(moment.time, moment.ramp)
 
     def prescribed(self, time: float) -> FloatArray:
@@ -435,7 +434,7 @@ class DirectorBody(Body):
         k = kernel.tangent(self._elements, self._rest, self._rest, 1.0)
         return self._gather(np.einsum("nii->ni", k))
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """Mean diagonal of the tangent at each node in the reference [N/m]. Collective."""
         mean = self._diagonal.reshape(-1, 3).mean(axis=1)
         return np.repeat(mean, 3)
@@ -444,7 +443,7 @@ class DirectorBody(Body):
         """Strain energy on this rank [J]. Collective."""
         return float(kernel.energy(self._elements, self._vectors(u)).sum())
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the places of each condition, this rank's part [N], (conditions, 3)."""
         return self._conditions.reactions(residual)
 

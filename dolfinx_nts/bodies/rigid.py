@@ -19,6 +19,7 @@ from dolfinx_nts.bodies.body import Body, Moment
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
+from dolfinx_nts.bodies.parameters import Parameter, is_number, require_positive_parameter
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
@@ -64,7 +65,7 @@ class RigidBody(Body):
 
     Args:
         mesh: 3D hexahedral or tetrahedral mesh.
-        density: [kg/m^3], > 0.
+        density: [kg/m^3], > 0: a number, or a Constant or Function on the mesh as it is now.
         velocity: Of the centre of mass at the start [m/s]; not beside `motion`.
         angular_velocity: At the start [rad/s]; not beside `rotation`.
         force: Dead force on the centre of mass [N]: a vector, or a function of time.
@@ -97,7 +98,7 @@ class RigidBody(Body):
         self,
         mesh: Any,
         *,
-        density: float,
+        density: Parameter,
         velocity: Any = (0.0, 0.0, 0.0),
         angular_velocity: Any = (0.0, 0.0, 0.0),
         force: VectorInTime = (0.0, 0.0, 0.0),
@@ -109,10 +110,11 @@ class RigidBody(Body):
         require_name("name", name)
         check_mesh(mesh, name)
         require_same(
-            mesh.comm, density=density, velocity=velocity, angular_velocity=angular_velocity,
-            force=force, torque=torque, motion=motion, rotation=rotation, name=name,
+            mesh.comm, density=density if is_number(density) else None, velocity=velocity,
+            angular_velocity=angular_velocity, force=force, torque=torque, motion=motion,
+            rotation=rotation, name=name,
         )  # fmt: skip
-        require_positive("density", density, "kg/m^3")
+        require_positive_parameter("density", density, "kg/m^3")
         self.mesh, self.density, self.degree = mesh, density, 1
         self.space = compat.vector_space(mesh, 1)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
@@ -231,7 +233,6 @@ class RigidBody(Body):
         masses = np.array([mass, *(euler / self.length**2)])
         self.reference: FloatArray = y.ravel()[: self.num_owned]
         self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
-        self._held_at = y[1:]
         self._lent = np.zeros(self.num_owned)
         if np.count_nonzero(euler) < 2:
             self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * mass
@@ -454,8 +455,8 @@ class RigidBody(Body):
         f = self.weight(gravity).reshape(-1, 3)
         if self.num_owned:
             f[0] += self._load
-            self._held_at = directors = self._directors(u1)
             if self._couple.any():
+                directors = self._directors(u1)
                 f[1:] = cross(np.tile(self._turning(directors), (3, 1)), directors)
         return f.ravel()
 
@@ -506,7 +507,7 @@ class RigidBody(Body):
         self._matrix.assemble()
         return self._matrix
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """None [N/m]."""
         return np.zeros(self.num_owned)
 
@@ -514,7 +515,7 @@ class RigidBody(Body):
         """None [J]: loads do external work."""
         return 0.0
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Return what prescribed motion needs on this rank: force [N], then moment [N m].
 
         Shape (2, 3), (1, 3) if only one of them is prescribed, (0, 3) if none is.
@@ -522,7 +523,8 @@ class RigidBody(Body):
         rows = np.zeros((2, 3))
         if self.num_owned:
             forces = residual.reshape(4, 3)
-            rows[0], rows[1] = forces[0], cross(self._held_at, forces[1:]).sum(axis=0)
+            rows[0] = forces[0]
+            rows[1] = cross(self._directors(u1), forces[1:]).sum(axis=0)
         return rows[[self._motion is not None, self._turn is not None]]
 
     @property

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import numbers
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.elements import Step
 from dolfinx_nts.validation import known_options
-
-if TYPE_CHECKING:
-    from dolfinx_nts.elements import Step
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -169,6 +167,11 @@ class ContactPair:
     # ---- what a kind of master has of its own
     def _set_up(self) -> None:
         """Check the master and prepare the search."""
+
+    @property
+    def driven(self) -> bool:
+        """Whether its master moves as prescribed by a function of time, apart from bodies."""
+        return False
 
     @property
     def bodies(self) -> tuple[Any, ...]:

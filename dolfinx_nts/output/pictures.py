@@ -38,7 +38,7 @@ def picture(
         bodies: Continua and rigid bodies, in the state of `body.u`, `body.v`; beams and shells, of
             which the skin is drawn.
         path: Picture file; its ending chooses the format.
-        colour: "speed" |v| [m/s] or "stress" (von Mises of the Cauchy stress) [Pa].
+        colour: "speed" [m/s] or "stress" (von Mises of the Cauchy stress) [Pa].
         title: Text above the picture.
         labels: Whether to write the bodies' names beside them.
         view: Elevation above the x-y plane and azimuth from the x axis, of the viewer [degrees].

@@ -28,6 +28,7 @@ from dolfinx_nts.run.start import (
 from dolfinx_nts.run.step_size import Pace
 from dolfinx_nts.run.step_warnings import tell_step
 from dolfinx_nts.run.table import Table
+from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, consistent, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
@@ -38,7 +39,7 @@ from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.resting import with_resting_forces
 from dolfinx_nts.step.unresolved import tell_unresolved
-from dolfinx_nts.system import State, System, is_like
+from dolfinx_nts.system import System, is_like
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -158,7 +159,7 @@ class Stepper:
             raise ValueError(f"restitution={restitution!r}: must lie between 0 and 1")
         if impact == "published" and restitution != 1.0:
             raise ValueError(f"restitution={restitution!r}: pass impact='restored', too")
-        if impact != "published" and integrator.accelerations:
+        if impact != "published" and not integrator.keeps_energy:
             raise ValueError(
                 f"impact={impact!r}: {integrator!r} keeps no energy in contact that could be given "
                 "back; choose EnergyMomentum() or Midpoint()"
@@ -173,6 +174,8 @@ class Stepper:
             raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
         self._before_step = before_step
         self.newton = newton or Newton()
+        self._materials, self._material_change = MaterialWatch(system), 0.0
+        self._restated: dict[str, Any] | None = None
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
             system,
@@ -207,7 +210,6 @@ class Stepper:
         if self.restart is None:
             self.solution.rows = Table([self._first_row()])
         self._promises = Promises(self.solution, integrator, self.newton.rtol)
-        self._materials, self._material_change = MaterialWatch(system), 0.0
         self._last_step: tuple[float, float] | None = None
 
     @property
@@ -475,20 +477,21 @@ class Stepper:
             call_together(self.system.comm, name, self._before_step, time, dt)
 
     def _note_materials(self) -> None:
-        """Name in the ledger what changed parameters of materials do to the stored energy."""
+        """Name in the ledger what changed parameters of materials do to the energy."""
         names = self._materials.changed()
         if names:
             self.problem.forget_forces()
         if not names or not self._keeps_ledger:
             return
         self._measured.clear()
-        stored = balance.measure(self.system, self.state, self._measured)["potential"]
-        change = stored - self.solution.rows[-1]["potential"] - self._material_change
+        self._restated = balance.measure(self.system, self.state, self._measured)
+        now = self._restated["kinetic"] + self._restated["potential"]
+        change = now - self.solution.rows[-1]["energy"] - self._material_change
         self._material_change += change
         self.solution.warn(
             "material changed", self.state.time, abs(change),
             f"a changed parameter of the material of {', '.join(map(repr, names))} adds "
-            f"{change:.3g} J to the stored energy without work; see material_change in the balance",
+            f"{change:.3g} J to its energy without work; see material_change in the balance",
         )  # fmt: skip
 
     def _attempt(self, dt: float, time: float) -> Trial:
@@ -501,7 +504,7 @@ class Stepper:
         state = self._accepted(step, dt, time)
         impact = None
         if self._keeps_ledger:
-            before: Mapping[str, Any] = self.solution.rows[-1]
+            before: Mapping[str, Any] = self._restated or self.solution.rows[-1]
             measured: dict[str, Any] = balance.measure(self.system, state, self._measured)
         else:
             before, measured = (balance.momenta(self.system, s) for s in (self.state, state))
@@ -544,6 +547,7 @@ class Stepper:
             terms = balance.step_terms(self.problem, step) | known
             terms["impact_restored"] = 0.0 if impact is None else impact.energy
             terms["material_change"], self._material_change = self._material_change, 0.0
+            self._restated = None
             row = balance.next_row(rows[0], rows[-1], trial.measured, terms)
         else:
             row = balance.unknown_row(self.system) | known
@@ -576,8 +580,10 @@ class Stepper:
                 # What has no momentum has no velocity of its own either.
                 massless = self.system.bodies[k].massless
                 v[k][massless] = step.bodies[k].du[massless] / dt
-        histories = [coupling.history(parts) for coupling, parts in self.problem.each(step)]
-        return State(time, tuple(u), tuple(v), tuple(a), tuple(histories))
+        contacts, *joints = (
+            coupling.history(parts) for coupling, parts in self.problem.each(step)
+        )
+        return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))
 
     def mean_force(self, k: int) -> FloatArray:
         """Contact force p_N of the last two steps in the mean over their time [N].

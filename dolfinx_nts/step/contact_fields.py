@@ -13,7 +13,8 @@ from mpi4py import MPI
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.evaluation import Evaluation
-from dolfinx_nts.system import State, System
+from dolfinx_nts.state import State
+from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
     from dolfinx_nts.step.problem import StepProblem
