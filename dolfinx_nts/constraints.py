@@ -10,21 +10,20 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.elements import EveryStep, PointElements, Step
+from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kinematics import OFF, Kinematics
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.point_elements import EveryStep, PointElements
+from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError
-
-if TYPE_CHECKING:
-    from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -220,6 +219,10 @@ class Constraints(EveryStep):
         self._driven, self._force = driven, np.zeros_like(equations.value)
         self._upright = upright
 
+    def hold_alone(self) -> None:
+        """They repeat no others: nothing is lent to them, which light bodies would feel."""
+        self._lent = 0.0
+
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
         self._factor = step.factor
         # A guess alone: a run may go on from one whose joint of this name had other equations.
@@ -258,9 +261,10 @@ class Constraints(EveryStep):
         Raises:
             StepFailedError: Directions have turned over.
         """
-        if self._upright is None or self._begun is None:
+        step = self.step
+        if self._upright is None or step is None:
             return False
-        (part,), (step, _) = parts, self._begun
+        (part,) = parts
         along = self._upright(part.end, (step.state.time, step.state.time + step.dt))
         raise_together(
             self._sides[0].body.comm,

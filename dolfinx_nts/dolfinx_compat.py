@@ -203,6 +203,14 @@ def scalar_space(msh: Any, family: str, degree: int) -> Any:
     return fem.functionspace(msh, (family, degree))
 
 
+def cell_vector_space(msh: Any, family: str, degree: int) -> Any:
+    """Space of 3-vectors of the family ("DG")."""
+    if _OLD:
+        with _quiet_compiler():
+            return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
+    return fem.functionspace(msh, (family, degree, (3,)))
+
+
 def tensor_space(msh: Any, family: str, degree: int) -> Any:
     """Space of 3 x 3 tensors of the family ("Lagrange" or "DG")."""
     if _OLD:

@@ -22,7 +22,16 @@ StrPath = str | os.PathLike[str]
 
 
 class StepFailedError(RuntimeError):
-    """A step was not solved; the message names the worst block, nodes and facets."""
+    """A step was not solved; the message names the worst block, nodes and facets.
+
+    Args:
+        message: What failed.
+        advises: Whether it says what to do, too.
+    """
+
+    def __init__(self, message: str, *, advises: bool = False) -> None:
+        super().__init__(message)
+        self.advises = advises
 
 
 class UserFunctionError(StepFailedError, ValueError):

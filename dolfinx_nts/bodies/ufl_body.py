@@ -21,9 +21,10 @@ from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
 from dolfinx_nts.bodies.points import Points, in_mesh
-from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
+from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import gather_on_root, raise_together
 from dolfinx_nts.validation import (
     UserFunctionError,
@@ -162,7 +163,7 @@ class UflBody(Body):
                 "pass degree=1, on a finer mesh for the same accuracy"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
-        surface = Surface(self, found, smoothing)
+        surface = Surface(self, skin_of_mesh(self, found), smoothing)
         if mass == "redistributed":
             self._make_massless(surface)
         return surface
@@ -387,7 +388,7 @@ class UflBody(Body):
     # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n."""
-        self._rule, self._forms = rule, self._compile(rule)
+        self._forms = self._compile(rule)
         self._fill(self._u0, moment.u0)
         if self._extra_form is not None:
             self._rate.value, self._time.value = moment.rate, moment.time
@@ -421,7 +422,7 @@ class UflBody(Body):
         self.check_alive()
         diagonal = mass * self._mean(self.nodal_mass)
         if not mass:
-            diagonal = stiffness * self._mean(self.nodal_stiffness(self._rule))
+            diagonal = stiffness * self._mean(self.nodal_stiffness())
         self._fill(self._u1, u1)
         self._factors.value = mass, stiffness
         compat.assemble_matrix(self._matrix, self._forms[1], self._supports.masks, diagonal)
@@ -447,10 +448,11 @@ class UflBody(Body):
         total = self.comm.allreduce(np.array([values.sum(), self.num_owned]))
         return float(total[0] / total[1])
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
-        """Mean diagonal of a rule's tangent at each node of the undeformed body [N/m]."""
+    def nodal_stiffness(self) -> FloatArray:
+        """Mean diagonal of the tangent in equilibrium at each node, without deformation [N/m]."""
         self.check_alive()
         if self._stiffness is None:
+            rule: Any = Static()
             tangent = self._compile(rule)[1]
             kept = [f.x.array.copy() for f in (self._u0, self._u1)]
             for u in (self._u0, self._u1):
@@ -465,7 +467,7 @@ class UflBody(Body):
                 u.x.array[:] = values
         return self._stiffness
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the coordinates of each `Dirichlet` condition, this rank's part [N]."""
         return self._supports.reactions(residual)
 

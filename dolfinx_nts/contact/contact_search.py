@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import no_pull
+from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation

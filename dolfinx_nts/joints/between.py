@@ -232,12 +232,17 @@ class Between(ABC):
         return np.arange(self._here)
 
     @property
+    def driven(self) -> bool:
+        """Whether a function of time prescribes its motion."""
+        return self.motion is not None
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What a restart compares; of a motion only whether there is one."""
         return {
             "bodies": ["ground" if body is None else body.name for body in self.ends],
             "points": [place.tolist() for place in self._places],
-            "driven": self.motion is not None,
+            "driven": self.driven,
         }
 
     def start(self) -> None:

@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
-from dolfinx_nts.elements import EveryStep, PointElements, Step
-from dolfinx_nts.integrators.rule import taken_at
+from dolfinx_nts.elements import Slopes, Step
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
+from dolfinx_nts.point_elements import EveryStep, PointElements
 from dolfinx_nts.validation import StepFailedError, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]
@@ -145,7 +145,7 @@ class SpringElements(PointElements):
 
     def evaluate(self, x: FloatArray, own: Any) -> SpringPart:
         """Residual and tangent."""
-        way, theta, n = self.way, taken_at(self.step.integrator), len(x)
+        way, theta, n = self.way, self.step.integrator.taken_at, len(x)
         rate = self.step.moments[0].rate
         du = x - self.y0
         first, last = (self.y0, x) if theta is None else (self.y0 + theta * du,) * 2
@@ -235,18 +235,12 @@ class Between:
         y = self._way.reference() + self._way.nodal(u)
         return y, self._way.coordinate.value(self._way.vectors(y), history)
 
-    def slopes(
-        self, u: Sequence[FloatArray], history: FloatArray
-    ) -> tuple[list[FloatArray], float, float]:
+    def slopes(self, u: Sequence[FloatArray], history: FloatArray) -> Slopes:
         """Gradient of the coordinate, and derivatives of the force. Collective.
 
         Args:
             u: Owned displacements of each of its bodies [m].
             history: The coordinate there.
-
-        Returns:
-            By the owned coordinates of each body; by the coordinate [N/m] or [N m], and by its rate
-            [N s/m] or [N m s], the same on all ranks.
         """
         y, at = self._at(u, history)
         p = self._way.vectors(y)
@@ -257,7 +251,7 @@ class Between:
             here = slice(first, first := first + side.nodes.shape[1])
             gradients.append(side.gathered(along[:, here]))
         stiffness, damping = self.comm.allreduce(np.array(self._force.slopes(at))).tolist()
-        return gradients, stiffness, damping
+        return Slopes(gradients, stiffness, damping, self._way.coordinate is kernel.Angle)
 
     def coupling(self, bodies: tuple[int, ...]) -> EveryStep:
         """What makes its elements in a run, and remembers the coordinate."""

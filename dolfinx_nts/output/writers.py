@@ -166,7 +166,9 @@ class _Series:
         for label, k in self.contacts.items():
             slave, mean = system.contacts[k].slave, stepper.mean_force(k)
             for name, values in (("force", mean), ("pressure", mean / slave.area[slave.share])):
-                found[f"contact_{name}_mean_{label}"] = contact_fields.spread(slave, 0.0, values)
+                found[f"contact_{name}_mean_{label}"] = contact_fields.spread(
+                    slave, 0.0, values, values
+                )
         return fields | {name: self._nodal(values) for name, values in found.items()}
 
     def own(self) -> dict[str, tuple[bool, FloatArray]]:

@@ -18,12 +18,13 @@ from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.run.writer import Writer
+from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
 from dolfinx_nts.step.convergence import unrest
 from dolfinx_nts.step.free_motion import free_motion
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -183,7 +184,7 @@ class _LoadStepper(Stepper):
             new: At its end.
             told: What the ledgers of each joint's elements say, shape (joints,).
         """
-        histories, works = zip(old.histories[1:], new.histories[1:], strict=True), []
+        histories, works = zip(old.joints, new.joints, strict=True), []
         for joint, both, ledger in zip(
             self.problem.joints, histories, told.tolist(), strict=True
         ):
@@ -237,7 +238,7 @@ class _LoadStepper(Stepper):
                             slipped, state.contacts, reached.contacts, strict=True
                         )
                     )
-                    reached = replace(reached, histories=(contacts, *reached.histories[1:]))
+                    reached = replace(reached, contacts=contacts)
                     self._check_missed(reached)
                 except UserFunctionError:
                     raise

@@ -16,7 +16,8 @@ from petsc4py import PETSc
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.parallel import write_on_root
 from dolfinx_nts.run.record import Record, unpacked
-from dolfinx_nts.system import State, System
+from dolfinx_nts.state import State
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import StrPath, as_path
 
 

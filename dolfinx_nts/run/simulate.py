@@ -184,7 +184,7 @@ def simulate(
     begin = stepper.state.time
     if not t_end > begin:
         raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
-    remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
+    remedy = "Try a smaller dt"
     end, dt = float(t_end), float(dt)
     stepper.solution.settings |= {"dt": dt, "t_end": end, "adapt": adapt and repr(adapt)}
     if adapt is not None:
@@ -245,7 +245,7 @@ def run(
         steps: Length and end of each [s], one after another; with `adapt` the largest and the end.
         output: Writers.
         progress: Show a progress line on rank 0.
-        remedy: What to do if a step fails, for `status`.
+        remedy: What to do if a step fails and says nothing better, for `status`.
         adapt: How to choose the steps between, each of which is written.
         checkpoint: Where and how often to write what `restart` needs.
     """
@@ -278,9 +278,11 @@ def _run(
             else:
                 _stop(stepper, _interrupted(stepper, signal, checkpoint))
         except UserFunctionError as failure:
+            _last_look(stepper)
             _stop(stepper, str(failure), failure.__cause__)
         except StepFailedError as failure:
-            _stop(stepper, f"{failure}. {remedy}")
+            _last_look(stepper)
+            _stop(stepper, str(failure) if failure.advises else f"{failure}. {remedy}")
         except BaseException:
             # Where one rank alone comes here, no other answers.
             _call(stepper, started, "close")
@@ -293,6 +295,15 @@ def _run(
     finally:
         stepper.close()
     return solution
+
+
+def _last_look(stepper: Stepper) -> None:
+    """Warn if bodies are inside each other where a run stops, which may be why. Collective."""
+    try:
+        stepper.look(last=True)
+    except UserFunctionError:
+        # An obstacle whose motion raises again, as the status says.
+        logger.debug("no last look for overlaps", exc_info=True)
 
 
 def _march(

@@ -13,9 +13,10 @@ from dolfinx_nts.run.run_warnings import RunWarnings
 from dolfinx_nts.run.saved import save
 from dolfinx_nts.run.step_size import PaceMemory
 from dolfinx_nts.run.table import Table
+from dolfinx_nts.state import State
 from dolfinx_nts.step import contact_fields
 from dolfinx_nts.step.contact_fields import ContactLoads
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import StrPath, as_path
 
 

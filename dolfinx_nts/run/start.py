@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Restart, Solution
+from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import is_finite
 
 FloatArray = npt.NDArray[np.float64]
@@ -64,13 +65,13 @@ def refuse_moved(system: System) -> None:
     The energy that an impact with it leaves depends on its motion.
     """
     for pair in system.contacts:
-        if getattr(pair.master, "motion", None) is not None:
+        if pair.driven:
             raise ValueError(
                 f"impact='restored': obstacle {pair.master.name!r} moves; use impact='published', "
                 "or let a heavy rigid body take its place"
             )
     for joint in system.joints:
-        if getattr(joint, "motion", None) is not None:
+        if getattr(joint, "driven", False):
             raise ValueError(
                 f"impact='restored': joint {joint.name!r} is driven; use impact='published'"
             )
@@ -150,6 +151,7 @@ def consistent_start(
     if found is not None:
         raise ValueError(
             f"project_start=True: no velocities fit joint {found[1]!r}, which stays violated "
-            f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it"
+            f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it: leave "
+            "one of them out"
         )
     return state

@@ -17,8 +17,9 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.state import State
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import known_options
 
 FloatArray = npt.NDArray[np.float64]

@@ -8,8 +8,9 @@ from dolfinx_nts.bodies.inversion import describe, smallest_dets
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
+from dolfinx_nts.state import State
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 
 #: Smallest det F below which cells count as crushed.
 _CRUSHED = 0.05

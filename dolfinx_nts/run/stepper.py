@@ -28,6 +28,7 @@ from dolfinx_nts.run.start import (
 from dolfinx_nts.run.step_size import Pace
 from dolfinx_nts.run.step_warnings import tell_step
 from dolfinx_nts.run.table import Table
+from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, consistent, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
@@ -38,7 +39,7 @@ from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.resting import with_resting_forces
 from dolfinx_nts.step.unresolved import tell_unresolved
-from dolfinx_nts.system import State, System, is_like
+from dolfinx_nts.system import System, is_like
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -158,7 +159,7 @@ class Stepper:
             raise ValueError(f"restitution={restitution!r}: must lie between 0 and 1")
         if impact == "published" and restitution != 1.0:
             raise ValueError(f"restitution={restitution!r}: pass impact='restored', too")
-        if impact != "published" and integrator.accelerations:
+        if impact != "published" and not integrator.keeps_energy:
             raise ValueError(
                 f"impact={impact!r}: {integrator!r} keeps no energy in contact that could be given "
                 "back; choose EnergyMomentum() or Midpoint()"
@@ -579,8 +580,10 @@ class Stepper:
                 # What has no momentum has no velocity of its own either.
                 massless = self.system.bodies[k].massless
                 v[k][massless] = step.bodies[k].du[massless] / dt
-        histories = [coupling.history(parts) for coupling, parts in self.problem.each(step)]
-        return State(time, tuple(u), tuple(v), tuple(a), tuple(histories))
+        contacts, *joints = (
+            coupling.history(parts) for coupling, parts in self.problem.each(step)
+        )
+        return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))
 
     def mean_force(self, k: int) -> FloatArray:
         """Contact force p_N of the last two steps in the mean over their time [N].

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import State
 from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
-from dolfinx_nts.system import State
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -23,10 +23,10 @@ from mpi4py import MPI
 from dolfinx_nts.constraints import SHIFT
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.state import State
 from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
-from dolfinx_nts.system import State
 from dolfinx_nts.validation import StepFailedError
 
 FloatArray = npt.NDArray[np.float64]
