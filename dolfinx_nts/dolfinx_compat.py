@@ -206,7 +206,7 @@ def scalar_space(msh: Any, family: str, degree: int) -> Any:
 def cell_vector_space(msh: Any, family: str, degree: int) -> Any:
     """Space of 3-vectors of the family ("DG")."""
     if _OLD:
-        with _quiet_compiler():
+        with _told_compiler("an element"):
             return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
     return fem.functionspace(msh, (family, degree, (3,)))
 
