@@ -114,7 +114,7 @@ class StepProblem:
                 continue
             rigid = all(body.rigid for body in joint.bodies)
             found.append((getattr(coupling, "hold_alone", None) if rigid else None, bodies))
-        moved = system.comm.allreduce(np.array([b.fixed.any() for b in system.bodies]), op=MPI.LOR)
+        moved = system.comm.allreduce(np.array([b.fixed.sum() for b in system.bodies]))
         free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
         alone = hanging([bodies for _, bodies in found], free)
         for (hold_alone, _), hangs in zip(found, alone, strict=True):
