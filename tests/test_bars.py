@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from bars import bars
 from mpi4py import MPI
-from test_massless import bars
 
 LENGTH, WAVE, YOUNG, DENSITY, SPEED = 10.0, 30.0, 9e5, 1e3, 1e-2
 
