@@ -4,14 +4,15 @@
 SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 DEMO ?= two_blocks
-export PYTEST_ARGS
+export PYTEST_ARGS RUNS
 
 help:
+	@echo 'make setup          what the others do first: packages of Debian, .venv'
 	@echo 'make test           lint, the fast tests in serial, some cases of the parallel ones on 2 ranks'
 	@echo 'make test-all       what make test leaves out: the tests marked slow, likewise'
 	@echo '                    (.venv/bin/python -m pytest runs both in serial; -m "not slow" the fast)'
 	@echo 'make demo           demos/$(DEMO).py on 2 ranks, output in out/$(DEMO) (DEMO=name for another)'
-	@echo 'make docs           the site, in docs/_build/html; a warning is an error'
+	@echo 'make docs           the site, in docs/_build/html; a warning is an error (RUNS=no: no pictures)'
 	@echo 'make dist           sdist and wheel in dist/, checked by twine'
 	@echo 'make lint           ruff and mypy'
 	@echo 'make test-debian13  the fast tests on Debian 13 in a chroot (made once, some minutes)'

@@ -85,7 +85,7 @@ class Block(nts.Body):
         """Displacements of the base [m]."""
         return np.zeros(len(self.fixed))
 
-    def nodal_stiffness(self, rule):
+    def nodal_stiffness(self):
         """Scale of the contact forces [N/m]."""
         return np.full(self.num_owned, MU)
 

@@ -101,7 +101,7 @@ def main(*, comm=MPI.COMM_WORLD, output=None, steps=STEPS, integrators=tuple(INT
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", default="out/stability_demo", help="pictures and fields")
-    for name, number in STEPS.items():
-        parser.add_argument(f"--{name}", type=int, default=number, help="steps")
+    parser.add_argument("--bouncing", type=int, default=STEPS["bouncing"], help="steps")
+    parser.add_argument("--rubbing", type=int, default=STEPS["rubbing"], help="steps")
     options = vars(parser.parse_args())
     main(progress=True, output=options.pop("output"), steps=options)

@@ -3,6 +3,8 @@
 from importlib.metadata import version as installed
 from typing import Any
 
+from sphinx.util import inspect
+
 project = "dolfinx_nts"
 author = copyright = "The dolfinx_nts authors"
 version = release = installed("dolfinx_nts")
@@ -39,7 +41,20 @@ def leave_out(app: Any, what: str, name: str, obj: Any, skip: bool, options: Any
     return True if type(obj).__name__ == "_tuplegetter" else None
 
 
+def arguments(
+    app: Any, what: str, name: str, obj: Any, options: Any, given: str | None, returned: Any
+) -> tuple[str, None] | None:
+    """Show the arguments of __init__ where __new__ takes any, and none of protocols."""
+    if what != "class" or "**" not in (given or ""):
+        return None
+    if getattr(obj, "_is_protocol", False):
+        return "", None
+    taken = inspect.signature(obj.__init__, bound_method=True)
+    return inspect.stringify_signature(taken, show_annotation=False), None
+
+
 def setup(app: Any) -> None:
     """Connect `leave_out`, and `show_code` before napoleon, which reads the sections."""
+    app.connect("autodoc-process-signature", arguments)
     app.connect("autodoc-skip-member", leave_out)
     app.connect("autodoc-process-docstring", show_code, priority=400)

@@ -2,7 +2,8 @@
 
 `python docs/pages.py` (a part of `make docs`) runs every whole script of the pages and the demos,
 short, keeps what they write in docs/made/runs, and writes a page for each demo and for each folder
-of the package to docs/made. Runs whose sources have not changed are kept.
+of the package to docs/made. Runs whose sources have not changed are kept. With `--no-runs` it only
+writes pages, without the pictures that are not there.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ SHORT: dict[str, str] = {
     "flying_l_block": "--t-end 40",
     "heavy_top": "--steps 4e-3 2e-3",
     "hertz": "--problems cylinders",
-    "ironing": "--block 32 4 --die 8 4 --end 1.3",
+    "ironing": "--block 24 3 --die 6 2 --steps 10 50 --end 1.5",
     "newtons_cradle": "--kinds 'rigid, touching' 'flexible, touching'",
     "partial_slip": "--scales 1 --refinement 0.5",
     "rolling": "--facets 32",
@@ -97,22 +98,31 @@ def blocks() -> Iterator[Block]:
 
 
 # ---- runs
+def source(demo: Path) -> str:
+    """The text of a demo, and of other demos and meshes that it imports."""
+    text = demo.read_text()
+    for other in re.findall(r"^from (\w+) import", text, re.MULTILINE):
+        places = (ROOT / folder / f"{other}.py" for folder in ("demos", "meshes"))
+        text += "".join(path.read_text() for path in places if path.exists())
+    return text
+
+
 def fingerprint(*more: str) -> str:
-    """Of the package, the demos and what else a run depends on."""
-    sources = [*(ROOT / "dolfinx_nts").rglob("*.[pch]*"), *(ROOT / "demos").glob("*.py")]
+    """Of the package and of what else a run depends on."""
     summed = hashlib.sha256("\n".join(more).encode())
-    for path in sorted(p for p in sources if p.suffix != ".pyc" and p.is_file()):
-        summed.update(path.read_bytes())
+    for path in sorted((ROOT / "dolfinx_nts").rglob("*.*")):
+        if path.suffix in {".py", ".c", ".h"}:
+            summed.update(path.read_bytes())
     return summed.hexdigest()
 
 
-def run(command: list[str], folder: Path, code: str = "") -> None:
+def run(command: list[str], folder: Path, code: str) -> None:
     """Run a command in a folder unless it has been run there with the same sources.
 
     Args:
         command: What to run; what it prints is in the folder, too.
         folder: Where; made if it is missing.
-        code: What the command runs, if that is not a demo.
+        code: What the command runs.
     """
     folder.mkdir(parents=True, exist_ok=True)
     wanted = fingerprint(*command, code)
@@ -139,6 +149,18 @@ def run_block(block: Block, folder: Path) -> None:
     if not script.exists() or script.read_text() != block.code:
         script.write_text(block.code)
     run([sys.executable, script.name], folder, block.code)
+
+
+def demos() -> list[Path]:
+    """All demos."""
+    return sorted((ROOT / "demos").glob("*.py"))
+
+
+def run_demo(demo: Path) -> None:
+    """Run a demo, short; what it writes is in the folder of its name."""
+    options = shlex.split(SHORT.get(demo.stem, ""))
+    command = [sys.executable, str(demo), "--output", ".", *options]
+    run(command, MADE / "runs" / demo.stem, source(demo))
 
 
 def run_page(page: Path, scripts: list[Block]) -> None:
@@ -196,29 +218,27 @@ def api_page(title: str, names: list[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    """Run what has changed, on two cores, and write the pages that are made."""
-    MADE.mkdir(exist_ok=True)
-    for name, text in reference().items():
-        write(MADE / name, text)
+def run_all() -> None:
+    """Run what has changed of demos and scripts, on two cores."""
     scripts: dict[Path, list[Block]] = {}
     for block in blocks():
         if block.whole:
             scripts.setdefault(block.page, []).append(block)
-    demos = sorted((ROOT / "demos").glob("*.py"))
     with ThreadPoolExecutor(2) as pool:
-        jobs = [
-            pool.submit(
-                run,
-                [sys.executable, str(d), "--output", ".", *shlex.split(SHORT.get(d.stem, ""))],
-                MADE / "runs" / d.stem,
-            )
-            for d in demos
-        ]
+        jobs = [pool.submit(run_demo, demo) for demo in demos()]
         jobs += [pool.submit(run_page, page, some) for page, some in scripts.items()]
         for job in jobs:
             job.result()
-    for demo in demos:
+
+
+def main() -> None:
+    """Run what has changed unless told not to, and write the pages that are made."""
+    MADE.mkdir(exist_ok=True)
+    if "--no-runs" not in sys.argv[1:]:
+        run_all()
+    for name, text in reference().items():
+        write(MADE / name, text)
+    for demo in demos():
         write(MADE / f"demo_{demo.stem}.md", demo_page(demo))
 
 

@@ -9,6 +9,7 @@ from dolfinx_nts.bodies.continuum import Continuum
 from dolfinx_nts.bodies.form_body import FormBody
 from dolfinx_nts.bodies.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.bodies.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
 from dolfinx_nts.bodies.points import Points
@@ -19,7 +20,7 @@ from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
-from dolfinx_nts.contact.obstacles import Cylinder, Plane, Sphere
+from dolfinx_nts.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.elements import (
@@ -107,6 +108,7 @@ __all__ = [
     "NeoHookean",
     "Newmark",
     "Newton",
+    "Obstacle",
     "ObstaclePair",
     "Planar",
     "Plane",
@@ -146,7 +148,9 @@ __all__ = [
     "bodies_from_tags",
     "cauchy_stress",
     "equilibrium",
+    "extrude",
     "intercept",
+    "linear",
     "load",
     "motion_of",
     "restart",

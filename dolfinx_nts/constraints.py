@@ -219,6 +219,10 @@ class Constraints(EveryStep):
         self._driven, self._force = driven, np.zeros_like(equations.value)
         self._upright = upright
 
+    def hold_alone(self) -> None:
+        """They repeat no others: nothing is lent to them, which light bodies would feel."""
+        self._lent = 0.0
+
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
         self._factor = step.factor
         # A guess alone: a run may go on from one whose joint of this name had other equations.
@@ -257,9 +261,10 @@ class Constraints(EveryStep):
         Raises:
             StepFailedError: Directions have turned over.
         """
-        if self._upright is None or self._begun is None:
+        step = self.step
+        if self._upright is None or step is None:
             return False
-        (part,), (step, _) = parts, self._begun
+        (part,) = parts
         along = self._upright(part.end, (step.state.time, step.state.time + step.dt))
         raise_together(
             self._sides[0].body.comm,

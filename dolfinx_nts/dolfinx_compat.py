@@ -183,12 +183,32 @@ def lagrange_degree(space: Any) -> int | None:
     return int(degree) if vectors and known else None
 
 
+def is_nodal(space: Any, msh: Any) -> bool:
+    """Return whether a space is of Lagrange elements with one block at each corner of a cell."""
+    element = space.ufl_element()
+    if _OLD:
+        scalar = (*element.sub_elements(), element)[0]
+        broken = scalar.family() not in ("Lagrange", "Q")
+    else:
+        broken = element.discontinuous
+    same = cell_dofs(space).shape[1] == geometry_dofmap(msh).shape[1]
+    return same and not broken
+
+
 def scalar_space(msh: Any, family: str, degree: int) -> Any:
     """Scalar space of the family ("Lagrange" or "DG")."""
     if _OLD:
         with _told_compiler("an element"):
             return fem.FunctionSpace(msh, (family, degree))
     return fem.functionspace(msh, (family, degree))
+
+
+def cell_vector_space(msh: Any, family: str, degree: int) -> Any:
+    """Space of 3-vectors of the family ("DG")."""
+    if _OLD:
+        with _told_compiler("an element"):
+            return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
+    return fem.functionspace(msh, (family, degree, (3,)))
 
 
 def tensor_space(msh: Any, family: str, degree: int) -> Any:

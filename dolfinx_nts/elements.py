@@ -82,7 +82,8 @@ class Step:
         massless = surface.massless
         if self.integrator.inertia and not massless.any():
             return surface.mass
-        stiff = self.factor * surface.material.divided(self.stiffness(surface.body))
+        change = self.factor * self.integrator.theta
+        stiff = change * surface.material.divided(self.stiffness(surface.body))
         return np.where(massless, stiff, surface.mass) if self.integrator.inertia else stiff
 
 
@@ -392,7 +393,11 @@ class Coupling(Protocol):
 
 
 class JointCoupling(Coupling, Protocol):
-    """What a `Joint` makes: a `Coupling` that also says what its forces do."""
+    """What a `Joint` makes: a `Coupling` that also says what its forces do.
+
+    It may have `hold_alone()`, which a run calls at its start where its constraints repeat no
+    others, so that its equations need no compliance.
+    """
 
     def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
         """External work in a load step of `equilibrium` on this rank [J]. Collective.

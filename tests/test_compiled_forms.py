@@ -101,14 +101,16 @@ def test_a_canonical_form_is_the_form():
     mesh = create_box(COMM, [np.zeros(3), np.ones(3)], [2, 1, 1], CellType.tetrahedron)
     u = fem.Function(compat.vector_space(mesh, 1))
     u.interpolate(lambda x: np.stack([x[0] * x[1], x[1] + 2 * x[2], x[0] ** 2]))
-    c = [fem.Constant(mesh, value) for value in (0.3, np.array([1.0, 2.0, -1.0]))]
     i, j = ufl.indices(2)
     v = ufl.variable(ufl.grad(u))
+    count_up(mesh, 1)
+    c = [fem.Constant(mesh, value) for value in (0.3, np.array([1.0, 2.0, -1.0]))]
     form = (c[0] * ufl.tr(ufl.diff(v[i, j] * v[i, j], v)) + ufl.inner(c[1], u)) * ufl.dx
     made = canonical(form)
     terminals = [*made.coefficients(), *made.constants()]
-    assert [t.count() for t in terminals] == [0, 0, 1]
+    assert [t.count() for t in terminals] == [0, 100, 101]
     assert not {id(t) for t in terminals} & {id(t) for t in (u, *c)}
+    assert canonical(made) is made
     values = [fem.assemble_scalar(fem.form(f)) for f in (form, made)]
     assert values[0] == values[1]
     c[0].value = 0.6

@@ -74,13 +74,15 @@ def test_commands_exist(page):
 
 def check_options(script, command):
     """Options of a demo or benchmark are in its text, or in that of a demo that it imports."""
-    text = script.read_text()
-    for other in re.findall(r"^from (\w+) import", text, re.MULTILINE):
-        path = script.with_name(f"{other}.py")
-        text += path.read_text() if path.exists() else ""
+    text = pages.source(script)
     of_script = command.split(script.name, 1)[1] if "tradeoff" not in command else ""
     for option in re.findall(r"(?<!\S)--[a-z-]+", of_script):
         assert f'"{option}"' in text, f"{option} of {script.name}"
+
+
+@pytest.mark.parametrize("demo", pages.SHORT)
+def test_short_runs_have_options_of_their_demos(demo):
+    check_options(ROOT / "demos" / f"{demo}.py", f"{demo}.py {pages.SHORT[demo]}")
 
 
 @functools.cache

@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from shells import grid, plate, plate_nodes, surface_mesh
 
 import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.kernels import quadratic_energy as kernel
 from dolfinx_nts.kernels import shell as shell_kernel
+from dolfinx_nts.output.pictures import picture
 
 EM, MID = nts.EnergyMomentum(), nts.Midpoint()
 RUBBER = {"young": 1e5, "poisson": 0.3, "thickness": 0.05, "density": 10.0}
@@ -507,3 +509,62 @@ def test_components_of_clamps():
     section = nts.Circle(0.1).section(young=1.0, poisson=0.0, density=1.0)
     with pytest.raises(ValueError, match="three directors of a beam are held as a whole"):
         nts.Beam(mesh, section, bcs=[nts.Clamp(at(0, 0.0), components=(0,))])
+
+
+# ---- results
+@pytest.mark.mpi
+def test_stress_resultants_of_a_beam_and_of_a_shell():
+    """Of cantilevers with a small force at the end: constant shear, a moment that grows."""
+    clamp, load = nts.Clamp(at(0, 0.0)), (0, 0, 1e-4)
+    line = np.column_stack([np.linspace(0, 1, 9), np.zeros(9), np.zeros(9)])
+    mesh = surface_mesh(line, np.column_stack([np.arange(8), np.arange(1, 9)]), kind="interval")
+    section = nts.Rectangle(1.0, 0.1).section(young=1e6, poisson=0.0, density=1.0)
+    beam = nts.Beam(mesh, section, bcs=[clamp], direction=(0, 1, 0),
+                    forces=[nts.PointForce(at(0, 1.0), load)])  # fmt: skip
+    plate_ = nts.Shell(plate(8, 1, 1.0, 1.0), young=1e6, poisson=0.0, thickness=0.1, density=1.0,
+                       bcs=[clamp], forces=[nts.LineForce(load, where=at(0, 1.0))])  # fmt: skip
+    nts.equilibrium(nts.System([beam, plate_]))
+    for body, shape in ((beam, (3,)), (plate_, (3, 3))):
+        found = body.resultants()
+        own = body.mesh.topology.index_map(body.mesh.topology.dim).size_local
+        force, moment = (
+            found[name].x.array.reshape(-1, *shape)[:own] for name in ("force", "moment")
+        )
+        dofs = body.mesh.geometry.x[compat.geometry_dofmap(body.mesh)[:own]]
+        arm = 1.0 - dofs[:, :, 0].mean(axis=1)
+        if shape == (3,):
+            assert force[:, 2] == pytest.approx(1e-4, rel=1e-4)
+            assert moment[:, 1] == pytest.approx(-1e-4 * arm, rel=1e-4)
+        else:
+            assert force[:, 0, 2] == pytest.approx(1e-4, rel=1e-4)
+            assert np.abs(moment[:, 0, 0]) == pytest.approx(1e-4 * arm, rel=1e-4)
+            assert np.abs(moment[:, 1]).max(initial=0.0) < 1e-9
+
+
+@pytest.mark.mpi
+def test_a_picture_of_skins(mpi_tmp_path):
+    line = np.column_stack([np.linspace(0, 1, 9), np.zeros(9), np.zeros(9) + 0.1])
+    mesh = surface_mesh(line, np.column_stack([np.arange(8), np.arange(1, 9)]), kind="interval")
+    beam = nts.Beam(mesh, nts.Circle(0.03).section(young=1.0, poisson=0.0, density=1.0))
+    body = nts.Shell(plate(4, 4, 1.0, 1.0), **RUBBER)
+    file = mpi_tmp_path / "thin.png"
+    picture([beam, body], file)
+    assert file.stat().st_size > 5000
+    with pytest.raises(ValueError, match="shell 'shell' has none; colour by 'speed'"):
+        picture([body], file, colour="stress")
+    bare = nts.Section(EA=1, GA=(1, 1), GJ=1, EI=(1, 1), rhoA=1, rhoI=(1, 1))
+    with pytest.raises(ValueError, match="'beam' has no volume; leave it out"):
+        picture([nts.Beam(mesh, bare)], file)
+
+
+@pytest.mark.mpi
+def test_a_shell_at_rest_sleeps():
+    """While another one flies; the motion is the same."""
+    ends = []
+    for sleep in (False, True):
+        body, other = flying(n=(4, 2)), nts.Shell(plate(2, 2, 1.0, 1.0), **RUBBER, name="still")
+        run = nts.simulate(nts.System([body, other]), EM, dt=0.05, t_end=0.3, sleep=sleep)
+        assert run.status == "completed"
+        ends.append(body.midsurface()[1])
+        assert moved(other) == pytest.approx(0.0, abs=1e-14)
+    assert ends[1] == pytest.approx(ends[0], abs=1e-10)

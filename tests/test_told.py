@@ -115,3 +115,37 @@ def test_a_stiff_body_on_a_soft_one_is_held(young):
     )
     run = nts.equilibrium(nts.System([steel, pad], contacts=[pair], gravity=(0, 0, -9.81)))
     assert "free motion" not in run.warnings
+
+
+def spinning_cube():
+    """A stiff one, at 50 rad/s."""
+    return nts.Continuum(
+        box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5), 1), nts.NeoHookean(1e9, 0.3), density=1e3,
+        velocity=lambda x: 50.0 * np.stack([-x[1], x[0], 0 * x[0]]), name="cube",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("turn", [0.9, 1.0, 1.2])
+@pytest.mark.fast("1.0")
+@pytest.mark.fast_on_ranks("1.0")
+def test_a_flexible_body_that_turns_by_a_radian_in_a_step_is_told(turn):
+    """By its spin: the angle of a turn of 1 rad a step comes out short by a twelfth."""
+    system, dt = nts.System([spinning_cube()]), turn / 50
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=3 * dt)
+    assert run.status == "completed" and ("turns" in run.warnings) is (turn > 0.95)
+    if turn > 0.95:
+        # Stretched by its turning it is slower than at first, by no more than this.
+        assert 0.9 * turn < run.warnings["turns"].worst <= turn * (1 + 1e-9)
+        assert run.warnings["turns"].count == 3
+        assert "body 'cube' turns by" in run.warnings["turns"].text
+
+
+def test_a_flexible_body_that_turns_far_in_later_steps_is_told():
+    stepper = nts.Stepper(nts.System([spinning_cube()]), nts.EnergyMomentum())
+    for _ in range(14):
+        stepper.advance(1e-3)
+    assert not stepper.solution.warnings
+    for _ in range(2):
+        stepper.advance(2e-2)
+    assert stepper.solution.warnings["turns"].worst == pytest.approx(1.0, abs=0.05)
+    stepper.close()

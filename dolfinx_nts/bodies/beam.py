@@ -11,12 +11,14 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.axis import axis_of, check_line
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.director_body import DirectorBody
+from dolfinx_nts.bodies.hull import Hull, of_beam
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.section import Section
+from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import beam as kernel
 from dolfinx_nts.kernels.quadratic_energy import Elements
-from dolfinx_nts.validation import known_options, require_name, vector
+from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
 FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float] | FloatArray
@@ -33,8 +35,8 @@ class Beam(DirectorBody):
     rounding.
 
     Limits: each mesh is one line or ring, or several, without branches, and without corners of more
-    than 60 degrees (`Fixed` joins beams there); no contact surface; `Dirichlet` prescribes
-    places alone; joints and springs hold nodes.
+    than 60 degrees (`Fixed` joins beams there); `Dirichlet` prescribes places alone; joints
+    and springs hold nodes.
 
     Args:
         mesh: Intervals of degree 1 whose points have three coordinates.
@@ -58,7 +60,7 @@ class Beam(DirectorBody):
             has a cell without length, a branch or a corner.
     """
 
-    kind = "beam"
+    kind, _redundant = "beam", True
 
     def __init__(
         self,
@@ -88,6 +90,11 @@ class Beam(DirectorBody):
         found = kernel.beams(y, length, self.length, self.section.stiffness)
         return found, length[:, None, None] * (np.ones((2, 2)) + np.eye(2)) / 6.0
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return {"section": self.section, **super().settings}
+
     def centreline(self) -> tuple[FloatArray, FloatArray]:
         """Nodes of the axis as they follow each other, the same on all ranks. Collective.
 
@@ -95,6 +102,56 @@ class Beam(DirectorBody):
             In the reference X and now x [m], shape (n, 3) each.
         """
         return self._in_order()
+
+    def _make_hull(self) -> Hull:
+        """Its whole skin, see `DirectorBody`; without an outline none but the axis."""
+        outline = np.array(self.section.outline, dtype=np.float64).reshape(-1, 2)
+        return of_beam(self._skeleton, outline / self.length)
+
+    def surface(self, marker: Any = None, *, smoothing: bool = False) -> Surface:
+        """A part of the skin for contact: the section's outline along the axis, and its ends.
+
+        Collective.
+
+        Args:
+            marker: Function x (3, n) -> bool (n,) that holds at all corners of a facet of the skin;
+                None: all of it.
+            smoothing: Whether slaves touch a smooth surface when this one is the master, as of
+                `Continuum.surface`.
+
+        Raises:
+            TypeError: marker is no function, or smoothing no bool.
+            ValueError: The section has no outline, or the marker selects nothing.
+        """
+        require_bool("smoothing", smoothing)
+        if not len(self.section.outline):
+            raise ValueError(
+                f"section of {self.name!r}: has no outline, so no surface; pass Section(..., "
+                "outline=[(x_1, x_2), ...]), or take one of a shape, Rectangle(b, h).section(...)"
+            )
+        hull = self._hull
+        x = np.einsum("pk,pki->pi", hull.weights, self._vectors_at(hull.node))
+        every = np.ones(len(hull.facets), dtype=bool)
+        return self._surface(self._marked(marker, every, x), smoothing)
+
+    def resultants(self) -> dict[str, Any]:
+        """Force and moment in the sections of the cells, at the last accepted state. Collective.
+
+        Returns:
+            DOLFINx Functions of degree 0, vectors in space as the sections are turned: "force" [N]
+            and "moment" [N m] on what lies before a section from what lies behind it.
+        """
+        y = self._vectors(self.last_accepted()[0])
+        stress = kernel.strains(self._elements, y) * self.section.stiffness
+        axes = 0.5 * (y[:, 1:4] + y[:, 5:]) / self.length
+        force, moment = (
+            np.einsum("ni,nij->nj", stress[:, part], axes) for part in (slice(3), slice(3, 6))
+        )
+        stem = self.u.name[:-2]
+        return {
+            "force": self._cell_function(f"{stem}_force", force),
+            "moment": self._cell_function(f"{stem}_moment", moment),
+        }
 
     def directions_at(self, direction: FloatArray, x: Any) -> Points:
         """A direction that turns with a node, for joints. Collective.

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
 
 FloatArray = npt.NDArray[np.float64]
@@ -152,7 +154,8 @@ class Body:
 
     def last_accepted(self) -> tuple[FloatArray, FloatArray]:
         """Owned u [m] and v [m/s] of the last accepted state, or of the start."""
-        return self._accepted or (self.initial_displacement, self.initial_velocity)
+        known = getattr(self, "_accepted", None)
+        return known or (self.initial_displacement, self.initial_velocity)
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of the sum of the places' momenta [kg m/s], shape (3,)."""
@@ -189,7 +192,7 @@ class Body:
                 "make it anew, or destroy it later"
             )
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """Stiffness of each node's neighbourhood at rest [N/m], shape (num_owned,).
 
         What the nodal mass is in dynamics, a scale, is this in statics, which alone asks for it.
@@ -200,11 +203,12 @@ class Body:
         """
         raise self._missing("nodal_stiffness")
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultant of a force [N] on the coordinates of each condition, this rank's part.
 
         Args:
-            residual: Force on all owned coordinates, shape (num_owned,).
+            residual: Force of the step on all owned coordinates, shape (num_owned,).
+            u1: Displacement at the end of the step, from which moments take their arms [m].
 
         Returns:
             Shape (conditions, 3).
@@ -214,7 +218,8 @@ class Body:
     @property
     def reaction_labels(self) -> list[tuple[str, str]]:
         """Name and unit of each row of `reactions`."""
-        count = len(self.reactions(np.zeros(self.num_owned)))
+        zero = np.zeros(self.num_owned)
+        count = len(self.reactions(zero, zero))
         return [(str(k), "N") for k in range(count)]
 
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
@@ -237,6 +242,11 @@ class Body:
         What `turn` cannot tell from their places at both times.
         """
         return 0.0
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Numbers and texts by the arguments that it was made of, which ranks have in common."""
+        return {}
 
     def parameters(self) -> FloatArray:
         """Values of the material that a caller may change during a run, shape (n,)."""
@@ -305,6 +315,18 @@ class Body:
         prescribed = np.zeros(self.num_owned, dtype=bool)
         prescribed[self.fixed] = True
         return replace(points, fixed=points.nodal(prescribed))
+
+    def boundary(self) -> Surface:
+        """The whole boundary of a body with a mesh, for looks at what lies inside. Collective."""
+        return Surface(self, skin_of_mesh(self, compat.exterior_facets(self.mesh)))
+
+    def boundary_now(self, u: FloatArray) -> FloatArray:
+        """This rank's part of the whole boundary, corners of facets [m], (m, nc, 3). Collective.
+
+        Args:
+            u: Owned displacements [m].
+        """
+        return boundary_of_mesh(self, u)
 
     def at_mesh(self, values: FloatArray) -> FloatArray:
         """Values at the nodes of its mesh on this rank, as of its `space`. Collective.

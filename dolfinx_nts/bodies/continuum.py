@@ -53,8 +53,8 @@ class Continuum(UflBody):
             What it or a parameter of the material is changed to between steps, e.g. by
             `before_step`, holds in the next one; what that does to the energy is
             `material_change` in the balance.
-        velocity: Initial velocity [m/s]: a vector, or a callable x (3, n) -> (3, n) as in DOLFINx's
-            interpolate.
+        velocity: Initial velocity [m/s]: a vector, a callable x (3, n) -> (3, n) as in DOLFINx's
+            interpolate, or a Function of vectors on the mesh.
         displacement: Displacement [m] from the stress-free mesh in which the body starts, as
             `velocity`; prescribed coordinates start where their condition says. `equilibrium` takes
             it as its first guess, so that its ledger misses the energy stored in the guess.
@@ -196,6 +196,13 @@ class Continuum(UflBody):
         return ufl.inner(rule.piola(self.law, h0, h1), ufl.grad(w)) * self._dx
 
     # ---- as of Body
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
+        own = {"material": self.material, "density": self.density, "degree": self.degree}
+        return own | loads | super().settings
+
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         if not self._seen_at_rest:

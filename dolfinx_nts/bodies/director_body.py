@@ -17,10 +17,12 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body, Moment
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
+from dolfinx_nts.bodies.hull import Hull
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.node_conditions import NodeConditions
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.skeleton import Skeleton
+from dolfinx_nts.contact.surfaces import Skin, Surface, in_order
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels import quadratic_energy as kernel
 from dolfinx_nts.parallel import gather_rows
@@ -28,6 +30,7 @@ from dolfinx_nts.validation import at_points, vector, vectors
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
 
 #: Part of a body's size within which a point is a node.
 _AT_NODE = 1e-9
@@ -58,6 +61,13 @@ class DirectorBody(Body):
             The elements, and int N_a N_b of their nodes [m or m^2], shape (n, nodes, nodes).
         """
         raise NotImplementedError
+
+    def _make_hull(self) -> Hull:
+        """Its whole skin."""
+        raise NotImplementedError
+
+    #: Whether more points of its skin may touch at once than it has freedom for.
+    _redundant: ClassVar[bool]
 
     # ---- set-up
     def _set_up_mesh(self, mesh: Any, name: str) -> None:
@@ -198,6 +208,14 @@ class DirectorBody(Body):
         order = self._skeleton.order
         return self._skeleton.x[order], self._skeleton.x[order] + moved[order]
 
+    def _cell_function(self, name: str, values: FloatArray) -> Any:
+        """DOLFINx Function of degree 0 from values (n, 3) or (n, 3, 3) in this rank's cells."""
+        make = compat.cell_vector_space if values.ndim == 2 else compat.tensor_space
+        function = fem.Function(make(self.mesh, "DG", 0), name=name)
+        function.x.array[: values.size] = values.ravel()
+        function.x.scatter_forward()
+        return function
+
     # ---- points
     def points(self, x: Any) -> Points:
         """Nodes as material points, for joints and springs. Collective.
@@ -242,6 +260,68 @@ class DirectorBody(Body):
             np.tile(self._place > 0.0, (n, 1)),
         )
 
+    # ---- skin
+    @cached_property
+    def _hull(self) -> Hull:
+        return self._make_hull()
+
+    def _surface(self, chosen: BoolArray, smoothing: bool = False) -> Surface:
+        """Some of the facets of the skin, chosen by a mask. Collective."""
+        hull = self._hull
+        used, inverse = np.unique(hull.facets[chosen], return_inverse=True)
+        facets, original = inverse.reshape(-1, 4), hull.original[used]
+        roll, order = in_order(original[facets])
+        facets = np.take_along_axis(facets, roll, axis=1)[order]
+        node, columns = hull.node[used], np.flatnonzero(hull.weights.any(axis=0))
+        points = self._points(node, hull.weights[used]).columns(columns)
+        rows = node[(node >= self._here.start) & (node < self._here.stop)] - self._first
+        skin = Skin(used, facets, original, points.combine(points.reference), rows, points)
+        return Surface(self, skin, smoothing, self._redundant)
+
+    def _marked(self, marker: Any, facets: BoolArray, x: FloatArray) -> BoolArray:
+        """Which of some facets of the skin a user's marker selects, shape (m,). Collective.
+
+        Args:
+            marker: Function x (3, n) -> bool (n,), or None.
+            facets: Mask of the facets to choose from.
+            x: What it is asked for, of each point of the skin [m], shape (p, 3).
+        """
+        if marker is None:
+            return facets
+        what = f"marker of a surface of {self.name!r}"
+        if not callable(marker):
+            raise TypeError(f"{what}={marker!r}: pass a function of x with shape (3, n)")
+        chosen = at_points(self.comm, what, marker, x.T, (), "b")
+        found: BoolArray = facets & chosen[self._hull.facets].all(axis=1)
+        if not found.any():
+            raise ValueError(f"{what}={marker!r}: selects no facet; check its tolerance")
+        return found
+
+    @cached_property
+    def _whole(self) -> Surface:
+        """The whole skin. Collective."""
+        return self._surface(np.ones(len(self._hull.facets), dtype=bool))
+
+    @property
+    def has_skin(self) -> bool:
+        """Whether it has one; a beam whose section has no outline has none."""
+        return bool(len(self._hull.facets))
+
+    def boundary(self) -> Surface:
+        """The whole skin. Collective."""
+        return self._whole
+
+    def boundary_now(self, u: FloatArray) -> FloatArray:
+        """This rank's part of the whole skin, corners of facets [m], (m, 4, 3). Collective."""
+        corners: FloatArray = self._whole.positions(u)[self._whole.facets]
+        return corners[self.comm.rank :: self.comm.size]
+
+    def motion_of_points(self, du: FloatArray) -> float:
+        """Bound on the components of the motion of the skin's points on this rank [m]."""
+        reach = np.abs(self._hull.weights).max(axis=0)
+        moved = np.abs(du).reshape(-1, len(reach), 3)
+        return float(np.einsum("k,nki->ni", reach, moved).max(initial=0.0))
+
     def at_mesh(self, values: FloatArray) -> FloatArray:
         """Values of the places at the mesh's nodes on this rank, as of `space`."""
         return values.reshape(-1, self._width)[:, :3].ravel()
@@ -252,6 +332,11 @@ class DirectorBody(Body):
         self._u0, self._y0 = moment.u0, self._vectors(moment.u0)
         self._theta, self._held_at = rule.taken_at, rule.theta
         self._load, self._couple = self._conditions.loads(moment.time, moment.ramp)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return self._conditions.settings
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
@@ -354,7 +439,7 @@ class DirectorBody(Body):
         k = kernel.tangent(self._elements, self._rest, self._rest, 1.0)
         return self._gather(np.einsum("nii->ni", k))
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """Mean diagonal of the tangent at each node in the reference [N/m]. Collective."""
         mean = self._diagonal.reshape(-1, 3).mean(axis=1)
         return np.repeat(mean, 3)
@@ -363,7 +448,7 @@ class DirectorBody(Body):
         """Strain energy on this rank [J]. Collective."""
         return float(kernel.energy(self._elements, self._vectors(u)).sum())
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the places of each condition, this rank's part [N], (conditions, 3)."""
         return self._conditions.reactions(residual)
 

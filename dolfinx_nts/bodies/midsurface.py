@@ -80,6 +80,7 @@ def midsurface_of(space: Any, name: str) -> Skeleton:
     directors = np.zeros_like(x)
     np.add.at(directors, cells, angles[:, :, None] * normals)
     directors /= np.linalg.norm(directors, axis=1, keepdims=True)
+    edge, count = _edges(cells)
     ends = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
     return Skeleton(x, np.argsort(given), cells, directors[:, None], ends[count[edge] == 1])
 

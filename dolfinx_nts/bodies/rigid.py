@@ -22,12 +22,13 @@ from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.parameters import Parameter, is_number, require_positive_parameter
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
-from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import gather_rows, raise_together
 from dolfinx_nts.validation import (
     UserFunctionError,
+    agree,
     call_together,
     floats,
     known_options,
@@ -233,7 +234,6 @@ class RigidBody(Body):
         masses = np.array([mass, *(euler / self.length**2)])
         self.reference: FloatArray = y.ravel()[: self.num_owned]
         self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
-        self._held_at = y[1:]
         self._lent = np.zeros(self.num_owned)
         if np.count_nonzero(euler) < 2:
             self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * mass
@@ -379,7 +379,7 @@ class RigidBody(Body):
                 f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
-        return Surface(self, found, smoothing)
+        return Surface(self, skin_of_mesh(self, found), smoothing)
 
     def motion_of_points(self, du: FloatArray) -> float:
         """Bound on the components of the motion of the mesh's points on this rank [m]."""
@@ -403,10 +403,9 @@ class RigidBody(Body):
 
     def _rotation_at(self, time: float) -> FloatArray:
         """The prescribed rotation since the start, shape (3, 3). Collective."""
-        given, name = self._turn, f"rotation of {self.name!r}"
-        kind: type[Exception] = ValueError
-        if callable(given):
-            name, kind = f"{name} at t={time!r}", UserFunctionError
+        given, name, moves = self._turn, f"rotation of {self.name!r}", callable(self._turn)
+        if moves:
+            name = f"{name} at t={time!r}"
             given = call_together(self.comm, name, given, time)
         problem, turned = None, np.eye(3)
         array = floats(given)
@@ -416,8 +415,11 @@ class RigidBody(Body):
             turned = Rotation.from_rotvec(array).as_matrix()
         else:
             problem, turned = misfit_of_axes(array), array
-        text = f"{name}={given!r}: {problem}"
-        raise_together(self.comm, text if problem else None, kind)
+        if moves:
+            text = f"{name}: returned {given!r}; {problem}"
+            agree(self.comm, name, turned, text if problem else None)
+        else:
+            raise_together(self.comm, f"{name}={given!r}: {problem}" if problem else None)
         return turned
 
     def _check_torque(self, torque: FloatArray) -> None:
@@ -456,8 +458,8 @@ class RigidBody(Body):
         f = self.weight(gravity).reshape(-1, 3)
         if self.num_owned:
             f[0] += self._load
-            self._held_at = directors = self._directors(u1)
             if self._couple.any():
+                directors = self._directors(u1)
                 f[1:] = cross(np.tile(self._turning(directors), (3, 1)), directors)
         return f.ravel()
 
@@ -508,7 +510,7 @@ class RigidBody(Body):
         self._matrix.assemble()
         return self._matrix
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """None [N/m]."""
         return np.zeros(self.num_owned)
 
@@ -516,7 +518,7 @@ class RigidBody(Body):
         """None [J]: loads do external work."""
         return 0.0
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Return what prescribed motion needs on this rank: force [N], then moment [N m].
 
         Shape (2, 3), (1, 3) if only one of them is prescribed, (0, 3) if none is.
@@ -524,7 +526,8 @@ class RigidBody(Body):
         rows = np.zeros((2, 3))
         if self.num_owned:
             forces = residual.reshape(4, 3)
-            rows[0], rows[1] = forces[0], cross(self._held_at, forces[1:]).sum(axis=0)
+            rows[0] = forces[0]
+            rows[1] = cross(self._directors(u1), forces[1:]).sum(axis=0)
         return rows[[self._motion is not None, self._turn is not None]]
 
     @property

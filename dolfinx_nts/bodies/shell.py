@@ -10,14 +10,18 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.director_body import DirectorBody
+from dolfinx_nts.bodies.hull import SIDES, Hull, of_shell
 from dolfinx_nts.bodies.midsurface import check_midsurface, midsurface_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.kernels import shell as kernel
 from dolfinx_nts.kernels.quadratic_energy import Elements
 from dolfinx_nts.validation import (
     is_finite,
     known_options,
+    require_bool,
     require_name,
     require_positive,
     vector,
@@ -68,7 +72,7 @@ class Shell(DirectorBody):
             or has a flat cell, a T-junction, a fold or one side alone.
     """
 
-    kind = "shell"
+    kind, _redundant = "shell", False
 
     def __init__(
         self,
@@ -105,6 +109,12 @@ class Shell(DirectorBody):
         stiffness = kernel.stiffness(self.young, self.poisson, self.thickness)
         return kernel.shells(y, self.length, stiffness)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        own = {name: getattr(self, name) for name in ("young", "poisson", "thickness", "density")}
+        return {**own, **super().settings}
+
     def midsurface(self) -> tuple[FloatArray, FloatArray]:
         """Nodes in the order of the mesh's input, the same on all ranks. Collective.
 
@@ -112,6 +122,56 @@ class Shell(DirectorBody):
             In the reference X and now x [m], shape (n, 3) each.
         """
         return self._in_order()
+
+    def _make_hull(self) -> Hull:
+        """Its whole skin, see `DirectorBody`."""
+        return of_shell(self._skeleton)
+
+    def surface(
+        self, marker: Any = None, *, side: str = "top", smoothing: bool = False
+    ) -> Surface:
+        """A part of the skin for contact, half a thickness from the middle surface. Collective.
+
+        Args:
+            marker: Function x (3, n) -> bool (n,) that holds at all nodes of a cell, or of an edge,
+                of the middle surface; None: everywhere.
+            side: "top", "bottom" or "edge".
+            smoothing: Whether slaves touch a smooth surface when this one is the master, as of
+                `Continuum.surface`.
+
+        Raises:
+            TypeError: marker is no function, or smoothing no bool.
+            ValueError: side is unknown, or the marker selects nothing.
+        """
+        require_bool("smoothing", smoothing)
+        choose("side", side, SIDES)
+        x = self._skeleton.x[self._hull.node]
+        chosen = self._marked(marker, self._hull.part == SIDES.index(side), x)
+        return self._surface(chosen, smoothing)
+
+    def resultants(self) -> dict[str, Any]:
+        """Stress resultants in the middles of the cells, at the last accepted state. Collective.
+
+        Returns:
+            DOLFINx Functions of degree 0, 3 x 3 tensors in axes of the reference: "force" [N/m],
+            membrane forces and, in the rows and columns of the normal, transverse shear; "moment"
+            [N], bending and twisting moments.
+        """
+        y = self._vectors(self.last_accepted()[0])
+        middle = np.zeros((1, 2))
+        e = kernel.strains(y, self._rest, self.length, middle)[:, 0]
+        axes = kernel.axes(self._rest[:, ::2], middle)[0][:, 0]
+        c = kernel.stiffness(self.young, self.poisson, self.thickness)
+        local = np.zeros((2, len(e), 3, 3))
+        for k, stress in enumerate((e[:, :3] @ c.membrane, e[:, 3:6] @ c.bending)):
+            local[k, :, [0, 1, 0, 1], [0, 1, 1, 0]] = stress[:, [0, 1, 2, 2]].T
+        local[0, :, :2, 2] = local[0, :, 2, :2] = c.shear * e[:, 6:]
+        force, moment = np.einsum("npi,knpq,nqj->knij", axes, local, axes)
+        stem = self.u.name[:-2]
+        return {
+            "force": self._cell_function(f"{stem}_force", force),
+            "moment": self._cell_function(f"{stem}_moment", moment),
+        }
 
     def directions_at(self, direction: FloatArray, x: Any) -> Points:
         """The director of a node, for joints. Collective.

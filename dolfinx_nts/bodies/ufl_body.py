@@ -15,15 +15,16 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body, Moment
-from dolfinx_nts.bodies.conditions import Dirichlet, Supports
+from dolfinx_nts.bodies.conditions import Dirichlet, Supports, at_nodes
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
 from dolfinx_nts.bodies.points import Points, in_mesh
-from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
+from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import gather_on_root, raise_together
 from dolfinx_nts.validation import (
     UserFunctionError,
@@ -161,7 +162,7 @@ class UflBody(Body):
                 f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
-        surface = Surface(self, found, smoothing)
+        surface = Surface(self, skin_of_mesh(self, found), smoothing)
         if mass == "redistributed":
             self._make_massless(surface)
         return surface
@@ -250,15 +251,19 @@ class UflBody(Body):
             )
 
     def _interpolate(self, function: Any, name: str, given: Any, unit: str) -> None:
-        """Fill a Function from a vector or a callable x (3, n) -> (3, n)."""
+        """Fill a Function from another, a vector or a callable x (3, n) -> (3, n)."""
         values = function.x.array
-        if callable(given):
+        if isinstance(given, fem.Function) and given.ufl_shape == (3,):
+            what = f"{name}={given!s} of {self.name!r}"
+            values[:] = at_nodes(self.space, what, given).ravel()
+        elif callable(given) and not hasattr(given, "ufl_shape"):
             # The nodes of Lagrange elements are their interpolation points.
             x = self.space.tabulate_dof_coordinates().T
             found = at_points(self.comm, f"{name} of {self.name!r}", given, x, (3,))
             values[:] = found.T.ravel()
         else:
-            constant = vector(name, given, unit, or_else="a callable x (3, n) -> (3, n)")
+            else_ = "a callable x (3, n) -> (3, n), or a Function of vectors"
+            constant = vector(name, given, unit, or_else=else_)
             values[:] = np.tile(constant, len(values) // 3)
 
     def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
@@ -382,7 +387,7 @@ class UflBody(Body):
     # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n."""
-        self._rule, self._forms = rule, self._compile(rule)
+        self._forms = self._compile(rule)
         self._fill(self._u0, moment.u0)
         if self._extra_form is not None:
             self._rate.value, self._time.value = moment.rate, moment.time
@@ -416,7 +421,7 @@ class UflBody(Body):
         self.check_alive()
         diagonal = mass * self._mean(self.nodal_mass)
         if not mass:
-            diagonal = stiffness * self._mean(self.nodal_stiffness(self._rule))
+            diagonal = stiffness * self._mean(self.nodal_stiffness())
         self._fill(self._u1, u1)
         self._factors.value = mass, stiffness
         compat.assemble_matrix(self._matrix, self._forms[1], self._supports.masks, diagonal)
@@ -442,10 +447,11 @@ class UflBody(Body):
         total = self.comm.allreduce(np.array([values.sum(), self.num_owned]))
         return float(total[0] / total[1])
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
-        """Mean diagonal of a rule's tangent at each node of the undeformed body [N/m]."""
+    def nodal_stiffness(self) -> FloatArray:
+        """Mean diagonal of the tangent in equilibrium at each node, without deformation [N/m]."""
         self.check_alive()
         if self._stiffness is None:
+            rule: Any = Static()
             tangent = self._compile(rule)[1]
             kept = [f.x.array.copy() for f in (self._u0, self._u1)]
             for u in (self._u0, self._u1):
@@ -460,7 +466,7 @@ class UflBody(Body):
                 u.x.array[:] = values
         return self._stiffness
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the coordinates of each `Dirichlet` condition, this rank's part [N]."""
         return self._supports.reactions(residual)
 
@@ -487,6 +493,12 @@ class UflBody(Body):
         self._in.ghostUpdate()
         with self._in.localForm() as here:
             return self._determinants.smallest(here.array_r)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        constants = [t.value for t in self._parameters if isinstance(t, fem.Constant)]
+        return {"bcs": self._supports.settings, "constants in the material": constants}
 
     def parameters(self) -> FloatArray:
         """Values of Constants and Functions in energy and mass, which a caller may change, (n,)."""

@@ -180,13 +180,13 @@ class ContactPair:
 
     @property
     def redundant(self) -> bool:
-        """Whether more points may touch than their bodies have freedom for, as of rigid ones."""
-        return not self.slave.material.are_nodes
+        """Whether more points may touch than their bodies have freedom for, see `Surface`."""
+        return self.slave.redundant
 
     @property
     def yields(self) -> bool:
         """Whether points of a surface may move against each other; rigid bodies' may not."""
-        return self.slave.material.are_nodes
+        return not self.slave.redundant
 
     @property
     def master_name(self) -> str:

@@ -16,28 +16,42 @@ from ufl.algorithms.map_integrands import map_integrand_dags
 from ufl.classes import Zero
 from ufl.core.multiindex import FixedIndex, Index, MultiIndex
 from ufl.corealg.multifunction import MultiFunction
-from ufl.variable import Label
+from ufl.corealg.traversal import traverse_unique_terminals
+
+#: Count of the first Constant that stands for another; a form has fewer than 900.
+_FIRST = 100
 
 
 def canonical(form: Any) -> Any:
-    """A form with the same integrals whose terminals are numbered from zero.
+    """A form whose signature does not depend on what was made before it.
 
     Args:
         form: In UFL.
 
     Returns:
-        A form of Coefficients and Constants that stand for the given ones, with their
-        `_cpp_object`, which is all that DOLFINx asks of them.
+        The form itself, or one with the same integrals of Constants and Functions that stand for
+        the given ones, with their `_cpp_object`, which is all that DOLFINx asks of them.
     """
+    constants = form.constants()
+    if len({len(str(c.count())) for c in constants}) <= 1 and not _has_indexed_zeros(form):
+        return form
     stands = {}
     for k, given in enumerate(extract_coefficients(form)):
         stands[given] = ufl.Coefficient(given.ufl_function_space(), count=k)
-    for k, given in enumerate(form.constants()):
+    for k, given in enumerate(constants, start=_FIRST):
         stands[given] = ufl.Constant(given.ufl_domain(), given.ufl_shape, count=k)
     for given, stand in stands.items():
         if hasattr(given, "_cpp_object"):
             stand._cpp_object = given._cpp_object
     return map_integrand_dags(_Renumber(stands), form)
+
+
+def _has_indexed_zeros(form: Any) -> bool:
+    return any(
+        isinstance(t, Zero) and t.ufl_free_indices
+        for part in form.integrals()
+        for t in traverse_unique_terminals(part.integrand())
+    )
 
 
 class _Renumber(MultiFunction):  # type: ignore[misc]
@@ -51,7 +65,6 @@ class _Renumber(MultiFunction):  # type: ignore[misc]
         super().__init__()
         self._stands = stands
         self._indices: dict[int, int] = {}
-        self._labels: dict[Any, Any] = {}
 
     expr = MultiFunction.reuse_if_untouched
 
@@ -62,10 +75,6 @@ class _Renumber(MultiFunction):  # type: ignore[misc]
     def constant(self, o: Any) -> Any:
         """What stands for a Constant."""
         return self._stands[o]
-
-    def label(self, o: Any) -> Any:
-        """A label numbered as it is met."""
-        return self._labels.setdefault(o, Label(len(self._labels)))
 
     def multi_index(self, o: Any) -> Any:
         """Its free indices, numbered as they are met."""

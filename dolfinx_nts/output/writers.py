@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.output.own_functions import Own, checked, of_body
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
 from dolfinx_nts.step import balance as ledger
@@ -45,7 +46,9 @@ _XDMF_HEAD = (
 _XDMF_TAIL = "</Grid>\n</Domain></Xdmf>\n"
 #: Part of a body's size by which places of its nodes may differ on other ranks.
 _ROUNDED = 1e-9
-_XDMF_TIME = r'<Grid><Time Value="([^"]*)"/>'
+#: XDMF's names of scalars, vectors and tensors.
+_RANKS = ("Scalar", "Vector", "Tensor")
+_XDMF_TIME = r'<Grid GridType="Uniform"><Time Value="([^"]*)"/>'
 #: XDMF's name of DOLFINx's cells and its order of their vertices.
 _CELLS = {
     "interval": ('Polyline" NodesPerElement="2', [0, 1]),
@@ -56,17 +59,29 @@ _CELLS = {
 }
 
 
+def _shape(values: FloatArray) -> tuple[int, ...]:
+    """Shape in a file, where a tensor has its rows one after another."""
+    return (*values.shape[:1], *([int(np.prod(values.shape[1:]))] if values.ndim > 1 else []))
+
+
 class _Series:
     """Files of one body: NAME.h5 holds the numbers, NAME.xdmf tells ParaView what they are."""
 
-    def __init__(self, body: Any, index: int, contacts: Mapping[str, int], folder: Path) -> None:
-        self.body, self.index, self.contacts = body, index, contacts
+    def __init__(
+        self,
+        body: Any,
+        index: int,
+        contacts: Mapping[str, int],
+        folder: Path,
+        functions: Sequence[Own] = (),
+    ) -> None:
+        self.body, self.index, self.contacts, self._functions = body, index, contacts, functions
         self.path = folder / _file_name(body.name)
         self._times = 0
         blocks = compat.node_blocks(body.mesh, body.space)
         self._owned = body.space.dofmap.index_map.size_local
         nodes = np.flatnonzero((blocks >= 0) & (blocks < self._owned))
-        self._blocks = blocks[nodes]
+        self._nodes, self._blocks = nodes, blocks[nodes]
         original = np.asarray(body.mesh.geometry.input_global_indices)
         everywhere = gather_on_root(body.comm, original[nodes])
         numbers, self._order = np.unique(everywhere, return_index=True)
@@ -76,7 +91,8 @@ class _Series:
         order = gather_on_root(
             body.comm, np.asarray(body.mesh.topology.original_cell_index[:owned], dtype=np.int64)
         )
-        self._cells = np.searchsorted(numbers, cells[np.argsort(order)])
+        self._cell_order = np.argsort(order)
+        self._cells = np.searchsorted(numbers, cells[self._cell_order])
         self._kind, self._corners = _CELLS[compat.cell_name(body.mesh)]
 
     def _nodal(self, values: FloatArray) -> FloatArray:
@@ -150,11 +166,32 @@ class _Series:
         for label, k in self.contacts.items():
             slave, mean = system.contacts[k].slave, stepper.mean_force(k)
             for name, values in (("force", mean), ("pressure", mean / slave.area[slave.share])):
-                found[f"contact_{name}_mean_{label}"] = contact_fields.spread(slave, 0.0, values)
+                found[f"contact_{name}_mean_{label}"] = contact_fields.spread(
+                    slave, 0.0, values, values
+                )
         return fields | {name: self._nodal(values) for name, values in found.items()}
 
-    def append(self, time: float, fields: Mapping[str, FloatArray]) -> None:
+    def own(self) -> dict[str, tuple[bool, FloatArray]]:
+        """The user's functions: whether on cells, and values on rank 0. Collective."""
+        found = {}
+        for name, on_cells, values in of_body(self._functions, self.body):
+            here = values if on_cells else values[self._nodes]
+            order = self._cell_order if on_cells else self._order
+            found[name] = on_cells, gather_on_root(self.body.comm, here)[order]
+        return found
+
+    def append(
+        self,
+        time: float,
+        fields: Mapping[str, FloatArray],
+        own: Mapping[str, tuple[bool, FloatArray]],
+    ) -> None:
         """Add one time; rank 0 only. Both files are complete and closed afterwards.
+
+        Args:
+            time: [s].
+            fields: Nodal ones by name.
+            own: As of `own`.
 
         Raises:
             OSError: They cannot be written; the times before are still whole.
@@ -162,25 +199,26 @@ class _Series:
         import h5py
 
         group, numbers = f"{self._times:06d}", Path(f"{self.path}.h5")
+        placed = {name: (False, values) for name, values in fields.items()} | dict(own)
         with Draft(open(numbers, "rb")) as draft:
             with h5py.File(draft, "r+") as file:
                 if group in file:  # from a call that failed for want of space for the other file
                     del file[group]
-                for name, values in fields.items():
-                    file[f"{group}/{name}"] = values
+                for name, (_, values) in placed.items():
+                    file[f"{group}/{name}"] = values.reshape(_shape(values))
             amend_file(numbers, draft.parts)
         cells = self._item("mesh/cells", self._cells.shape, "Int")
         points = self._item("mesh/points", self._points.shape, "Float")
         lines = [
-            f'<Grid><Time Value="{time:.17g}"/>',
+            f'<Grid GridType="Uniform"><Time Value="{time:.17g}"/>',
             f'<Topology TopologyType="{self._kind}" NumberOfElements="{len(self._cells)}">'
             f"{cells}</Topology>",
             f'<Geometry GeometryType="XYZ">{points}</Geometry>',
         ]
-        for name, values in fields.items():
-            kind = "Vector" if values.ndim == 2 else "Scalar"
-            item = self._item(f"{group}/{name}", values.shape, "Float")
-            head = f'<Attribute Name="{name}" AttributeType="{kind}" Center="Node">'
+        for name, (on_cells, values) in placed.items():
+            kind, centre = _RANKS[values.ndim - 1], "Cell" if on_cells else "Node"
+            item = self._item(f"{group}/{name}", _shape(values), "Float")
+            head = f'<Attribute Name="{name}" AttributeType="{kind}" Center="{centre}">'
             lines.append(f"{head}{item}</Attribute>")
         # One write over the old tail: the file is well-formed whenever the run dies.
         text, path = "\n".join([*lines, "</Grid>", _XDMF_TAIL]).encode(), Path(f"{self.path}.xdmf")
@@ -216,16 +254,28 @@ class Fields:
         every: Write after every `every`-th step, >= 1.
         interval: Instead of `every`: write after the first step that reaches each multiple of this
             time [s].
+        functions: More to write: scalars, 3-vectors or 3 x 3 tensors, in cells (DG 0) or at nodes
+            (Lagrange 1), under their names. A Function is written with the body on whose mesh it
+            is, as it then is; a callable body -> Function such as `dolfinx_nts.von_mises` is
+            called of each body with a material.
 
     Raises:
+        TypeError: An item of `functions` is none.
         ValueError: The cadence is out of range or given twice; from `start`: no body has a mesh,
-            or two bodies' names give one file.
+            two bodies' names give one file, or a Function has no values in cells or at nodes.
         OSError: From `start`, before any step and on all ranks: the folder cannot be written, or
             what a run from a checkpoint would go on with is of another mesh or run, or is not
             complete.
     """
 
-    def __init__(self, folder: StrPath, *, every: int = 1, interval: float | None = None) -> None:
+    def __init__(
+        self,
+        folder: StrPath,
+        *,
+        every: int = 1,
+        interval: float | None = None,
+        functions: Iterable[Own] = (),
+    ) -> None:
         if not is_whole(every) or every < 1:
             raise ValueError(f"every={every!r}: pass a whole number of steps >= 1")
         if interval is not None:
@@ -233,6 +283,7 @@ class Fields:
             if every != 1:
                 raise ValueError(f"every={every!r}, interval={interval!r}: pass one of the two")
         self.folder, self.every, self.interval = as_path("folder", folder), every, interval
+        self.functions = checked(functions)
         self._series: list[_Series] = []
 
     def start(self, stepper: Stepper) -> None:
@@ -243,7 +294,7 @@ class Fields:
         for i, body in enumerate(system.bodies):
             if body.mesh is not None:
                 own = {n: k for k, n in enumerate(label) if contacts[k].slave.body is body}
-                self._series.append(_Series(body, i, own, self.folder))
+                self._series.append(_Series(body, i, own, self.folder, self.functions))
         if not self._series:
             raise ValueError(f"folder={str(self.folder)!r}: no body has a mesh; leave Fields out")
         files = [s.path.name for s in self._series]
@@ -303,7 +354,8 @@ class Fields:
     def _append(self, stepper: Stepper) -> None:
         self._tried = time = stepper.state.time
         for series in self._series:
-            self._root(stepper, partial(series.append, time, series.fields(stepper)))
+            fields, own = series.fields(stepper), series.own()
+            self._root(stepper, partial(series.append, time, fields, own))
 
     def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
         write_on_root(stepper.system.comm, f"folder={str(self.folder)!r}", action)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent
@@ -40,6 +41,36 @@ def check_restart(restart: Restart | None, system: System, time: Any, ledger: bo
         raise ValueError(f"start_time={time!r}: a restart goes on at its own time; leave it out")
     if ledger and np.isnan(restart.rows[-1]["energy"]):
         raise ValueError("ledger=True: the run of the checkpoint kept none; pass ledger=False")
+
+
+def refuse_overwritten(system: System) -> None:
+    """Raise a ValueError on every rank if a caller has written into a body's u or v. Collective.
+
+    A run begins from the body's options or from `start`, so that what was written would be lost.
+
+    Args:
+        system: Its bodies, which hold what a run or their own options wrote last.
+    """
+    for body in system.bodies:
+        if body.mesh is None:
+            continue
+        found = [f.x.array.copy() for f in (body.u, body.v)]
+        body.accept(*Body.last_accepted(body))
+        here = next(
+            (
+                name
+                for name, values in zip("uv", found, strict=True)
+                if not np.array_equal(getattr(body, name).x.array, values, equal_nan=True)
+            ),
+            None,
+        )
+        option = "displacement" if here == "u" else "velocity"
+        raise_together(
+            system.comm,
+            here
+            and f"body {body.name!r}: its {here} was written since it was made or run, which a run "
+            f"would drop; it is undone now: pass {option}= to the body, or start= to the run",
+        )
 
 
 def first_state(system: System, start: Any, time: Any) -> State:
@@ -151,6 +182,7 @@ def consistent_start(
     if found is not None:
         raise ValueError(
             f"project_start=True: no velocities fit joint {found[1]!r}, which stays violated "
-            f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it"
+            f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it: leave "
+            "one of them out"
         )
     return state

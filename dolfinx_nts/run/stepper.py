@@ -17,12 +17,14 @@ from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.run.promises import MaterialWatch, Promises
+from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
     check_restart,
     consistent_start,
     first_state,
     refuse_moved,
+    refuse_overwritten,
     with_prescribed_rates,
 )
 from dolfinx_nts.run.step_size import Pace
@@ -129,6 +131,12 @@ class Stepper:
     ) -> None:
         if not isinstance(system, System):
             raise TypeError(f"system={system!r}: pass a System([body, ...])")
+        same_run(
+            system, integrator=integrator, newton=newton, petsc_options=petsc_options,
+            start=start is not None, start_time=start_time, sleep=sleep,
+            watch_overlap=watch_overlap, before_step=before_step, project_start=project_start,
+            ledger=ledger, impact=impact, restitution=restitution,
+        )  # fmt: skip
         system.check_alive()
         if not isinstance(integrator, Integrator) or isinstance(integrator, type):
             raise TypeError(
@@ -201,6 +209,7 @@ class Stepper:
             "restitution": float(restitution),
             "ranks": system.comm.size,
         }
+        refuse_overwritten(system)
         state = first_state(system, start, start_time)
         if not integrator.accelerations:
             state = replace(state, a=())

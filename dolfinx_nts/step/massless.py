@@ -78,7 +78,7 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
         off = np.abs(force[body.massless])
         arrays = (off, body.internal(u), body.reference + u)
         sizes = [np.abs(a).max(initial=0.0) for a in arrays]
-        sizes.append(body.nodal_stiffness(problem.integrator).max(initial=0.0))
+        sizes.append(body.nodal_stiffness().max(initial=0.0))
         top = global_max(problem.system.comm, np.array(sizes))
         missing, internal, length, stiffness = top.tolist()
         if missing > max(worst, _BALANCED * internal) and internal > _ROUNDED * stiffness * length:

@@ -27,6 +27,7 @@ from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_togethe
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
+from dolfinx_nts.step.least_norm import hanging
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
@@ -93,14 +94,32 @@ class StepProblem:
         self._shared = SharedWeight(system.comm, system.contacts, system.contact_bodies)
         both = zip(system.joints, system.joint_bodies, strict=True)
         self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
+        self._lend_less()
         self.couplings: list[Coupling] = [self.contacts, *self.joints]
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.centre, self._span = _box(system)
-        self.stabilization = Stabilization(system, integrator, self._span)
+        self.stabilization = Stabilization(system, self._span)
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
+
+    def _lend_less(self) -> None:
+        """Lend no compliance to joints of rigid bodies that form no loop. Collective."""
+        system = self.system
+        found: list[tuple[Any, tuple[int, ...]]] = []
+        of = zip(system.declared_joints, self.joints, system.joint_bodies, strict=False)
+        for joint, coupling, bodies in of:
+            if hasattr(joint, "slopes"):  # a spring holds nothing
+                continue
+            rigid = all(body.rigid for body in joint.bodies)
+            found.append((getattr(coupling, "hold_alone", None) if rigid else None, bodies))
+        moved = system.comm.allreduce(np.array([b.fixed.any() for b in system.bodies]), op=MPI.LOR)
+        free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
+        alone = hanging([bodies for _, bodies in found], free)
+        for (hold_alone, _), hangs in zip(found, alone, strict=True):
+            if hold_alone is not None and hangs:
+                hold_alone()
 
     # ---- set-up of a step
     def begin(
