@@ -59,8 +59,8 @@ class FormBody(UflBody):
         displacement: Displacement [m] in which the body starts, as of `Continuum`.
         bcs: `Dirichlet` conditions, on parts of the mesh's boundary.
         name: Name in messages and files.
-        quadrature_degree: Of all integrals of `energy`, `density` and `mass` whose measures name
-            none; default twice the degree of the space.
+        quadrature_degree: Of all integrals of `energy` whose measures name none; default twice the
+            degree of the space, which those of `density` and `mass` have at least.
         extra_form: Further virtual work such as damping and loads, as of `Continuum`.
         allow_inversion: On a 3D mesh, accept steps that turn a cell inside out, as of `Continuum`.
 
@@ -110,6 +110,8 @@ class FormBody(UflBody):
             )
         check_any_mesh(space.mesh, name)
         self._quadrature, self._given_mass = quadrature_degree or 2 * degree, mass
+        # With one point a cell could turn for nothing.
+        self._of_mass = max(self._quadrature, 2 * degree)
         super().__init__(space, degree, name, extra_form, self._quadrature, allow_inversion)
         # A Constant, not a number: bodies of any density share compiled forms.
         self._rho = None if density is None else fem.Constant(self.mesh, float(density))
@@ -201,7 +203,7 @@ class FormBody(UflBody):
             form = self._rho * ufl.inner(v, w) * ufl.Measure("dx", self.mesh)
         else:
             form = self._given_mass(v, w)
-        return self._integrated(form, max(self._quadrature, 2 * self.degree))
+        return self._integrated(form, self._of_mass)
 
     def _virtual_work(self, rule: Integrator, w: Any) -> Any:
         """Virtual work of the potential by the rule in UFL."""
