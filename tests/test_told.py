@@ -177,3 +177,31 @@ def test_one_point_of_quadrature_leaves_the_mass_whole(kind, cell):
     turning = run.balance["angular_momentum"][0]
     assert turning == pytest.approx([0, 0, 2 * exact], rel=1e-12, abs=1e-9)
     assert np.abs(run.balance["ledger_residual"]).max() < 1e-12 * exact
+
+
+@pytest.mark.fast_on_ranks()
+def test_a_run_from_a_settled_state_begins_with_its_contact_forces():
+    """9.81 kN of weight on the plane; the first row had none while nine nodes were active."""
+    system = standing(friction=0.3)
+    settled = nts.equilibrium(system)
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=2e-3, t_end=4e-3, start=settled, start_time=0.0
+    )
+    assert run.balance["active"][0] == 9
+    assert run.contact_forces[0, 0] == pytest.approx([0, 0, 9810], rel=1e-9, abs=1e-6)
+    assert run.contact_moments[0, 0] == pytest.approx([4905, -4905, 0], rel=1e-9, abs=1e-6)
+    other = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=1e-3)
+    assert not other.contact_forces[0].any()
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_restored_impulses_have_no_friction_and_say_so(friction):
+    body = cube(velocity=(3, 0, -2))
+    floor = nts.Plane((0, 0, -1e-3), (0, 0, 1))
+    pair = nts.ContactPair(body.surface(lambda x: x[2] < 1e-9), floor, friction=friction)
+    run = nts.simulate(
+        nts.System([body], contacts=[pair]), nts.EnergyMomentum(), dt=1e-3, t_end=3e-3,
+        impact="restored",
+    )  # fmt: skip
+    assert run.status == "completed"
+    assert ("impulses without friction" in run.warnings) is (friction > 0)
