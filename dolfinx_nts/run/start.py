@@ -12,7 +12,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.state import State
-from dolfinx_nts.step import consistent
+from dolfinx_nts.step import consistent, resultants
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import is_finite
@@ -112,6 +112,28 @@ def refuse_moved(system: System) -> None:
                 f"impact='restored': coordinates of body {body.name!r} move as prescribed by a "
                 "function of time; use impact='published', or supports at rest, given as vectors"
             )
+
+
+def carried_forces(system: System, start: Solution | None) -> dict[str, FloatArray]:
+    """Resultants of contacts with which a run begins: the last ones of where it goes on from.
+
+    Args:
+        system: The scene.
+        start: As of `simulate`.
+
+    Returns:
+        By column of the balance table; without a start none, and of its other contacts zeros.
+    """
+    if start is None or not len(start.rows):
+        return {}
+    row, found = start.rows[-1], {}
+    for name in resultants.CONTACTS:
+        found[name] = np.zeros((len(system.contacts), 3))
+        for k, pair in enumerate(system.contacts):
+            for j, known in enumerate(start.system.contacts):
+                if pair.is_like(known):
+                    found[name][k] = row[name][j]
+    return found
 
 
 def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: bool) -> State:

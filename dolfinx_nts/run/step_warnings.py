@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from dolfinx_nts.bodies.inversion import describe, smallest_dets
 from dolfinx_nts.bodies.motion import motion_of
@@ -11,6 +12,8 @@ from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.state import State
 from dolfinx_nts.step.problem import StepProblem
+
+FloatArray = npt.NDArray[np.float64]
 
 #: Smallest det F below which cells count as crushed.
 _CRUSHED = 0.05
@@ -58,6 +61,25 @@ def tell_couplings(
     for coupling, parts in problem.each(step):
         for kind, size, text in coupling.warnings(parts):
             solution.warn(kind, state.time, size, text)
+
+
+def tell_frictionless(solution: Solution, impulses: FloatArray, time: float) -> None:
+    """Warn of restored impulses in contacts with friction, of which they know nothing.
+
+    Args:
+        solution: The run.
+        impulses: Of each contact [N s], shape (contacts, 3), the same on all ranks.
+        time: End of the step [s].
+    """
+    for pair, impulse in zip(solution.system.contacts, impulses, strict=True):
+        size = float(np.linalg.norm(impulse))
+        if pair.friction and size:
+            solution.warn(
+                "impulses without friction", time, size,
+                f"impact='restored' has given contact {pair.name!r} an impulse of {size:.3g} N s "
+                f"along its normals, none of friction={pair.friction:.3g}; pass "
+                "impact='published' if friction in impacts matters",
+            )  # fmt: skip
 
 
 def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
