@@ -44,7 +44,7 @@ class PointElements:
         """On this rank."""
         return len(self.sides[0].nodes)
 
-    @property
+    @cached_property
     def num_coordinates(self) -> int:
         """Coordinates of all nodes of an element."""
         return sum(3 * side.nodes.shape[1] for side in self.sides)

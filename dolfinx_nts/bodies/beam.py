@@ -90,6 +90,11 @@ class Beam(DirectorBody):
         found = kernel.beams(y, length, self.length, self.section.stiffness)
         return found, length[:, None, None] * (np.ones((2, 2)) + np.eye(2)) / 6.0
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return {"section": self.section, **super().settings}
+
     def centreline(self) -> tuple[FloatArray, FloatArray]:
         """Nodes of the axis as they follow each other, the same on all ranks. Collective.
 

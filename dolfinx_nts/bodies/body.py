@@ -140,7 +140,8 @@ class Body:
 
     def last_accepted(self) -> tuple[FloatArray, FloatArray]:
         """Owned u [m] and v [m/s] of the last accepted state, or of the start."""
-        return self._accepted or (self.initial_displacement, self.initial_velocity)
+        known = getattr(self, "_accepted", None)
+        return known or (self.initial_displacement, self.initial_velocity)
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of the sum of the places' momenta [kg m/s], shape (3,)."""
@@ -227,6 +228,11 @@ class Body:
         What `turn` cannot tell from their places at both times.
         """
         return 0.0
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Numbers and texts by the arguments that it was made of, which ranks have in common."""
+        return {}
 
     def parameters(self) -> FloatArray:
         """Values of the material that a caller may change during a run, shape (n,)."""

@@ -334,6 +334,11 @@ class DirectorBody(Body):
         self._theta, self._held_at = rule.taken_at, rule.theta
         self._load, self._couple = self._conditions.loads(moment.time, moment.ramp)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return self._conditions.settings
+
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
         return self._conditions.prescribed(time)

@@ -109,6 +109,12 @@ class Shell(DirectorBody):
         stiffness = kernel.stiffness(self.young, self.poisson, self.thickness)
         return kernel.shells(y, self.length, stiffness)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        own = {name: getattr(self, name) for name in ("young", "poisson", "thickness", "density")}
+        return {**own, **super().settings}
+
     def midsurface(self) -> tuple[FloatArray, FloatArray]:
         """Nodes in the order of the mesh's input, the same on all ranks. Collective.
 

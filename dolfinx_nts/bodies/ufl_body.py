@@ -160,7 +160,8 @@ class UflBody(Body):
             )
         if self.degree != 1:
             raise ValueError(
-                f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"
+                f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1; "
+                "pass degree=1, on a finer mesh for the same accuracy"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
         surface = Surface(self, skin_of_mesh(self, found), smoothing)
@@ -494,6 +495,12 @@ class UflBody(Body):
         self._in.ghostUpdate()
         with self._in.localForm() as here:
             return self._determinants.smallest(here.array_r)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        constants = [t.value for t in self._parameters if isinstance(t, fem.Constant)]
+        return {"bcs": self._supports.settings, "constants in the material": constants}
 
     def parameters(self) -> FloatArray:
         """Values of Constants and Functions in energy and mass, which a caller may change, (n,)."""

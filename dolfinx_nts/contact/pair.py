@@ -186,7 +186,7 @@ class ContactPair:
     @property
     def yields(self) -> bool:
         """Whether points of a surface may move against each other; rigid bodies' may not."""
-        return not self.slave.redundant
+        return not self.slave.body.rigid
 
     @property
     def master_name(self) -> str:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
+from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
@@ -394,6 +395,7 @@ def equilibrium(
     Raises:
         ValueError: An argument is out of range; before any work.
     """
+    same_run(system, load_steps=load_steps, stabilization=stabilization)
     times = _pseudo_times(load_steps)
     if stabilization is not None:
         require_positive("stabilization", stabilization, "-")

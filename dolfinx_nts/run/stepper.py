@@ -17,15 +17,18 @@ from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme
 from dolfinx_nts.run.last_steps import LastSteps
 from dolfinx_nts.run.promises import MaterialWatch, Promises
+from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
+    carried_forces,
     check_restart,
     consistent_start,
     first_state,
+    refuse_overwritten,
     with_prescribed_rates,
 )
 from dolfinx_nts.run.step_size import Pace
-from dolfinx_nts.run.step_warnings import tell_step
+from dolfinx_nts.run.step_warnings import tell_frictionless, tell_step
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, consistent, resultants
@@ -122,6 +125,12 @@ class Stepper:
         impact: str = "published",
         restitution: float = 1.0,
     ) -> None:
+        same_run(
+            system, integrator=integrator, newton=newton, petsc_options=petsc_options,
+            start=start is not None, start_time=start_time, sleep=sleep,
+            watch_overlap=watch_overlap, before_step=before_step, project_start=project_start,
+            ledger=ledger, impact=impact, restitution=restitution,
+        )  # fmt: skip
         check_scheme(system, integrator, newton, petsc_options)
         check_run(
             before_step, sleep=sleep, watch_overlap=watch_overlap, project_start=project_start,
@@ -161,12 +170,13 @@ class Stepper:
             "restitution": float(restitution),
             "ranks": system.comm.size,
         }
+        refuse_overwritten(system)
         state = first_state(system, start, start_time)
         if not integrator.accelerations:
             state = replace(state, a=())
         self._accept(state)
-        self._started, self._goes_on = False, start is not None and start.moving
         self._start = start
+        self._started, self._goes_on = False, start is not None and start.moving
         if self.restart is None:
             self.solution.rows = Table([self._first_row()])
         self._promises = Promises(self.solution, integrator, self.newton.rtol)
@@ -404,7 +414,8 @@ class Stepper:
                 )
 
     def _first_row(self) -> dict[str, Any]:
-        return balance.first_row(self.system, self.state) | resultants.at_start(self.system)
+        forces = resultants.at_start(self.system) | carried_forces(self.system, self._start)
+        return balance.first_row(self.system, self.state) | forces
 
     def _accept(self, state: State) -> None:
         for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
@@ -520,6 +531,8 @@ class Stepper:
         self._last_steps.take(self.state, self.problem.dt, state)
         self._accept(state)
         tell_step(self.solution, self.problem, step, state)
+        if impact is not None:
+            tell_frictionless(self.solution, impact.impulses[0], time)
         self.look()
 
     def _accepted(self, step: Evaluation, dt: float, time: float) -> State:

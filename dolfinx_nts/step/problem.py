@@ -112,7 +112,7 @@ class StepProblem:
                 continue
             rigid = all(body.rigid for body in joint.bodies)
             found.append((getattr(coupling, "hold_alone", None) if rigid else None, bodies))
-        moved = system.comm.allreduce(np.array([b.fixed.any() for b in system.bodies]), op=MPI.LOR)
+        moved = system.comm.allreduce(np.array([b.fixed.sum() for b in system.bodies]))
         free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
         alone = hanging([bodies for _, bodies in found], free)
         for (hold_alone, _), hangs in zip(found, alone, strict=True):
@@ -143,6 +143,7 @@ class StepProblem:
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
         if moments is None:
             moments = [self._moment(k) for k in range(len(system.bodies))]
+        self._moments = list(moments)
         for body, moment in zip(system.bodies, moments, strict=True):
             body.begin_step(self.integrator, moment)
         self._gravity = self.integrator.ramp(self._when) * system.gravity
@@ -328,6 +329,30 @@ class StepProblem:
         # Load steps of equilibrium end with some of no length.
         rate = rule.theta * rule.rate(self.dt) if rule.inertia else 0.0
         return Moment(state.u[k], self._when, rule.ramp(self._when), rate, drift)
+
+    def work_at_ends(self, e: Evaluation) -> list[float]:
+        """What work of loads at both ends adds on this rank, by body, times `factor`. Collective.
+
+        v_0 + v_1 = 2 (u_1 - u_0)/h makes the mean of the forces at both ends do the work in the
+        methods that carry accelerations, not those where the step takes them. Loads that are
+        functions of time differ; of others, and of other methods, it is 0.
+
+        Args:
+            e: Solution of the step.
+        """
+        works = [0.0] * len(e.bodies)
+        if not self.integrator.accelerations:
+            return works
+        ends = self.state.time, self.state.time + self.dt
+        for k, (body, terms) in enumerate(zip(self.system.bodies, e.bodies, strict=True)):
+            mean = np.zeros_like(terms.du)
+            for time in ends:
+                body.begin_step(self.integrator, self._moments[k]._replace(time=time))
+                mean += 0.5 * self.factor * body.external(terms.u1, self._gravity)
+            body.begin_step(self.integrator, self._moments[k])
+            here = self.factor * body.external(terms.u1, self._gravity)
+            works[k] = float((mean - here) @ terms.du)
+        return works
 
     def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
         """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
