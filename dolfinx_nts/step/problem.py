@@ -147,33 +147,13 @@ class StepProblem:
         for body, moment in zip(system.bodies, moments, strict=True):
             body.begin_step(self.integrator, moment)
         self._gravity = self.integrator.ramp(self._when) * system.gravity
-        flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
-        self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
-        for body, u1 in zip(system.bodies, self.first, strict=True):
-            u1[body.fixed] = body.prescribed(state.time + dt)
-        local = [
-            [
-                b.motion_of_points(u1 - u),
-                *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
-            ]
-            for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
-        ]
-        top = global_max(system.comm, np.array(local)).T
-        motion, extent, speed, moved = top
-        if state.a:
-            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
-            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
-        # In statics v only predicts the first guess.
-        moves = (speed > 0.0) & self.integrator.inertia
-        self.flight = [
-            self._inertial(b, ahead) if top else np.zeros_like(ahead)
-            for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
-        ]
+        self.lengths, speed = self._fly()
         way = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
         if again is not None:
-            motion = np.maximum(motion, self.motion(again))
+            motion = np.maximum(self.lengths.motion, self.motion(again))
+            self.lengths = self.lengths._replace(motion=motion)
             way = [terms.du for terms in again.bodies]
-        self.lengths = Lengths(motion, extent, moved)
+        motion, extent, moved = self.lengths
         # Bodies at rest may fall.
         length = moved + motion + dt**2 * float(np.linalg.norm(self._gravity))
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
@@ -189,6 +169,36 @@ class StepProblem:
             coupling.begin(step, history, again, search)
         self._asleep = self._find_asleep(np.maximum(motion, speed) == 0.0)
         self._lay_out()
+
+    def _fly(self) -> tuple[Lengths, FloatArray]:
+        """Set `first` and `flight`, the step without forces. Collective.
+
+        Returns:
+            Its lengths, and the largest speed of each body [m/s], shape (bodies,).
+        """
+        system, state, dt = self.system, self.state, self.dt
+        flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
+        self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
+        for body, u1 in zip(system.bodies, self.first, strict=True):
+            u1[body.fixed] = body.prescribed(state.time + dt)
+        local = [
+            [
+                b.motion_of_points(u1 - u),
+                *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
+            ]
+            for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
+        ]
+        motion, extent, speed, moved = global_max(system.comm, np.array(local)).T
+        if state.a:
+            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
+            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
+        # In statics v only predicts the first guess.
+        moves = (speed > 0.0) & self.integrator.inertia
+        self.flight = [
+            self._inertial(b, ahead) if top else np.zeros_like(ahead)
+            for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
+        ]
+        return Lengths(motion, extent, moved), speed
 
     @property
     def elements(self) -> list[Any]:
