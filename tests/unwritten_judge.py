@@ -7,6 +7,7 @@ code with the package.
 
 import re
 import traceback
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -149,6 +150,7 @@ class Watch:
     def _scene(self):
         return self.made.scene
 
+    @cached_property
     def _mechanics(self):
         """Of each row kinetic and stored energy, momentum, angular momentum, centre times mass."""
         rows = []
@@ -160,7 +162,7 @@ class Watch:
                 mass = body.density * solid.mass
                 mv = mass @ v
                 total[0] += 0.5 * float((mv * v).sum())
-                total[1] += solid.energy(y, law_of(body)) if body.law else 0.0
+                total[1] += solid.energy(y, law_of(body, self._scene.unit)) if body.law else 0.0
                 total[2] += mv.sum(axis=0)
                 total[3] += np.cross(y, mv).sum(axis=0)
                 total[4] += (mass @ y).sum(axis=0)
@@ -169,12 +171,12 @@ class Watch:
 
     def _energies(self, table):
         """Kinetic and stored energy of the balance are those of the nodes."""
-        kinetic, stored, momentum, angular, _ = self._mechanics()
+        kinetic, stored, momentum, angular, _ = self._mechanics
         largest = max(np.abs(table["energy"]).max(), kinetic.max(), stored.max(), 1e-300)
         massless = any(c.mass == "redistributed" for c in self._scene.contacts)
         stores = any(kind == "Spring" for kind, _, _ in self._scene.joints)
         # A W(C) is rounded at C = 1.
-        stiff = 1e-6 * sum(b.young * s.mass.sum() for b, s in
+        stiff = 1e-6 * self._scene.unit**2 * sum(b.young * s.mass.sum() for b, s in
                            zip(self._scene.bodies, self.made.solids, strict=True))  # fmt: skip
         checks = [("kinetic", kinetic, largest, massless),
                   ("potential", stored, largest + stiff, stores)]  # fmt: skip
@@ -186,7 +188,7 @@ class Watch:
                    ("angular_momentum", angular, mass * speed * size, massless)]  # fmt: skip
         for name, own, scale, other in checks:
             off = np.abs(table[name] - own).max()
-            if not other and off > 1e-8 * scale + 1e-14:
+            if not other and off > 1e-8 * scale:
                 yield f"{name} of the balance is off by {off:.3g} of {scale:.3g}"
 
     def _momenta(self, table):
@@ -199,17 +201,17 @@ class Watch:
                    zip(scene.bodies, self.made.solids, strict=True))  # fmt: skip
         speed = max(np.abs(v).max() for row in self.rows for _, v in row)
         size = max(np.abs(y).max() for row in self.rows for y, _ in row)
-        fall = -scene.gravity * np.outer(table["time"], scene.row)
+        fall = -scene.unit * scene.gravity * np.outer(table["time"], scene.row)
         expected = table["linear_momentum"][0] + mass * fall
         off = np.abs(table["linear_momentum"] - expected).max()
-        scale = max(mass * speed, np.abs(mass * fall).max(), 1e-12)
+        scale = max(mass * speed, np.abs(mass * fall).max(), 1e-9 * mass * scene.unit)
         loose = max(1e-9, 1e3 * self._promise)
         if off > loose * scale:
             yield f"linear momentum changes by {off:.3g} of {scale:.3g}"
-        fallen = self._mechanics()[4] @ np.array(scene.row)
-        work = scene.gravity * (fallen[0] - fallen)
+        fallen = self._mechanics[4] @ np.array(scene.row)
+        work = scene.unit * scene.gravity * (fallen[0] - fallen)
         off, whole = np.abs(table["external_work"] - work).max(), np.abs(table["energy"]).max()
-        if off > 1e-8 * max(whole, np.abs(work).max()) + 1e-12:
+        if off > 1e-8 * max(whole, np.abs(work).max(), 1e-9 * mass * scene.unit**2):
             yield f"external work is off from gravity's by {off:.3g} of {whole:.3g}"
         keeps = RULES[scene.rule].keeps_angular_momentum and not scene.gravity
         off = np.abs(table["angular_momentum"] - table["angular_momentum"][0]).max()
@@ -235,7 +237,7 @@ class Watch:
         missing = np.abs(residual).max()
         if closes and missing > 2 * self._promise * largest and "ledger" not in told:
             # Below it there is the rounding of large forces over small motions.
-            if missing > 1e-9 * largest or missing > 1e-6:
+            if missing > 1e-9 * largest or missing > 1e-9 * self._scene.unit**5:
                 yield f"the ledger misses {missing / largest:.3g} of the largest energy"
         if (np.diff(table["friction_dissipation"]) < -1e-9 * largest).any():
             yield "friction gives energy back"
@@ -292,7 +294,7 @@ class Watch:
                 away = away - np.outer(away @ axis, axis)
             return (np.linalg.norm(away, axis=1) - floor.radius) * (-1 if floor.inside else 1)
 
-        return np.max(-gap(k), where=gap(0) >= -1e-9, initial=0.0)
+        return np.max(-gap(k), where=gap(0) >= -1e-9 * self._scene.unit, initial=0.0)
 
     def _deepest(self, a, b):
         """How deep samples of body a come into body b on straight ways between the rows [m]."""
@@ -310,9 +312,9 @@ class Watch:
         return deepest, where
 
 
-def law_of(body):
+def law_of(body, unit=1.0):
     """Strain energy W(C) of a body [J/m^3] in NumPy, C of shape (..., 3, 3)."""
-    mu = body.young / (2 * (1 + body.poisson))
+    mu = unit**2 * body.young / (2 * (1 + body.poisson))
     lame = 2 * mu * body.poisson / (1 - 2 * body.poisson)
 
     def energy(c):
