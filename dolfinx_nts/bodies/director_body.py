@@ -213,7 +213,9 @@ class DirectorBody(Body):
         """DOLFINx Function of degree 0 from values (n, 3) or (n, 3, 3) in this rank's cells."""
         make = compat.cell_vector_space if values.ndim == 2 else compat.tensor_space
         function = fem.Function(make(self.mesh, "DG", 0), name=name)
-        function.x.array[: values.size] = values.ravel()
+        of_cells = compat.cell_dofs(function.function_space)[: len(values), 0]
+        rows = values.reshape(len(values), 3 ** (values.ndim - 1))
+        function.x.array.reshape(-1, rows.shape[1])[of_cells] = rows
         function.x.scatter_forward()
         return function
 
