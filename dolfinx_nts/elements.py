@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import Moment
-from dolfinx_nts.bodies.points import Points
-from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.evaluation import Evaluation, Moment
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.kernels.vectors import cross
-from dolfinx_nts.kinematics import Kinematics, differenced, has_constraints, unknown
-
-if TYPE_CHECKING:
-    from dolfinx_nts.contact.surfaces import Surface
-    from dolfinx_nts.system import State
+from dolfinx_nts.kinematics import Kinematics
+from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import State
+from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -38,7 +33,7 @@ def over(value: float, limit: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A step as those know it who make its elements.
+    """What a step tells those who make its elements.
 
     Attributes:
         state: At t_n.
@@ -76,30 +71,34 @@ class Step:
         total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
         return float(total[0] / total[1])
 
-    def scale(self, surface: Surface) -> FloatArray:
-        """Force per motion of a surface's points in the units of the step, (p,). Collective.
+    def scale(self, surface: Any) -> FloatArray:
+        """Force per motion of a `Surface`'s points in the units of the step, (p,). Collective.
 
         Massless nodes have their stiffness for it: with more, Newton's method would go to and fro
         between contact and none, and stick and slip, in small steps.
         """
         massless = surface.massless
         if self.integrator.inertia and not massless.any():
-            return surface.mass
-        stiff = self.factor * surface.material.divided(self.stiffness(surface.body))
+            mass: FloatArray = surface.mass
+            return mass
+        change = self.factor * self.integrator.theta
+        stiff = change * surface.material.divided(self.stiffness(surface.body))
         return np.where(massless, stiff, surface.mass) if self.integrator.inertia else stiff
 
 
 class Part(Protocol):
-    """What elements contribute at an iterate; axis 0 = element.
+    """What elements contribute at an iterate; axis 0 = element."""
 
-    Attributes:
-        residual: Rows of coordinates [kg m] (forces times `Step.factor`), then of own unknowns.
-        tangent: Its derivative, shape (n, r, r).
-        status: What Newton's method may flip from iterate to iterate, shape (states, n).
-    """
+    @property
+    def residual(self) -> FloatArray:
+        """Rows of coordinates and own unknowns, shape (n, r).
 
-    residual: FloatArray
-    tangent: FloatArray
+        Those of the coordinates are minus the forces on the bodies times `Step.factor` [kg m].
+        """
+
+    @property
+    def tangent(self) -> FloatArray:
+        """Its derivative, shape (n, r, r)."""
 
     @property
     def status(self) -> BoolArray:
@@ -134,8 +133,12 @@ class Elements(Protocol):
         """Whether its constraints hold always and in both directions, as those of joints."""
 
     @property
+    def extent(self) -> float:
+        """Length beside the displacements whose rounding is in its rows, on this rank [m]."""
+
+    @property
     def force_scale(self) -> float:
-        """What a constraint's unknown is multiplied by to be a force, in the step's units."""
+        """Force, in the step's units, per unit of a constraint's unknown."""
 
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates of each body, shape (n, k) each."""
@@ -150,7 +153,9 @@ class Elements(Protocol):
         """Augmented unknowns that fit predicted positions, shape (n, augmented)."""
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Part:
-        """Residual and tangent; pure. All ranks call it.
+        """Residual and tangent; pure. All ranks call it, also those without elements.
+
+        What it raises on one rank ends the solution on all, see `evaluate_together`.
 
         Args:
             x: Reference plus displacement at t_{n+1} [m], shape (n, k / 3, 3).
@@ -193,7 +198,7 @@ class Elements(Protocol):
     def ledger(self, part: Any, factor: float) -> dict[str, float]:
         """Sums of an accepted step on this rank, by columns of the balance table.
 
-        Of the same columns on all ranks; those that only a joint has are energies [J] that leave.
+        All ranks return the same columns. A column that only a joint has is energy [J] that leaves.
         """
 
     def describe(self, part: Any, flips: IntArray) -> tuple[float, str]:
@@ -205,19 +210,78 @@ class Elements(Protocol):
         """
 
 
+def evaluate_together(
+    comm: Any,
+    elements: Sequence[Any],
+    places: Sequence[FloatArray],
+    own: Sequence[Mapping[str, FloatArray]],
+) -> tuple[Any, ...]:
+    """What elements contribute at an iterate; what fails on one rank fails on all. Collective.
+
+    Args:
+        comm: MPI communicator.
+        elements: Batches of elements.
+        places: Of each, as of `Elements.evaluate`.
+        own: Of each, as of `Elements.evaluate`.
+
+    Raises:
+        UserFunctionError: One raised on some rank.
+        StepFailedError: It raised this.
+    """
+    parts: list[Any] = []
+    cause, problem = None, None
+    for batch, x, unknowns in zip(elements, places, own, strict=True):
+        try:
+            parts.append(batch.evaluate(x, unknowns))
+        except Exception as error:  # any: a rank that raises alone would leave the others waiting
+            if cause is None:
+                told = isinstance(error, UserFunctionError | StepFailedError)
+                what = str(error) if told else f"{batch.name!r}: its elements raised {error!r}"
+                cause, problem = error, (isinstance(error, StepFailedError), what)
+    if global_max(comm, np.array([float(cause is not None)]))[0]:
+        failed, text = next(filter(None, comm.allgather(problem)))
+        raise (StepFailedError if failed else UserFunctionError)(text) from cause
+    return tuple(parts)
+
+
+class Slopes(NamedTuple):
+    """What a force along a coordinate, a length or an angle, does near a state.
+
+    Attributes:
+        gradients: Of the coordinate, by the owned coordinates of each body of the joint.
+        stiffness: Change of the force with the coordinate [N/m], or [N m] of an angle, the same on
+            all ranks.
+        damping: The same with the coordinate's rate [N s/m] or [N m s].
+        about: Whether the coordinate is an angle.
+    """
+
+    gradients: Sequence[FloatArray]
+    stiffness: float
+    damping: float = 0.0
+    about: bool = False
+
+
 class Joint(Protocol):
     """What a System accepts beside contacts: joints, springs, ties; part of the scene.
+
+    All ranks call all its functions, also those without elements. What one raises must be raised on
+    all ranks, or the others wait for ever; `Elements.evaluate` alone may raise on some.
 
     Attributes:
         name: For messages.
         bodies: Bodies of the system that it couples.
         losses: Columns of the balance table for energy that leaves through it, of its own names;
             its elements' `ledger` says how much.
-        numbers: Of each element on this rank, one that does not depend on the ranks; may be missing
-            where it remembers nothing that a checkpoint must hold.
+        numbers: One number per element on this rank, the same on any number of ranks. A joint that
+            remembers nothing may leave it out.
         settings: Numbers and texts by name, for JSON and the same on all ranks, that it was made
             with; a checkpoint goes on only with equal ones. It may be missing: then name and kind
             alone are compared.
+        slopes: Function of the arguments of `potential` that returns `Slopes`, for a force along
+            one coordinate; a run warns of one that is too fast for its steps. Collective. It may
+            be missing.
+        driven: Whether it moves bodies as prescribed by a function of time, which impacts that give
+            their energy back refuse. It may be missing where it does not.
     """
 
     name: str
@@ -241,221 +305,6 @@ class Joint(Protocol):
         Args:
             bodies: Numbers of its bodies in the system.
         """
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PointElements:
-    """What elements between points of bodies have in common, see `Elements`.
-
-    A kind of its own adds `evaluate`, and what else it has to say. Each element is to be on one
-    rank alone: what `body.points` gives is the same on all.
-
-    Attributes:
-        name: For messages.
-        sides: Of each body, the nodes of the elements' points, see `Points`.
-    """
-
-    name: str
-    sides: tuple[Points, ...]
-
-    @property
-    def num_elements(self) -> int:
-        """On this rank."""
-        return len(self.sides[0].nodes)
-
-    @property
-    def num_coordinates(self) -> int:
-        """Coordinates of all nodes of an element."""
-        return sum(3 * side.nodes.shape[1] for side in self.sides)
-
-    @property
-    def widths(self) -> Mapping[str, int]:
-        """No unknowns of its own."""
-        return {"augmented": 0, "constraints": 0}
-
-    @property
-    def pattern(self) -> BoolArray:
-        """Which constraints stand in the rows of which: all."""
-        return np.ones((self.widths["constraints"],) * 2, dtype=bool)
-
-    @property
-    def bilateral(self) -> bool:
-        """Its constraints hold always."""
-        return True
-
-    @property
-    def force_scale(self) -> float:
-        """Unknowns are forces."""
-        return 1.0
-
-    def points(self) -> tuple[IntArray, ...]:
-        """Global coordinates of each body's nodes."""
-        return tuple(side.flat() for side in self.sides)
-
-    def dofs(self) -> tuple[IntArray, ...]:
-        """The same with -1 where they are prescribed."""
-        return tuple(side.flat(prescribed=-1) for side in self.sides)
-
-    def reference(self) -> FloatArray:
-        """Reference positions of the nodes [m], shape (n, nodes, 3)."""
-        return np.concatenate([side.reference for side in self.sides], axis=1)
-
-    @property
-    def weights(self) -> FloatArray:
-        """Weights of the nodes in each side's point, shape (n, sides, nodes)."""
-        zeros = [np.zeros_like(side.weights) for side in self.sides]
-        rows = [
-            np.concatenate([*zeros[:k], side.weights, *zeros[k + 1 :]], axis=1)
-            for k, side in enumerate(self.sides)
-        ]
-        return np.stack(rows, axis=1)
-
-    @cached_property
-    def extent(self) -> float:
-        """Length beside the displacements whose rounding enters on this rank [m]."""
-        return float(np.abs(self.reference()).max(initial=0.0))
-
-    def initial_guess(self, x: FloatArray) -> FloatArray:
-        """No augmented unknowns."""
-        return np.empty((self.num_elements, 0))
-
-    def rows(self, part: Any, name: str) -> FloatArray:
-        """The residual's rows of a field of own unknowns."""
-        start = self.num_coordinates if name == "constraints" else part.residual.shape[1]
-        own: FloatArray = part.residual[:, start:]
-        return own
-
-    def largest(self, part: Any) -> list[float]:
-        """The largest row of its constraints, which are lengths [m], and its extent."""
-        rows = self.rows(part, "constraints")
-        return [0.0, float(np.abs(rows).max(initial=0.0)), 0.0, self.extent]
-
-    def ratios(
-        self, largest: FloatArray, motion: float, rounded: float, rtol: float
-    ) -> dict[str, float]:
-        """Its constraints over what counts as converged, if it has any."""
-        if not self.widths["constraints"]:
-            return {}
-        limit = rtol * motion + 8 * _EPS * (rounded + float(largest[3]))
-        return {f"{self.name} constraints": over(float(largest[1]), limit)}
-
-    def resultant(self, part: Any, k: int, u: FloatArray) -> FloatArray:
-        """Sums over the nodes of side k."""
-        side, out = self.sides[k], np.zeros((4, 3))
-        y = side.reference + side.nodal(u)
-        start = sum(3 * other.nodes.shape[1] for other in self.sides[:k])
-        force = -part.residual[:, start : start + 3 * side.nodes.shape[1]].reshape(y.shape)
-        out[0] = force[side.places].sum(axis=0)
-        out[1] = cross(y, force).sum(axis=(0, 1))
-        out[2], out[3] = side.combine(y).sum(axis=0), len(y)
-        return out
-
-    def ledger(self, part: Any, factor: float) -> dict[str, float]:
-        """Nothing lost."""
-        return {}
-
-    def describe(self, part: Any, flips: IntArray) -> tuple[float, str]:
-        """The element with the largest rows."""
-        size = np.nan_to_num(np.abs(part.residual).max(axis=1), nan=np.inf)
-        return float(size.max()), f"{self.name!r}: element {int(size.argmax())}"
-
-
-class PointPart(NamedTuple):
-    """What elements without states contribute, see `Part`."""
-
-    residual: FloatArray
-    tangent: FloatArray
-
-    @property
-    def status(self) -> BoolArray:
-        """Nothing flips."""
-        return np.empty((0, len(self.residual)), dtype=bool)
-
-
-class EveryStep:
-    """A `JointCoupling` with the same kind of elements in every step, and nothing to look for.
-
-    Args:
-        bodies: Numbers of their bodies in the system.
-        make: Makes the elements of a step from it and from what is remembered.
-        remember: What is remembered of an accepted one, from its part; nothing without.
-    """
-
-    may_slip = False
-
-    def __init__(
-        self,
-        bodies: tuple[int, ...],
-        make: Callable[[Step, Any], Any],
-        remember: Callable[[Any], Any] | None = None,
-    ) -> None:
-        self.bodies, self._make, self._remember = [bodies], make, remember
-        self.elements: list[Any] = []
-        self._begun: tuple[Step, Any] | None = None
-
-    def begin(self, step: Step, history: Any, again: Evaluation | None, search: bool) -> None:
-        """Make the elements of a step."""
-        self._begun = step, history
-        self.elements = [self._make(step, history)]
-
-    def touched(self) -> set[int]:
-        """All bodies."""
-        return set(self.bodies[0])
-
-    def wake(self, u1: Sequence[FloatArray]) -> bool:
-        """Nothing sleeps."""
-        return False
-
-    def misses(self, e: Evaluation, parts: Sequence[Any], motion: FloatArray) -> bool:
-        """Nothing is missed."""
-        return False
-
-    def guess(self, k: int, x: FloatArray) -> FloatArray:
-        """Zero."""
-        batch = self.elements[k]
-        return np.zeros((batch.num_elements, batch.widths["constraints"]))
-
-    def let_slip(self) -> None:
-        """Nothing slips."""
-
-    def give_way(self) -> bool:
-        """Nothing yields."""
-        return False
-
-    def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
-        """Nothing to warn of."""
-        return []
-
-    def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
-        """Nothing to tell."""
-        return {}
-
-    def history(self, parts: Sequence[Any]) -> Any:
-        """Return what is remembered of an accepted step."""
-        return self._remember(parts[0]) if self._remember else None
-
-    def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
-        """Return what the elements' ledgers say."""
-        return None
-
-    def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
-        """Take the kinematics from the residuals of the elements of steps up to this one.
-
-        Raises:
-            TypeError: These cannot say it: elements other than `PointElements`, or with unknowns
-                beside multipliers, or a `begin` of one's own.
-        """
-        if self._begun is None:
-            held = [batch for batch in self.elements if has_constraints(batch)]
-            if held:
-                raise unknown(held[0])
-            return [None] * len(self.elements)
-        step, history = self._begun
-
-        def make(length: float) -> Any:
-            return self._make(replace(step, dt=length), history)
-
-        return [differenced(make, self.bodies[0], state, dt)]
 
 
 class Coupling(Protocol):
@@ -543,7 +392,11 @@ class Coupling(Protocol):
 
 
 class JointCoupling(Coupling, Protocol):
-    """What a `Joint` makes: a `Coupling` that also says what its forces do."""
+    """What a `Joint` makes: a `Coupling` that also says what its forces do.
+
+    It may have `hold_alone()`, which a run calls at its start where its constraints repeat no
+    others, so that its equations need no compliance.
+    """
 
     def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
         """External work in a load step of `equilibrium` on this rank [J]. Collective.

@@ -3,51 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts.bodies.body import Body, is_body
-from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.elements import Joint
 from dolfinx_nts.parallel import raise_together, same_kernels
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.validation import items, known_options, vector
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Part of a body's coordinates by which a start may differ from prescribed displacements.
 _ON_SUPPORT = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """Everything a step starts from; never changed, a step makes a new one.
-
-    Attributes:
-        time: t [s].
-        u: Owned displacements of each body [m].
-        v: Owned velocities of each body [m/s].
-        a: Owned accelerations of each body [m/s^2], where the integrator carries any; else empty.
-        histories: What each `Coupling` of the system remembers; that of the contacts comes first.
-    """
-
-    time: float
-    u: tuple[FloatArray, ...]
-    v: tuple[FloatArray, ...]
-    a: tuple[FloatArray, ...]
-    histories: tuple[Any, ...]
-
-    @property
-    def contacts(self) -> tuple[ContactHistory, ...]:
-        """What each contact remembers of its slave nodes."""
-        history: tuple[ContactHistory, ...] = self.histories[0]
-        return history
 
 
 def is_like(one: Joint, other: Joint) -> bool:
@@ -181,13 +155,13 @@ class System:
 
     def initial_state(self) -> State:
         """Bodies with their initial displacements and velocities at t = 0."""
-        contacts = tuple(ContactHistory.of_start(len(c.slave.share)) for c in self.contacts)
         return State(
             time=0.0,
             u=tuple(self._at_start(b) for b in self.bodies),
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
             a=(),
-            histories=(contacts, *(joint.start() for joint in self.joints)),
+            contacts=tuple(ContactHistory.of_start(len(c.slave.share)) for c in self.contacts),
+            joints=tuple(joint.start() for joint in self.joints),
         )
 
     def state_from(self, other: System, state: State, *, moving: bool) -> State:
@@ -220,12 +194,14 @@ class System:
             for j, known in enumerate(other.contacts):
                 if pair.is_like(known):
                     contacts[k] = state.contacts[j]
-        joints = list(found.histories[1:])
+        joints = list(found.joints)
         for k, joint in enumerate(self.joints):
-            for known, history in zip(other.joints, state.histories[1:], strict=True):
+            for known, history in zip(other.joints, state.joints, strict=True):
                 if is_like(joint, known):
                     joints[k] = history
-        start = replace(found, time=state.time, u=u, histories=(tuple(contacts), *joints))
+        start = replace(
+            found, time=state.time, u=u, contacts=tuple(contacts), joints=tuple(joints)
+        )
         if moving:
             v = tuple(state.v[index[b.name]].copy() for b in self.bodies)
             a = tuple(state.a[index[b.name]].copy() for b in self.bodies) if state.a else ()

@@ -7,7 +7,7 @@ import pytest
 #: step.
 STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 #: What the ledger may miss of the largest energy without a word, by accuracy, where a rule closes
-#: it, and where none does (README).
+#: it, and where none does (docs/features.md).
 PROMISED, OPEN = {"exact": 1e-11, "balanced": 1e-8, "fast": 1e-5}, 1e-2
 #: Columns of the balance table that say whether two runs are the same.
 COLUMNS = ("kinetic", "potential", "friction_dissipation", "contact_defect", "angular_momentum")

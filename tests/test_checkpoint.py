@@ -159,7 +159,7 @@ def arrays(state):
     """Everything in a state, one array after another."""
     for part in (state.u, state.v, state.a, *state.contacts):
         yield from part
-    yield from (h for h in state.histories[1:] if h is not None)
+    yield from (h for h in state.joints if h is not None)
 
 
 def assert_same(one, other):
@@ -703,7 +703,7 @@ def test_elements_with_foreign_or_repeated_numbers_are_told():
         return
     order, state = numbering()
     tables = order.pack(state, {}, {})
-    assert np.array_equal(order.unpack(tables, 0.0).histories[1], [0.0, 70.0])
+    assert np.array_equal(order.unpack(tables, 0.0).joints[0], [0.0, 70.0])
     other, _ = numbering(first=1)
     with pytest.raises(ValueError, match="'counter': 1 is none of its elements or nodes there"):
         other.unpack(tables, 0.0)

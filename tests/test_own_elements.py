@@ -84,6 +84,19 @@ class Spring:
             parts.append(everywhere[side.nodes])
         return np.concatenate(parts, axis=1)
 
+    def slopes(self, u, history):
+        """For the warning of steps that do not resolve it."""
+        x = self._elements(None).reference() + self._gathered(u)
+        weight = self._elements(None).weights
+        r = np.einsum("na,nai->ni", weight[:, 0] - weight[:, 1], x)
+        r /= np.linalg.norm(r, axis=1)[:, None]
+        signs = (1.0, -1.0)
+        gradients = [
+            side.gathered(sign * side.weights[:, :, None] * r[:, None])
+            for sign, side in zip(signs, self._sides, strict=True)
+        ]
+        return nts.Slopes(gradients, self.stiffness, self.damping)
+
     def coupling(self, bodies):
         def make(step, history):
             u0 = [step.state.u[b] for b in bodies]
@@ -168,6 +181,61 @@ def test_two_stiff_cubes_vibrate_as_two_masses():
     stepper.close()
 
 
+def masses():
+    """Two of 1 kg, 1 m apart, and a flexible cube beside them."""
+    a, b = (
+        nts.RigidBody.from_inertia(1.0, (1, 2, 2.5), centre=(x, 0, 0), name=name, comm=COMM)
+        for x, name in ((0, "a"), (1, "b"))
+    )
+    return a, b, cube((1.5, -0.5, -0.5), "flexible")
+
+
+def told(bodies, joints, dt=1e-2):
+    """How many times too fast a spring is said to be."""
+    stepper = nts.Stepper(nts.System(bodies, joints=joints), nts.EnergyMomentum())
+    stepper.start(dt)
+    found = stepper.solution.warnings.get("unresolved")
+    stepper.close()
+    return 0.0 if found is None else found.worst
+
+
+@pytest.mark.mpi
+def test_a_spring_of_ones_own_that_steps_do_not_resolve_is_told():
+    """Omega h as of the built-in twin, and c h/(2 m) of its damper."""
+    a, b, _ = masses()
+    ends = [(0, 0, 0), (1, 0, 0)]
+    omega = np.sqrt(2.0 * 1e6)
+    assert told((a, b), [Spring(a, b, ends, stiffness=1e6)]) == pytest.approx(1e-2 * omega)
+    assert told((a, b), [nts.Spring(a, b, ends, stiffness=1e6)]) == pytest.approx(1e-2 * omega)
+    damper = Spring(a, b, ends, stiffness=1.0, damping=1e4)
+    assert told((a, b), [damper]) == pytest.approx(100.0)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("tells", [True, False])
+def test_a_weak_spring_of_ones_own_holds_no_body(tells):
+    """A fast spring beside it is told, whether the own one says its slopes or not."""
+    a, b, block = masses()
+    weak = Spring(b, block, [(1, 0, 0), (2, 0, 0)], stiffness=1e-3, name="weak")
+    if not tells:
+        weak = Silent(weak)
+    fast = nts.Spring(a, b, [(0, 0, 0), (1, 0, 0)], stiffness=1e6)
+    found = told((a, b, block), [fast, weak])
+    assert found == pytest.approx(1e-2 * np.sqrt(2.0 * 1e6), rel=1e-9)
+
+
+class Silent:
+    """A joint that leaves out what may be left out."""
+
+    def __init__(self, joint):
+        self._joint = joint
+
+    def __getattr__(self, name):
+        if name == "slopes":
+            raise AttributeError(name)
+        return getattr(self._joint, name)
+
+
 @pytest.mark.mpi
 def test_points_are_where_they_were_asked_for():
     body = cube((0, 0, 0), "a", bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9)])
@@ -232,10 +300,11 @@ class Drive:
     """A joint with the ground whose constraint depends on time: a way at an acceleration."""
 
     losses = ()
+    driven = True
 
     def __init__(self, body, x, speed, acceleration=0.0, name="drive"):
         self.name, self.bodies = name, (body,)
-        self.motion = (speed, acceleration)
+        self.rates = (speed, acceleration)
         side = body.points(x)
         self.side = side if COMM.rank == 0 else side.part(slice(0))
 
@@ -247,7 +316,7 @@ class Drive:
 
     def coupling(self, bodies):
         def make(step, history):
-            (speed, acceleration), t = self.motion, step.state.time + step.dt
+            (speed, acceleration), t = self.rates, step.state.time + step.dt
             return DriveElements(
                 name=self.name, sides=(self.side,), way=speed * t + 0.5 * acceleration * t**2
             )
@@ -273,6 +342,14 @@ def test_a_drive_moves_what_it_holds(newton):
 
 
 @pytest.mark.mpi
+def test_impacts_give_nothing_back_where_a_joint_of_ones_own_drives():
+    body = cube((0, 0, 0), "a")
+    system = nts.System([body], joints=[Drive(body, (0.3, 0.4, 0.6), 0.1)])
+    with pytest.raises(ValueError, match="impact='restored': joint 'drive' is driven"):
+        nts.Stepper(system, nts.EnergyMomentum(), impact="restored")
+
+
+@pytest.mark.mpi
 def test_a_step_with_a_joint_that_fails_is_cut():
     a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b", velocity=(30.0, 0, 0))
     spring = Spring(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e7)
@@ -281,6 +358,63 @@ def test_a_step_with_a_joint_that_fails_is_cut():
         newton=nts.Newton(max_iterations=1, max_retries=2),
     )  # fmt: skip
     assert run.retries == 2 and "not solved after" in run.status
+
+
+class FailingElements(SpringElements):
+    """A spring that fails on one rank, but not at once."""
+
+    def evaluate(self, x, own):
+        if COMM.rank == COMM.size - 1 and self.step.state.time > 3e-3:
+            raise RuntimeError("no table")
+        return super().evaluate(x, own)
+
+
+class TooLongElements(FailingElements):
+    """A spring that fails on one rank where steps are long."""
+
+    def evaluate(self, x, own):
+        if COMM.rank == COMM.size - 1 and self.step.dt > 1e-3:
+            raise nts.StepFailedError("steps are too long for a spring; use a smaller dt")
+        return SpringElements.evaluate(self, x, own)
+
+
+class Failing(Spring):
+    """A spring whose elements raise on one rank alone."""
+
+    kind = FailingElements
+
+    def coupling(self, bodies):
+        def make(step, history):
+            x0 = self._elements(None).reference()
+            x0 = x0 + self._gathered([step.state.u[b] for b in bodies])
+            return self.kind(
+                name=self.name, sides=self._sides, stiffness=self.stiffness, damping=0.0,
+                length=self.length, step=step, x0=x0,
+            )  # fmt: skip
+
+        return nts.EveryStep(bodies, make)
+
+
+@pytest.mark.mpi
+def test_what_elements_raise_on_one_rank_ends_the_run_on_all():
+    a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b", velocity=(3.0, 1.0, 0))
+    spring = Failing(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e4)
+    stepper = nts.Stepper(nts.System([a, b], joints=[spring]), nts.EnergyMomentum())
+    with pytest.raises(nts.UserFunctionError, match=r"'spring': its elements raised .*no table"):
+        for _ in range(9):
+            stepper.advance(2e-3)
+    stepper.close()
+
+
+@pytest.mark.mpi
+def test_a_step_is_cut_where_elements_refuse_it_on_one_rank():
+    a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b", velocity=(3.0, 1.0, 0))
+    spring = Failing(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e4)
+    spring.kind = TooLongElements
+    stepper = nts.Stepper(nts.System([a, b], joints=[spring]), nts.EnergyMomentum())
+    stepper.advance(2e-3)
+    assert stepper.solution.retries == 1 and len(stepper.solution.rows) == 4
+    stepper.close()
 
 
 # ---- starts
@@ -408,7 +542,7 @@ def test_constraints_that_nobody_can_follow_are_refused():
 
     class Own(nts.EveryStep):
         def begin(self, step, history, again, search):
-            self.elements = [self._make(step, history)]
+            self.elements = [self.make(step, history)]
 
     class Loose(Own):
         def kinematics(self, state, dt):
@@ -416,7 +550,7 @@ def test_constraints_that_nobody_can_follow_are_refused():
 
     class Other(Drive):
         def coupling(self, bodies):
-            return self.kind(bodies, super().coupling(bodies)._make)
+            return self.kind(bodies, super().coupling(bodies).make)
 
     drive = Other(body, x, 0.1)
     drive.kind = Own
@@ -434,7 +568,7 @@ class Telling(nts.EveryStep):
     firm = True
 
     def warnings(self, parts):
-        x = self._begun[0].state.u
+        x = self.step.state.u
         way = COMM.allreduce(max(float(np.abs(u).max(initial=0.0)) for u in x), op=MPI.MAX)
         return [("way", way, f"a body has moved by {way:.3g} m")] if way > 0.0125 else []
 
@@ -449,7 +583,7 @@ def test_a_coupling_of_ones_own_warns_and_gives_way():
 
     class Told(Drive):
         def coupling(self, bodies):
-            return Telling(bodies, super().coupling(bodies)._make)
+            return Telling(bodies, super().coupling(bodies).make)
 
     stepper = nts.Stepper(nts.System([body], joints=[Told(body, x, 1.0)]), nts.EnergyMomentum())
     for _ in range(5):
@@ -492,7 +626,7 @@ class Unspoken:
 
 class TwoBatches(nts.EveryStep):
     def begin(self, step, history, again, search):
-        self.elements = list(self._make(step, history))
+        self.elements = list(self.make(step, history))
         self.bodies = [self.bodies[0]] * len(self.elements)
 
 

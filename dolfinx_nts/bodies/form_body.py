@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import ufl
-from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.mesh_check import check_any_mesh
+from dolfinx_nts.bodies.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.ufl_body import UflBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.validation import is_whole, known_options, require_positive
+from dolfinx_nts.validation import is_whole, known_options
 
 #: Part of the mass that rounding may add where two directions, or two orders of nodes, differ.
 _ROUNDING = 1e-12
@@ -52,15 +52,16 @@ class FormBody(UflBody):
         energy: Callable u -> stored energy Pi [J] as a UFL form, or of what `strain` returns.
         strain: Callable u -> what the energy depends on, a UFL expression or a tuple of them, each
             of which `energy` gets as an argument; best of degree <= 2 in u.
-        density: Mass per reference volume, area or length [kg/m^d], > 0; or
+        density: Mass per reference volume, area or length [kg/m^d], > 0: a number, or a Constant or
+            Function on the mesh, which may change between steps; or
         mass: callable (v, w) -> bilinear form [kg m/s . m/s], symmetric and positive definite, the
             same in all directions.
         velocity: Initial velocity [m/s], as of `Continuum`.
         displacement: Displacement [m] in which the body starts, as of `Continuum`.
         bcs: `Dirichlet` conditions, on parts of the mesh's boundary.
         name: Name in messages and files.
-        quadrature_degree: Of all integrals of `energy`, `density` and `mass` whose measures name
-            none; default twice the degree of the space.
+        quadrature_degree: Of all integrals of `energy` whose measures name none; default twice the
+            degree of the space, which those of `density` and `mass` have at least.
         extra_form: Further virtual work such as damping and loads, as of `Continuum`.
         allow_inversion: On a 3D mesh, accept steps that turn a cell inside out, as of `Continuum`.
 
@@ -83,7 +84,7 @@ class FormBody(UflBody):
         energy: Callable[..., Any],
         *,
         strain: Callable[[Any], Any] | None = None,
-        density: float | None = None,
+        density: Parameter | None = None,
         mass: Callable[[Any, Any], Any] | None = None,
         velocity: Any = (0.0, 0.0, 0.0),
         displacement: Any = (0.0, 0.0, 0.0),
@@ -97,7 +98,7 @@ class FormBody(UflBody):
         if (density is None) == (mass is None):
             raise ValueError(f"density={density!r}, mass={mass!r}: pass one of the two")
         if density is not None:
-            require_positive("density", density, "kg/m^d")
+            require_positive_parameter("density", density, "kg/m^d")
         if quadrature_degree is not None and not (
             is_whole(quadrature_degree) and quadrature_degree > 0
         ):
@@ -110,12 +111,14 @@ class FormBody(UflBody):
             )
         check_any_mesh(space.mesh, name)
         self._quadrature, self._given_mass = quadrature_degree or 2 * degree, mass
+        # With one point a cell could turn for nothing.
+        self._of_mass = max(self._quadrature, 2 * degree)
         super().__init__(space, degree, name, extra_form, self._quadrature, allow_inversion)
-        # A Constant, not a number: bodies of any density share compiled forms.
-        self._rho = None if density is None else fem.Constant(self.mesh, float(density))
+        self._rho = None if density is None else self._density(density)
         self.rounded = self._size()
         self._potential = Potential(
-            lambda *strains: self._integrated(energy(*strains)), _in_tuple(strain)
+            lambda *strains: self._integrated(energy(*strains), self._quadrature),
+            _in_tuple(strain),
         )
         form = self._checked_energy(energy)
         if mass is not None:
@@ -125,8 +128,8 @@ class FormBody(UflBody):
         self._check_mass()
 
     # ---- set-up
-    def _integrated(self, form: Any) -> Any:
-        """A form with this body's quadrature, but where its measures name one.
+    def _integrated(self, form: Any, degree: int) -> Any:
+        """A form with a degree of quadrature, but where its measures name one.
 
         UFL's own choice differs between an energy and its derivative, which would then be that of
         another energy.
@@ -137,7 +140,7 @@ class FormBody(UflBody):
             part
             if "quadrature_degree" in part.metadata()
             else part.reconstruct(
-                metadata={**part.metadata(), "quadrature_degree": self._quadrature}
+                metadata={**part.metadata(), "quadrature_degree": degree}
             )
             for part in form.integrals()
         ]
@@ -196,10 +199,11 @@ class FormBody(UflBody):
 
     def _mass_form(self, v: Any, w: Any) -> Any:
         """Mass in UFL."""
-        if self._given_mass is not None:
-            return self._integrated(self._given_mass(v, w))
-        dx = ufl.Measure("dx", self.mesh)
-        return self._integrated(self._rho * ufl.inner(v, w) * dx)
+        if self._given_mass is None:
+            form = self._rho * ufl.inner(v, w) * ufl.Measure("dx", self.mesh)
+        else:
+            form = self._given_mass(v, w)
+        return self._integrated(form, self._of_mass)
 
     def _virtual_work(self, rule: Integrator, w: Any) -> Any:
         """Virtual work of the potential by the rule in UFL."""

@@ -33,6 +33,12 @@ class ObstaclePair(ContactPair, master=Obstacle):
     def _set_up(self) -> None:
         self.obstacle: Obstacle = self.master.about(self.origin)
 
+    @property
+    def driven(self) -> bool:
+        """Whether the obstacle moves."""
+        moves: bool = self.master.driven
+        return moves
+
     def has_master_of(self, other: ContactPair) -> bool:
         """Return whether the obstacles of both are equal."""
         return bool(self.master == other.master)
@@ -74,6 +80,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
         rule = step.integrator
         return ObstacleElements(
             pair=self,
+            obstacle=self.obstacle,
             candidates=found,
             contact_gradient=rule.contact_gradient,
             condense=step.condense,

@@ -42,12 +42,17 @@ class Obstacle:
     motion: Motion | None
 
     @property
+    def driven(self) -> bool:
+        """Whether it moves; one with a `displacement` of its own says so."""
+        return self.motion is not None
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What a restart compares: the fields of a dataclass, of a motion whether there is one."""
         given: dict[str, Any] = {}
         if is_dataclass(self):
             given = {f.name: getattr(self, f.name) for f in fields(self)}
-        return given | {"name": self.name, "motion": self.motion is not None}
+        return given | {"name": self.name, "motion": self.driven}
 
     def displacement(self, time: float, comm: Any) -> FloatArray:
         """Displacement at a time [m], shape (3,). Collective if there is a motion.
@@ -291,7 +296,7 @@ class _Round(Obstacle):
         return lowest
 
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(y_0 + y_1) / (|y_0| + |y_1|): the discrete gradient of the root of y . y."""
+        """(y_0 + y_1) / (r_0 + r_1): the discrete gradient of r, the root of y . y."""
         y0, r0, projection, side = self._radial(x0)
         y1, r1, _, _ = self._radial(x1)
         per_sum = inverse(r0 + r1)[:, None]

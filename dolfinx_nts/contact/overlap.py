@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.crossings import STEPS, BodyPair, Finding, Pause
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.surfaces import Surface
@@ -141,8 +140,7 @@ class OverlapWatch:
     def _boundary(self, k: int) -> Surface:
         """The whole boundary of a body with a mesh. Collective."""
         if k not in self._surfaces:
-            body = self._bodies[k]
-            self._surfaces[k] = Surface(body, compat.exterior_facets(body.mesh))
+            self._surfaces[k] = self._bodies[k].boundary()
         return self._surfaces[k]
 
 

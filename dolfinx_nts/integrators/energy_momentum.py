@@ -33,6 +33,7 @@ class EnergyMomentum(MiddleOfStep):
     """
 
     closes_ledger: ClassVar[bool] = True
+    taken_at: ClassVar[None] = None  # type: ignore[assignment]
 
     stress: str = "gonzalez"
     contact_gradient: str = "mean-value"  # type: ignore[misc]

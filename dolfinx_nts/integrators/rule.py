@@ -27,19 +27,26 @@ class Integrator(Protocol):
         closes_ledger: Whether the ledger closes to the tolerance of the solver.
         keeps_angular_momentum: Whether it changes by the moments of the step's forces at the middle
             of the step and nothing else.
+        keeps_energy: Whether kinetic energy changes by the work of the step's forces and nothing
+            else, as v_0 + v_1 = 2 (u_1 - u_0)/h makes it. Impacts can then give back what they
+            lose, and nodes may have no mass.
         ledger_remedy: What else closes an open ledger, for messages; begins with a comma.
         order: Local error of the motion is of order + 1.
         theta: Where between t_n and t_{n+1} loads, and the direct rule's contact forces, are taken.
-        contact_gradient: Rule of the contact forces: "direct", or a discrete gradient's name.
+        taken_at: The same of forces that come as arrays, such as those of springs and beams; None:
+            their discrete gradients between both ends. Forms have `piola` and `virtual_work`.
+        contact_gradient: Rule of contact alone: "direct", or a discrete gradient's name.
     """
 
     inertia: bool
     accelerations: bool
     closes_ledger: bool
     keeps_angular_momentum: bool
+    keeps_energy: bool
     ledger_remedy: str
     order: int
     theta: float
+    taken_at: float | None
     contact_gradient: str
 
     def factor(self, dt: float) -> float:
@@ -73,8 +80,14 @@ class InTime:
     accelerations: ClassVar[bool] = False
     closes_ledger: ClassVar[bool] = False
     keeps_angular_momentum: ClassVar[bool] = False
+    keeps_energy: ClassVar[bool] = False
     ledger_remedy: ClassVar[str] = ""
     contact_gradient: ClassVar[str] = "direct"
+
+    @property
+    def taken_at(self: Integrator) -> float | None:
+        """Where forces that come as arrays are taken: where loads are."""
+        return self.theta
 
     def ramp(self, time: float) -> float:
         """Part of a constant load that acts at a time: all of it."""
@@ -85,6 +98,7 @@ class MiddleOfStep(InTime):
     """Motion whose velocity is linear over the step, under forces of its middle: (58), (61)."""
 
     keeps_angular_momentum: ClassVar[bool] = True
+    keeps_energy: ClassVar[bool] = True
     order: ClassVar[int] = 2
     theta: ClassVar[float] = 0.5
 
@@ -145,11 +159,6 @@ class WithAccelerations(InTime):
         beta, gamma, _ = self._parameters
         a1 = (du - dt * v0) / (beta * dt**2) - (0.5 / beta - 1.0) * a0
         return v0 + dt * ((1.0 - gamma) * a0 + gamma * a1), a1
-
-
-def taken_at(rule: Integrator) -> float | None:
-    """Where between t_n and t_{n+1} forces are taken; None: discrete gradients take both ends."""
-    return rule.theta if rule.contact_gradient == "direct" else None
 
 
 def choose(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -23,9 +23,11 @@ class Static:
     accelerations: ClassVar[bool] = False
     closes_ledger: ClassVar[bool] = False
     keeps_angular_momentum: ClassVar[bool] = True
+    keeps_energy: ClassVar[bool] = False
     ledger_remedy: ClassVar[str] = ""
     order: ClassVar[int] = 1
     theta: ClassVar[float] = 1.0
+    taken_at: ClassVar[float] = 1.0
     contact_gradient: ClassVar[str] = "direct"
 
     def factor(self, dt: float) -> float:

@@ -13,9 +13,8 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations, Upright, rank_of
 from dolfinx_nts.kernels import quadratic
-from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import (
-    UserFunctionError,
+    agree,
     call_together,
     floats,
     is_finite,
@@ -232,12 +231,17 @@ class Between(ABC):
         return np.arange(self._here)
 
     @property
+    def driven(self) -> bool:
+        """Whether a function of time prescribes its motion."""
+        return self.motion is not None
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What a restart compares; of a motion only whether there is one."""
         return {
             "bodies": ["ground" if body is None else body.name for body in self.ends],
             "points": [place.tolist() for place in self._places],
-            "driven": self.motion is not None,
+            "driven": self.driven,
         }
 
     def start(self) -> None:
@@ -362,15 +366,13 @@ def number_at(comm: Any, name: str, function: Callable[[float], Any], t: float, 
     """The user's number at a time; what fails on one rank raises on all.
 
     Raises:
-        UserFunctionError: It raised, or returned anything but a finite number.
+        UserFunctionError: It raised, or returned anything but the same finite number on all ranks.
     """
     name = f"{name} at t={float(t)!r}"
     value = floats(given := call_together(comm, name, function, t))
     fits = value.size == 1 and is_finite(value.item())
-    raise_together(
-        comm,
-        None if fits else f"{name}={given!r}: return a finite number [{unit}]",
-        UserFunctionError,
-    )
-    return float(value.item())
+    problem = None if fits else f"{name}: returned {given!r}; return a finite number [{unit}]"
+    number = float(value.item()) if fits else 0.0
+    agree(comm, name, np.array([number]), problem)
+    return number
 

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
-from dolfinx_nts.elements import EveryStep, PointElements, Step
-from dolfinx_nts.integrators.rule import taken_at
+from dolfinx_nts.elements import Slopes, Step
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
+from dolfinx_nts.point_elements import EveryStep, PointElements
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import StepFailedError, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]
@@ -92,8 +92,8 @@ class Move(NamedTuple):
     Attributes:
         ends: Between which its gradient is taken, two of shape (n,).
         gradient: Its gradient.
-        share: Part of a change at t_{n+1} that is one of the second end, for what is the same if
-            both ends change places.
+        share: Derivative by the vectors at t_{n+1} over that by the second end, of what is
+            symmetric in both ends.
         speed: Of the vectors where forces are taken, shape (n, 3 v).
         rate: Its change with the vectors at t_{n+1} [1/s].
         time: Length of the step [s] if the ends are those of the step; else None.
@@ -145,7 +145,7 @@ class SpringElements(PointElements):
 
     def evaluate(self, x: FloatArray, own: Any) -> SpringPart:
         """Residual and tangent."""
-        way, theta, n = self.way, taken_at(self.step.integrator), len(x)
+        way, theta, n = self.way, self.step.integrator.taken_at, len(x)
         rate = self.step.moments[0].rate
         du = x - self.y0
         first, last = (self.y0, x) if theta is None else (self.y0 + theta * du,) * 2
@@ -235,18 +235,12 @@ class Between:
         y = self._way.reference() + self._way.nodal(u)
         return y, self._way.coordinate.value(self._way.vectors(y), history)
 
-    def slopes(
-        self, u: Sequence[FloatArray], history: FloatArray
-    ) -> tuple[list[FloatArray], float, float]:
+    def slopes(self, u: Sequence[FloatArray], history: FloatArray) -> Slopes:
         """Gradient of the coordinate, and derivatives of the force. Collective.
 
         Args:
             u: Owned displacements of each of its bodies [m].
             history: The coordinate there.
-
-        Returns:
-            By the owned coordinates of each body; by the coordinate [N/m] or [N m], and by its rate
-            [N s/m] or [N m s], the same on all ranks.
         """
         y, at = self._at(u, history)
         p = self._way.vectors(y)
@@ -257,7 +251,7 @@ class Between:
             here = slice(first, first := first + side.nodes.shape[1])
             gradients.append(side.gathered(along[:, here]))
         stiffness, damping = self.comm.allreduce(np.array(self._force.slopes(at))).tolist()
-        return gradients, stiffness, damping
+        return Slopes(gradients, stiffness, damping, self._way.coordinate is kernel.Angle)
 
     def coupling(self, bodies: tuple[int, ...]) -> EveryStep:
         """What makes its elements in a run, and remembers the coordinate."""

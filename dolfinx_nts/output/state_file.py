@@ -39,10 +39,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.contact_elements import ContactHistory
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.step import balance, resultants
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -210,7 +210,7 @@ class Numbering:
             more |= {"number": numbers, **history._asdict()}
             tables |= self._rows(f"contacts/{k}", more)
         for k, joint in enumerate(self.system.joints):
-            value = state.histories[1 + k]
+            value = state.joints[k]
             raise_together(self.comm, _misfit(joint, value), TypeError)
             if value is not None:
                 found = self._rows(f"joints/{k}", {"number": joint.numbers, "value": value})
@@ -226,19 +226,19 @@ class Numbering:
     def unpack(self, tables: Tables, time: float) -> State:
         """The state of a file. Collective."""
         accelerations = self.comm.bcast("bodies/0/a" in tables)
-        histories = [joint.start() for joint in self.system.joints]
+        joints = [joint.start() for joint in self.system.joints]
         for k, joint in enumerate(self.system.joints):
             rows = self._share(tables, f"joints/{k}", ("number", "value"))
             if rows is not None:
-                histories[k] = self._at(rows, "value", joint.numbers, joint.name)
+                joints[k] = self._at(rows, "value", joint.numbers, joint.name)
         parts = (self.nodal(tables, name) for name in ContactHistory._fields)
-        contacts = tuple(itertools.starmap(ContactHistory, zip(*parts, strict=True)))
         return State(
             time,
             self.from_file(tables, "u"),
             self.from_file(tables, "v"),
             self.from_file(tables, "a") if accelerations else (),
-            (contacts, *histories),
+            contacts=tuple(itertools.starmap(ContactHistory, zip(*parts, strict=True))),
+            joints=tuple(joints),
         )
 
     def nodal(self, tables: Tables, name: str) -> list[npt.NDArray[Any]]:

@@ -12,18 +12,20 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
+from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.run.writer import Writer
+from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
 from dolfinx_nts.step.convergence import unrest
 from dolfinx_nts.step.free_motion import free_motion
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -64,11 +66,11 @@ _ROUNDING = 16 * float(np.finfo(float).eps)
 class Equilibrium(Solution):
     """What `equilibrium` computed, complete up to where it ended.
 
-    `balance` has one row per accepted load step: "time" is the pseudo time, "potential" and
-    "energy" the strain energy, "external_work" that of loads and prescribed motion (of the mean of
-    the forces at both ends of each step), "ledger_residual" what energy and
-    friction_dissipation miss of it; "kinetic" and the momenta are 0, and changes of facet, which
-    cost nothing, are not listed.
+    `balance` has one row per accepted load step. "time" is the pseudo time. "potential" and
+    "energy" are the strain energy. "external_work" is that of loads and prescribed motion, of the
+    mean of the forces at both ends of each step. "ledger_residual" is what energy and
+    friction_dissipation miss of it. "kinetic" and the momenta are 0. Changes of facet cost nothing
+    and are not listed.
     """
 
     moving: ClassVar[bool] = False
@@ -183,7 +185,7 @@ class _LoadStepper(Stepper):
             new: At its end.
             told: What the ledgers of each joint's elements say, shape (joints,).
         """
-        histories, works = zip(old.histories[1:], new.histories[1:], strict=True), []
+        histories, works = zip(old.joints, new.joints, strict=True), []
         for joint, both, ledger in zip(
             self.problem.joints, histories, told.tolist(), strict=True
         ):
@@ -237,7 +239,7 @@ class _LoadStepper(Stepper):
                             slipped, state.contacts, reached.contacts, strict=True
                         )
                     )
-                    reached = replace(reached, histories=(contacts, *reached.histories[1:]))
+                    reached = replace(reached, contacts=contacts)
                     self._check_missed(reached)
                 except UserFunctionError:
                     raise
@@ -393,6 +395,7 @@ def equilibrium(
     Raises:
         ValueError: An argument is out of range; before any work.
     """
+    same_run(system, load_steps=load_steps, stabilization=stabilization)
     times = _pseudo_times(load_steps)
     if stabilization is not None:
         require_positive("stabilization", stabilization, "-")

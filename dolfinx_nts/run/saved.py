@@ -16,7 +16,8 @@ from petsc4py import PETSc
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.parallel import write_on_root
 from dolfinx_nts.run.record import Record, unpacked
-from dolfinx_nts.system import State, System
+from dolfinx_nts.state import State
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import StrPath, as_path
 
 
@@ -42,15 +43,18 @@ class Saved(Record):
     scene: Mapping[str, Any]
     versions: Mapping[str, str]
 
-    def plot(self, path: StrPath) -> None:
-        """Write a picture of energies, ledger and momenta over time.
+    def plot(self, path: StrPath | None = None) -> Any:
+        """Plot energies, ledger and momenta over time.
 
         Args:
-            path: Picture file; its ending chooses the format.
+            path: Picture file; its ending chooses the format. None: no file.
+
+        Returns:
+            matplotlib's Figure.
         """
         from dolfinx_nts.output.plots import plot_balance
 
-        plot_balance(self.balance, as_path("path", path))
+        return plot_balance(self.balance, None if path is None else as_path("path", path))
 
 
 def save(record: Record, system: System, state: State, path: Path) -> None:

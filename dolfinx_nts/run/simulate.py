@@ -11,6 +11,8 @@ from dolfinx_nts.parallel import first_problem
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.intercept import interceptable
 from dolfinx_nts.run.interrupts import Interrupts
+from dolfinx_nts.run.progress import progress_bar
+from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.stepper import Stepper
@@ -156,6 +158,9 @@ def simulate(
         ValueError: An argument is out of range; before any work.
         Exception: Before any step, what the `start` of a writer raises.
     """
+    # Of a checkpoint not the path, which rank 0 writes.
+    cadence = (getattr(checkpoint, "every", None), getattr(checkpoint, "seconds", None))
+    same_run(system, dt=dt, t_end=t_end, accuracy=accuracy, adapt=adapt, checkpoint=cadence)
     require_positive("dt", dt, "s")
     require_positive("t_end", t_end, "s")
     require_bool("progress", progress)
@@ -183,7 +188,7 @@ def simulate(
     begin = stepper.state.time
     if not t_end > begin:
         raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
-    remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
+    remedy = "Try a smaller dt"
     end, dt = float(t_end), float(dt)
     stepper.solution.settings |= {"dt": dt, "t_end": end, "adapt": adapt and repr(adapt)}
     if adapt is not None:
@@ -244,7 +249,7 @@ def run(
         steps: Length and end of each [s], one after another; with `adapt` the largest and the end.
         output: Writers.
         progress: Show a progress line on rank 0.
-        remedy: What to do if a step fails, for `status`.
+        remedy: What to do if a step fails and says nothing better, for `status`.
         adapt: How to choose the steps between, each of which is written.
         checkpoint: Where and how often to write what `restart` needs.
     """
@@ -264,13 +269,13 @@ def _run(
 ) -> Solution:
     """`run` while signals are noted."""
     solution, root = stepper.solution, stepper.system.comm.rank == 0
-    bar = _progress_bar(None if adapt else len(steps), progress and root)
     started: list[Writer] = []
     saver = None
     try:
         try:
             saver = None if checkpoint is None else Saver(checkpoint, stepper)
-            signal = _march(stepper, steps, output, started, adapt, bar, saver, interrupts)
+            with progress_bar(None if adapt else len(steps), progress and root) as bar:
+                signal = _march(stepper, steps, output, started, adapt, bar, saver, interrupts)
             stepper.look(last=True)
             if signal is None:
                 solution.finish()
@@ -281,7 +286,7 @@ def _run(
             _stop(stepper, str(failure), failure.__cause__)
         except StepFailedError as failure:
             _last_look(stepper)
-            _stop(stepper, f"{failure}. {remedy}")
+            _stop(stepper, str(failure) if failure.advises else f"{failure}. {remedy}")
         except BaseException:
             # Where one rank alone comes here, no other answers.
             _call(stepper, started, "close")
@@ -293,8 +298,6 @@ def _run(
             _stop(stepper, problem, cause)
     finally:
         stepper.close()
-        if bar is not None:
-            bar.close()
     return solution
 
 
@@ -416,11 +419,3 @@ def writers(output: Any) -> tuple[Writer, ...]:
     """The argument `output`, checked."""
     wanted = "writers of dolfinx_nts.output, or others with the Writer protocol"
     return items("output", output, _is_writer, wanted)
-
-
-def _progress_bar(steps: int | None, wanted: bool) -> Any:
-    if not wanted:
-        return None
-    from tqdm import tqdm
-
-    return tqdm(total=steps, unit="step")

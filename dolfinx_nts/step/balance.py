@@ -12,7 +12,8 @@ from mpi4py import MPI
 
 from dolfinx_nts.bodies.inversion import smallest_dets
 from dolfinx_nts.evaluation import Evaluation
-from dolfinx_nts.system import State, System
+from dolfinx_nts.state import State
+from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
     from dolfinx_nts.step.problem import StepProblem
@@ -138,7 +139,7 @@ def measure(
         if last is None or last[0] is not u or last[1] is not v:
             known[body.name] = last = u, v, _of_body(body, u, v)
         local += last[2]
-    joints = zip(system.joints, system.joint_bodies, state.histories[1:], strict=True)
+    joints = zip(system.joints, system.joint_bodies, state.joints, strict=True)
     for joint, bodies, history in joints:
         local[1] += joint.potential([state.u[b] for b in bodies], history)
     total = np.empty_like(local)
@@ -185,8 +186,9 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     scale = 1.0 / problem.factor
     losses = (name for joint in problem.system.joints for name in joint.losses)
     sums, smallest = dict.fromkeys((*WORKS, *COUNTS, *losses), 0.0), {"min_gap": np.inf}
-    for body, terms in zip(problem.system.bodies, step.bodies, strict=True):
-        work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed]
+    added = problem.work_at_ends(step)
+    for body, terms, more in zip(problem.system.bodies, step.bodies, added, strict=True):
+        work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed] + more
         sums["external_work"] += scale * float(work)
     for elements, part in zip(problem.elements, step.parts, strict=True):
         for name, value in elements.ledger(part, problem.factor).items():
@@ -213,7 +215,7 @@ def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
         step: Their solution.
     """
     work = np.zeros(len(problem.joints))
-    for k, (coupling, parts) in enumerate(list(problem.each(step))[1:]):
+    for k, (coupling, parts) in enumerate(problem.of_joints(step)):
         for batch, part in zip(coupling.elements, parts, strict=True):
             work[k] += batch.ledger(part, problem.factor).get("external_work", 0.0)
     return work

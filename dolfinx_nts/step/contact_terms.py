@@ -9,13 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.elements import Step
+from dolfinx_nts.elements import Step, evaluate_together
 from dolfinx_nts.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import State
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.unknowns import Unknowns
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 from dolfinx_nts.validation import StepFailedError, is_finite
 
 FloatArray = npt.NDArray[np.float64]
@@ -30,8 +31,8 @@ class ContactTerms:
     `demos/own_problem.py`.
 
     Args:
-        bodies: Bodies of the user's own, `nts.Body`, with its first seven attributes, `prescribed`
-            and `nodal_stiffness`; their velocity and mass play no part.
+        bodies: Bodies of the user's own, `nts.Body`, with its first six attributes but for
+            `nodal_mass`, with `prescribed` and `nodal_stiffness`.
         contacts: Contacts between them and with obstacles.
 
     Raises:
@@ -80,7 +81,7 @@ class ContactTerms:
             ahead=[np.zeros_like(a) for a in u],
             motion=np.full(len(u), float(reach)),
             length=global_max(system.comm, size),
-            stiffness=lambda body: body.nodal_stiffness(rule),
+            stiffness=lambda body: body.nodal_stiffness(),
             moments=[],
             force_rounding=lambda bodies: 0.0,
         )
@@ -170,7 +171,7 @@ class ContactTerms:
         """
         both = zip(self.displacements(x), self.state.u, strict=True)
         terms = [BodyTerms(u1, u1 - u0, *4 * [np.zeros_like(u0)]) for u1, u0 in both]
-        parts = tuple(self._parts(x))
+        parts = self._parts(x)
         e = Evaluation(x.array_r.copy(), tuple(terms), parts)
         bodies = zip(self._system.bodies, terms, strict=True)
         local = np.array([body.motion_of_points(t.du) for body, t in bodies])
@@ -183,7 +184,7 @@ class ContactTerms:
             )
         u = tuple(t.u1 for t in terms)
         rest = tuple(np.zeros_like(a) for a in u)
-        self.state = State(self._time, u, rest, (), (self._search.history(parts),))
+        self.state = State(self._time, u, rest, (), self._search.history(parts), ())
 
     def destroy(self) -> None:
         """Free the PETSc objects of the step; its vectors and matrices are of no use then."""
@@ -198,9 +199,9 @@ class ContactTerms:
         assert self._laid is not None, "begin comes first"
         return self._laid
 
-    def _parts(self, x: Any) -> list[Any]:
+    def _parts(self, x: Any) -> tuple[Any, ...]:
         """Contribution of the elements at an iterate. Collective."""
         laid, elements = self._layout, self._search.elements
         own = laid.own_values(x.array_r, elements)
         places = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
-        return [c.evaluate(y, mine) for c, y, mine in zip(elements, places, own, strict=True)]
+        return evaluate_together(self._system.comm, elements, places, own)

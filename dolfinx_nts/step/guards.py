@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.state import State
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State
 from dolfinx_nts.validation import StepFailedError
 
 #: Part of the momenta and impulses of a step by which momentum may change without an impulse ...

@@ -21,13 +21,14 @@ _SECOND = "dolfinx_nts_second"
 SOLVERS = ("auto", "direct", "krylov")
 #: Presets; a user's `petsc_options` override them one by one.
 PRESETS: dict[str, dict[str, Any]] = {
-    # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses.
+    # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses, most on
+    # thin bodies, whose nodes have about as many constraints in contact as coordinates.
     "direct": {
         "snes_linesearch_type": "basic",
         "ksp_type": "preonly",
         "pc_type": "lu",
         "pc_factor_mat_solver_type": "mumps",
-        "mat_mumps_icntl_14": 80,
+        "mat_mumps_icntl_14": 300,
     },
     # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good. "selfp" is
     # replaced by `SchurApproximation`, but for a user who asks for it, and where options are

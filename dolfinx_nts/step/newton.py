@@ -70,7 +70,7 @@ class StepSolver:
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
         self._version, self._solved = -1, False
-        self._raised: UserFunctionError | None = None
+        self._raised: UserFunctionError | StepFailedError | None = None
         joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
         self._independent: bool | None = True if form_tree(joints) else None
         self.matrix: StepMatrix | None = None
@@ -144,10 +144,10 @@ class StepSolver:
             if unsolved and self._presets.has_next:
                 return self._attempt_otherwise(iterations)
         self._tangents.due = True
-        message = self._failure(last, reason, iterations)
+        failure = self._failure(last, reason, iterations)
         if unsolved:
             self.destroy()
-        raise StepFailedError(message)
+        raise failure
 
     def _of_least_norm(self, solved: Evaluation) -> Evaluation:
         """The solution with multipliers of least norm, where constraints repeat each other."""
@@ -184,9 +184,9 @@ class StepSolver:
         self._tangents.begin()
         if self._version != self.problem.version:
             self.destroy()
-            self._version = self.problem.version
             self.assemble(self.iterates.at(self.problem.x))
             self._configure()
+            self._version = self.problem.version
 
     def assemble(self, e: Evaluation) -> StepMatrix:
         """Nested Jacobian at an iterate, and what SNES sees of it. Every rank must call it.
@@ -245,7 +245,7 @@ class StepSolver:
     def _function(self, _snes: Any, x: Any, f: Any) -> None:
         try:
             f.array_w[:] = self.problem.residual(self.iterates.at(x))
-        except UserFunctionError as error:
+        except (UserFunctionError, StepFailedError) as error:
             self._raised = error
             raise
 
@@ -306,18 +306,21 @@ class StepSolver:
         return self.newton.reuse and not self.problem.system.comm.allreduce(acts, op=MPI.LOR)
 
     # ---- failure
-    def _failure(self, e: Evaluation, reason: int, iterations: int) -> str:
+    def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:
         """What failed, and where a body is inside out or nearly so; every rank must call it."""
         problem = self.problem
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
-            return (
+            return StepFailedError(
                 f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
-                f"{iterations} iterations: {self._upright.describe_inverted(e.x)}"
+                f"{iterations} iterations: {self._upright.describe_inverted(e.x)}",
+                advises=True,
             )
         why = self._presets.why_failed(self.snes, reason)
         message = diagnosis(problem, e, self.iterates.flips, why, iterations)
         flat = self._upright.describe_flat(e.x)
-        return f"{message}; {flat}" if flat else message
+        if flat:
+            return StepFailedError(f"{message}; {flat}", advises=True)
+        return StepFailedError(message, advises=self.iterates.cycles)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

@@ -18,18 +18,20 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.body import Moment
-from dolfinx_nts.contact.contact_elements import ContactElements, ContactHistory
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.elements import Coupling, JointCoupling, Step
-from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
+from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_together
+from dolfinx_nts.evaluation import BodyTerms, Evaluation, Moment, free
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import ContactHistory, State
+from dolfinx_nts.step.least_norm import hanging
 from dolfinx_nts.step.rounding import Rounding
+from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.stabilization import Stabilization
 from dolfinx_nts.step.unknowns import Unknowns
-from dolfinx_nts.system import State, System
+from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -62,8 +64,8 @@ class StepProblem:
 
     Attributes:
         awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
-        contacts: What makes the elements of contacts. Asked by itself where contact is meant: by
-            `touching`, for when gaps close, and for what a checkpoint keeps of slave nodes.
+        contacts: What makes the elements of contacts. Used directly only for what contacts alone
+            have: `touching`, closing gaps, checkpoints.
         joints: What makes those of each joint.
         couplings: All that makes elements.
         unknowns: Their layout; made anew whenever the elements' coordinates change.
@@ -87,16 +89,35 @@ class StepProblem:
         self.awake: tuple[int, ...] = ()
         self._numbers: tuple[Any, ...] | None = None
         self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
+        self._shared = SharedWeight(system.comm, system.contacts, system.contact_bodies)
         both = zip(system.joints, system.joint_bodies, strict=True)
         self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
+        self._lend_less()
         self.couplings: list[Coupling] = [self.contacts, *self.joints]
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.centre, self._span = _box(system)
-        self.stabilization = Stabilization(system, integrator, self._span)
+        self.stabilization = Stabilization(system, self._span)
         self.rounding = Rounding(
-            system.bodies, lambda k: self.body_tangent(k, self.state.u[k])
+            system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
+
+    def _lend_less(self) -> None:
+        """Lend no compliance to joints of rigid bodies that form no loop. Collective."""
+        system = self.system
+        found: list[tuple[Any, tuple[int, ...]]] = []
+        of = zip(system.declared_joints, self.joints, system.joint_bodies, strict=False)
+        for joint, coupling, bodies in of:
+            if hasattr(joint, "slopes"):  # a spring holds nothing
+                continue
+            rigid = all(body.rigid for body in joint.bodies)
+            found.append((getattr(coupling, "hold_alone", None) if rigid else None, bodies))
+        moved = system.comm.allreduce(np.array([b.fixed.sum() for b in system.bodies]))
+        free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
+        alone = hanging([bodies for _, bodies in found], free)
+        for (hold_alone, _), hangs in zip(found, alone, strict=True):
+            if hold_alone is not None and hangs:
+                hold_alone()
 
     # ---- set-up of a step
     def begin(
@@ -122,6 +143,7 @@ class StepProblem:
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
         if moments is None:
             moments = [self._moment(k) for k in range(len(system.bodies))]
+        self._moments = list(moments)
         for body, moment in zip(system.bodies, moments, strict=True):
             body.begin_step(self.integrator, moment)
         self._gravity = self.integrator.ramp(self._when) * system.gravity
@@ -162,7 +184,8 @@ class StepProblem:
             state, dt, self.factor, self.integrator, self.condense, self.first, way,
             motion, length, self.stabilization.stiffness, moments, self.rounding.of,
         )  # fmt: skip
-        for coupling, history in zip(self.couplings, state.histories, strict=True):
+        histories: tuple[Any, ...] = (state.contacts, *state.joints)
+        for coupling, history in zip(self.couplings, histories, strict=True):
             coupling.begin(step, history, again, search)
         self._asleep = self._find_asleep(np.maximum(motion, speed) == 0.0)
         self._lay_out()
@@ -179,8 +202,13 @@ class StepProblem:
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """Couplings with their parts of an evaluation."""
-        start = 0
-        for coupling in self.couplings:
+        yield self.contacts, e.parts[: len(self.contacts.elements)]
+        yield from self.of_joints(e)
+
+    def of_joints(self, e: Evaluation) -> Iterator[tuple[JointCoupling, tuple[Any, ...]]]:
+        """Those of `System.joints`."""
+        start = len(self.contacts.elements)
+        for coupling in self.joints:
             stop = start + len(coupling.elements)
             yield coupling, e.parts[start:stop]
             start = stop
@@ -237,7 +265,7 @@ class StepProblem:
             coupling.let_slip()
 
     def give_way(self) -> bool:
-        """Limit forces that had no limit from the next step on; tells whether one had none."""
+        """From the next step on, limit forces that had no limit; return whether there was one."""
         return any([coupling.give_way() for coupling in self.couplings])
 
     def _touched(self) -> set[int]:
@@ -302,6 +330,30 @@ class StepProblem:
         rate = rule.theta * rule.rate(self.dt) if rule.inertia else 0.0
         return Moment(state.u[k], self._when, rule.ramp(self._when), rate, drift)
 
+    def work_at_ends(self, e: Evaluation) -> list[float]:
+        """What work of loads at both ends adds on this rank, by body, times `factor`. Collective.
+
+        v_0 + v_1 = 2 (u_1 - u_0)/h makes the mean of the forces at both ends do the work in the
+        methods that carry accelerations, not those where the step takes them. Loads that are
+        functions of time differ; of others, and of other methods, it is 0.
+
+        Args:
+            e: Solution of the step.
+        """
+        works = [0.0] * len(e.bodies)
+        if not self.integrator.accelerations:
+            return works
+        ends = self.state.time, self.state.time + self.dt
+        for k, (body, terms) in enumerate(zip(self.system.bodies, e.bodies, strict=True)):
+            mean = np.zeros_like(terms.du)
+            for time in ends:
+                body.begin_step(self.integrator, self._moments[k]._replace(time=time))
+                mean += 0.5 * self.factor * body.external(terms.u1, self._gravity)
+            body.begin_step(self.integrator, self._moments[k])
+            here = self.factor * body.external(terms.u1, self._gravity)
+            works[k] = float((mean - here) @ terms.du)
+        return works
+
     def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
         """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
         if self._sleepers is None:
@@ -329,8 +381,8 @@ class StepProblem:
             flight: Free flight from t_n under the contact forces of the last step; else the
                 positions of t_n, which free flight of a fast turning or vibrating body may invert,
                 and no forces. Prescribed coordinates are at t_{n+1}.
-            carried: Take the contact forces of the last step as they were, whatever `flight` is,
-                also what is no good as a guess.
+            carried: Take the contact forces of the last step unchanged, whatever `flight` is, even
+                where they are a poor guess.
         """
         laid, elements = self.laid, self.elements
         with self.x as x:
@@ -367,11 +419,11 @@ class StepProblem:
         """
         values, laid, elements = x.array_r.copy(), self.laid, self.elements
         positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
-        parts = tuple(
-            c.evaluate(y, own)
-            for c, y, own in zip(
-                elements, positions, laid.own_values(values, elements), strict=True
-            )
+        own = laid.own_values(values, elements)
+        parts = evaluate_together(self.system.comm, elements, positions, own)
+        touching = len(self.contacts.elements)
+        self._shared.divide(
+            self.contacts.elements, self.contacts.bodies, parts[:touching], positions[:touching]
         )
         force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
         bodies = dict(self._asleep)
@@ -419,6 +471,29 @@ class StepProblem:
         """
         self.rounding.length = np.maximum(self.rounding.length, self.displacement(e))
         self.rounding.measure(self.awake)
+        self.rounding.measure_springs()
+
+    def _springs(self) -> FloatArray:
+        """Stiffness at t_n of elements without unknowns of their own, of each body. Collective."""
+        laid, elements, start = self.laid, self.elements, self.x.duplicate()
+        local = np.zeros(len(self.system.bodies))
+        start.set(0.0)
+        for k in self.awake:
+            start.array_w[laid.of_body(k)] = self.state.u[k]
+        positions = laid.positions(start, elements)
+        own = laid.own_values(start.array_r, elements)
+        start.destroy()
+        for batch, numbers, x, mine in zip(elements, self.bodies, positions, own, strict=True):
+            if any(batch.widths.values()):
+                continue
+            stiffness, first = batch.evaluate(x, mine).tangent, 0
+            for k, dofs in zip(numbers, batch.dofs(), strict=True):
+                stop = first + dofs.shape[1]
+                along = stiffness[:, first:stop, first:stop].diagonal(axis1=1, axis2=2)
+                local[k] += float(np.linalg.norm(along[dofs >= 0]))
+                first = stop
+        found: FloatArray = self.system.comm.allreduce(local)
+        return found
 
     # ---- lengths and rounding
     def displacement(self, e: Evaluation) -> FloatArray:

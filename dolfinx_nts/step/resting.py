@@ -14,10 +14,10 @@ from mpi4py import MPI
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Newmark
+from dolfinx_nts.state import State
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 logger = logging.getLogger(__name__)
@@ -67,6 +67,7 @@ def with_resting_forces(
     touches = any(_closed(c).any() for c in batches)
     if not system.comm.allreduce(touches, op=MPI.LOR):
         return state
+    # With beta = 1/2 a step moves by h v_0 + h^2/2 a_1: a_0, which is sought, plays no part.
     rule = Newmark(beta=0.5, gamma=1.0)
     short = StepProblem(system, rule, rtol=newton.rtol, condense=newton.condense)
     solver = StepSolver(short, newton, newton.preset(system, True, options), options)
@@ -95,7 +96,7 @@ def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:
         force = np.where(rests, new.force, 0.0)
         tangential = np.where(rests[:, None], new.tangential, 0.0)
         found.append(old._replace(force=force, tangential=tangential))
-    return replace(state, histories=(tuple(found), *state.histories[1:]))
+    return replace(state, contacts=tuple(found))
 
 
 def _closed(c: ContactElements) -> BoolArray:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.joints.forces import AboutAxis, Between
+from dolfinx_nts.elements import Slopes
+from dolfinx_nts.kinematics import has_constraints
+from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import State, System
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,21 +30,19 @@ class _Fast(NamedTuple):
         limit: Largest of what it can be times the step, over what counts as resolved.
         joint: The spring or damper.
         gradient: Of its coordinate, by the owned coordinates of each body of the system.
-        stiffness: [N/m] or [N m].
-        damping: [N s/m] or [N m s].
+        slopes: Of its force.
     """
 
     limit: float
-    joint: Between
+    joint: Any
     gradient: list[FloatArray]
-    stiffness: float
-    damping: float
+    slopes: Slopes
 
 
 def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[float, str] | None:
     """The spring or damper that is too fast by most for a step, if there is any. Collective.
 
-    It is judged alone, by its stiffness at the start and by the mass that it moves along its
+    It is judged alone, by its `slopes` at the start and by the mass that it moves along its
     coordinate in bodies and joints. On flexible bodies, also behind joints, none is: the mass that
     moves depends on how fast it moves.
 
@@ -55,49 +54,52 @@ def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[floa
     Returns:
         How many times it is too fast, and a sentence with a remedy.
     """
+    if not any(hasattr(joint, "slopes") for joint in problem.system.joints):
+        return None
+    still = tuple(np.zeros_like(v) for v in state.v)
+    problem.begin(replace(state, a=state.a or still), dt)
     worst, text = 1.0, ""
-    begun = False
-    for fast in sorted(_suspects(problem.system, state, dt), key=lambda f: f.limit, reverse=True):
+    for fast in sorted(_suspects(problem, state, dt), key=lambda f: f.limit, reverse=True):
         # Joints hold bodies, so that the mass is at least that of the limit.
         if fast.limit <= worst:
             break
-        if not begun:
-            still = tuple(np.zeros_like(v) for v in state.v)
-            problem.begin(replace(state, a=state.a or still), dt)
-            begun = True
         mobility = consistent.mobility(problem, state, fast.gradient, dt)
-        size = _size(fast.stiffness, fast.damping, mobility, dt)
+        size = max(_sizes(fast.slopes, mobility, dt))
         if size > worst:
             worst, text = size, _sentence(fast, mobility, dt, dt / size)
     return (worst, text) if text else None
 
 
-def _suspects(system: System, state: State, dt: float) -> list[_Fast]:
+def _suspects(problem: StepProblem, state: State, dt: float) -> list[_Fast]:
     """Springs and dampers that would be too fast if no constraint held the bodies. Collective."""
-    found = []
-    joints = zip(system.joints, system.joint_bodies, state.histories[1:], strict=True)
+    found, system = [], problem.system
+    joints = zip(system.joints, system.joint_bodies, state.joints, strict=True)
     for joint, bodies, history in joints:
-        if not isinstance(joint, Between):
+        if not hasattr(joint, "slopes"):
             continue
-        if not all(system.bodies[k].rigid for k in _joined(system, bodies)):
+        if not all(system.bodies[k].rigid for k in _joined(problem, bodies)):
             continue
-        of_bodies, stiffness, damping = joint.slopes([state.u[k] for k in bodies], history)
+        slopes = joint.slopes([state.u[k] for k in bodies], history)
         gradient = [np.zeros_like(u) for u in state.u]
         mobility = 0.0
-        for k, g in zip(bodies, of_bodies, strict=True):
+        for k, g in zip(bodies, slopes.gradients, strict=True):
             gradient[k] = g
             free = np.flatnonzero(g)
             with np.errstate(divide="ignore"):
                 mobility += float((g[free] ** 2 / system.bodies[k].nodal_mass[free]).sum())
-        limit = _size(stiffness, damping, system.comm.allreduce(mobility), dt)
-        found.append(_Fast(limit, joint, gradient, stiffness, damping))
+        limit = max(_sizes(slopes, system.comm.allreduce(mobility), dt))
+        found.append(_Fast(limit, joint, gradient, slopes))
     return found
 
 
-def _joined(system: System, bodies: Iterable[int]) -> set[int]:
-    """Bodies that joints other than springs and dampers hold to some bodies, with these."""
-    both = zip(system.joints, system.joint_bodies, strict=True)
-    held = [set(of) for joint, of in both if not isinstance(joint, Between)]
+def _joined(problem: StepProblem, bodies: Iterable[int]) -> set[int]:
+    """Bodies that constraints of joints hold to some bodies, with these; after `begin`."""
+    held = [
+        set(of)
+        for coupling in problem.joints
+        for batch, of in zip(coupling.elements, coupling.bodies, strict=True)
+        if has_constraints(batch)
+    ]
     reached, more = set(bodies), set(bodies)
     while more:
         more = set().union(*(of for of in held if of & reached)) - reached
@@ -105,28 +107,29 @@ def _joined(system: System, bodies: Iterable[int]) -> set[int]:
     return reached
 
 
-def _size(stiffness: float, damping: float, mobility: float, dt: float) -> float:
-    """How many times a spring or damper is too fast for a step."""
+def _sizes(slopes: Slopes, mobility: float, dt: float) -> tuple[float, float]:
+    """How many times a spring and a damper are too fast for a step."""
+    stiffness, damping = slopes.stiffness, slopes.damping
     # A mobility without mass is infinite, and nothing times that no number.
     phase = float(np.sqrt(stiffness * mobility)) * dt if stiffness > 0.0 else 0.0
     decay = damping * mobility * dt if damping > 0.0 else 0.0
-    return max(phase / _PHASE, decay / _DECAY)
+    return phase / _PHASE, decay / _DECAY
 
 
 def _sentence(fast: _Fast, mobility: float, dt: float, most: float) -> str:
-    about = isinstance(fast.joint, AboutAxis)
+    _, stiffness, damping, about = fast.slopes
     mass = f"{1.0 / mobility:.3g} kg{' m^2' if about else ''}"
-    if fast.damping:
+    phase, decay = _sizes(fast.slopes, mobility, dt)
+    if decay > phase:
         unit = "N m s" if about else "N s/m"
         return (
-            f"damper {fast.joint.name!r} of {fast.damping:.3g} {unit} on {mass} is not resolved, "
-            f"c h/m = {fast.damping * mobility * dt:.3g}: the velocity changes its sign in each "
-            f"step where it should be gone; use a dt below {most:.2g} s"
+            f"damper {fast.joint.name!r} of {damping:.3g} {unit} on {mass} is not resolved, "
+            f"c h/m = {_DECAY * decay:.3g}: the velocity changes its sign in each step where it "
+            f"should be gone; use a dt below {most:.2g} s"
         )
     unit = "N m" if about else "N/m"
-    phase = float(np.sqrt(fast.stiffness * mobility)) * dt
     return (
-        f"spring {fast.joint.name!r} of {fast.stiffness:.3g} {unit} on {mass} is not resolved, "
-        f"omega h = {phase:.3g}: where it vibrates, it does so too slowly, though energy may be "
-        f"kept; use a dt below {most:.2g} s if that matters"
+        f"spring {fast.joint.name!r} of {stiffness:.3g} {unit} on {mass} is not resolved, "
+        f"omega h = {_PHASE * phase:.3g}: where it vibrates, it does so too slowly, though energy "
+        f"may be kept; use a dt below {most:.2g} s if that matters"
     )

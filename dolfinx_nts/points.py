@@ -58,6 +58,10 @@ class Points:
         arrays = (self.nodes, self.weights, self.reference, self.fixed, self.places)
         return Points(self.body, *(a[chosen] for a in arrays))
 
+    def columns(self, chosen: IntArray) -> Points:
+        """Return the points by some of the nodes each depends on; the others have no weight."""
+        return self.part((slice(None), chosen))
+
     @cached_property
     def _table(self) -> tuple[IntArray, IntArray]:
         """Rows of this rank's nodes among its owned ones, and where each node is. Collective."""
