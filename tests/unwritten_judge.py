@@ -196,7 +196,7 @@ class Watch:
                    ("angular_momentum", angular, mass * speed * size, massless)]  # fmt: skip
         for name, own, scale, other in checks:
             off = np.abs(table[name] - own).max()
-            if not other and off > 1e-8 * scale:
+            if not other and off > 1e-8 * scale + 1e-290:
                 yield f"{name} of the balance is off by {off:.3g} of {scale:.3g}"
 
     def _momenta(self, table):
@@ -364,7 +364,8 @@ def judge_restart(scene, comm, path):
     except (TypeError, ValueError) as error:
         return Verdict("refused", repr(error), [])
     middle = previous(path)
-    if not middle.is_file():
+    # Where Newton's method fails depends on rounding, as of what the linear solver went over to.
+    if not (middle.is_file() and whole.status.startswith("completed")):
         made.system.destroy()
         return Verdict("stopped", whole.status, [])
     again = built(scene, comm)
@@ -395,7 +396,7 @@ def judge_restart(scene, comm, path):
     more = {k for k in found.warnings if k not in whole.warnings and not OVERLAPS.search(k)}
     if not reuses and (lost or more):
         wrong.append(f"warns otherwise: {found.warnings}")
-    if whole.status.split(",")[0].split(" (")[0] != found.status.split(",")[0].split(" (")[0]:
+    if not found.status.startswith("completed"):
         wrong.append(f"ends otherwise: {found.status}")
     touched = bool(whole.balance["active"].any())
     return Verdict("completed", f"{whole.status} {whole.warnings}", wrong, touched)

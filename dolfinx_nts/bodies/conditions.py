@@ -172,8 +172,8 @@ class Meetings:
         times = np.zeros(width * len(x), dtype=int)
         for here in dofs:
             times[here] += 1
-        local = [np.any(times[here] > 1) for here in dofs]
-        meet = comm.allreduce(np.array(local, dtype=bool), op=MPI.LOR)
+        meet = np.array([np.any(times[here] > 1) for here in dofs], dtype=bool)
+        comm.Allreduce(MPI.IN_PLACE, meet, op=MPI.LOR)
         self._any = bool(meet.any())
         self._moving = any(m and callable(v) for m, v in zip(meet, values, strict=True))
         self._size = float(comm.allreduce(np.abs(x).max(initial=0.0), op=MPI.MAX))
