@@ -22,6 +22,7 @@ from dolfinx_nts.output.state_file import previous
 DEEP = 0.5
 #: Energy over the largest that may come from nowhere without a word (the package's 1 % twice).
 GAIN = 0.02
+EPS = np.finfo(float).eps
 #: What an argument is named by in a message, and words of a remedy.
 NAMED = re.compile(r"\w+(\[\d+\])?=|'[\w ->]+'|\b(bodies|contacts|joints|slave|surface|marker)\b")
 REMEDY = re.compile(
@@ -150,6 +151,15 @@ class Watch:
     def _scene(self):
         return self.made.scene
 
+    @property
+    def _mass(self):
+        solids = zip(self._scene.bodies, self.made.solids, strict=True)
+        return sum(b.density * s.mass.sum() for b, s in solids)
+
+    @property
+    def _speed(self):
+        return max(np.abs(v).max() for row in self.rows for _, v in row)
+
     @cached_property
     def _mechanics(self):
         """Of each row kinetic and stored energy, momentum, angular momentum, centre times mass."""
@@ -180,15 +190,13 @@ class Watch:
                            zip(self._scene.bodies, self.made.solids, strict=True))  # fmt: skip
         checks = [("kinetic", kinetic, largest, massless),
                   ("potential", stored, largest + stiff, stores)]  # fmt: skip
-        speed = max(np.abs(v).max() for row in self.rows for _, v in row)
-        mass = sum(b.density * s.mass.sum() for b, s in
-                   zip(self._scene.bodies, self.made.solids, strict=True))  # fmt: skip
+        mass, speed = self._mass, self._speed
         size = max(np.abs(y).max() for row in self.rows for y, _ in row)
         checks += [("linear_momentum", momentum, mass * speed, massless),
                    ("angular_momentum", angular, mass * speed * size, massless)]  # fmt: skip
         for name, own, scale, other in checks:
             off = np.abs(table[name] - own).max()
-            if not other and off > 1e-8 * scale:
+            if not other and off > 1e-8 * scale + 1e-290:
                 yield f"{name} of the balance is off by {off:.3g} of {scale:.3g}"
 
     def _momenta(self, table):
@@ -197,9 +205,7 @@ class Watch:
         grounded = any(g or k + 1 == len(scene.bodies) for _, k, g in scene.joints)
         if scene.floor or grounded or any(b.held for b in scene.bodies):
             return
-        mass = sum(b.density * s.mass.sum() for b, s in
-                   zip(scene.bodies, self.made.solids, strict=True))  # fmt: skip
-        speed = max(np.abs(v).max() for row in self.rows for _, v in row)
+        mass, speed = self._mass, self._speed
         size = max(np.abs(y).max() for row in self.rows for y, _ in row)
         fall = -scene.unit * scene.gravity * np.outer(table["time"], scene.row)
         expected = table["linear_momentum"][0] + mass * fall
@@ -235,10 +241,12 @@ class Watch:
         told = set(self.run.warnings)
         closes = RULES[self._scene.rule].closes_ledger
         missing = np.abs(residual).max()
-        if closes and missing > 2 * self._promise * largest and "ledger" not in told:
-            # Below it there is the rounding of large forces over small motions.
-            if missing > 1e-9 * largest or missing > 1e-9 * self._scene.unit**5:
-                yield f"the ledger misses {missing / largest:.3g} of the largest energy"
+        # Forces that stop all in a step do work over the rounding of positions.
+        size = max(np.abs(y).max() for row in self.rows for y, _ in row)
+        stops = self._mass * self._speed / np.diff(table["time"]).min(initial=np.inf)
+        allowed = 2.0 * self._promise * largest + 100.0 * EPS * stops * size
+        if closes and missing > allowed and "ledger" not in told:
+            yield f"the ledger misses {missing / largest:.3g} of the largest energy"
         if (np.diff(table["friction_dissipation"]) < -1e-9 * largest).any():
             yield "friction gives energy back"
         gain = (table["energy"] - table["energy"][0] - table["external_work"]).max()
@@ -356,7 +364,8 @@ def judge_restart(scene, comm, path):
     except (TypeError, ValueError) as error:
         return Verdict("refused", repr(error), [])
     middle = previous(path)
-    if not middle.is_file():
+    # Where Newton's method fails depends on rounding, as of what the linear solver went over to.
+    if not (middle.is_file() and whole.status.startswith("completed")):
         made.system.destroy()
         return Verdict("stopped", whole.status, [])
     again = built(scene, comm)
@@ -387,7 +396,7 @@ def judge_restart(scene, comm, path):
     more = {k for k in found.warnings if k not in whole.warnings and not OVERLAPS.search(k)}
     if not reuses and (lost or more):
         wrong.append(f"warns otherwise: {found.warnings}")
-    if whole.status.split(",")[0].split(" (")[0] != found.status.split(",")[0].split(" (")[0]:
+    if not found.status.startswith("completed"):
         wrong.append(f"ends otherwise: {found.status}")
     touched = bool(whole.balance["active"].any())
     return Verdict("completed", f"{whole.status} {whole.warnings}", wrong, touched)
