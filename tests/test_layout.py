@@ -113,7 +113,7 @@ def test_types_come_from_below_too(module):
     """Writers alone name the type of what calls them."""
     names = {n.removeprefix("dolfinx_nts.") for n in imported(module)} & set(FILES)
     up = {name for name in names if level(name) > level(module)}
-    assert up <= ({"run.stepper"} if module == "output.writers" else set())
+    assert up <= ({"run.stepper"} if module in ("output.writers", "output.film") else set())
 
 
 @pytest.mark.parametrize("module", PRESENT)
