@@ -17,6 +17,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.axis import axis_of, check_line
 from dolfinx_nts.bodies.body import Body, Moment
 from dolfinx_nts.bodies.conditions import Dirichlet, Meetings
+from dolfinx_nts.bodies.mesh_check import places_of
 from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.section import Clamp, LineForce, PointForce, Section
 from dolfinx_nts.bodies.triad import Triads, largest_turn
@@ -101,6 +102,7 @@ class Beam(Body):
         spin = vector("angular_velocity", angular_velocity, "rad/s")
         self.name, self.mesh, self.comm, self.degree = name, mesh, mesh.comm, 1
         self.section, self.length = section, section.radius
+        self.made_on = places_of(mesh)
         self.space = compat.vector_space(mesh, 1)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")

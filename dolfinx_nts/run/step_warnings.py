@@ -63,6 +63,19 @@ def tell_couplings(
             solution.warn(kind, state.time, size, text)
 
 
+def tell_stressed(solution: Solution, time: float) -> None:
+    """Warn of bodies whose undeformed state is under stress, as their first step has shown.
+
+    Args:
+        solution: The run.
+        time: When [s].
+    """
+    for body in solution.system.bodies:
+        stressed = getattr(body, "stressed", None)
+        if stressed is not None and "stress at rest" not in solution.warnings:
+            solution.warn("stress at rest", time, *stressed)
+
+
 def tell_frictionless(solution: Solution, impulses: FloatArray, time: float) -> None:
     """Warn of restored impulses in contacts with friction, of which they know nothing.
 
