@@ -27,13 +27,28 @@ napoleon_use_ivar = True
 napoleon_attr_annotations = False  # types say less than the text beside them
 
 
-def show_code(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Make literal blocks of what docstrings indent behind a line that ends with a colon."""
+def indent(line: str) -> int:
+    """How far a line is indented."""
+    return len(line) - len(line.lstrip())
+
+
+def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Make of plain docstrings what Sphinx reads as code and as lists.
+
+    Code is what is indented behind a line that ends with a colon and an empty line; a list may
+    begin without an empty line before it.
+    """
     for i in range(len(lines) - 2):
         line, after = lines[i], lines[i + 2]
-        deeper = len(after) - len(after.lstrip()) > len(line) - len(line.lstrip())
-        if line.rstrip().endswith(":") and not lines[i + 1].strip() and after.strip() and deeper:
+        deeper = bool(after.strip()) and indent(after) > indent(line)
+        if line.rstrip().endswith(":") and not lines[i + 1].strip() and deeper:
             lines[i] = line.rstrip() + ":"
+    for i in range(len(lines) - 1, 0, -1):
+        line, before = lines[i], lines[i - 1]
+        begins = line.lstrip().startswith("- ") and indent(before) <= indent(line)
+        goes_on = before.lstrip().startswith("- ") and indent(before) == indent(line)
+        if begins and before.strip() and not goes_on:
+            lines.insert(i, "")
 
 
 def leave_out(app: Any, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
@@ -54,7 +69,7 @@ def arguments(
 
 
 def setup(app: Any) -> None:
-    """Connect `leave_out`, and `show_code` before napoleon, which reads the sections."""
+    """Connect what is above, and `as_markup` before napoleon, which reads the sections."""
     app.connect("autodoc-process-signature", arguments)
     app.connect("autodoc-skip-member", leave_out)
-    app.connect("autodoc-process-docstring", show_code, priority=400)
+    app.connect("autodoc-process-docstring", as_markup, priority=400)

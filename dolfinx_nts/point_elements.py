@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import Step, over
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.kinematics import Kinematics, differenced, has_constraints, unknown
+from dolfinx_nts.points import Points
 from dolfinx_nts.state import State
 
 FloatArray = npt.NDArray[np.float64]
@@ -44,7 +44,7 @@ class PointElements:
         """On this rank."""
         return len(self.sides[0].nodes)
 
-    @property
+    @cached_property
     def num_coordinates(self) -> int:
         """Coordinates of all nodes of an element."""
         return sum(3 * side.nodes.shape[1] for side in self.sides)

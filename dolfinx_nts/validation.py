@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import inspect
 import math
 import numbers
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
 
@@ -19,6 +21,9 @@ from dolfinx_nts.parallel import raise_together
 FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
 StrPath = str | os.PathLike[str]
+
+#: Part of a function's value by which ranks may differ, as by sums in another order.
+_ALIKE = 1e-9
 
 
 class StepFailedError(RuntimeError):
@@ -145,20 +150,36 @@ def require_same(comm: Any, **given: Any) -> None:
 
     Of functions only that they are some is compared.
     """
-    shown = {name: "a function" if callable(v) else _plain(v) for name, v in given.items()}
+    shown = {name: as_text(value) for name, value in given.items()}
+    digest = hashlib.sha256(repr(shown).encode()).digest()
+    if len(set(comm.allgather(digest))) == 1:
+        return
     problem = None
     for name, first in comm.bcast(shown).items():
-        if shown[name] != first and problem is None:
+        here = shown.get(name, "missing")
+        if here != first and problem is None:
             problem = (
-                f"{name}: is {shown[name]} on rank {comm.rank} and {first} on rank 0; pass the "
-                "same on all ranks"
+                f"{name}: is {here} on rank {comm.rank} and {first} on rank 0; pass the same on "
+                "all ranks"
             )
     raise_together(comm, problem)
 
 
-def _plain(value: Any) -> str:
+def as_text(value: Any) -> str:
+    """What a value is made of, numbers and texts, in words that do not depend on the rank."""
     array = floats(value)
-    return repr(array.tolist() if array.size else value)
+    if array.size:
+        return repr(array.tolist())
+    if value is None or isinstance(value, str | bool):
+        return repr(value)
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{k}: {as_text(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(as_text, value)) + "]"
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = (f"{f.name}={as_text(getattr(value, f.name))}" for f in fields(value))
+        return f"{type(value).__name__}({', '.join(parts)})"
+    return "a function" if callable(value) else type(value).__name__
 
 
 def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tuple[Any, ...]:
@@ -207,6 +228,8 @@ def at_time(
 ) -> FloatArray:
     """The user's vector at a time, shape (3,); what fails on one rank raises on all.
 
+    So does one that differs between ranks by more than rounding.
+
     Args:
         comm: MPI communicator.
         name: Name of the argument.
@@ -215,21 +238,52 @@ def at_time(
         unit: Of the components.
 
     Raises:
-        UserFunctionError: It raised, or returned anything but three finite numbers.
+        UserFunctionError: It raised, or returned anything but the same three finite numbers on all
+            ranks.
     """
-    name = f"{name} at t={float(time)!r}"
+    label = f"{name} at t={float(time)!r}"
     problem, cause, value = None, None, np.zeros(3)
     try:
         given = function(time)
     except Exception as error:  # any: a rank that raises alone would leave the others waiting
-        cause, problem = error, f"{name}: {function!r} raised {error!r}; correct it"
+        cause, problem = error, f"{label}: {function!r} raised {error!r}; correct it"
     else:
-        try:
-            value = vector(name, given, unit)
-        except Exception as error:  # any: as above
-            problem = str(error)
-    raise_together(comm, problem, UserFunctionError, cause)
+        array = floats(given)
+        if array.shape == (3,) and np.isfinite(array).all():
+            value = array
+        else:
+            problem = f"{label}: returned {given!r}; pass three finite components [{unit}]"
+    agree(comm, label, value, problem, cause)
     return value
+
+
+def agree(
+    comm: Any, label: str, value: FloatArray, problem: str | None, cause: Exception | None = None
+) -> None:
+    """Raise on all ranks what is wrong with a function's value on one, or if values differ.
+
+    Args:
+        comm: MPI communicator.
+        label: What the function is for, and when it was called.
+        value: What it returned here, of the same shape on all ranks.
+        problem: What is wrong with it.
+        cause: What it raised.
+
+    Raises:
+        UserFunctionError: As above; the largest numbers may differ by rounding.
+    """
+    gathered = comm.allgather((problem, value.tolist()))
+    problem = next((p for p, _ in gathered if p is not None), None)
+    first = np.array(gathered[0][1])
+    for rank, (_, other) in enumerate(gathered):
+        size = max(np.abs(first).max(), np.abs(other).max())
+        if problem is None and np.abs(first - other).max() > _ALIKE * size:
+            problem = (
+                f"{label}: is {other} on rank {rank} and {first.tolist()} on rank 0; return the "
+                "same on all ranks"
+            )
+    if problem is not None:
+        raise UserFunctionError(problem) from cause
 
 
 def vector_in_time(comm: Any, name: str, value: Any, time: float, unit: str) -> FloatArray:

@@ -14,5 +14,6 @@ if [ "${RUNS:-yes}" = no ]; then
 else
   "$PYTHON" docs/pages.py
 fi
-"$PYTHON" -m sphinx -q -W --keep-going -b html "${missing[@]}" docs docs/_build/html
+# -E: pages that are kept would keep their warnings to themselves.
+"$PYTHON" -m sphinx -q -E -W --keep-going -b html "${missing[@]}" docs docs/_build/html
 say "docs/_build/html/index.html is the site's first page"

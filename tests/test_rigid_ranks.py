@@ -7,6 +7,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.constraints import rank_of
 
 COMM = MPI.COMM_WORLD
 G = 9.81
@@ -102,3 +103,15 @@ def test_ranks_change_nothing(scene, dt, t_end):
 def test_more_ranks_change_nothing(on_ranks, ranks):
     name = f"{__file__}::test_ranks_change_nothing"
     on_ranks(ranks, "-m", "pytest", "-q", "-p", "no:cacheprovider", name)
+
+
+@pytest.mark.parametrize("names", ["link {}", "revolute of link {} and link {}", "b{}"])
+@pytest.mark.parametrize("ranks", [2, 3, 4])
+def test_numbered_names_are_dealt_evenly(names, ranks):
+    """Rigid bodies and joints live on one rank each."""
+    class Comm:
+        size = ranks
+
+    owners = [rank_of(names.format(k, k + 1), Comm) for k in range(100)]
+    counts = np.bincount(owners, minlength=ranks)
+    assert counts.max() - counts.min() <= 1

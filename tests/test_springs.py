@@ -568,7 +568,9 @@ def test_a_torsion_spring_follows_a_prescribed_rotation(turn):
     settled = nts.equilibrium(scene(turn))
     run = nts.simulate(scene(turn / 0.1), nts.EnergyMomentum(), dt=0.1, t_end=0.1)
     for found in (settled, run):
-        assert found.status == "completed"
+        # The rate of what turns by more than a radian a step comes out wrong.
+        far = found is run and turn / (1 + found.retries) > 1.0
+        assert found.status.startswith("completed, but body" if far else "completed")
         assert found.balance["potential"][-1] == pytest.approx(turn**2, rel=1e-9)
         assert (found.retries > 0) is (turn > np.pi)
 

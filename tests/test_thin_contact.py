@@ -246,3 +246,24 @@ def test_contact_fields_of_a_beam_on_a_plane():
     assert bar.comm.allreduce(pushed.sum()) == pytest.approx((momentum[1] - momentum[0]) / 1e-3)
     assert (status[:own] == 2).all() and (pushed > 0.0).all()
     assert (force[:own] <= pushed * (1 + 1e-9)).all() and (force[:own] >= pushed / 8).all()
+
+
+@pytest.mark.mpi
+def test_a_run_goes_on_from_a_checkpoint_in_contact(mpi_tmp_path):
+    """Of a beam that slides on a plate, as if nothing had stopped it."""
+    path = mpi_tmp_path / "thin.h5"
+
+    def scene():
+        bar = beam(0.0505, velocity=(0.2, 0.0, -0.5))
+        plate = shell(n=4)
+        return nts.System([bar, plate], contacts=[
+            nts.ContactPair(bar.surface(), plate.surface(side="top"), friction=MU)
+        ])  # fmt: skip
+
+    whole, first, second = scene(), scene(), scene()
+    run = nts.simulate(whole, EM, dt=1e-3, t_end=4e-3)
+    nts.simulate(first, EM, dt=1e-3, t_end=2e-3, checkpoint=nts.Checkpoint(path, every=2))
+    nts.simulate(second, EM, dt=1e-3, t_end=4e-3, start=nts.restart(path, second))
+    assert run.balance["active"][1:].max() > 0
+    for a, b in zip(whole.bodies, second.bodies, strict=True):
+        assert a.comm.allreduce(np.abs(a.u.x.array - b.u.x.array).max(initial=0.0)) < 1e-11

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from point_mass import MASS, SPEED, STEP, mass_on_wall
-from scenes import box
+from scenes import CELLS, box
 
 import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
 
 COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.mpi
@@ -115,3 +117,91 @@ def test_a_stiff_body_on_a_soft_one_is_held(young):
     )
     run = nts.equilibrium(nts.System([steel, pad], contacts=[pair], gravity=(0, 0, -9.81)))
     assert "free motion" not in run.warnings
+
+
+def spinning_cube():
+    """A stiff one, at 50 rad/s."""
+    return nts.Continuum(
+        box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5), 1), nts.NeoHookean(1e9, 0.3), density=1e3,
+        velocity=lambda x: 50.0 * np.stack([-x[1], x[0], 0 * x[0]]), name="cube",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("turn", [0.9, 1.0, 1.2])
+@pytest.mark.fast("1.0")
+@pytest.mark.fast_on_ranks("1.0")
+def test_a_flexible_body_that_turns_by_a_radian_in_a_step_is_told(turn):
+    """By its spin: the angle of a turn of 1 rad a step comes out short by a twelfth."""
+    system, dt = nts.System([spinning_cube()]), turn / 50
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=3 * dt)
+    assert run.status == "completed" and ("turns" in run.warnings) is (turn > 0.95)
+    if turn > 0.95:
+        # Stretched by its turning it is slower than at first, by no more than this.
+        assert 0.9 * turn < run.warnings["turns"].worst <= turn * (1 + 1e-9)
+        assert run.warnings["turns"].count == 3
+        assert "body 'cube' turns by" in run.warnings["turns"].text
+
+
+def test_a_flexible_body_that_turns_far_in_later_steps_is_told():
+    stepper = nts.Stepper(nts.System([spinning_cube()]), nts.EnergyMomentum())
+    for _ in range(14):
+        stepper.advance(1e-3)
+    assert not stepper.solution.warnings
+    for _ in range(2):
+        stepper.advance(2e-2)
+    assert stepper.solution.warnings["turns"].worst == pytest.approx(1.0, abs=0.05)
+    stepper.close()
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+@pytest.mark.parametrize("kind", [nts.Continuum, nts.FormBody])
+@pytest.mark.fast("Continuum-hexahedron")
+@pytest.mark.fast_on_ranks("Continuum-hexahedron")
+def test_one_point_of_quadrature_leaves_the_mass_whole(kind, cell):
+    """A cube that turns at 2 rad/s about its centre: J = m/6 2 = 333, E = 333."""
+    mesh = box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5), 1, CELLS[cell])
+    options = {
+        "density": 1e3, "quadrature_degree": 1,
+        "velocity": lambda x: 2.0 * np.stack([-x[1], x[0], 0 * x[0]]),
+    }  # fmt: skip
+    if kind is nts.Continuum:
+        body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), **options)
+    else:
+        space = compat.vector_space(mesh, 1)
+        stored = lambda u: 1e3 * ufl.inner(ufl.grad(u), ufl.grad(u)) * ufl.dx  # noqa: E731
+        body = nts.FormBody(space, stored, **options)
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=5e-3, t_end=2e-2)
+    exact = 1e3 / 6
+    assert run.status == "completed"
+    assert run.balance["energy"][0] == pytest.approx(0.5 * exact * 4, rel=1e-12)
+    turning = run.balance["angular_momentum"][0]
+    assert turning == pytest.approx([0, 0, 2 * exact], rel=1e-12, abs=1e-9)
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-12 * exact
+
+
+@pytest.mark.fast_on_ranks()
+def test_a_run_from_a_settled_state_begins_with_its_contact_forces():
+    """9.81 kN of weight on the plane; the first row had none while nine nodes were active."""
+    system = standing(friction=0.3)
+    settled = nts.equilibrium(system)
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=2e-3, t_end=4e-3, start=settled, start_time=0.0
+    )
+    assert run.balance["active"][0] == 9
+    assert run.contact_forces[0, 0] == pytest.approx([0, 0, 9810], rel=1e-9, abs=1e-6)
+    assert run.contact_moments[0, 0] == pytest.approx([4905, -4905, 0], rel=1e-9, abs=1e-6)
+    other = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=1e-3)
+    assert not other.contact_forces[0].any()
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_restored_impulses_have_no_friction_and_say_so(friction):
+    body = cube(velocity=(3, 0, -2))
+    floor = nts.Plane((0, 0, -1e-3), (0, 0, 1))
+    pair = nts.ContactPair(body.surface(lambda x: x[2] < 1e-9), floor, friction=friction)
+    run = nts.simulate(
+        nts.System([body], contacts=[pair]), nts.EnergyMomentum(), dt=1e-3, t_end=3e-3,
+        impact="restored",
+    )  # fmt: skip
+    assert run.status == "completed"
+    assert ("impulses without friction" in run.warnings) is (friction > 0)

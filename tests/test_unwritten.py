@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from mpi4py import MPI
 from solids import Solid
-from unwritten_judge import judge, law_of
+from unwritten_judge import judge, judge_restart, law_of
 from unwritten_scenes import NONSENSE, Body, Contact, Floor, Scene, scenes
 
 import dolfinx_nts as nts
@@ -37,7 +37,7 @@ def together(verdict):
     return COMM.allgather(verdict)
 
 
-def run_many(count, number):
+def run_many(count, number, judged=judge):
     """Draw and judge so many scenes; every rank draws the same. Returns counts and failures."""
     counts, failures = Counter(), []
 
@@ -47,7 +47,7 @@ def run_many(count, number):
               suppress_health_check=list(HealthCheck))  # fmt: skip
     @given(scenes())
     def run(scene):
-        verdicts = together(judge(scene, COMM))
+        verdicts = together(judged(scene, COMM))
         first = verdicts[0]
         counts.update([first.outcome, *(["touched"] if first.touched else [])])
         if len({(v.outcome, v.said) for v in verdicts}) > 1:
@@ -136,6 +136,7 @@ FOUND = {
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", FOUND)
+@pytest.mark.fast("last look at both", "remedy where no start fits")
 @pytest.mark.fast_on_ranks()
 def test_what_was_found_is_mended(name):
     verdict = judge(FOUND[name], COMM)
@@ -156,6 +157,22 @@ def test_five_hundred_scenes(part):
     assert counts["completed"] > 0.4 * sum(counts.values()) and counts["touched"] > 5
 
 
+@pytest.mark.slow
+def test_scenes_that_go_on_from_a_checkpoint(tmp_path):
+    """They end as without, in serial to the bit; the judge says how else."""
+    if COMM.size > 1:
+        pytest.skip("takes no less time on 2 ranks")
+
+    def judged(scene, comm):
+        for file in tmp_path.iterdir():
+            file.unlink()
+        return judge_restart(scene, comm, tmp_path / "run.h5")
+
+    counts, failures = run_many(max(50, SCENES // 10), 200 + SEED, judged)
+    assert not failures, "\n".join(failures)
+    assert counts["completed"] > 20
+
+
 @pytest.mark.mpi
 @pytest.mark.slow
 def test_scenes_on_all_ranks():
@@ -166,4 +183,4 @@ def test_scenes_on_all_ranks():
 
 @pytest.mark.slow
 def test_scenes_on_three_ranks(on_ranks):
-    on_ranks(3, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-m", "mpi")
+    on_ranks(3, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "all_ranks")

@@ -68,8 +68,8 @@ NAMES = {
 }
 FAILURES = {
     raises: r": <function .* raised KeyError\('table'\); correct it$",
-    nan: r"=\(0, 0, nan\): pass three finite components \[[\w^/]+\]$",
-    two_numbers: r"=\(0, 0\): pass three finite components \[[\w^/]+\]$",
+    nan: r": returned \(0, 0, nan\); pass three finite components \[[\w^/]+\]$",
+    two_numbers: r": returned \(0, 0\); pass three finite components \[[\w^/]+\]$",
 }
 
 

@@ -7,6 +7,7 @@ code with the package.
 
 import re
 import traceback
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from dolfinx_nts.output.state_file import previous
 DEEP = 0.5
 #: Energy over the largest that may come from nowhere without a word (the package's 1 % twice).
 GAIN = 0.02
+EPS = np.finfo(float).eps
 #: What an argument is named by in a message, and words of a remedy.
 NAMED = re.compile(r"\w+(\[\d+\])?=|'[\w ->]+'|\b(bodies|contacts|joints|slave|surface|marker)\b")
 REMEDY = re.compile(
@@ -149,6 +151,16 @@ class Watch:
     def _scene(self):
         return self.made.scene
 
+    @property
+    def _mass(self):
+        solids = zip(self._scene.bodies, self.made.solids, strict=True)
+        return sum(b.density * s.mass.sum() for b, s in solids)
+
+    @property
+    def _speed(self):
+        return max(np.abs(v).max() for row in self.rows for _, v in row)
+
+    @cached_property
     def _mechanics(self):
         """Of each row kinetic and stored energy, momentum, angular momentum, centre times mass."""
         rows = []
@@ -160,7 +172,7 @@ class Watch:
                 mass = body.density * solid.mass
                 mv = mass @ v
                 total[0] += 0.5 * float((mv * v).sum())
-                total[1] += solid.energy(y, law_of(body)) if body.law else 0.0
+                total[1] += solid.energy(y, law_of(body, self._scene.unit)) if body.law else 0.0
                 total[2] += mv.sum(axis=0)
                 total[3] += np.cross(y, mv).sum(axis=0)
                 total[4] += (mass @ y).sum(axis=0)
@@ -169,24 +181,22 @@ class Watch:
 
     def _energies(self, table):
         """Kinetic and stored energy of the balance are those of the nodes."""
-        kinetic, stored, momentum, angular, _ = self._mechanics()
+        kinetic, stored, momentum, angular, _ = self._mechanics
         largest = max(np.abs(table["energy"]).max(), kinetic.max(), stored.max(), 1e-300)
         massless = any(c.mass == "redistributed" for c in self._scene.contacts)
         stores = any(kind == "Spring" for kind, _, _ in self._scene.joints)
         # A W(C) is rounded at C = 1.
-        stiff = 1e-6 * sum(b.young * s.mass.sum() for b, s in
+        stiff = 1e-6 * self._scene.unit**2 * sum(b.young * s.mass.sum() for b, s in
                            zip(self._scene.bodies, self.made.solids, strict=True))  # fmt: skip
         checks = [("kinetic", kinetic, largest, massless),
                   ("potential", stored, largest + stiff, stores)]  # fmt: skip
-        speed = max(np.abs(v).max() for row in self.rows for _, v in row)
-        mass = sum(b.density * s.mass.sum() for b, s in
-                   zip(self._scene.bodies, self.made.solids, strict=True))  # fmt: skip
+        mass, speed = self._mass, self._speed
         size = max(np.abs(y).max() for row in self.rows for y, _ in row)
         checks += [("linear_momentum", momentum, mass * speed, massless),
                    ("angular_momentum", angular, mass * speed * size, massless)]  # fmt: skip
         for name, own, scale, other in checks:
             off = np.abs(table[name] - own).max()
-            if not other and off > 1e-8 * scale + 1e-14:
+            if not other and off > 1e-8 * scale + 1e-290:
                 yield f"{name} of the balance is off by {off:.3g} of {scale:.3g}"
 
     def _momenta(self, table):
@@ -195,21 +205,19 @@ class Watch:
         grounded = any(g or k + 1 == len(scene.bodies) for _, k, g in scene.joints)
         if scene.floor or grounded or any(b.held for b in scene.bodies):
             return
-        mass = sum(b.density * s.mass.sum() for b, s in
-                   zip(scene.bodies, self.made.solids, strict=True))  # fmt: skip
-        speed = max(np.abs(v).max() for row in self.rows for _, v in row)
+        mass, speed = self._mass, self._speed
         size = max(np.abs(y).max() for row in self.rows for y, _ in row)
-        fall = -scene.gravity * np.outer(table["time"], scene.row)
+        fall = -scene.unit * scene.gravity * np.outer(table["time"], scene.row)
         expected = table["linear_momentum"][0] + mass * fall
         off = np.abs(table["linear_momentum"] - expected).max()
-        scale = max(mass * speed, np.abs(mass * fall).max(), 1e-12)
+        scale = max(mass * speed, np.abs(mass * fall).max(), 1e-9 * mass * scene.unit)
         loose = max(1e-9, 1e3 * self._promise)
         if off > loose * scale:
             yield f"linear momentum changes by {off:.3g} of {scale:.3g}"
-        fallen = self._mechanics()[4] @ np.array(scene.row)
-        work = scene.gravity * (fallen[0] - fallen)
+        fallen = self._mechanics[4] @ np.array(scene.row)
+        work = scene.unit * scene.gravity * (fallen[0] - fallen)
         off, whole = np.abs(table["external_work"] - work).max(), np.abs(table["energy"]).max()
-        if off > 1e-8 * max(whole, np.abs(work).max()) + 1e-12:
+        if off > 1e-8 * max(whole, np.abs(work).max(), 1e-9 * mass * scene.unit**2):
             yield f"external work is off from gravity's by {off:.3g} of {whole:.3g}"
         keeps = RULES[scene.rule].keeps_angular_momentum and not scene.gravity
         off = np.abs(table["angular_momentum"] - table["angular_momentum"][0]).max()
@@ -233,10 +241,12 @@ class Watch:
         told = set(self.run.warnings)
         closes = RULES[self._scene.rule].closes_ledger
         missing = np.abs(residual).max()
-        if closes and missing > 2 * self._promise * largest and "ledger" not in told:
-            # Below it there is the rounding of large forces over small motions.
-            if missing > 1e-9 * largest or missing > 1e-6:
-                yield f"the ledger misses {missing / largest:.3g} of the largest energy"
+        # Forces that stop all in a step do work over the rounding of positions.
+        size = max(np.abs(y).max() for row in self.rows for y, _ in row)
+        stops = self._mass * self._speed / np.diff(table["time"]).min(initial=np.inf)
+        allowed = 2.0 * self._promise * largest + 100.0 * EPS * stops * size
+        if closes and missing > allowed and "ledger" not in told:
+            yield f"the ledger misses {missing / largest:.3g} of the largest energy"
         if (np.diff(table["friction_dissipation"]) < -1e-9 * largest).any():
             yield "friction gives energy back"
         gain = (table["energy"] - table["energy"][0] - table["external_work"]).max()
@@ -292,7 +302,7 @@ class Watch:
                 away = away - np.outer(away @ axis, axis)
             return (np.linalg.norm(away, axis=1) - floor.radius) * (-1 if floor.inside else 1)
 
-        return np.max(-gap(k), where=gap(0) >= -1e-9, initial=0.0)
+        return np.max(-gap(k), where=gap(0) >= -1e-9 * self._scene.unit, initial=0.0)
 
     def _deepest(self, a, b):
         """How deep samples of body a come into body b on straight ways between the rows [m]."""
@@ -310,9 +320,9 @@ class Watch:
         return deepest, where
 
 
-def law_of(body):
+def law_of(body, unit=1.0):
     """Strain energy W(C) of a body [J/m^3] in NumPy, C of shape (..., 3, 3)."""
-    mu = body.young / (2 * (1 + body.poisson))
+    mu = unit**2 * body.young / (2 * (1 + body.poisson))
     lame = 2 * mu * body.poisson / (1 - 2 * body.poisson)
 
     def energy(c):
@@ -354,7 +364,8 @@ def judge_restart(scene, comm, path):
     except (TypeError, ValueError) as error:
         return Verdict("refused", repr(error), [])
     middle = previous(path)
-    if not middle.is_file():
+    # Where Newton's method fails depends on rounding, as of what the linear solver went over to.
+    if not (middle.is_file() and whole.status.startswith("completed")):
         made.system.destroy()
         return Verdict("stopped", whole.status, [])
     again = built(scene, comm)
@@ -385,7 +396,7 @@ def judge_restart(scene, comm, path):
     more = {k for k in found.warnings if k not in whole.warnings and not OVERLAPS.search(k)}
     if not reuses and (lost or more):
         wrong.append(f"warns otherwise: {found.warnings}")
-    if whole.status.split(",")[0].split(" (")[0] != found.status.split(",")[0].split(" (")[0]:
+    if not found.status.startswith("completed"):
         wrong.append(f"ends otherwise: {found.status}")
     touched = bool(whole.balance["active"].any())
     return Verdict("completed", f"{whole.status} {whole.warnings}", wrong, touched)

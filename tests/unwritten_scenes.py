@@ -1,7 +1,8 @@
 """Scenes that no one wrote: hypothesis draws them as plain data, `built` makes systems of these.
 
-All lengths are about a metre. Bodies stand in a row in a random direction, each at a gap from the
-one before. What is drawn may be nonsense: the package is to refuse it.
+Lengths are about a `unit`; moduli, loads and speeds go with it, so that times are the same. Bodies
+stand in a row in some direction, each at a gap from the one before. What is drawn may be nonsense:
+the package is to refuse it.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -134,6 +135,7 @@ class Scene(Plain):
         options: Of `simulate`.
         newton: Of `Newton`; empty: none is passed.
         nonsense: Name in NONSENSE of an argument that is spoilt, or "".
+        unit: Of all lengths [m]; speeds, moduli, stiffnesses and gravity follow.
     """
 
     row: tuple = (1.0, 0.0, 0.0)
@@ -148,11 +150,17 @@ class Scene(Plain):
     options: tuple = ()
     newton: tuple = ()
     nonsense: str = ""
+    unit: float = 1.0
 
 
 # ---- drawing
+def rounded(x):
+    """Four digits, to be read."""
+    return float(f"{x:.4g}")
+
+
 def number(low, high):
-    return st.floats(low, high, allow_nan=False).map(lambda x: float(f"{x:.4g}"))
+    return st.floats(low, high, allow_nan=False).map(rounded)
 
 
 def mostly(usual, *others, odds=2):
@@ -253,6 +261,7 @@ def scenes(draw):
         options=tuple((k, v) for k, v in options.items() if v not in (None, False, "published")),
         newton=tuple(newton.items()),
         nonsense=draw(mostly("", *NONSENSE, odds=12)),
+        unit=draw(mostly(1.0, 1e-3, 1e3, odds=4)),
     )
 
 
@@ -283,7 +292,7 @@ def placed(scene):
         along = x @ row
         x += (end + (body.gap if k else 0.0) - along.min()) * row
         end = (x @ row).max()
-        solids.append(replace(solid, x=x))
+        solids.append(replace(solid, x=scene.unit * x))
     return solids
 
 
@@ -292,8 +301,8 @@ def built(scene, comm):
     row, spoilt = np.array(scene.row), {scene.nonsense: NONSENSE.get(scene.nonsense)}
     beside = np.cross(row, (0.6, 0.0, -0.8))
     solids, made = placed(scene), []
-    for k, (body, solid) in enumerate(zip(scene.bodies, solids, strict=True)):
-        made.append(flexible_or_rigid(k, body, solid, row, beside, spoilt, comm))
+    for k, solid in enumerate(solids):
+        made.append(flexible_or_rigid(k, scene, solid, beside, spoilt, comm))
 
     def surface(k, least, up, **options):
         marker = solids[k].facing(row if up else -row, spoilt.get("marker", least))
@@ -313,23 +322,25 @@ def built(scene, comm):
         slave = surface(0, -1.0 if scene.floor.kind.startswith("h") else 0.3, False)
         pairs.append(nts.ContactPair(slave, obstacle(scene, solids[0]), friction=friction))
     joints = [
-        joint_of(f"joint {n}", *joint, made, solids, row) for n, joint in enumerate(scene.joints)
+        joint_of(f"joint {n}", *joint, scene, made, solids) for n, joint in enumerate(scene.joints)
     ]
-    gravity = spoilt.get("gravity", -scene.gravity * row)
+    gravity = spoilt.get("gravity", -scene.unit * scene.gravity * row)
     system = nts.System(made, contacts=pairs, joints=joints, gravity=gravity)
     return Built(scene, solids, system, arguments(scene, spoilt))
 
 
-def flexible_or_rigid(k, body, solid, row, beside, spoilt, comm):
+def flexible_or_rigid(k, scene, solid, beside, spoilt, comm):
     """The k-th body of the package."""
+    body, row, unit = scene.bodies[k], np.array(scene.row), scene.unit
     mesh, name = solid.mesh(comm), f"body {k}"
     density = spoilt.get("density", body.density)
     towards = -body.speed if k else body.speed
     linear = towards * row + body.drift[0] * beside + body.drift[1] * np.cross(row, beside)
+    linear = unit * linear
     turning, middle = np.array(body.spin), solid.x.mean(axis=0)
 
     def moved(t):
-        return 0.1 * np.sin(20.0 * t) * row + 0.05 * t * beside
+        return unit * (0.1 * np.sin(20.0 * t) * row + 0.05 * t * beside)
 
     if not body.law:
         motion = {"": None, "at rest": (0, 0, 0), "moving": moved}[body.held]
@@ -337,7 +348,7 @@ def flexible_or_rigid(k, body, solid, row, beside, spoilt, comm):
         fixed = {"motion": motion, "rotation": (0, 0, 0)}
         free = free | {"velocity": spoilt["velocity"]} if "velocity" in spoilt else free
         return nts.RigidBody(mesh, density=density, name=name, **(fixed if body.held else free))
-    young, poisson = spoilt.get("young", body.young), spoilt.get("poisson", body.poisson)
+    young, poisson = spoilt.get("young", body.young * unit**2), spoilt.get("poisson", body.poisson)
     bcs = []
     if body.held:
         value = moved if body.held == "moving" else (0.0, 0.0, 0.0)
@@ -357,16 +368,16 @@ def obstacle(scene, solid):
     floor, row = scene.floor, np.array(scene.row)
     along = solid.x @ row
     first = solid.x[along.argmin()]
-    motion = (lambda t: 0.02 * np.sin(30.0 * t) * row) if floor.moving else None
-    at = first - floor.gap * row
+    motion = (lambda t: 0.02 * scene.unit * np.sin(30.0 * t) * row) if floor.moving else None
+    gap, radius = scene.unit * floor.gap, scene.unit * floor.radius
+    at = first - gap * row
     if floor.kind == "plane":
         return nts.Plane(at, row, motion=motion)
     hollow = floor.kind.startswith("hollow")
-    radius = floor.radius
     centre = at - radius * row
     if hollow:
         middle = solid.x.mean(axis=0)
-        radius = np.linalg.norm(solid.x - middle, axis=1).max() + floor.gap
+        radius = np.linalg.norm(solid.x - middle, axis=1).max() + gap
         centre = middle
     if floor.kind.endswith("ball"):
         return nts.Sphere(centre, radius, inside=hollow, motion=motion)
@@ -374,13 +385,13 @@ def obstacle(scene, solid):
     return nts.Cylinder(centre, axis, radius, inside=hollow, motion=motion)
 
 
-def joint_of(name, kind, k, ground, made, solids, row):
+def joint_of(name, kind, k, ground, scene, made, solids):
     """A joint or spring between a body and the next one, or the ground."""
-    ground = ground or k + 1 == len(made)
+    ground, row, unit = ground or k + 1 == len(made), np.array(scene.row), scene.unit
     a, b = made[k], None if ground else made[k + 1]
     along = solids[k].x @ row
     point = solids[k].x[along.argmax()]
-    far = point + 0.3 * row if ground else solids[k + 1].x[(solids[k + 1].x @ row).argmin()]
+    far = point + 0.3 * unit * row if ground else solids[k + 1].x[(solids[k + 1].x @ row).argmin()]
     axis = np.cross(row, (0.6, 0.0, -0.8))
     if kind == "Tie":
         surface = b.surface(solids[k + 1].facing(-row, 0.3)) if b else None
@@ -392,7 +403,10 @@ def joint_of(name, kind, k, ground, made, solids, row):
         given["axes"] = (row, axis)
     elif kind not in ("Distance", "Spring", "Damper", "Spherical", "Fixed"):
         given["axis"] = axis
-    more = {"Spring": {"stiffness": 1e5, "length": 0.05}, "Damper": {"damping": 10.0}}
+    more = {
+        "Spring": {"stiffness": 1e5 * unit**3, "length": 0.05 * unit},
+        "Damper": {"damping": 10.0 * unit**3},
+    }
     given |= more.get(kind, {})
     return getattr(nts, kind)(a, b, **given, name=name)
 

@@ -13,11 +13,11 @@ from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.director_body import DirectorBody
 from dolfinx_nts.bodies.hull import Hull, of_beam
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.section import Section
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import beam as kernel
 from dolfinx_nts.kernels.quadratic_energy import Elements
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
 FloatArray = npt.NDArray[np.float64]
@@ -89,6 +89,11 @@ class Beam(DirectorBody):
         length = np.linalg.norm(y[:, 4] - y[:, 0], axis=1)
         found = kernel.beams(y, length, self.length, self.section.stiffness)
         return found, length[:, None, None] * (np.ones((2, 2)) + np.eye(2)) / 6.0
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return {"section": self.section, **super().settings}
 
     def centreline(self) -> tuple[FloatArray, FloatArray]:
         """Nodes of the axis as they follow each other, the same on all ranks. Collective.

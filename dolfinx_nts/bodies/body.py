@@ -1,47 +1,30 @@
-"""What a System asks of a body, and what a body knows of a step."""
+"""What a System asks of a body."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.points import Points
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 
-class Moment(NamedTuple):
-    """Where a step evaluates the forces of a body.
-
-    Attributes:
-        u0: Displacement at t_n [m], owned coordinates.
-        time: Of the loads [s].
-        ramp: Part of constant loads that acts.
-        rate: Change of the velocity there with u_1 [1/s]; 0 in statics.
-        drift: Velocity there for u_1 = u_0 [m/s]; None: zero.
-    """
-
-    u0: FloatArray
-    time: float
-    ramp: float = 1.0
-    rate: float = 0.0
-    drift: FloatArray | None = None
-
-
 class Body:
     """A body with coordinates q = X + u and a constant mass matrix (39); what all bodies inherit.
 
     A body knows neither the step's length nor the name of its integrator, which is the `rule` that
-    tells how forces follow from two states. A body of one's own sets the first seven attributes and
+    tells how forces follow from two states. A body of one's own sets the first six attributes and
     has the first seven methods. All else has a default here, which is that of a body whose
     coordinates are the places of material points, free of conditions, without a mesh.
 
@@ -50,7 +33,6 @@ class Body:
         comm: MPI communicator.
         num_owned: Coordinates this rank owns; the global numbering is contiguous by rank.
         reference: X [m], shape (num_owned,).
-        initial_velocity: v at the start [m/s], shape (num_owned,).
         nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
         fixed: Positions of the prescribed coordinates among the owned ones.
         mesh: DOLFINx mesh whose nodes move with the body; None: it has none, hence no surface, no
@@ -62,8 +44,8 @@ class Body:
         rigid: Whether no motion changes distances in it, so that `directions` turn with it.
         oriented: Whether it has directors, and with them `length`, `directions_at` and `turn`.
         length: What its directors are multiples of [m].
-        rounded: Length [m], the same on all ranks, whose rounding the forces hold beside that of u;
-            None: that of the positions.
+        rounded: Length [m] whose rounding enters the forces in addition to that of u, the same on
+            all ranks; None: the size of the positions.
         allow_inversion: Whether steps are accepted that end with `smallest_det` <= 0.
         has_massless: Whether coordinates on any rank have no mass.
         destroyed: Whether `destroy` was called.
@@ -73,7 +55,6 @@ class Body:
     comm: Any
     num_owned: int
     reference: FloatArray
-    initial_velocity: FloatArray
     nodal_mass: FloatArray
     fixed: IntArray
 
@@ -136,6 +117,11 @@ class Body:
         return np.zeros(self.num_owned)
 
     @cached_property
+    def initial_velocity(self) -> FloatArray:
+        """Velocity v at the start [m/s], shape (num_owned,)."""
+        return np.zeros(self.num_owned)
+
+    @cached_property
     def places(self) -> BoolArray:
         """Which of this rank's nodes are places, t_a = 1, shape (num_owned / 3,).
 
@@ -154,7 +140,8 @@ class Body:
 
     def last_accepted(self) -> tuple[FloatArray, FloatArray]:
         """Owned u [m] and v [m/s] of the last accepted state, or of the start."""
-        return self._accepted or (self.initial_displacement, self.initial_velocity)
+        known = getattr(self, "_accepted", None)
+        return known or (self.initial_displacement, self.initial_velocity)
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of the sum of the places' momenta [kg m/s], shape (3,)."""
@@ -241,6 +228,11 @@ class Body:
         What `turn` cannot tell from their places at both times.
         """
         return 0.0
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Numbers and texts by the arguments that it was made of, which ranks have in common."""
+        return {}
 
     def parameters(self) -> FloatArray:
         """Values of the material that a caller may change during a run, shape (n,)."""

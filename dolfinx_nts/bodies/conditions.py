@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import locate_facets
@@ -37,6 +38,9 @@ _ELSE = (
     "a function of time t -> (3,), a function of place and time x (3, n), t -> (3, n), or a "
     "Constant or Function of DOLFINx with three components"
 )
+
+#: Rounding of displacements over them and over the distance of the body from the origin.
+_ROUNDING = 64 * float(np.finfo(float).eps)
 
 
 @known_options
@@ -148,6 +152,69 @@ def at_nodes(space: Any, what: str, value: Any) -> FloatArray:
     return found
 
 
+class Meetings:
+    """Coordinates that two conditions of a body prescribe, which must be of one mind. Collective.
+
+    Args:
+        comm: MPI communicator.
+        name: Of the body, for messages.
+        values: Of the conditions, as they were given.
+        dofs: Positions that each of them prescribes among this rank's coordinates.
+        x: Reference position of each node [m], shape (n, 3).
+        width: Coordinates of a node, of which the first three are its place.
+    """
+
+    def __init__(
+        self, comm: Any, name: str, values: Sequence[Any], dofs: Sequence[IntArray],
+        x: FloatArray, width: int = 3,
+    ) -> None:  # fmt: skip
+        self._comm, self._name, self._dofs, self._x, self._width = comm, name, dofs, x, width
+        times = np.zeros(width * len(x), dtype=int)
+        for here in dofs:
+            times[here] += 1
+        local = [np.any(times[here] > 1) for here in dofs]
+        meet = comm.allreduce(np.array(local, dtype=int)) > 0
+        self._any = bool(meet.any())
+        self._moving = any(m and callable(v) for m, v in zip(meet, values, strict=True))
+        self._size = float(comm.allreduce(np.abs(x).max(initial=0.0), op=MPI.MAX))
+
+    def check(self, now: Sequence[FloatArray], time: float, *, anew: bool = True) -> None:
+        """Raise on every rank where two conditions prescribe different displacements.
+
+        Args:
+            now: Of each condition the displacements at its positions [m].
+            time: When [s].
+            anew: Whether those that do not depend on time were found to be of one mind.
+
+        Raises:
+            UserFunctionError: They do; not tried again in smaller steps.
+        """
+        if not self._any or (anew and not self._moving):
+            return
+        problem = None
+        owner = np.full(self._width * len(self._x), -1)
+        before = np.zeros(len(owner))
+        for k, (dofs, new) in enumerate(zip(self._dofs, now, strict=True)):
+            old = before[dofs]
+            limit = _ROUNDING * np.maximum(self._size, np.maximum(np.abs(old), np.abs(new)))
+            apart = np.flatnonzero((owner[dofs] >= 0) & (np.abs(old - new) > limit))
+            if apart.size and problem is None:
+                i = apart[0]
+                problem = self._sentence(int(owner[dofs[i]]), k, int(dofs[i]), old[i], new[i], time)
+            owner[dofs], before[dofs] = k, new
+        raise_together(self._comm, problem, UserFunctionError)
+
+    def _sentence(self, j: int, k: int, dof: int, one: float, other: float, time: float) -> str:
+        near = _ROUNDING * self._size
+        place = self._x[dof // self._width].tolist()
+        where = ", ".join(f"{x if abs(x) > near else 0.0:.4g}" for x in place)
+        return (
+            f"bcs[{j}] and bcs[{k}] of {self._name!r}: at t={time:.6g} they prescribe {one:.6g} m "
+            f"and {other:.6g} m along {'xyz'[dof % self._width % 3]} of the node at X = ({where}); "
+            "leave that place or component out of one of them, or give both one value"
+        )
+
+
 class Supports:
     """The `Dirichlet` conditions of a body. Collective.
 
@@ -165,7 +232,8 @@ class Supports:
 
     Raises:
         TypeError: An item is no condition.
-        ValueError: A condition selects no facet, or has no values at t = 0.
+        ValueError: A condition selects no facet, or has no values at t = 0, or two of them
+            prescribe different values of one coordinate.
     """
 
     def __init__(self, comm: Any, space: Any, bcs: Sequence[Dirichlet], name: str) -> None:
@@ -173,6 +241,7 @@ class Supports:
         self._num_owned = 3 * space.dofmap.index_map.size_local
         bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")
         self._space, self._nodes = space, space.tabulate_dof_coordinates()
+        start = []
         self.masks: list[Any] = []
         self._parts: list[tuple[Any, IntArray, list[tuple[int, IntArray]]]] = []
         owner, dim = np.full(self._num_owned, -1), space.mesh.topology.dim
@@ -183,7 +252,7 @@ class Supports:
             owned = blocks[3 * blocks < self._num_owned]
             self._parts.append((bc.value, owned, []))
             try:
-                self._values(number, bc.value, owned, 0.0)
+                start.append(self._values(number, bc.value, owned, 0.0))
             except UserFunctionError as error:
                 one = callable(bc.value) and not _takes_place(bc.value)
                 hint = "; it is called with the time: one that varies in space takes (x, t)"
@@ -198,8 +267,17 @@ class Supports:
         self.driven = any(callable(value) for value, _, _ in self._parts)
         still = [d for value, _, parts in self._parts if not callable(value) for _, d in parts]
         self.still: IntArray = np.concatenate([np.empty(0, dtype=int), *still])
-        # Where two conditions meet, the later one's value holds, so it carries the force.
+        # Where two conditions meet, the later one carries the force.
         self._condition = owner[self.fixed]
+        x = self._nodes[: self._num_owned // 3]
+        of_each = [np.concatenate([d for _, d in parts]) for _, _, parts in self._parts]
+        self._meetings = Meetings(comm, name, [bc.value for bc in bcs], of_each, x)
+        self._meetings.check([self._at_dofs(*both) for both in enumerate(start)], 0.0, anew=False)
+
+    @property
+    def settings(self) -> list[Any]:
+        """Of each condition value and components."""
+        return [(value, [c for c, _ in parts]) for value, _, parts in self._parts]
 
     def _values(self, k: int, value: Any, nodes: IntArray, time: float) -> FloatArray:
         """Displacements of a condition at a time [m], shape (3,) or (nodes, 3). Collective."""
@@ -216,13 +294,20 @@ class Supports:
             return found.T
         return vector_in_time(self._comm, what, value, time, "m")
 
+    def _at_dofs(self, k: int, now: FloatArray) -> FloatArray:
+        """Displacements of a condition, (3,) or (nodes, 3), at its positions [m]."""
+        _, nodes, parts = self._parts[k]
+        of_nodes = np.broadcast_to(now, (len(nodes), 3))
+        return np.concatenate([of_nodes[:, component] for component, _ in parts])
+
     def prescribed(self, time: float) -> FloatArray:
         """Displacements at a time, in the order of `fixed` [m]. Collective."""
         values = np.zeros(self._num_owned)
-        for k, (value, nodes, parts) in enumerate(self._parts):
-            now = self._values(k, value, nodes, time)
+        now = [self._values(k, v, n, time) for k, (v, n, _) in enumerate(self._parts)]
+        self._meetings.check([self._at_dofs(*both) for both in enumerate(now)], time)
+        for here, (_, _, parts) in zip(now, self._parts, strict=True):
             for component, dofs in parts:
-                values[dofs] = now[..., component]
+                values[dofs] = here[..., component]
         return values[self.fixed]
 
     def reactions(self, residual: FloatArray) -> FloatArray:

@@ -14,12 +14,12 @@ from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.materials import misfit, with_constants
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.ufl_body import UflBody
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.parallel import raise_together
@@ -63,8 +63,8 @@ class Continuum(UflBody):
         degree: Polynomial degree; contact surfaces need 1.
         body_force: Force per reference volume [N/m^3], a vector or a function of time.
         traction: `Traction` loads.
-        quadrature_degree: For energy, stress and mass alike; default 2 x 2 x 2 Gauss points on
-            trilinear hexahedra.
+        quadrature_degree: For energy, stress and loads; default 2 x 2 x 2 Gauss points on trilinear
+            hexahedra. Mass has never less than that: with one point a cell could turn for nothing.
         extra_form: Further virtual work as UFL, a callable (u, v, w, t) -> form of displacement,
             velocity and time where the integrator takes forces (the middle of the step; in statics
             its end, at rest) and of the test function w; it is added to the internal virtual work
@@ -126,6 +126,7 @@ class Continuum(UflBody):
         # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
         self.rounded = 0.0 if isinstance(material, Isotropic) else self._size()
         self.body_force, self._traction = body_force, traction
+        self._of_mass = max(quadrature_degree, 2 * degree)
         self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
         self._ds = self._boundary_measure(quadrature_degree)
         self._loads_at(0.0)
@@ -188,7 +189,8 @@ class Continuum(UflBody):
 
     def _mass_form(self, v: Any, w: Any) -> Any:
         """Mass in UFL."""
-        return self._rho * ufl.inner(v, w) * self._dx
+        dx = ufl.Measure("dx", self.mesh, metadata={"quadrature_degree": self._of_mass})
+        return self._rho * ufl.inner(v, w) * dx
 
     def _virtual_work(self, rule: Integrator, w: Any) -> Any:
         """Virtual work of the rule's stress in UFL."""
@@ -196,6 +198,13 @@ class Continuum(UflBody):
         return ufl.inner(rule.piola(self.law, h0, h1), ufl.grad(w)) * self._dx
 
     # ---- as of Body
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
+        own = {"material": self.material, "density": self.density, "degree": self.degree}
+        return own | loads | super().settings
+
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         if not self._seen_at_rest:

@@ -14,18 +14,19 @@ from petsc4py import PETSc
 from scipy.spatial import cKDTree
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.hull import Hull
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.node_conditions import NodeConditions
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.bodies.skeleton import Skeleton
 from dolfinx_nts.contact.surfaces import Skin, Surface, in_order
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels import quadratic_energy as kernel
 from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import at_points, vector, vectors
 
 FloatArray = npt.NDArray[np.float64]
@@ -212,7 +213,9 @@ class DirectorBody(Body):
         """DOLFINx Function of degree 0 from values (n, 3) or (n, 3, 3) in this rank's cells."""
         make = compat.cell_vector_space if values.ndim == 2 else compat.tensor_space
         function = fem.Function(make(self.mesh, "DG", 0), name=name)
-        function.x.array[: values.size] = values.ravel()
+        of_cells = compat.cell_dofs(function.function_space)[: len(values), 0]
+        rows = values.reshape(len(values), 3 ** (values.ndim - 1))
+        function.x.array.reshape(-1, rows.shape[1])[of_cells] = rows
         function.x.scatter_forward()
         return function
 
@@ -332,6 +335,11 @@ class DirectorBody(Body):
         self._u0, self._y0 = moment.u0, self._vectors(moment.u0)
         self._theta, self._held_at = rule.taken_at, rule.theta
         self._load, self._couple = self._conditions.loads(moment.time, moment.ramp)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return self._conditions.settings
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""

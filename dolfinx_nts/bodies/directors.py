@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dolfinx_nts.constraints import Constraints, Equations
 
 if TYPE_CHECKING:
-    from dolfinx_nts.bodies.points import Points
+    from dolfinx_nts.points import Points
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

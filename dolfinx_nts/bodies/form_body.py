@@ -60,8 +60,8 @@ class FormBody(UflBody):
         displacement: Displacement [m] in which the body starts, as of `Continuum`.
         bcs: `Dirichlet` conditions, on parts of the mesh's boundary.
         name: Name in messages and files.
-        quadrature_degree: Of all integrals of `energy`, `density` and `mass` whose measures name
-            none; default twice the degree of the space.
+        quadrature_degree: Of all integrals of `energy` whose measures name none; default twice the
+            degree of the space, which those of `density` and `mass` have at least.
         extra_form: Further virtual work such as damping and loads, as of `Continuum`.
         allow_inversion: On a 3D mesh, accept steps that turn a cell inside out, as of `Continuum`.
 
@@ -111,11 +111,14 @@ class FormBody(UflBody):
             )
         check_any_mesh(space.mesh, name)
         self._quadrature, self._given_mass = quadrature_degree or 2 * degree, mass
+        # With one point a cell could turn for nothing.
+        self._of_mass = max(self._quadrature, 2 * degree)
         super().__init__(space, degree, name, extra_form, self._quadrature, allow_inversion)
         self._rho = None if density is None else self._density(density)
         self.rounded = self._size()
         self._potential = Potential(
-            lambda *strains: self._integrated(energy(*strains)), _in_tuple(strain)
+            lambda *strains: self._integrated(energy(*strains), self._quadrature),
+            _in_tuple(strain),
         )
         form = self._checked_energy(energy)
         if mass is not None:
@@ -125,8 +128,8 @@ class FormBody(UflBody):
         self._check_mass()
 
     # ---- set-up
-    def _integrated(self, form: Any) -> Any:
-        """A form with this body's quadrature, but where its measures name one.
+    def _integrated(self, form: Any, degree: int) -> Any:
+        """A form with a degree of quadrature, but where its measures name one.
 
         UFL's own choice differs between an energy and its derivative, which would then be that of
         another energy.
@@ -137,7 +140,7 @@ class FormBody(UflBody):
             part
             if "quadrature_degree" in part.metadata()
             else part.reconstruct(
-                metadata={**part.metadata(), "quadrature_degree": self._quadrature}
+                metadata={**part.metadata(), "quadrature_degree": degree}
             )
             for part in form.integrals()
         ]
@@ -196,10 +199,11 @@ class FormBody(UflBody):
 
     def _mass_form(self, v: Any, w: Any) -> Any:
         """Mass in UFL."""
-        if self._given_mass is not None:
-            return self._integrated(self._given_mass(v, w))
-        dx = ufl.Measure("dx", self.mesh)
-        return self._integrated(self._rho * ufl.inner(v, w) * dx)
+        if self._given_mass is None:
+            form = self._rho * ufl.inner(v, w) * ufl.Measure("dx", self.mesh)
+        else:
+            form = self._given_mass(v, w)
+        return self._integrated(form, self._of_mass)
 
     def _virtual_work(self, rule: Integrator, w: Any) -> Any:
         """Virtual work of the potential by the rule in UFL."""

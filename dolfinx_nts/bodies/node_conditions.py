@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.conditions import Dirichlet
+from dolfinx_nts.bodies.conditions import Dirichlet, Meetings
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.skeleton import Skeleton
 from dolfinx_nts.validation import at_points, items, vector_in_time
@@ -59,12 +59,20 @@ class NodeConditions:
         self._loads = [self._load(k, load) for k, load in enumerate(forces)]
         turning = [weights != 0.0 for load, weights, _ in self._loads if load.turns]
         self.turned: IntArray = np.flatnonzero(np.any(turning, axis=0) if turning else [])
-        self.prescribed(0.0)
+        x = skeleton.x[here]
+        self._meetings = Meetings(comm, name, self._values, self._dofs, x, self._width)
+        self._meetings.check(self._at_dofs(0.0), 0.0, anew=False)
         self.loads(0.0, 1.0)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return {"bcs": self._values, "forces": [load.value for load, _, _ in self._loads]}
 
     def _hold(self, bcs: Sequence[Clamp | Dirichlet], kind: str) -> None:
         owner = np.full((self._here.stop - self._here.start, self._width), -1)
         self._values: list[Any] = []
+        self._dofs: list[IntArray] = []
         for k, bc in enumerate(bcs):
             what = f"{type(bc).__name__}.where of bcs[{k}] of {self._name!r}"
             chosen = np.flatnonzero(self._chosen(what, bc.where)[self._here])
@@ -77,6 +85,7 @@ class NodeConditions:
                     )
                 columns = (columns[:, None] + np.arange(0, self._width, 3)).ravel()
             owner[np.ix_(chosen, columns)] = k
+            self._dofs.append((self._width * chosen[:, None] + columns).ravel())
             self._values.append((0.0,) * 3 if isinstance(bc, Clamp) else bc.value)
         self.driven = any(callable(value) for value in self._values)
         self.fixed: IntArray = np.flatnonzero(owner >= 0)
@@ -132,14 +141,24 @@ class NodeConditions:
             both[int(load.turns)] += part * weights[:, None] * value
         return both[0], both[1][self.turned]
 
+    def _at_dofs(self, time: float) -> list[FloatArray]:
+        """Displacements of each condition at its positions [m]. Collective."""
+        found = []
+        for k, (value, dofs) in enumerate(zip(self._values, self._dofs, strict=True)):
+            now = np.zeros(self._width)
+            what = f"Dirichlet.value of bcs[{k}] of {self._name!r}"
+            now[:3] = vector_in_time(self._comm, what, value, time, "m")
+            found.append(now[dofs % self._width])
+        return found
+
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
-        now = np.zeros((len(self._values), self._width))
-        for k, value in enumerate(self._values):
-            what = f"Dirichlet.value of bcs[{k}] of {self._name!r}"
-            now[k, :3] = vector_in_time(self._comm, what, value, time, "m")
-        found: FloatArray = now[self._condition, self.fixed % self._width]
-        return found
+        now = self._at_dofs(time)
+        self._meetings.check(now, time)
+        values = np.zeros(self._width * (self._here.stop - self._here.start))
+        for dofs, here in zip(self._dofs, now, strict=True):
+            values[dofs] = here
+        return values[self.fixed]
 
     def reactions(self, residual: FloatArray) -> FloatArray:
         """Resultants on the places of each condition, this rank's part [N], (conditions, 3)."""

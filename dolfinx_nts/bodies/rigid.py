@@ -15,19 +15,21 @@ from petsc4py import PETSc
 from scipy.spatial.transform import Rotation
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh
 from dolfinx_nts.bodies.parameters import Parameter, is_number, require_positive_parameter
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import gather_rows, raise_together
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import (
     UserFunctionError,
+    agree,
     call_together,
     floats,
     known_options,
@@ -402,10 +404,9 @@ class RigidBody(Body):
 
     def _rotation_at(self, time: float) -> FloatArray:
         """The prescribed rotation since the start, shape (3, 3). Collective."""
-        given, name = self._turn, f"rotation of {self.name!r}"
-        kind: type[Exception] = ValueError
-        if callable(given):
-            name, kind = f"{name} at t={time!r}", UserFunctionError
+        given, name, moves = self._turn, f"rotation of {self.name!r}", callable(self._turn)
+        if moves:
+            name = f"{name} at t={time!r}"
             given = call_together(self.comm, name, given, time)
         problem, turned = None, np.eye(3)
         array = floats(given)
@@ -415,8 +416,11 @@ class RigidBody(Body):
             turned = Rotation.from_rotvec(array).as_matrix()
         else:
             problem, turned = misfit_of_axes(array), array
-        text = f"{name}={given!r}: {problem}"
-        raise_together(self.comm, text if problem else None, kind)
+        if moves:
+            text = f"{name}: returned {given!r}; {problem}"
+            agree(self.comm, name, turned, text if problem else None)
+        else:
+            raise_together(self.comm, f"{name}={given!r}: {problem}" if problem else None)
         return turned
 
     def _check_torque(self, torque: FloatArray) -> None:

@@ -13,11 +13,11 @@ from dolfinx_nts.bodies.director_body import DirectorBody
 from dolfinx_nts.bodies.hull import SIDES, Hull, of_shell
 from dolfinx_nts.bodies.midsurface import check_midsurface, midsurface_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.kernels import shell as kernel
 from dolfinx_nts.kernels.quadratic_energy import Elements
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import (
     is_finite,
     known_options,
@@ -108,6 +108,12 @@ class Shell(DirectorBody):
         """This rank's elements from their reference, see `DirectorBody`."""
         stiffness = kernel.stiffness(self.young, self.poisson, self.thickness)
         return kernel.shells(y, self.length, stiffness)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        own = {name: getattr(self, name) for name in ("young", "poisson", "thickness", "density")}
+        return {**own, **super().settings}
 
     def midsurface(self) -> tuple[FloatArray, FloatArray]:
         """Nodes in the order of the mesh's input, the same on all ranks. Collective.

@@ -14,18 +14,19 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports, at_nodes
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
-from dolfinx_nts.bodies.points import Points, in_mesh
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import gather_on_root, raise_together
+from dolfinx_nts.points import Points, in_mesh
 from dolfinx_nts.validation import (
     UserFunctionError,
     at_points,
@@ -494,6 +495,12 @@ class UflBody(Body):
         self._in.ghostUpdate()
         with self._in.localForm() as here:
             return self._determinants.smallest(here.array_r)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        constants = [t.value for t in self._parameters if isinstance(t, fem.Constant)]
+        return {"bcs": self._supports.settings, "constants in the material": constants}
 
     def parameters(self) -> FloatArray:
         """Values of Constants and Functions in energy and mass, which a caller may change, (n,)."""

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution
 from dolfinx_nts.contact.coulomb import Slip
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.elements import over
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.points import Points
+from dolfinx_nts.state import ContactHistory
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

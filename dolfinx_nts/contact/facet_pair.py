@@ -68,7 +68,7 @@ class FacetPair(ContactPair, master=Surface):
     @property
     def yields(self) -> bool:
         """Whether points of a surface can move against each other, as of `ContactPair`."""
-        return super().yields or not self.master.redundant
+        return super().yields or not self.master.body.rigid
 
     @property
     def master_name(self) -> str:

@@ -13,9 +13,8 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations, Upright, rank_of
 from dolfinx_nts.kernels import quadratic
-from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import (
-    UserFunctionError,
+    agree,
     call_together,
     floats,
     is_finite,
@@ -367,15 +366,13 @@ def number_at(comm: Any, name: str, function: Callable[[float], Any], t: float, 
     """The user's number at a time; what fails on one rank raises on all.
 
     Raises:
-        UserFunctionError: It raised, or returned anything but a finite number.
+        UserFunctionError: It raised, or returned anything but the same finite number on all ranks.
     """
     name = f"{name} at t={float(t)!r}"
     value = floats(given := call_together(comm, name, function, t))
     fits = value.size == 1 and is_finite(value.item())
-    raise_together(
-        comm,
-        None if fits else f"{name}={given!r}: return a finite number [{unit}]",
-        UserFunctionError,
-    )
-    return float(value.item())
+    problem = None if fits else f"{name}: returned {given!r}; return a finite number [{unit}]"
+    number = float(value.item()) if fits else 0.0
+    agree(comm, name, np.array([number]), problem)
+    return number
 

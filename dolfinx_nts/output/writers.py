@@ -13,21 +13,19 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.output.own_functions import Own, checked, of_body
+from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
 from dolfinx_nts.step import balance as ledger
 from dolfinx_nts.step import contact_fields, resultants
 from dolfinx_nts.validation import StrPath, as_path, is_whole, require_positive
-
-if TYPE_CHECKING:
-    from dolfinx_nts.run.stepper import Stepper
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -153,7 +151,7 @@ class _Series:
             replace_file(path, (text[: times[len(kept)][1]] + _XDMF_TAIL).encode())
         self._times = len(kept)
 
-    def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
+    def fields(self, stepper: Running) -> dict[str, FloatArray]:
         """Nodal fields of the last accepted state on rank 0; collective."""
         state = stepper.state
         u, v = (self.body.at_mesh(w[self.index]) for w in (state.u, state.v))
@@ -286,7 +284,7 @@ class Fields:
         self.functions = checked(functions)
         self._series: list[_Series] = []
 
-    def start(self, stepper: Stepper) -> None:
+    def start(self, stepper: Running) -> None:
         """Create the files with the initial state."""
         system, contacts = stepper.system, stepper.system.contacts
         label = contact_fields.labels(system)
@@ -308,7 +306,7 @@ class Fields:
             self._root(stepper, series.create)
         self._append(stepper)
 
-    def _go_on(self, stepper: Stepper, due: bool) -> bool:
+    def _go_on(self, stepper: Running, due: bool) -> bool:
         """Go on with the files of an earlier part of the run; tells whether they are there."""
         comm = stepper.system.comm
         files = [Path(f"{s.path}.{kind}") for s in self._series for kind in ("xdmf", "h5")]
@@ -327,12 +325,12 @@ class Fields:
             on_root(comm, partial(series.go_on, times, due))
         return True
 
-    def write(self, stepper: Stepper, *, last: bool = False) -> None:
+    def write(self, stepper: Running, *, last: bool = False) -> None:
         """Write the accepted state if the cadence asks for it, or if it is the last."""
         if self._due(stepper) or last:
             self._append(stepper)
 
-    def _due(self, stepper: Stepper) -> bool:
+    def _due(self, stepper: Running) -> bool:
         """Return whether the cadence asks for this state; the first one of a run is due."""
         times = stepper.solution.rows.column("time")
         before, self._seen = self._seen, len(times)
@@ -344,20 +342,20 @@ class Fields:
         then, now = np.floor(multiples + 1e-12 * np.abs(multiples))
         return bool(now > then)
 
-    def close(self, stepper: Stepper) -> None:
+    def close(self, stepper: Running) -> None:
         """Write the last accepted state of a run that failed."""
         # Unlike an exception, a status is the same on all ranks, so that all come here.
         failed = not stepper.solution.status.startswith(("running", "completed"))
         if self._series and failed and stepper.state.time > self._tried:
             self._append(stepper)
 
-    def _append(self, stepper: Stepper) -> None:
+    def _append(self, stepper: Running) -> None:
         self._tried = time = stepper.state.time
         for series in self._series:
             fields, own = series.fields(stepper), series.own()
             self._root(stepper, partial(series.append, time, fields, own))
 
-    def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
+    def _root(self, stepper: Running, action: Callable[[], Any]) -> None:
         write_on_root(stepper.system.comm, f"folder={str(self.folder)!r}", action)
 
 
@@ -383,7 +381,7 @@ class BalanceCSV:
         self.path = as_path("path", path)
         self._open = False
 
-    def start(self, stepper: Stepper) -> None:
+    def start(self, stepper: Running) -> None:
         """Write the header and the row of the initial state."""
         self._rows = 0
         self._columns, header = self._of(stepper)
@@ -391,7 +389,7 @@ class BalanceCSV:
         self._root(stepper, lambda: replace_file(self.path, line.encode()))
         self.write(stepper)
 
-    def _of(self, stepper: Stepper) -> tuple[tuple[str, ...], list[str]]:
+    def _of(self, stepper: Running) -> tuple[tuple[str, ...], list[str]]:
         """Columns of the table to write, and their headings."""
         columns, header = ledger.columns(stepper.system), []
         for name in columns:
@@ -400,11 +398,11 @@ class BalanceCSV:
             header += [f"{name}{s} [{unit}]" for s in (("_x", "_y", "_z") if vector else ("",))]
         return columns, header
 
-    def write(self, stepper: Stepper, *, last: bool = False) -> None:
+    def write(self, stepper: Running, *, last: bool = False) -> None:
         """Add the rows of the steps accepted since the last call."""
         self._root(stepper, lambda: self._append(stepper))
 
-    def close(self, stepper: Stepper) -> None:
+    def close(self, stepper: Running) -> None:
         """Add rows that are still missing and the warnings, unless the file could not be written.
 
         Raises:
@@ -414,7 +412,7 @@ class BalanceCSV:
             self._append(stepper, (f"# {w}" for w in stepper.solution.warnings.lines))
         self._open = False
 
-    def _append(self, stepper: Stepper, footer: Iterable[str] = ()) -> None:
+    def _append(self, stepper: Running, footer: Iterable[str] = ()) -> None:
         self._open = False
         lines = []
         for row in stepper.solution.rows[self._rows :]:
@@ -424,16 +422,18 @@ class BalanceCSV:
         self._rows += len(lines)
         self._open = True
 
-    def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
+    def _root(self, stepper: Running, action: Callable[[], Any]) -> None:
         write_on_root(stepper.system.comm, f"path={str(self.path)!r}", action)
 
 
 class ForcesCSV(BalanceCSV):
     """Writes the forces of supports, joints and contacts: a row for the start and one per step.
 
-    Of each body the force of each of its conditions, of each joint force and moment on the first of
-    its bodies, about its point, of each contact force and moment about the origin on its slave; see
-    `Solution.reactions`, `Solution.contact_forces` and `Solution.contact_moments`.
+    - Of each body: the force or moment of each of its conditions.
+    - Of each joint: force, and moment about its point, on the first of its bodies.
+    - Of each contact: force, and moment about the origin, on its slave.
+
+    See `Solution.reactions`, `Solution.contact_forces` and `Solution.contact_moments`.
 
     Args:
         path: File; its folder is made if missing, an existing file is replaced.
@@ -442,7 +442,7 @@ class ForcesCSV(BalanceCSV):
         OSError: From `start`, before any step and on all ranks: the file cannot be written.
     """
 
-    def _of(self, stepper: Stepper) -> tuple[tuple[str, ...], list[str]]:
+    def _of(self, stepper: Running) -> tuple[tuple[str, ...], list[str]]:
         system, header = stepper.system, ["time [s]"]
         joints = system.declared_joints
         columns = [resultants.reactions_of(item) for item in (*system.bodies, *joints)]

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
+from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
@@ -65,11 +66,11 @@ _ROUNDING = 16 * float(np.finfo(float).eps)
 class Equilibrium(Solution):
     """What `equilibrium` computed, complete up to where it ended.
 
-    `balance` has one row per accepted load step: "time" is the pseudo time, "potential" and
-    "energy" the strain energy, "external_work" that of loads and prescribed motion (of the mean of
-    the forces at both ends of each step), "ledger_residual" what energy and
-    friction_dissipation miss of it; "kinetic" and the momenta are 0, and changes of facet, which
-    cost nothing, are not listed.
+    `balance` has one row per accepted load step. "time" is the pseudo time. "potential" and
+    "energy" are the strain energy. "external_work" is that of loads and prescribed motion, of the
+    mean of the forces at both ends of each step. "ledger_residual" is what energy and
+    friction_dissipation miss of it. "kinetic" and the momenta are 0. Changes of facet cost nothing
+    and are not listed.
     """
 
     moving: ClassVar[bool] = False
@@ -394,6 +395,7 @@ def equilibrium(
     Raises:
         ValueError: An argument is out of range; before any work.
     """
+    same_run(system, load_steps=load_steps, stabilization=stabilization)
     times = _pseudo_times(load_steps)
     if stabilization is not None:
         require_positive("stabilization", stabilization, "-")

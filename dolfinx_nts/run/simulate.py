@@ -12,6 +12,7 @@ from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.intercept import interceptable
 from dolfinx_nts.run.interrupts import Interrupts
 from dolfinx_nts.run.progress import progress_bar
+from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.stepper import Stepper
@@ -157,6 +158,9 @@ def simulate(
         ValueError: An argument is out of range; before any work.
         Exception: Before any step, what the `start` of a writer raises.
     """
+    # Of a checkpoint not the path, which rank 0 writes.
+    cadence = (getattr(checkpoint, "every", None), getattr(checkpoint, "seconds", None))
+    same_run(system, dt=dt, t_end=t_end, accuracy=accuracy, adapt=adapt, checkpoint=cadence)
     require_positive("dt", dt, "s")
     require_positive("t_end", t_end, "s")
     require_bool("progress", progress)

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.state import State
-from dolfinx_nts.step import consistent
+from dolfinx_nts.step import consistent, resultants
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import is_finite
@@ -40,6 +41,36 @@ def check_restart(restart: Restart | None, system: System, time: Any, ledger: bo
         raise ValueError(f"start_time={time!r}: a restart goes on at its own time; leave it out")
     if ledger and np.isnan(restart.rows[-1]["energy"]):
         raise ValueError("ledger=True: the run of the checkpoint kept none; pass ledger=False")
+
+
+def refuse_overwritten(system: System) -> None:
+    """Raise a ValueError on every rank if a caller has written into a body's u or v. Collective.
+
+    A run begins from the body's options or from `start`, so that what was written would be lost.
+
+    Args:
+        system: Its bodies, which hold what a run or their own options wrote last.
+    """
+    for body in system.bodies:
+        if body.mesh is None:
+            continue
+        found = [f.x.array.copy() for f in (body.u, body.v)]
+        body.accept(*Body.last_accepted(body))
+        here = next(
+            (
+                name
+                for name, values in zip("uv", found, strict=True)
+                if not np.array_equal(getattr(body, name).x.array, values, equal_nan=True)
+            ),
+            None,
+        )
+        option = "displacement" if here == "u" else "velocity"
+        raise_together(
+            system.comm,
+            here
+            and f"body {body.name!r}: its {here} was written since it was made or run, which a run "
+            f"would drop; it is undone now: pass {option}= to the body, or start= to the run",
+        )
 
 
 def first_state(system: System, start: Any, time: Any) -> State:
@@ -81,6 +112,28 @@ def refuse_moved(system: System) -> None:
                 f"impact='restored': coordinates of body {body.name!r} move as prescribed by a "
                 "function of time; use impact='published', or supports at rest, given as vectors"
             )
+
+
+def carried_forces(system: System, start: Solution | None) -> dict[str, FloatArray]:
+    """Resultants of contacts with which a run begins: the last ones of where it goes on from.
+
+    Args:
+        system: The scene.
+        start: As of `simulate`.
+
+    Returns:
+        By column of the balance table; without a start none, and of its other contacts zeros.
+    """
+    if start is None or not len(start.rows):
+        return {}
+    row, found = start.rows[-1], {}
+    for name in resultants.CONTACTS:
+        found[name] = np.zeros((len(system.contacts), 3))
+        for k, pair in enumerate(system.contacts):
+            for j, known in enumerate(start.system.contacts):
+                if pair.is_like(known):
+                    found[name][k] = row[name][j]
+    return found
 
 
 def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: bool) -> State:

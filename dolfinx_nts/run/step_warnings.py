@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from dolfinx_nts.bodies.inversion import describe, smallest_dets
+from dolfinx_nts.bodies.motion import motion_of
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.state import State
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import System
+
+FloatArray = npt.NDArray[np.float64]
 
 #: Smallest det F below which cells count as crushed.
 _CRUSHED = 0.05
 #: Turn in a step [rad] that is told: a steady one comes out short by a twelfth of its cube.
 _FAR = 1.0
+#: The same of a flexible body, by its spin: as it turns it stretches, and turns more slowly.
+_STRETCHED = 0.95
+#: Its spin is measured after 1, 2, 4, 8 steps and then every so many, which costs nothing.
+_SELDOM = 16
 
 
 def tell_step(solution: Solution, problem: StepProblem, step: Evaluation, state: State) -> None:
@@ -27,7 +34,7 @@ def tell_step(solution: Solution, problem: StepProblem, step: Evaluation, state:
         step: Their solution.
         state: At the end of the step.
     """
-    _tell_turns(solution, problem.system, problem.state, state)
+    _tell_turns(solution, problem, state)
     tell_inversion(solution, problem, step, state)
     tell_couplings(solution, problem, step, state)
 
@@ -56,21 +63,55 @@ def tell_couplings(
             solution.warn(kind, state.time, size, text)
 
 
-def _tell_turns(solution: Solution, system: System, old: State, new: State) -> None:
-    """Warn where directors of a body have turned too far in an accepted step. Collective."""
-    turning = [k for k, body in enumerate(system.bodies) if body.oriented]
+def tell_frictionless(solution: Solution, impulses: FloatArray, time: float) -> None:
+    """Warn of restored impulses in contacts with friction, of which they know nothing.
+
+    Args:
+        solution: The run.
+        impulses: Of each contact [N s], shape (contacts, 3), the same on all ranks.
+        time: End of the step [s].
+    """
+    for pair, impulse in zip(solution.system.contacts, impulses, strict=True):
+        size = float(np.linalg.norm(impulse))
+        if pair.friction and size:
+            solution.warn(
+                "impulses without friction", time, size,
+                f"impact='restored' has given contact {pair.name!r} an impulse of {size:.3g} N s "
+                f"along its normals, none of friction={pair.friction:.3g}; pass "
+                "impact='published' if friction in impacts matters",
+            )  # fmt: skip
+
+
+def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
+    """Warn where a body has turned too far in an accepted step. Collective."""
+    system, old = problem.system, problem.state
+    steps = len(solution.rows) - 1
+    often = steps % _SELDOM == 0 or (steps < _SELDOM and steps & (steps - 1) == 0)
+    measured = often or "turns" in solution.warnings
+    turning = [k for k, body in enumerate(system.bodies) if body.oriented or measured]
     if not turning:
         return
-    bodies = [system.bodies[k] for k in turning]
-    driven = [body.prescribed_turn(old.time, new.time) for body in bodies]
-    seen = [body.turn(old.u[k], new.u[k]) for k, body in zip(turning, bodies, strict=True)]
-    turns = global_max(system.comm, np.maximum(seen, driven))
-    worst = int(turns.argmax())
-    if turns[worst] > _FAR:
-        name, turn = bodies[worst].name, float(turns[worst])
+    seen, driven, far = (np.zeros(len(turning)) for _ in range(3))
+    for place, k in enumerate(turning):
+        body = system.bodies[k]
+        far[place] = _FAR if body.oriented else _STRETCHED
+        if body.oriented:
+            driven[place] = body.prescribed_turn(old.time, new.time)
+            seen[place] = body.turn(old.u[k], new.u[k])
+        else:
+            spin = motion_of(body, new.u[k], new.v[k]).spin
+            seen[place] = problem.dt * float(np.linalg.norm(spin))
+    seen, driven = global_max(system.comm, np.array([seen, driven]))
+    turns = np.maximum(seen, driven)
+    worst = int((turns / far).argmax())
+    if turns[worst] > far[worst]:
+        name, turn = system.bodies[turning[worst]].name, float(turns[worst])
         by = "by" if turn < np.pi else "by at least"
+        prescribed = driven[worst] > _FAR
         solution.warn(
             "turns", new.time, turn,
             f"body {name!r} turns {by} {turn:.2g} rad in a step, too far for how it turns to be "
-            "right, though energy and momenta may be kept; use a smaller dt",
+            f"right, though {'its places' if prescribed else 'energy and momenta'} may be "
+            f"{'as prescribed' if prescribed else 'kept'}; use a smaller dt",
+            grave=bool(prescribed),
         )  # fmt: skip

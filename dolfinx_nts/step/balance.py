@@ -186,8 +186,9 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     scale = 1.0 / problem.factor
     losses = (name for joint in problem.system.joints for name in joint.losses)
     sums, smallest = dict.fromkeys((*WORKS, *COUNTS, *losses), 0.0), {"min_gap": np.inf}
-    for body, terms in zip(problem.system.bodies, step.bodies, strict=True):
-        work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed]
+    added = problem.work_at_ends(step)
+    for body, terms, more in zip(problem.system.bodies, step.bodies, added, strict=True):
+        work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed] + more
         sums["external_work"] += scale * float(work)
     for elements, part in zip(problem.elements, step.parts, strict=True):
         for name, value in elements.ledger(part, problem.factor).items():

@@ -31,8 +31,8 @@ class ContactTerms:
     `demos/own_problem.py`.
 
     Args:
-        bodies: Bodies of the user's own, `nts.Body`, with its first seven attributes, `prescribed`
-            and `nodal_stiffness`; their velocity and mass play no part.
+        bodies: Bodies of the user's own, `nts.Body`, with its first six attributes but for
+            `nodal_mass`, with `prescribed` and `nodal_stiffness`.
         contacts: Contacts between them and with obstacles.
 
     Raises:

@@ -77,7 +77,7 @@ def hanging(joints: Sequence[Sequence[int]], free: Collection[int]) -> list[bool
 
 
 class NullSpace:
-    """Null space of what bilateral constraints of a solved step push the bodies with.
+    """Multipliers of bilateral constraints that exert no force on any body.
 
     Args:
         comm: MPI communicator.

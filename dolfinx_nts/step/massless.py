@@ -53,8 +53,8 @@ def check_massless(system: System, integrator: Any, impact: str) -> None:
 def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, str]:
     """The largest force that massless nodes start under, and a warning for it. Collective.
 
-    The mean of both ends of a step is balanced, so what one end misses the other has too much of,
-    step after step.
+    A step balances the mean of its ends. A force missing at one end returns with the other sign at
+    the next.
 
     Args:
         problem: Equations of the run.

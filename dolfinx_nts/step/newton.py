@@ -224,16 +224,16 @@ class StepSolver:
         self.snes.setConvergenceTest(self._converged)
         self.snes.setLineSearchPreCheck(self._upright.shorten)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
-        contact = self.matrix if self.problem.laid.own else None
+        split = self.matrix if self.problem.laid.own else None
         self._solved = False
         options = self._presets.options
         ours = options.blocked and self.problem.system.comm.size > 1
         bodies = self.matrix.whole_bodies() if ours else None
         whole = bodies is not None
-        options.configure(self.snes, contact, len(self.problem.awake), whole=whole)
+        options.configure(self.snes, split, len(self.problem.awake), whole=whole)
         self._refresh_schur()
         if bodies is not None:
-            take_bodies(self.snes, self.matrix.operator, bodies, contact is not None)
+            take_bodies(self.snes, self.matrix.operator, bodies, split is not None)
 
     def _refresh_schur(self) -> None:
         """Give the preset's field split the Schur complement of the matrix as it is now."""

@@ -18,15 +18,13 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_together
-from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
+from dolfinx_nts.evaluation import BodyTerms, Evaluation, Moment, free
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.state import State
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.step.least_norm import hanging
 from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.shared_weight import SharedWeight
@@ -66,8 +64,8 @@ class StepProblem:
 
     Attributes:
         awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
-        contacts: What makes the elements of contacts. Asked by itself where contact is meant: by
-            `touching`, for when gaps close, and for what a checkpoint keeps of slave nodes.
+        contacts: What makes the elements of contacts. Used directly only for what contacts alone
+            have: `touching`, closing gaps, checkpoints.
         joints: What makes those of each joint.
         couplings: All that makes elements.
         unknowns: Their layout; made anew whenever the elements' coordinates change.
@@ -145,36 +143,17 @@ class StepProblem:
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
         if moments is None:
             moments = [self._moment(k) for k in range(len(system.bodies))]
+        self._moments = list(moments)
         for body, moment in zip(system.bodies, moments, strict=True):
             body.begin_step(self.integrator, moment)
         self._gravity = self.integrator.ramp(self._when) * system.gravity
-        flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
-        self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
-        for body, u1 in zip(system.bodies, self.first, strict=True):
-            u1[body.fixed] = body.prescribed(state.time + dt)
-        local = [
-            [
-                b.motion_of_points(u1 - u),
-                *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
-            ]
-            for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
-        ]
-        top = global_max(system.comm, np.array(local)).T
-        motion, extent, speed, moved = top
-        if state.a:
-            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
-            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
-        # In statics v only predicts the first guess.
-        moves = (speed > 0.0) & self.integrator.inertia
-        self.flight = [
-            self._inertial(b, ahead) if top else np.zeros_like(ahead)
-            for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
-        ]
+        self.lengths, speed = self._fly()
         way = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
         if again is not None:
-            motion = np.maximum(motion, self.motion(again))
+            motion = np.maximum(self.lengths.motion, self.motion(again))
+            self.lengths = self.lengths._replace(motion=motion)
             way = [terms.du for terms in again.bodies]
-        self.lengths = Lengths(motion, extent, moved)
+        motion, extent, moved = self.lengths
         # Bodies at rest may fall.
         length = moved + motion + dt**2 * float(np.linalg.norm(self._gravity))
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
@@ -190,6 +169,36 @@ class StepProblem:
             coupling.begin(step, history, again, search)
         self._asleep = self._find_asleep(np.maximum(motion, speed) == 0.0)
         self._lay_out()
+
+    def _fly(self) -> tuple[Lengths, FloatArray]:
+        """Set `first` and `flight`, the step without forces. Collective.
+
+        Returns:
+            Its lengths, and the largest speed of each body [m/s], shape (bodies,).
+        """
+        system, state, dt = self.system, self.state, self.dt
+        flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
+        self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
+        for body, u1 in zip(system.bodies, self.first, strict=True):
+            u1[body.fixed] = body.prescribed(state.time + dt)
+        local = [
+            [
+                b.motion_of_points(u1 - u),
+                *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
+            ]
+            for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
+        ]
+        motion, extent, speed, moved = global_max(system.comm, np.array(local)).T
+        if state.a:
+            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
+            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
+        # In statics v only predicts the first guess.
+        moves = (speed > 0.0) & self.integrator.inertia
+        self.flight = [
+            self._inertial(b, ahead) if top else np.zeros_like(ahead)
+            for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
+        ]
+        return Lengths(motion, extent, moved), speed
 
     @property
     def elements(self) -> list[Any]:
@@ -266,7 +275,7 @@ class StepProblem:
             coupling.let_slip()
 
     def give_way(self) -> bool:
-        """Limit forces that had no limit from the next step on; tells whether one had none."""
+        """From the next step on, limit forces that had no limit; return whether there was one."""
         return any([coupling.give_way() for coupling in self.couplings])
 
     def _touched(self) -> set[int]:
@@ -331,6 +340,30 @@ class StepProblem:
         rate = rule.theta * rule.rate(self.dt) if rule.inertia else 0.0
         return Moment(state.u[k], self._when, rule.ramp(self._when), rate, drift)
 
+    def work_at_ends(self, e: Evaluation) -> list[float]:
+        """What work of loads at both ends adds on this rank, by body, times `factor`. Collective.
+
+        v_0 + v_1 = 2 (u_1 - u_0)/h makes the mean of the forces at both ends do the work in the
+        methods that carry accelerations, not those where the step takes them. Loads that are
+        functions of time differ; of others, and of other methods, it is 0.
+
+        Args:
+            e: Solution of the step.
+        """
+        works = [0.0] * len(e.bodies)
+        if not self.integrator.accelerations:
+            return works
+        ends = self.state.time, self.state.time + self.dt
+        for k, (body, terms) in enumerate(zip(self.system.bodies, e.bodies, strict=True)):
+            mean = np.zeros_like(terms.du)
+            for time in ends:
+                body.begin_step(self.integrator, self._moments[k]._replace(time=time))
+                mean += 0.5 * self.factor * body.external(terms.u1, self._gravity)
+            body.begin_step(self.integrator, self._moments[k])
+            here = self.factor * body.external(terms.u1, self._gravity)
+            works[k] = float((mean - here) @ terms.du)
+        return works
+
     def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
         """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
         if self._sleepers is None:
@@ -358,8 +391,8 @@ class StepProblem:
             flight: Free flight from t_n under the contact forces of the last step; else the
                 positions of t_n, which free flight of a fast turning or vibrating body may invert,
                 and no forces. Prescribed coordinates are at t_{n+1}.
-            carried: Take the contact forces of the last step as they were, whatever `flight` is,
-                also what is no good as a guess.
+            carried: Take the contact forces of the last step unchanged, whatever `flight` is, even
+                where they are a poor guess.
         """
         laid, elements = self.laid, self.elements
         with self.x as x:

@@ -52,10 +52,12 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
         step: Their solution.
 
     Returns:
-        By column: of each body's conditions, shape (conditions, 3), of each joint on the first of
-        its bodies, force [N] and moment about its point [N m], shape (2, 3), NaN where its elements
-        do not say them, and of each contact on
-        its slave body forces [N] and moments about the origin [N m], shape (contacts, 3) each.
+        By column:
+            - of each body: forces of its conditions [N], or their moments [N m], (conditions, 3);
+            - of each joint: force [N] and moment about its point [N m] on the first of its bodies,
+              shape (2, 3), NaN where its elements do not say them;
+            - of all contacts: forces [N] on the slaves, and their moments about the origin [N m],
+              shape (contacts, 3) each.
     """
     bodies, contacts = problem.system.bodies, problem.touching(step)
     joints = problem.system.declared_joints

@@ -25,6 +25,11 @@ _NONE = 1e-12
 _PASSES = 3
 
 
+def _is_rigid(pair: Any) -> bool:
+    """Whether it is one of rigid bodies, with each other or with an obstacle."""
+    return all(body.rigid for body in pair.bodies)
+
+
 class SharedWeight:
     """Gaps of rigid bodies without what is redundant in them.
 
@@ -38,7 +43,7 @@ class SharedWeight:
         self, comm: Any, contacts: Sequence[Any], bodies: Sequence[tuple[int, ...]]
     ) -> None:
         both = zip(contacts, bodies, strict=True)
-        rigid = sorted({k for pair, numbers in both if not pair.yields for k in numbers})
+        rigid = sorted({k for pair, numbers in both if _is_rigid(pair) for k in numbers})
         self._comm = comm
         self._place = {k: i for i, k in enumerate(rigid)}
 
@@ -65,7 +70,7 @@ class SharedWeight:
             return
         found, pushes, values = [], [], []
         for batch, numbers, part, x in zip(elements, bodies, parts, places, strict=True):
-            if batch.pair.yields:
+            if not _is_rigid(batch.pair):
                 continue
             on, row = np.flatnonzero(part.active), batch.gap_row
             scale = batch.scale[on]
