@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,13 +19,11 @@ from dolfinx_nts.output.pictures import (
     painted,
     seen,
 )
+from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.step import contact_fields
 from dolfinx_nts.validation import StrPath, as_path, is_whole, require_bool, require_positive
-
-if TYPE_CHECKING:
-    from dolfinx_nts.run.stepper import Stepper
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -97,27 +95,27 @@ class Film:
         self._look: tuple[Any, ...] = (colour, view, limits, width)
         self._frames: list[_Frame] = []
 
-    def start(self, stepper: Stepper) -> None:
+    def start(self, stepper: Running) -> None:
         """Take the initial state."""
         self._bodies = [b for b in stepper.system.bodies if b.mesh is not None]
         check_picture(self._bodies, *self._look)
         self._frames, self._steps = [], 0
         self._take(stepper)
 
-    def write(self, stepper: Stepper, *, last: bool = False) -> None:
+    def write(self, stepper: Running, *, last: bool = False) -> None:
         """Take the accepted state if it is due, or the last."""
         self._steps += 1
         if last or self._steps % self.every == 0:
             self._take(stepper)
 
-    def close(self, stepper: Stepper) -> None:
+    def close(self, stepper: Running) -> None:
         """Draw the frames and write the file."""
         if self._frames:
             what = f"path={str(self.path)!r}"
             write_on_root(stepper.system.comm, what, self._draw)
             self._frames = []
 
-    def _take(self, stepper: Stepper) -> None:
+    def _take(self, stepper: Running) -> None:
         """Keep what is seen now. Collective."""
         colour, view, _, _ = self._look
         drawn, axes = seen(self._bodies, colour, view), axes_of(*view)[:2]
@@ -157,7 +155,7 @@ class Film:
         replace_file(self.path, file.getvalue())
 
 
-def _loads(stepper: Stepper, body: Any) -> Sequence[tuple[FloatArray, FloatArray]]:
+def _loads(stepper: Running, body: Any) -> Sequence[tuple[FloatArray, FloatArray]]:
     """Places [m] and contact forces [N] of this rank's nodes, (n, 3) each. Collective."""
     if body.degree != 1:
         return []
