@@ -79,6 +79,9 @@ class System:
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
         self.check_alive()
+        for k, b in enumerate(self.bodies):
+            if any(b is other for other in self.bodies[:k]):
+                raise ValueError(f"bodies[{k}]: {b.name!r} is given twice; drop one")
         names = [b.name for b in self.bodies]
         if len(set(names)) < len(names):
             raise ValueError(f"bodies: names {names} are not unique; pass name= to each body")

@@ -554,6 +554,8 @@ def test_bodies():
     raises(TypeError, r"^bodies=.*: pass a sequence", lambda: nts.System(body))
     pattern = r"^bodies: names \['body', 'body'\] are not unique; pass name= to each body"
     raises(ValueError, pattern, lambda: nts.System([body, continuum()]))
+    twice = r"^bodies\[1\]: 'body' is given twice; drop one"
+    raises(ValueError, twice, lambda: nts.System([body, body]))
 
 
 @pytest.mark.skipif(COMM.size == 1, reason="one rank: all communicators are alike")

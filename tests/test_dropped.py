@@ -37,3 +37,11 @@ def test_what_was_written_into_u_or_v_is_not_dropped_in_silence(kind, which, opt
     function.x.array[-1:] = 1.0
     with pytest.raises(ValueError, match=text):
         moved(body, start=run, start_time=0.0)
+
+
+@pytest.mark.parametrize("kind", ["flexible", "rigid"])
+def test_a_mesh_that_moved_after_its_body_was_made(kind):
+    body = cube() if kind == "flexible" else nts.RigidBody(box(cells=1), density=1e3, name="cube")
+    body.mesh.geometry.x[-1:, 2] += 0.1
+    with pytest.raises(ValueError, match="mesh of 'cube': its nodes were moved after the body"):
+        moved(body)

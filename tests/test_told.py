@@ -98,6 +98,15 @@ def test_load_steps_that_are_too_few_for_the_ledger(load_steps):
     assert ("ledger" in run.warnings) == (load_steps == 1)
 
 
+def test_constant_values_of_conditions_act_at_once_in_statics():
+    """Their energy is there before the first load step: more of these do not help."""
+    top = nts.Dirichlet(lambda x: x[2] > 1 - 1e-9, value=(0, 0, 0.1))
+    body = cube(bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9), top])
+    run = nts.equilibrium(nts.System([body]))
+    assert run.balance["potential"][0] > run.balance["potential"][-1] > 0
+    assert "functions of the pseudo time" in run.warnings["ledger"].text
+
+
 @pytest.mark.parametrize("young", [1e1, 1e4])
 @pytest.mark.fast("10.0")
 @pytest.mark.fast_on_ranks()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -30,8 +29,6 @@ from dolfinx_nts.validation import (
     require_name,
     vector_in_time,
 )
-
-logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -79,6 +76,8 @@ class Continuum(UflBody):
         space: Their function space.
         law: W as a function of Green's strain in UFL, with Constants for numbers of the package's
             materials.
+        stressed: Stress of the undeformed body over its stiffness, and a sentence about it; None:
+            it has none, or no step was made yet.
 
     Raises:
         TypeError: `material`, `extra_form`, `name` or a condition is not of the right kind, or what
@@ -137,6 +136,7 @@ class Continuum(UflBody):
         (self._load_form,) = self._set_forms(self._energy() * self._dx, load)
         self._assembled_loads = np.zeros(3 * len(self._loads))
         self._seen_at_rest = False
+        self.stressed: tuple[float, str] | None = None
 
     # ---- set-up
     def _boundary_measure(self, degree: int) -> Any:
@@ -208,7 +208,7 @@ class Continuum(UflBody):
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         if not self._seen_at_rest:
-            self._warn_of_stress_at_rest(rule)
+            self._seek_stress_at_rest(rule)
         super().begin_step(rule, moment)
         for constant, (value, now) in zip(self._loads, self._loads_at(moment.time), strict=True):
             constant.value[:] = now if callable(value) else moment.ramp * now
@@ -216,8 +216,8 @@ class Continuum(UflBody):
         if not np.array_equal(loads, self._assembled_loads):
             self._load, self._assembled_loads = self._assemble(self._load_form), loads
 
-    def _warn_of_stress_at_rest(self, rule: Integrator) -> None:
-        """Tell whether forces of its own move the undeformed body, as where dW/dC(1) is not 0.
+    def _seek_stress_at_rest(self, rule: Integrator) -> None:
+        """Note whether forces of its own move the undeformed body, as where dW/dC(1) is not 0.
 
         Beside them stand those of a small shear x, -y. Costs two evaluations of internal forces.
         """
@@ -231,12 +231,13 @@ class Continuum(UflBody):
         at_rest[self.fixed] = 0.0
         squares = np.array([at_rest @ at_rest, change @ change])
         stress, stiffness = np.sqrt(self.comm.allreduce(squares)).tolist()
-        if not stress <= _STRESS_FREE * stiffness and self.comm.rank == 0:
-            logger.warning(
-                "body %r is under a stress of about %.2g of its stiffness while undeformed, and "
-                "will move by itself; unless that is meant, let W(C) have dW/dC = 0 at C = 1",
-                self.name, stress / stiffness if stiffness else math.inf,
-            )  # fmt: skip
+        if not stress <= _STRESS_FREE * stiffness:
+            size = stress / stiffness if stiffness else math.inf
+            self.stressed = size, (
+                f"body {self.name!r} is under a stress of about {size:.2g} of its stiffness while "
+                "undeformed, and moves by itself; unless that is meant, let W(C) have dW/dC = 0 at "
+                "C = 1"
+            )
 
     def _loads_at(self, time: float) -> list[tuple[VectorInTime, FloatArray]]:
         """Body force and tractions as they were given, and their values at a time."""

@@ -18,6 +18,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.hull import Hull
+from dolfinx_nts.bodies.mesh_check import places_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.node_conditions import NodeConditions
 from dolfinx_nts.bodies.skeleton import Skeleton
@@ -74,6 +75,7 @@ class DirectorBody(Body):
     def _set_up_mesh(self, mesh: Any, name: str) -> None:
         """What fields live on."""
         self.name, self.mesh, self.comm, self.degree = name, mesh, mesh.comm, 1
+        self.made_on = places_of(mesh)
         self.space = compat.vector_space(mesh, 1)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")

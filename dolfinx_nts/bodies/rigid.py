@@ -18,7 +18,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
-from dolfinx_nts.bodies.mesh_check import check_mesh
+from dolfinx_nts.bodies.mesh_check import check_mesh, places_of
 from dolfinx_nts.bodies.parameters import Parameter, is_number, require_positive_parameter
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
@@ -118,6 +118,7 @@ class RigidBody(Body):
         )  # fmt: skip
         require_positive_parameter("density", density, "kg/m^3")
         self.mesh, self.density, self.degree = mesh, density, 1
+        self.made_on = places_of(mesh)
         self.space = compat.vector_space(mesh, 1)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")

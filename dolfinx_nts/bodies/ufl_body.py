@@ -19,6 +19,7 @@ from dolfinx_nts.bodies.conditions import Dirichlet, Supports, at_nodes
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
+from dolfinx_nts.bodies.mesh_check import places_of
 from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
@@ -71,6 +72,7 @@ class UflBody(Body):
             raise TypeError(f"extra_form={extra_form!r}: pass a callable (u, v, w, t) -> UFL form")
         self.name, self.space, self.degree, self._extra_form = name, space, degree, extra_form
         self.mesh = space.mesh
+        self.made_on = places_of(self.mesh)
         self.comm = self.mesh.comm
         # DOLFINx makes C identifiers of the names.
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)

@@ -168,14 +168,24 @@ class _LoadStepper(Stepper):
         if missing > _OPEN * size + rounding:
             self.solution.warn(
                 "ledger", time, missing,
-                f"work and stored energy differ by {missing:.3g} J of {size:.3g} J: work is that "
-                "of the mean forces of each load step; use more load steps",
+                f"work and stored energy differ by {missing:.3g} J of {size:.3g} J: "
+                f"{self._remedy_of_ledger()}",
             )  # fmt: skip
         self._accept(state)
         tell_inversion(self.solution, self.problem, step, state)
         tell_couplings(self.solution, self.problem, step, state)
         self._solved = step
         self.look()
+
+    def _remedy_of_ledger(self) -> str:
+        """Why the ledger is open, and what closes it."""
+        if self.solution.rows[0]["potential"] > self._largest * _OPEN:
+            return (
+                "the first load step starts from a displacement with that much energy, such as "
+                "Dirichlet values other than 0 at t=0, which act at once; let them be functions "
+                "of the pseudo time, e.g. value=lambda t: (0, 0, 0.1 * t)"
+            )
+        return "work is that of the mean forces of each load step; use more load steps"
 
     def _joints_works(self, old: State, new: State, told: FloatArray) -> list[float]:
         """External work of what each joint prescribes in a load step on this rank [J]. Collective.

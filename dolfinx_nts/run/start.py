@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.mesh_check import places_of
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.state import State
@@ -71,6 +72,24 @@ def refuse_overwritten(system: System) -> None:
             and f"body {body.name!r}: its {here} was written since it was made or run, which a run "
             f"would drop; it is undone now: pass {option}= to the body, or start= to the run",
         )
+
+
+def refuse_moved_meshes(system: System) -> None:
+    """Raise a ValueError on every rank if a body's mesh has other places than it was made with.
+
+    Mass, surfaces and forces would be of different meshes. Collective.
+
+    Args:
+        system: Its bodies.
+    """
+    for body in system.bodies:
+        made = getattr(body, "made_on", None)
+        moved = made is not None and made != places_of(body.mesh)
+        text = (
+            f"mesh of {body.name!r}: its nodes were moved after the body was made; move them "
+            "before, or pass displacement= to the body"
+        )
+        raise_together(system.comm, text if moved else None)
 
 
 def first_state(system: System, start: Any, time: Any) -> State:

@@ -21,8 +21,8 @@ _CRUSHED = 0.05
 _FAR = 1.0
 #: The same of a flexible body, by its spin: as it turns it stretches, and turns more slowly.
 _STRETCHED = 0.95
-#: Its spin is measured after 1, 2, 4, 8 steps and then every so many, which costs nothing.
-_SELDOM = 16
+#: Its spin is measured after 1, 2, 4, 8, 16 steps and then every so many, as it costs 1 % of one.
+_SELDOM = 32
 
 
 def tell_step(solution: Solution, problem: StepProblem, step: Evaluation, state: State) -> None:
@@ -61,6 +61,19 @@ def tell_couplings(
     for coupling, parts in problem.each(step):
         for kind, size, text in coupling.warnings(parts):
             solution.warn(kind, state.time, size, text)
+
+
+def tell_stressed(solution: Solution, time: float) -> None:
+    """Warn of bodies whose undeformed state is under stress, as their first step has shown.
+
+    Args:
+        solution: The run.
+        time: When [s].
+    """
+    for body in solution.system.bodies:
+        stressed = getattr(body, "stressed", None)
+        if stressed is not None and "stress at rest" not in solution.warnings:
+            solution.warn("stress at rest", time, *stressed)
 
 
 def tell_frictionless(solution: Solution, impulses: FloatArray, time: float) -> None:

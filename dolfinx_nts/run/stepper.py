@@ -24,11 +24,12 @@ from dolfinx_nts.run.start import (
     check_restart,
     consistent_start,
     first_state,
+    refuse_moved_meshes,
     refuse_overwritten,
     with_prescribed_rates,
 )
 from dolfinx_nts.run.step_size import Pace
-from dolfinx_nts.run.step_warnings import tell_frictionless, tell_step
+from dolfinx_nts.run.step_warnings import tell_frictionless, tell_step, tell_stressed
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, consistent, resultants
@@ -170,6 +171,7 @@ class Stepper:
             "restitution": float(restitution),
             "ranks": system.comm.size,
         }
+        refuse_moved_meshes(system)
         refuse_overwritten(system)
         state = first_state(system, start, start_time)
         if not integrator.accelerations:
@@ -407,6 +409,7 @@ class Stepper:
         Args:
             last: Look wherever anything has moved since the last look.
         """
+        tell_stressed(self.solution, self.state.time)
         if self._overlap is not None:
             for found in self._overlap.look(self.state.u, self.state.time, last=last):
                 self.solution.warn(

@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.validation import StepFailedError
@@ -73,7 +75,8 @@ def check_momentum(
     for batch, part in zip(problem.elements, step.parts, strict=True):
         # Of forces that cancel each other within a body only the rounding counts.
         local[12] += float(np.abs(part.residual[:, : batch.num_coordinates]).sum())
-    total = problem.system.comm.allreduce(local)
+    total = np.empty_like(local)
+    problem.system.comm.Allreduce(local, total, op=MPI.SUM)
     arm = problem.span + math.sqrt(total[8])
     total[:7] *= rule.rate(dt)
     activity = total[6] + total[7]
@@ -82,7 +85,7 @@ def check_momentum(
     off = after["linear_momentum"] - before["linear_momentum"] - total[:3] - total[9:12]
     # About the middle of the bodies: about a far origin every error of P would look like one of J.
     turn = after["angular_momentum"] - before["angular_momentum"] - total[3:6]
-    turn -= np.cross(problem.centre, off)
+    turn -= cross(problem.centre, off)
     far = _FAR * float(np.linalg.norm(problem.centre)) * activity
     checks = [("linear", off, allowed)]
     if rule.keeps_angular_momentum:
