@@ -123,7 +123,7 @@ def mesh_of(comm, cells):
 def by_hand(comm, cells, steps, progress):
     """Contact force [N] and number of nodes in contact after each load step."""
     block = Block(mesh_of(comm, cells))
-    top = nts.Surface(block, compat.exterior_facets(block.mesh))
+    top = block.boundary()
     contact, rows = nts.ContactTerms([block], [nts.ContactPair(top, ball())]), []
     for k in tqdm(range(steps), unit="step", disable=not (progress and comm.rank == 0)):
         x = contact.begin((k + 1) / steps, reach=2 * DEPTH / steps)
@@ -146,7 +146,7 @@ def by_package(comm, cells, steps, output):
     base = nts.Dirichlet(lambda x: x[2] < 1e-9)
     mesh = mesh_of(comm, cells)
     block = nts.Continuum(mesh, neo_hooke, density=1.0, bcs=[base], name="block")
-    top = nts.Surface(block, compat.exterior_facets(mesh))
+    top = block.boundary()
     system = nts.System([block], contacts=[nts.ContactPair(top, ball())])
     writers = [Fields(output)] if output else []
     run = nts.equilibrium(system, load_steps=steps, output=writers)
