@@ -1,16 +1,19 @@
 # Each target alone takes a fresh clone on a fresh Debian 12 (root or sudo) to a finished run.
 # PYTEST_ARGS="-k friction -x" goes to pytest; DEMO=name chooses a demo; see scripts/ for the rest.
-.PHONY: help setup test test-all lint demo test-debian13 test-sid clean distclean
+.PHONY: help setup test test-all lint demo docs dist test-debian13 test-sid clean distclean
 SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 DEMO ?= two_blocks
-export PYTEST_ARGS
+export PYTEST_ARGS RUNS
 
 help:
+	@echo 'make setup          what the others do first: packages of Debian, .venv'
 	@echo 'make test           lint, the fast tests in serial, some cases of the parallel ones on 2 ranks'
 	@echo 'make test-all       what make test leaves out: the tests marked slow, likewise'
 	@echo '                    (.venv/bin/python -m pytest runs both in serial; -m "not slow" the fast)'
 	@echo 'make demo           demos/$(DEMO).py on 2 ranks, output in out/$(DEMO) (DEMO=name for another)'
+	@echo 'make docs           the site, in docs/_build/html; a warning is an error (RUNS=no: no pictures)'
+	@echo 'make dist           sdist and wheel in dist/, checked by twine'
 	@echo 'make lint           ruff and mypy'
 	@echo 'make test-debian13  the fast tests on Debian 13 in a chroot (made once, some minutes)'
 	@echo 'make test-sid       the same on Debian sid'
@@ -28,6 +31,12 @@ test-all: setup
 demo: setup
 	@scripts/demo.sh $(DEMO)
 
+docs: setup
+	@scripts/docs.sh
+
+dist:
+	@scripts/dist.sh
+
 lint: setup
 	@scripts/lint.sh
 
@@ -38,7 +47,7 @@ test-sid:
 	@scripts/chroot.sh sid
 
 clean:
-	rm -rf .venv .venv-lint .pytest_cache .ruff_cache .mypy_cache build out *.egg-info
+	rm -rf .venv .venv-lint .pytest_cache .ruff_cache .mypy_cache build dist out *.egg-info docs/_build docs/made
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
 
 distclean: clean

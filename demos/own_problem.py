@@ -64,7 +64,6 @@ class Block(nts.Body):
         self.fixed = np.flatnonzero(self.reference[2::3].repeat(3) < 1e-9)
         base = fem.locate_dofs_geometrical(self.space, lambda x: x[2] < 1e-9)
         self._bcs = [compat.subspace_component_bc(self.space, i, base) for i in range(3)]
-        self.nodal_mass, self.initial_velocity = np.ones((2, self.num_owned))
 
     def at(self, u):
         """Take displacements [m] of this rank."""
@@ -85,7 +84,7 @@ class Block(nts.Body):
         """Displacements of the base [m]."""
         return np.zeros(len(self.fixed))
 
-    def nodal_stiffness(self, rule):
+    def nodal_stiffness(self):
         """Scale of the contact forces [N/m]."""
         return np.full(self.num_owned, MU)
 

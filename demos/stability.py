@@ -101,4 +101,7 @@ def main(*, comm=MPI.COMM_WORLD, output=None, steps=STEPS, integrators=tuple(INT
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", default="out/stability_demo", help="pictures and fields")
-    main(progress=True, **vars(parser.parse_args()))
+    parser.add_argument("--bouncing", type=int, default=STEPS["bouncing"], help="steps")
+    parser.add_argument("--rubbing", type=int, default=STEPS["rubbing"], help="steps")
+    options = vars(parser.parse_args())
+    main(progress=True, output=options.pop("output"), steps=options)

@@ -63,14 +63,14 @@ def read_parts(comm, refinement):
     return parts
 
 
-def scene(comm, refinement=1, smoothing=False):
-    """The flat torus at rest and the tilted one on its way."""
+def scene(comm, refinement=1, smoothing=False, mass="consistent"):
+    """The flat torus at rest and the tilted one on its way; `mass` is that of its outer nodes."""
     parts = read_parts(comm, refinement)
     rubber = nts.NeoHookean(young=2250.0, poisson=0.3)
     flat = parts["flat"].continuum(rubber, density=DENSITY)
     tilted = parts["tilted"].continuum(rubber, density=DENSITY, velocity=VELOCITY)
     pair = nts.ContactPair(
-        slave=tilted.surface(*parts["tilted"].where("tilted_outer")),
+        slave=tilted.surface(*parts["tilted"].where("tilted_outer"), mass=mass),
         master=flat.surface(*parts["flat"].where("flat_outer"), smoothing=smoothing),
     )
     return nts.System([flat, tilted], contacts=[pair])

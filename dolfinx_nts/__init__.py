@@ -3,21 +3,22 @@
 from importlib.metadata import version
 
 from dolfinx_nts.bodies.beam import Beam
-from dolfinx_nts.bodies.body import Body, Moment
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction
 from dolfinx_nts.bodies.continuum import Continuum
 from dolfinx_nts.bodies.form_body import FormBody
 from dolfinx_nts.bodies.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
 from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.bodies.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
-from dolfinx_nts.bodies.points import Points
+from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
 from dolfinx_nts.bodies.rigid import RigidBody
-from dolfinx_nts.bodies.section import Circle, Clamp, LineForce, PointForce, Rectangle, Section
+from dolfinx_nts.bodies.section import Circle, Rectangle, Section
+from dolfinx_nts.bodies.shell import Shell
 from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.facet_pair import FacetPair
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
-from dolfinx_nts.contact.obstacles import Cylinder, Plane, Sphere
+from dolfinx_nts.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.elements import (
@@ -28,6 +29,7 @@ from dolfinx_nts.elements import (
     Slopes,
     Step,
 )
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import (
     EnergyMomentum,
     GeneralizedAlpha,
@@ -50,6 +52,7 @@ from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpr
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.strain_energy import Isotropic
 from dolfinx_nts.point_elements import EveryStep, PointElements, PointPart
+from dolfinx_nts.points import Points
 from dolfinx_nts.run.checkpoint import Checkpoint, restart
 from dolfinx_nts.run.equilibrium import Equilibrium, equilibrium
 from dolfinx_nts.run.intercept import intercept
@@ -59,7 +62,7 @@ from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.step_size import Adapt
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
-from dolfinx_nts.state import State
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_terms import ContactTerms
 from dolfinx_nts.system import System
@@ -98,17 +101,20 @@ __all__ = [
     "Joint",
     "JointCoupling",
     "LineForce",
+    "LineMoment",
     "Midpoint",
     "Moment",
     "MooneyRivlin",
     "NeoHookean",
     "Newmark",
     "Newton",
+    "Obstacle",
     "ObstaclePair",
     "Planar",
     "Plane",
     "PointElements",
     "PointForce",
+    "PointMoment",
     "PointPart",
     "Points",
     "Prismatic",
@@ -118,6 +124,7 @@ __all__ = [
     "RigidBody",
     "Saved",
     "Section",
+    "Shell",
     "Slopes",
     "Solution",
     "Sphere",
@@ -141,7 +148,9 @@ __all__ = [
     "bodies_from_tags",
     "cauchy_stress",
     "equilibrium",
+    "extrude",
     "intercept",
+    "linear",
     "load",
     "motion_of",
     "restart",

@@ -6,6 +6,7 @@ forces -D g(y_m)^T lambda do no work but that of a prescribed value (theory sect
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,13 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kinematics import OFF, Kinematics
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.point_elements import EveryStep, PointElements
+from dolfinx_nts.points import Points
 from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError
 
@@ -40,8 +41,13 @@ SHIFT = 1e-7
 
 
 def rank_of(name: str, comm: Any) -> int:
-    """Rank that has what is of one rank alone, evenly for many names, the same in every run."""
-    return zlib.crc32(name.encode()) % int(comm.size)
+    """Rank that holds an item that lives on one rank, the same in every run.
+
+    Names that differ in their last number are dealt one by one, others by chance.
+    """
+    numbers = re.findall(r"\d+", name)
+    stem = zlib.crc32(re.sub(r"\d+", "", name).encode())
+    return (stem + int(numbers[-1] if numbers else 0)) % int(comm.size)
 
 
 class Equations(NamedTuple):
@@ -56,6 +62,23 @@ class Equations(NamedTuple):
     weights: FloatArray
     constants: FloatArray
     value: FloatArray
+
+
+def _extent(equations: Equations, rest: FloatArray) -> float:
+    """Length whose rounding enters constraints on this rank [m].
+
+    That of what each vector is made of, times the other vector: nothing of nodes with weight 0,
+    such as the directors of a point, whose length is no length of the scene.
+
+    Args:
+        equations: Their coefficients.
+        rest: Reference values of the nodes [m], shape (n, k, 3).
+    """
+    weights, constants, _ = equations
+    made_of = np.abs(weights) @ np.abs(rest)[:, None] + np.abs(constants)
+    vectors = np.linalg.norm(kernel.factors(weights, constants, rest), axis=3)
+    both = made_of.max(axis=3) * vectors[:, :, ::-1]
+    return float(both.sum(axis=2).max(initial=0.0))
 
 
 class ConstraintPart(NamedTuple):
@@ -94,6 +117,7 @@ class ConstraintElements(PointElements):
         scale: Force per motion in the units of the step: a mass in dynamics.
         theta: Where between t_n and t_{n+1} the forces act.
         lent: Compliance over that of the bodies that the matrix lends them, see `SHIFT`.
+        size: As of `_extent` [m].
     """
 
     equations: Equations
@@ -104,6 +128,7 @@ class ConstraintElements(PointElements):
     scale: float
     theta: float
     lent: float
+    size: float
 
     @property
     def widths(self) -> Mapping[str, int]:
@@ -126,16 +151,19 @@ class ConstraintElements(PointElements):
 
     @cached_property
     def extent(self) -> float:
-        """Length whose rounding enters its constraints on this rank [m].
+        """Length whose rounding enters on this rank [m]."""
+        return self.size
 
-        That of what each vector is made of, times the other vector: nothing of nodes with weight 0,
-        such as the directors of a point, whose length is no length of the scene.
-        """
+    @cached_property
+    def _start(self) -> FloatArray:
+        """Factors of each constraint at t_n, shape (n, m, 2, 3)."""
         weights, constants, _ = self.equations
-        made_of = np.abs(weights) @ np.abs(self.rest)[:, None] + np.abs(constants)
-        vectors = np.linalg.norm(kernel.factors(weights, constants, self.rest), axis=3)
-        both = made_of.max(axis=3) * vectors[:, :, ::-1]
-        return float(both.sum(axis=2).max(initial=0.0))
+        return kernel.factors(weights, constants, self.y0)
+
+    @cached_property
+    def _is_curved(self) -> bool:
+        """Whether any constraint is quadratic."""
+        return bool(self.curvature.any())
 
     @cached_property
     def _bent(self) -> FloatArray:
@@ -149,18 +177,19 @@ class ConstraintElements(PointElements):
         n, m, _, k = weights.shape
         scale, last = self.scale, 3 * k
         multiplier = scale * own["constraints"]
-        middle = kernel.factors(weights, constants, self.y0 + self.theta * (x - self.y0))
         end = kernel.factors(weights, constants, x)
+        middle = self._start + self.theta * (end - self._start)
         force = kernel.gradient(weights, middle).reshape(n, m, last)
         gap = kernel.value(end) - self.prescribed[1]
         residual = np.empty((n, last + m))
         residual[:, :last] = np.matmul(multiplier[:, None], force)[:, 0]
         residual[:, last:] = scale * gap
         tangent = np.zeros((n, last + m, last + m))
-        bend = np.matmul(self.theta * multiplier[:, None], self.curvature.reshape(n, m, k * k))
-        stiffness = bend.reshape(n, k, k)
-        for i in range(3):
-            tangent[:, i:last:3, i:last:3] = stiffness
+        if self._is_curved:
+            bend = np.matmul(self.theta * multiplier[:, None], self.curvature.reshape(n, m, k * k))
+            stiffness = bend.reshape(n, k, k)
+            for i in range(3):
+                tangent[:, i:last:3, i:last:3] = stiffness
         tangent[:, :last, last:] = (scale * force).transpose(0, 2, 1)
         tangent[:, last:, :last] = scale * kernel.gradient(weights, end).reshape(n, m, last)
         if self.lent:
@@ -216,8 +245,13 @@ class Constraints(EveryStep):
         self._scale: float | None = None
         self._rest = np.concatenate([s.reference for s in self._sides], axis=1)
         self._curvature = kernel.curvature(equations.weights)
+        self._extent = _extent(equations, self._rest)
         self._driven, self._force = driven, np.zeros_like(equations.value)
         self._upright = upright
+
+    def hold_alone(self) -> None:
+        """They repeat no others: nothing is lent to them, which light bodies would feel."""
+        self._lent = 0.0
 
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
         self._factor = step.factor
@@ -241,6 +275,7 @@ class Constraints(EveryStep):
             scale=self._scale,
             theta=step.integrator.theta,
             lent=self._lent,
+            size=_extent(equations, self._rest) if driven else self._extent,
         )
 
     def _at(self, *times: float) -> tuple[Equations, FloatArray]:
@@ -257,9 +292,10 @@ class Constraints(EveryStep):
         Raises:
             StepFailedError: Directions have turned over.
         """
-        if self._upright is None or self._begun is None:
+        step = self.step
+        if self._upright is None or step is None:
             return False
-        (part,), (step, _) = parts, self._begun
+        (part,) = parts
         along = self._upright(part.end, (step.state.time, step.state.time + step.dt))
         raise_together(
             self._sides[0].body.comm,

@@ -15,7 +15,12 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import cpp, fem, geometry, mesh
+from ffcx.codegeneration import jit as ffcx_jit
 from petsc4py import PETSc
+
+from dolfinx_nts.kernels.canonical import canonical
+
+logger = logging.getLogger(__name__)
 
 VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
 #: UFL-owned elements, AdjacencyList dofmaps.
@@ -130,23 +135,36 @@ def create_submesh(msh: Any, dim: int, entities: npt.ArrayLike) -> tuple[Any, In
 
 # ---- spaces and functions
 @contextmanager
-def _quiet_compiler() -> Iterator[None]:
-    """0.5.2 sends the C compiler's progress to the root logger, whose level it raises itself.
+def _told_compiler(what: str) -> Iterator[None]:
+    """Tell in one line that something is compiled, which is not in FFCx's cache, and nothing else.
 
-    Of spaces, too: their elements are compiled. Errors are still raised and printed.
+    0.5.2 sends the C compiler's progress to the root logger, whose level it raises itself. Of
+    spaces, too: their elements are compiled. Errors are still raised and printed.
     """
-    before = logging.root.manager.disable
-    logging.disable(logging.INFO)
+    before, look = logging.root.manager.disable, ffcx_jit.get_cached_module
+    told = False
+
+    def looked(*arguments: Any) -> Any:
+        nonlocal told
+        found = look(*arguments)
+        if found[0] is None and not told:
+            logger.info("compiling %s, which is kept in %s", what, arguments[2])
+            logging.disable(logging.INFO)
+            told = True
+        return found
+
+    ffcx_jit.get_cached_module = looked
     try:
         yield
     finally:
+        ffcx_jit.get_cached_module = look
         logging.disable(before)
 
 
 def vector_space(msh: Any, degree: int) -> Any:
     """Continuous Lagrange space of 3-vectors."""
     if _OLD:
-        with _quiet_compiler():
+        with _told_compiler("an element"):
             return fem.VectorFunctionSpace(msh, ("Lagrange", degree), dim=3)
     return fem.functionspace(msh, ("Lagrange", degree, (3,)))
 
@@ -165,18 +183,38 @@ def lagrange_degree(space: Any) -> int | None:
     return int(degree) if vectors and known else None
 
 
+def is_nodal(space: Any, msh: Any) -> bool:
+    """Return whether a space is of Lagrange elements with one block at each corner of a cell."""
+    element = space.ufl_element()
+    if _OLD:
+        scalar = (*element.sub_elements(), element)[0]
+        broken = scalar.family() not in ("Lagrange", "Q")
+    else:
+        broken = element.discontinuous
+    same = cell_dofs(space).shape[1] == geometry_dofmap(msh).shape[1]
+    return same and not broken
+
+
 def scalar_space(msh: Any, family: str, degree: int) -> Any:
     """Scalar space of the family ("Lagrange" or "DG")."""
     if _OLD:
-        with _quiet_compiler():
+        with _told_compiler("an element"):
             return fem.FunctionSpace(msh, (family, degree))
     return fem.functionspace(msh, (family, degree))
+
+
+def cell_vector_space(msh: Any, family: str, degree: int) -> Any:
+    """Space of 3-vectors of the family ("DG")."""
+    if _OLD:
+        with _told_compiler("an element"):
+            return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
+    return fem.functionspace(msh, (family, degree, (3,)))
 
 
 def tensor_space(msh: Any, family: str, degree: int) -> Any:
     """Space of 3 x 3 tensors of the family ("Lagrange" or "DG")."""
     if _OLD:
-        with _quiet_compiler():
+        with _told_compiler("an element"):
             return fem.TensorFunctionSpace(msh, (family, degree), shape=(3, 3))
     return fem.functionspace(msh, (family, degree, (3, 3)))
 
@@ -226,6 +264,7 @@ C_FLAGS = ["-O2", "-g0", "-fno-math-errno", "-fno-trapping-math"]
 
 def compile_forms(forms: Sequence[Any]) -> list[Any]:
     """Compile forms; signatures first because 0.5.2's depend on what was compiled before."""
+    forms = [canonical(f) for f in forms]
     for f in forms:
         if _OLD:
             # Compiling a form sets this on its mesh, and so would change the next one's signature.
@@ -233,10 +272,11 @@ def compile_forms(forms: Sequence[Any]) -> list[Any]:
                 domain.ufl_coordinate_element()._sub_element._variant = "equispaced"
         f.signature()
     options = {"cffi_extra_compile_args": C_FLAGS, "timeout": 600}
+    given: dict[str, Any] = {"jit_options": options}
     if _OLD:
-        with _quiet_compiler():
-            return [fem.form(f, form_compiler_params={}, jit_params=options) for f in forms]
-    return [fem.form(f, jit_options=options) for f in forms]
+        given = {"jit_params": options, "form_compiler_params": {}}
+    with _told_compiler("forms of a material or mesh that is new here"):
+        return [fem.form(f, **given) for f in forms]
 
 
 def create_vector(space: Any) -> Any:

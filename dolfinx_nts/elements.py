@@ -9,9 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import Moment
-from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.evaluation import Evaluation, Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
@@ -35,7 +33,7 @@ def over(value: float, limit: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A step as those know it who make its elements.
+    """What a step tells those who make its elements.
 
     Attributes:
         state: At t_n.
@@ -73,16 +71,18 @@ class Step:
         total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
         return float(total[0] / total[1])
 
-    def scale(self, surface: Surface) -> FloatArray:
-        """Force per motion of a surface's points in the units of the step, (p,). Collective.
+    def scale(self, surface: Any) -> FloatArray:
+        """Force per motion of a `Surface`'s points in the units of the step, (p,). Collective.
 
         Massless nodes have their stiffness for it: with more, Newton's method would go to and fro
         between contact and none, and stick and slip, in small steps.
         """
         massless = surface.massless
         if self.integrator.inertia and not massless.any():
-            return surface.mass
-        stiff = self.factor * surface.material.divided(self.stiffness(surface.body))
+            mass: FloatArray = surface.mass
+            return mass
+        change = self.factor * self.integrator.theta
+        stiff = change * surface.material.divided(self.stiffness(surface.body))
         return np.where(massless, stiff, surface.mass) if self.integrator.inertia else stiff
 
 
@@ -138,7 +138,7 @@ class Elements(Protocol):
 
     @property
     def force_scale(self) -> float:
-        """What a constraint's unknown is multiplied by to be a force, in the step's units."""
+        """Force, in the step's units, per unit of a constraint's unknown."""
 
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates of each body, shape (n, k) each."""
@@ -198,7 +198,7 @@ class Elements(Protocol):
     def ledger(self, part: Any, factor: float) -> dict[str, float]:
         """Sums of an accepted step on this rank, by columns of the balance table.
 
-        Of the same columns on all ranks; those that only a joint has are energies [J] that leave.
+        All ranks return the same columns. A column that only a joint has is energy [J] that leaves.
         """
 
     def describe(self, part: Any, flips: IntArray) -> tuple[float, str]:
@@ -272,8 +272,8 @@ class Joint(Protocol):
         bodies: Bodies of the system that it couples.
         losses: Columns of the balance table for energy that leaves through it, of its own names;
             its elements' `ledger` says how much.
-        numbers: Of each element on this rank, one that does not depend on the ranks; may be missing
-            where it remembers nothing that a checkpoint must hold.
+        numbers: One number per element on this rank, the same on any number of ranks. A joint that
+            remembers nothing may leave it out.
         settings: Numbers and texts by name, for JSON and the same on all ranks, that it was made
             with; a checkpoint goes on only with equal ones. It may be missing: then name and kind
             alone are compared.
@@ -392,7 +392,11 @@ class Coupling(Protocol):
 
 
 class JointCoupling(Coupling, Protocol):
-    """What a `Joint` makes: a `Coupling` that also says what its forces do."""
+    """What a `Joint` makes: a `Coupling` that also says what its forces do.
+
+    It may have `hold_alone()`, which a run calls at its start where its constraints repeat no
+    others, so that its equations need no compliance.
+    """
 
     def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
         """External work in a load step of `equilibrium` on this rank [J]. Collective.

@@ -1,14 +1,32 @@
-"""What the step equations are at an iterate."""
+"""Where a step evaluates its equations, and what they are at an iterate."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+
+
+class Moment(NamedTuple):
+    """Where a step evaluates the forces of a body.
+
+    Attributes:
+        u0: Displacement at t_n [m], owned coordinates.
+        time: Of the loads [s].
+        ramp: Part of constant loads that acts.
+        rate: Change of the velocity there with u_1 [1/s]; 0 in statics.
+        drift: Velocity there for u_1 = u_0 [m/s]; None: zero.
+    """
+
+    u0: FloatArray
+    time: float
+    ramp: float = 1.0
+    rate: float = 0.0
+    drift: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

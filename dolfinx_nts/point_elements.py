@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.elements import Step, over
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.kinematics import Kinematics, differenced, has_constraints, unknown
+from dolfinx_nts.points import Points
 from dolfinx_nts.state import State
 
 FloatArray = npt.NDArray[np.float64]
@@ -44,7 +44,7 @@ class PointElements:
         """On this rank."""
         return len(self.sides[0].nodes)
 
-    @property
+    @cached_property
     def num_coordinates(self) -> int:
         """Coordinates of all nodes of an element."""
         return sum(3 * side.nodes.shape[1] for side in self.sides)
@@ -160,6 +160,10 @@ class EveryStep:
         bodies: Numbers of their bodies in the system.
         make: Makes the elements of a step from it and from what is remembered.
         remember: What is remembered of an accepted one, from its part; nothing without.
+
+    Attributes:
+        make: As given.
+        step: The last one that began; None before.
     """
 
     may_slip = False
@@ -170,14 +174,15 @@ class EveryStep:
         make: Callable[[Step, Any], Any],
         remember: Callable[[Any], Any] | None = None,
     ) -> None:
-        self.bodies, self._make, self._remember = [bodies], make, remember
+        self.bodies, self.make, self._remember = [bodies], make, remember
         self.elements: list[Any] = []
-        self._begun: tuple[Step, Any] | None = None
+        self.step: Step | None = None
+        self._history: Any = None
 
     def begin(self, step: Step, history: Any, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step."""
-        self._begun = step, history
-        self.elements = [self._make(step, history)]
+        self.step, self._history = step, history
+        self.elements = [self.make(step, history)]
 
     def touched(self) -> set[int]:
         """All bodies."""
@@ -226,14 +231,14 @@ class EveryStep:
             TypeError: These cannot say it: elements other than `PointElements`, or with unknowns
                 beside multipliers, or a `begin` of one's own.
         """
-        if self._begun is None:
+        step, history = self.step, self._history
+        if step is None:
             held = [batch for batch in self.elements if has_constraints(batch)]
             if held:
                 raise unknown(held[0])
             return [None] * len(self.elements)
-        step, history = self._begun
 
         def make(length: float) -> Any:
-            return self._make(replace(step, dt=length), history)
+            return self.make(replace(step, dt=length), history)
 
         return [differenced(make, self.bodies[0], state, dt)]

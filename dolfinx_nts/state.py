@@ -3,14 +3,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.history import ContactHistory
-
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class ContactHistory(NamedTuple):
+    """What a contact remembers from step to step, of each slave node in this rank's share.
+
+    Attributes:
+        facet: Facet in the last step, or -1, shape (n,).
+        force: Contact force p_N [N], >= 0.
+        gap: Gap [m], infinite where a node was no candidate.
+        tangential: Friction force [N], shape (n, 3).
+        stick: Whether it sticks.
+        slip: Distance that it has slipped since the start [m].
+        followed: Whether it is not known to have passed by the surface's edge.
+    """
+
+    facet: IntArray
+    force: FloatArray
+    gap: FloatArray
+    tangential: FloatArray
+    stick: BoolArray
+    slip: FloatArray
+    followed: BoolArray
+
+    @classmethod
+    def of_start(cls, n: int) -> ContactHistory:
+        """Return the history of n nodes that have not touched yet."""
+        off, none = np.zeros(n, dtype=bool), np.zeros(n)
+        return cls(
+            np.full(n, -1), none, np.full(n, np.inf), np.zeros((n, 3)), off, none.copy(), ~off
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,11 @@ from mpi4py import MPI
 
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.contact.crossings import point
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.elements import Joint
 from dolfinx_nts.parallel import raise_together, same_kernels
-from dolfinx_nts.state import State
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.validation import items, known_options, vector
 
 FloatArray = npt.NDArray[np.float64]

@@ -27,7 +27,16 @@ _ALIKE = 1e-9
 
 
 class StepFailedError(RuntimeError):
-    """A step was not solved; the message names the worst block, nodes and facets."""
+    """A step was not solved; the message names the worst block, nodes and facets.
+
+    Args:
+        message: What failed.
+        advises: Whether it says what to do, too.
+    """
+
+    def __init__(self, message: str, *, advises: bool = False) -> None:
+        super().__init__(message)
+        self.advises = advises
 
 
 class UserFunctionError(StepFailedError, ValueError):
@@ -108,6 +117,8 @@ def require_name(argument: str, value: Any) -> None:
 
 def floats(value: Any) -> FloatArray:
     """The value as floats; an empty array where it is no array of real numbers, text included."""
+    if hasattr(value, "ufl_shape"):  # UFL would take being asked for an array for Einstein's sum
+        return np.empty(0)
     try:
         array = np.asarray(value)
         if array.dtype.kind in "iufO":
@@ -277,7 +288,8 @@ def agree(
 
 def vector_in_time(comm: Any, name: str, value: Any, time: float, unit: str) -> FloatArray:
     """A vector, or a function of time at a time, for which every rank must call this."""
-    return at_time(comm, name, value, time, unit) if callable(value) else vector(name, value, unit)
+    is_function = callable(value) and not hasattr(value, "ufl_shape")  # UFL's can be called, too
+    return at_time(comm, name, value, time, unit) if is_function else vector(name, value, unit)
 
 
 def at_points(
@@ -287,6 +299,7 @@ def at_points(
     x: FloatArray,
     rows: tuple[int, ...],
     kinds: str = "iuf",
+    error: type[Exception] = ValueError,
 ) -> npt.NDArray[Any]:
     """The user's function at this rank's points; what fails on one rank raises on all.
 
@@ -297,13 +310,14 @@ def at_points(
         x: Points [m], shape (3, n).
         rows: Leading shape of the result.
         kinds: NumPy's kinds that the result may be of, "b" for truth values.
+        error: What to raise.
     """
     problem, cause, shape, values = None, None, (*rows, x.shape[1]), np.empty(0)
     try:
         values = np.asarray(function(x))
-    except Exception as error:  # any: a rank that raises alone would leave the others waiting
-        problem = f"{name}={function!r}: raised {error!r} for x of shape {x.shape}; correct it"
-        cause = error
+    except Exception as caught:  # any: a rank that raises alone would leave the others waiting
+        problem = f"{name}={function!r}: raised {caught!r} for x of shape {x.shape}; correct it"
+        cause = caught
     else:
         if values.shape != shape:
             problem = (
@@ -316,7 +330,7 @@ def at_points(
         elif values.size and not np.isfinite(values).all():
             bad = x[:, np.flatnonzero(~np.isfinite(values.reshape(-1, x.shape[1])).all(axis=0))[0]]
             problem = f"{name}={function!r}: not finite at x={bad.tolist()}; check it for NaN"
-    raise_together(comm, problem, cause=cause)
+    raise_together(comm, problem, error, cause)
     return values
 
 

@@ -9,8 +9,8 @@ LINT_VENV=$REPO/.venv-lint
 say() { printf '==> %s\n' "$*"; }
 die() { printf 'error: %s\n' "$*" >&2; exit 1; }
 
-# The packages of debian-packages.txt, one a line.
-debian_packages() { sed 's/#.*//; /^ *$/d' "$REPO/scripts/debian-packages.txt"; }
+# The packages of debian-packages.txt, or of another list, one a line.
+debian_packages() { sed 's/#.*//; /^ *$/d' "$REPO/scripts/${1:-debian-packages.txt}"; }
 
 # Run a command as root: directly, or through sudo.
 as_root() {

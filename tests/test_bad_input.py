@@ -320,7 +320,7 @@ def test_loads():
     raises(TypeError, pattern, lambda: continuum(traction=nts.Traction(top, (1, 0, 0))))
     pattern = r"^traction\[0\]='push': pass a sequence of Traction"
     raises(TypeError, pattern, lambda: continuum(traction=["push"]))
-    pattern = r"^body_force of 'body' at t=0.0: returned 4.0; pass three finite"
+    pattern = r"^body_force of 'body' at t=0.0: returned 4.0; pass three finite components \[N/m\^"
     raises(ValueError, pattern, lambda: continuum(body_force=lambda t: 4.0))
     pattern = (
         r"^Traction.where of traction\[1\] of 'body': selects no exterior facet; check the marker"

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.kernels import beam as kernel
+from dolfinx_nts.kernels import beam as beam_kernel
+from dolfinx_nts.kernels import quadratic_energy as kernel
 
 STEEL = nts.Section(EA=2000, GA=(800, 700), GJ=3, EI=(1, 2), rhoA=1, rhoI=(1e-2, 2e-2))
 EM, MID = nts.EnergyMomentum(), nts.Midpoint()
@@ -43,7 +44,7 @@ def elements(seed=0, n=3, radius=0.3):
     length = rng.uniform(0.5, 2.0, n)
     y = rng.standard_normal((3, n, 8, 3))
     stiffness = np.array([3.0, 4.0, 9.0, 1.0, 2.0, 0.5])
-    return kernel.beams(y[0], length, radius, stiffness), y[1], y[2]
+    return beam_kernel.beams(y[0], length, radius, stiffness), y[1], y[2]
 
 
 @pytest.mark.parametrize("theta", [None, 0.5, 0.7, 1.0])
@@ -76,20 +77,20 @@ def test_strains_of_known_motions():
     rest = np.zeros((1, 8, 3))
     rest[0, 4] = (0, 0, length)
     rest[0, 1:4] = rest[0, 5:] = radius * np.eye(3)
-    of = kernel.beams(rest, np.array([length]), radius, np.ones(6))
+    of = beam_kernel.beams(rest, np.array([length]), radius, np.ones(6))
     turn = Rotation.from_rotvec((0.3, -1.2, 2.0)).as_matrix()
     moved = rest @ turn.T
     moved[:, ::4] += (3.0, -2.0, 1.0)
-    assert np.abs(kernel.strains(of, moved)).max() < 1e-14
+    assert np.abs(beam_kernel.strains(of, moved)).max() < 1e-14
     pulled = rest.copy()
     pulled[0, 4] += (0.01, 0.02, 0.03)
     expected = np.array([0.01, 0.02, 0.03, 0, 0, 0]) / length
-    assert kernel.strains(of, pulled)[0] == pytest.approx(expected, abs=1e-15)
+    assert beam_kernel.strains(of, pulled)[0] == pytest.approx(expected, abs=1e-15)
     for axis in range(3):
         angle, bent = 0.2, rest.copy()
         spin = Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix()
         bent[0, 5:] = radius * spin.T
-        assert kernel.strains(of, bent)[0, 3 + axis] == pytest.approx(np.sin(angle) / length)
+        assert beam_kernel.strains(of, bent)[0, 3 + axis] == pytest.approx(np.sin(angle) / length)
 
 
 # ---- equilibrium

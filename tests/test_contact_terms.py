@@ -7,7 +7,6 @@ import ufl
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts import dolfinx_compat as compat
 
 COMM = MPI.COMM_WORLD
 STEPS = 4
@@ -26,7 +25,7 @@ def ball():
 def block_and_terms(comm, friction=0.0):
     """The demo's block, and contact with a ball beside it."""
     block = own_problem.Block(own_problem.mesh_of(comm, 2))
-    top = nts.Surface(block, compat.exterior_facets(block.mesh))
+    top = block.boundary()
     pair = nts.ContactPair(top, ball(), friction=friction)
     return block, nts.ContactTerms([block], [pair])
 

@@ -8,6 +8,9 @@ import pytest
 SMALL = {
     "bar_impact": {"elements": 4, "t_end": 0.1},
     "domino": {"dominoes": 3, "duration": 0.02},
+    "drum_stick": {"cells": 4, "t_end": 5e-4},
+    "flying_beam": {"steps": (0.5,), "t_end": 2.0, "integrators": ("energy-momentum",)},
+    "flying_plate": {"steps": (0.1,), "t_end": 0.3, "integrators": ("energy-momentum",)},
     "flying_l_block": {"t_end": 2.0},
     "heavy_top": {"steps": (4e-3,), "t_end": 0.02, "size": 0.05},
     "newtons_cradle": {

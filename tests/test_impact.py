@@ -200,3 +200,75 @@ def test_bad_input(options, message):
     with pytest.raises(ValueError, match="restitution|impact") as error:
         nts.simulate(cubes(), nts.EnergyMomentum(), dt=1e-3, t_end=0.1, **options)
     assert message in str(error.value)
+
+
+def ball(cells, low, rigid=False, **options):
+    """A round body of 1 m radius whose lowest point is a node at this height."""
+    mesh = grid((-1, -1, -1), (2, 2, 2), (cells, cells, cells))
+    x = mesh.geometry.x
+    far, length = np.abs(x).max(axis=1), np.linalg.norm(x, axis=1)
+    x *= (0.8 * (1 - far) + far * far / np.where(length > 0, length, 1.0))[:, None]
+    x[:, 2] += 1.0 + low
+    if rigid:
+        return nts.RigidBody(mesh, density=1e3, name="ball", **options)
+    rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+    return nts.Continuum(mesh, rubber, density=1e3, name="ball", **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("restitution", [0.5, 0.8])
+def test_a_bouncing_ball_rises_by_its_restitution(restitution):
+    """B24: e^(2 n) of the height from which it fell, and the ledger names what it lost."""
+    height, gravity = 1.0, 9.81
+    body = ball(2, height, rigid=True)
+    pair = nts.ContactPair(slave=body.surface(lambda x: x[2] < height + 0.5), master=FLOOR)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -gravity))
+    fall = np.sqrt(2 * height / gravity)
+    hits = fall * (1 + 2 * np.cumsum([0.0, restitution, restitution**2]))
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=1e-3, t_end=hits[2] + restitution**3 * fall,
+        impact="restored", restitution=restitution,
+    )  # fmt: skip
+    table, size = run.balance, body.mass * gravity * height
+    assert run.status == "completed"
+    stored = table["energy"] - table["external_work"]  # m g times the height of the next rise
+    gravitational = (stored - stored[0]) / size + 1.0
+    for n, (begin, end) in enumerate(zip([0.0, *hits], [*hits, table["time"][-1]], strict=True)):
+        # A step moves the body by 4 mm while it falls: the height at a touch is known to that.
+        flight = gravitational[(table["time"] > begin + 2e-3) & (table["time"] < end - 2e-3)]
+        assert np.ptp(flight) < 1e-10
+        assert flight[0] == pytest.approx(restitution ** (2 * n), abs=5e-3)
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * size
+    lost = table["contact_defect"][-1] - table["impact_restored"][-1]
+    assert lost == pytest.approx(size * (1.0 - gravitational[-1]), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_an_elastic_ball_on_an_elastic_plate():
+    """At e = 1 energy stays; of the first touch e leaves e^2 of what a plastic impact takes."""
+    first, last = {}, {}
+    for restitution in (0.0, 0.5, 1.0):
+        body = ball(4, 0.0151, velocity=(0, 0, -2))
+        plate = nts.Continuum(
+            grid((-1.5, -1.5, -1), (3, 3, 1), (3, 3, 2)), nts.NeoHookean(young=1e6, poisson=0.3),
+            density=1e3, bcs=[nts.Dirichlet(lambda x: x[2] < -1 + 1e-9)], name="plate",
+        )  # fmt: skip
+        pair = nts.ContactPair(
+            slave=body.surface(lambda x: x[2] < 0.7), master=plate.surface(lambda x: x[2] > -1e-9)
+        )
+        run = nts.simulate(
+            nts.System([body, plate], contacts=[pair]), nts.EnergyMomentum(), dt=4e-3, t_end=0.16,
+            impact="restored", restitution=restitution,
+        )  # fmt: skip
+        table = run.balance
+        assert run.status.startswith("completed") and table["active"].max() > 1
+        part = table["energy"] / table["energy"][0]
+        assert np.abs(table["ledger_residual"]).max() < 1e-11 * table["energy"][0]
+        assert table["min_gap"].min() > -1e-12 and nts.motion_of(body).velocity[2] > 0.0
+        touch = int(np.argmax(table["active"] > 0))
+        first[restitution], last[restitution] = 1.0 - part[touch], 1.0 - part[-1]
+        if restitution == 1.0:
+            assert np.abs(part - 1.0).max() < 1e-11
+    assert first[0.0] > 1e-3 and first[0.5] == pytest.approx(0.75 * first[0.0], rel=1e-9)
+    # Later touches are other ones: nodes that keep half their speed come back more often.
+    assert min(last[0.0], last[0.5]) > 1e-3

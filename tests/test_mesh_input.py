@@ -11,6 +11,8 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 
 COMM = MPI.COMM_WORLD
+#: Young's moduli and a traction [Pa].
+SOFT, HARD, PULL = 1e6, 4e6, 10.0
 
 
 def line_of_blocks(gmsh, kind="hexahedron"):
@@ -318,3 +320,76 @@ def test_wrong_tags_and_names_are_named():
         parts["volume_7"].where("end")
     with pytest.raises(KeyError, match="no body 'volume_8' in this mesh; it has 'volume_7'"):
         parts["volume_8"]
+
+
+# ---- bodies of several volumes
+def check_bar(part, soft, hard):
+    """A bar of two halves of other moduli and densities, pulled at its end: springs in series."""
+    young = part.by_region({soft: SOFT, hard: HARD})
+    density = part.by_region({soft: 1e3, hard: 3e3})
+    body = part.continuum(
+        nts.StVenantKirchhoff(young, 0.0), density=density,
+        bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
+        traction=[nts.Traction(lambda x: x[0] > 2 - 1e-9, (PULL, 0, 0))],
+    )  # fmt: skip
+    motion = nts.motion_of(body)
+    np.testing.assert_allclose(motion.mass, 4e3, rtol=1e-13)
+    np.testing.assert_allclose(motion.centre[0], (0.5 * 1e3 + 1.5 * 3e3) / 4e3, rtol=1e-13)
+    nts.equilibrium(nts.System([body]))
+    x = body.reference.reshape(-1, 3)
+    u = body.u.x.array[: body.num_owned].reshape(-1, 3)[:, 0]
+    for place, expected in ((1.0, PULL / SOFT), (2.0, PULL / SOFT + PULL / HARD)):
+        there = np.isclose(x[:, 0], place)
+        np.testing.assert_allclose(u[there], expected, rtol=1e-4)
+    return body
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron"])
+def test_tags_in_one_body(kind):
+    parts = nts.bodies_from_tags(*tagged_bar(kind), names={"bar": (7, 9)}, surfaces={"end": 5})
+    (part,) = parts.values()
+    assert part.name == "bar" and not part.regions
+    check_bar(part, 7, 9)
+    surface = nts.Continuum(part.mesh, nts.NeoHookean(SOFT, 0.3), density=1.0).surface(
+        *part.where("end")
+    )
+    assert surface.area.sum() == pytest.approx(1.0, rel=1e-14)
+
+
+@pytest.mark.mpi
+def test_volumes_of_gmsh_in_one_body(blocks):
+    parts = nts.bodies_from_gmsh(blocks, COMM, bodies={"bar": ("left", "volume_9")})
+    (part,) = parts.values()
+    nodes = part.mesh.geometry.index_map().size_global
+    assert part.name == "bar" and nodes == 45  # 5 x 3 x 3, those between them once
+    assert set(part.regions) == {"left", "volume_9"}
+    assert part.surfaces == {"start": 4, "interface": 3}
+    check_bar(part, "left", 9)
+
+
+@pytest.mark.mpi
+def test_one_body_beside_another(blocks):
+    parts = nts.bodies_from_gmsh(blocks, COMM, bodies={"base": ["left"]})
+    assert list(parts) == ["base", "volume_9"]
+    assert set(COMM.allreduce(set(parts["base"].cell_tags.values), lambda a, b: a | b)) == {
+        parts["base"].regions["left"]
+    }
+
+
+@pytest.mark.mpi
+def test_wrong_regions_are_named(blocks):
+    part = nts.bodies_from_tags(*tagged_bar(), names={"bar": [7, 9]})["bar"]
+    for values in ({7: 1.0}, {7: 1.0, 9: 2.0, 8: 3.0}, {"left": 1.0}):
+        with pytest.raises(ValueError, match="body 'bar' is made of 7, 9; pass a value for each"):
+            part.by_region(values)
+    with pytest.raises(ValueError, match=r"names\['bar'\]=\(7, 8\): no such tag; .* has 7, 9"):
+        nts.bodies_from_tags(*tagged_bar(), names={"bar": (7, 8)})
+    with pytest.raises(ValueError, match=r"bodies\['a'\]=\['x'\]: 'x' is no volume that is left"):
+        nts.bodies_from_gmsh(blocks, COMM, bodies={"a": ["x"]})
+    with pytest.raises(ValueError, match=r"'left' is no volume that is left; there are 'volume_9'"):
+        nts.bodies_from_gmsh(blocks, COMM, bodies={"a": ["left"], "b": ["left"]})
+    with pytest.raises(ValueError, match=r"bodies\['volume_9'\]: there is a volume of this name"):
+        nts.bodies_from_gmsh(blocks, COMM, bodies={"volume_9": ["left"]})
+    with pytest.raises(TypeError, match=r"bodies=\{'a': 'left'\}: pass a dict of names of bodies"):
+        nts.bodies_from_gmsh(blocks, COMM, bodies={"a": "left"})

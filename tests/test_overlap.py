@@ -15,7 +15,6 @@ from scipy import ndimage
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact import crossings, intrusion, obstacle_crossings, overlap
-from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.kernels import facets
 
 COMM = MPI.COMM_WORLD
@@ -518,7 +517,7 @@ def test_what_is_behind_an_open_surface_but_outside_is_no_overlap():
 
 
 # ---- obstacles
-class Ball(Obstacle):
+class Ball(nts.Obstacle):
     """A ball as a user may write it: by its gap alone."""
 
     def __init__(self, centre, radius, width=np.inf):

@@ -542,7 +542,7 @@ def test_constraints_that_nobody_can_follow_are_refused():
 
     class Own(nts.EveryStep):
         def begin(self, step, history, again, search):
-            self.elements = [self._make(step, history)]
+            self.elements = [self.make(step, history)]
 
     class Loose(Own):
         def kinematics(self, state, dt):
@@ -550,7 +550,7 @@ def test_constraints_that_nobody_can_follow_are_refused():
 
     class Other(Drive):
         def coupling(self, bodies):
-            return self.kind(bodies, super().coupling(bodies)._make)
+            return self.kind(bodies, super().coupling(bodies).make)
 
     drive = Other(body, x, 0.1)
     drive.kind = Own
@@ -568,7 +568,7 @@ class Telling(nts.EveryStep):
     firm = True
 
     def warnings(self, parts):
-        x = self._begun[0].state.u
+        x = self.step.state.u
         way = COMM.allreduce(max(float(np.abs(u).max(initial=0.0)) for u in x), op=MPI.MAX)
         return [("way", way, f"a body has moved by {way:.3g} m")] if way > 0.0125 else []
 
@@ -583,7 +583,7 @@ def test_a_coupling_of_ones_own_warns_and_gives_way():
 
     class Told(Drive):
         def coupling(self, bodies):
-            return Telling(bodies, super().coupling(bodies)._make)
+            return Telling(bodies, super().coupling(bodies).make)
 
     stepper = nts.Stepper(nts.System([body], joints=[Told(body, x, 1.0)]), nts.EnergyMomentum())
     for _ in range(5):
@@ -626,7 +626,7 @@ class Unspoken:
 
 class TwoBatches(nts.EveryStep):
     def begin(self, step, history, again, search):
-        self.elements = list(self._make(step, history))
+        self.elements = list(self.make(step, history))
         self.bodies = [self.bodies[0]] * len(self.elements)
 
 

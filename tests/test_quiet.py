@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 SCRIPT = """
 import ufl
 from dolfinx.mesh import CellType, create_box
@@ -19,13 +21,20 @@ compat.compile_forms([{form}])
 """
 
 
-def run(form, cache):
-    """Run the script in a new interpreter that does not believe to be an MPI rank of this one."""
+def run(form, cache, scene="", before=""):
+    """Run the script in a new interpreter that does not believe to be an MPI rank of this one.
+
+    Args:
+        form: What it compiles.
+        cache: Folder for what is compiled.
+        scene: Lines after it.
+        before: Lines before it.
+    """
     mpi = ("OMPI_", "PMIX_", "PRTE_", "ORTE_")
     environment = {k: v for k, v in os.environ.items() if not k.startswith(mpi)}
     environment |= {"XDG_CACHE_HOME": str(cache), "OMPI_ALLOW_RUN_AS_ROOT": "1"}
     return subprocess.run(
-        [sys.executable, "-c", SCRIPT.replace("{form}", form)],
+        [sys.executable, "-c", before + SCRIPT.replace("{form}", form) + scene],
         env=environment | {"OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"},
         cwd=cache,
         capture_output=True,
@@ -39,6 +48,28 @@ def test_a_cold_cache_prints_nothing(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     # The form; DOLFINx 0.5 compiles the elements of spaces, too.
     assert list(tmp_path.rglob("*.so"))
+
+
+@pytest.mark.slow
+def test_a_run_with_a_bar_tells_what_it_compiles(tmp_path):
+    """In one line above the bar, and with a warm cache in none."""
+    scene = """
+import dolfinx_nts as nts
+
+body = nts.Continuum(mesh, nts.StVenantKirchhoff(1e6, 0.3), density=1e3)
+nts.simulate(nts.System([body]), nts.Midpoint(), dt=1e-3, t_end=1e-3, progress=True)
+"""
+    for lines in (1, 0):
+        done = run("w[2] * ufl.dx", tmp_path, scene)
+        assert (done.returncode, done.stdout.count("compiling forms")) == (0, lines)
+        assert done.stderr.count("INFO") == 0
+
+
+def test_who_asks_is_told_what_is_compiled(tmp_path):
+    asks = "import logging\nlogging.basicConfig(level=logging.INFO)\n"
+    done = run("w[1] * ufl.dx", tmp_path, before=asks)
+    assert done.returncode == 0
+    assert done.stderr.count("compiling forms of a material or mesh that is new here") == 1
 
 
 def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):

@@ -45,6 +45,31 @@ def test_reuse_changes_no_solution(integrator, solver):
     assert again["newton_iterations"].sum() < 2 * table["newton_iterations"].sum()
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("reuse", [False, True])
+def test_two_runs_of_one_system_in_turns_are_those_one_after_the_other(reuse):
+    """Each finds the bodies' matrix changed by the other one, and makes it anew."""
+
+    def ends(system, in_turns, dt=2e-3, steps=12):
+        newton = nts.Newton(linear_solver="direct", condense=True, reuse=reuse)
+        runs = [
+            nts.Stepper(system, nts.EnergyMomentum(), newton=newton),
+            nts.Stepper(system, nts.Midpoint(), newton=newton),
+        ]
+        both = [(k, run) for k in range(steps) for run in runs]
+        for k, stepper in both if in_turns else sorted(both, key=lambda pair: runs.index(pair[1])):
+            stepper.advance((k + 1) * dt - stepper.state.time)
+        for stepper in runs:
+            stepper.close()
+        return [stepper.solution.balance for stepper in runs]
+
+    system = rubbing_blocks(0.3)
+    apart, mixed = ends(system, False), ends(system, True)
+    for one, other in zip(apart, mixed, strict=True):
+        assert one["active"].max() >= 4
+        assert difference(one, other) <= (1e-9 if reuse else 0.0)
+
+
 @pytest.mark.slow
 @pytest.mark.mpi
 def test_without_condensing_too():

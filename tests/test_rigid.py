@@ -231,6 +231,17 @@ def test_reactions_of_prescribed_motion_are_force_and_moment():
     assert run.reactions["turned"][-1, 0] == pytest.approx([0, 0, 4], rel=1e-3, abs=1e-9)
 
 
+def test_reactions_depend_on_the_displacement_that_is_asked_for():
+    """Not on the iterate that was evaluated last."""
+    body = nts.RigidBody.from_inertia(2.0, (1, 1, 2), rotation=(0, 0, 0))
+    force, u1, other = 0.3 * np.random.default_rng(2).standard_normal((3, 12))
+    body.begin_step(nts.EnergyMomentum(), nts.Moment(np.zeros(12), 0.0))
+    arms = (body.reference + 0.5 * u1).reshape(4, 3)[1:]
+    moment = np.cross(arms, force.reshape(4, 3)[1:]).sum(axis=0)
+    body.external(other, np.zeros(3))
+    assert body.reactions(force, u1) == pytest.approx(moment[None], rel=1e-14)
+
+
 @pytest.mark.mpi
 def test_prescribed_motion_does_external_work():
     """The body follows; the work is that of the forces that accelerate it."""

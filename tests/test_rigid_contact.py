@@ -61,7 +61,25 @@ def test_a_box_at_rest_stays(nodes, friction):
     assert np.abs(body.position - body.centre).max() < 1e-13
     force = run.state.contacts[0].force
     everyone = np.concatenate(COMM.allgather(force))
-    assert np.abs(everyone - weight / nodes**2).max() < 1e-2 * weight / nodes**2
+    assert np.abs(everyone - weight / nodes**2).max() < 1e-9 * weight
+
+
+@pytest.mark.mpi
+def test_a_leaning_weight_divides_by_least_norm():
+    """Two contacts hold one brick against inclined gravity: of all forces the least squares."""
+    body, lean = rigid((0, 0, 0), (1, 1, 1), (5, 3, 1)), 0.1
+    halves = [body.surface(lambda x, s=s: (x[2] < 1e-9) & (s * (x[0] - 0.5) > 0)) for s in (-1, 1)]
+    pairs = [nts.ContactPair(slave=half, master=FLOOR, friction=0.5) for half in halves]
+    system = nts.System([body], contacts=pairs, gravity=(lean * G, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.1)
+    weight = body.mass * G
+    # Six nodes along x, four of each: the sum is the weight, its moment that of gravity at z = 0.5.
+    x = np.repeat(np.linspace(-0.5, 0.5, 6), 4)
+    rows = np.array([np.ones(24), x])
+    least = np.linalg.pinv(rows) @ [weight, 0.5 * lean * weight]
+    found = np.concatenate([np.concatenate(COMM.allgather(c.force)) for c in run.state.contacts])
+    assert run.status == "completed"
+    assert np.abs(np.sort(found) - np.sort(least)).max() < 1e-11 * weight
 
 
 @pytest.mark.slow

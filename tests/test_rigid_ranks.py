@@ -7,6 +7,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.constraints import rank_of
 
 COMM = MPI.COMM_WORLD
 G = 9.81
@@ -20,11 +21,31 @@ def box(comm, low, size, n, **options):
     return nts.RigidBody(mesh, density=1e3, **options)
 
 
-def contact(comm):
-    """A tripod slides and turns with friction on a rigid plate that slides on a plane.
+def on_a_plate(plate, body):
+    """It slides and turns with friction on a rigid plate that slides on a plane."""
+    on_plate = nts.ContactPair(
+        slave=body.surface(lambda x: x[2] < 0.01 + 1e-9),
+        master=plate.surface(lambda x: x[2] > 0.01 - 1e-9),
+        friction=0.3,
+    )
+    on_floor = nts.ContactPair(
+        slave=plate.surface(lambda x: x[2] < 1e-9), master=nts.Plane((0, 0, 0), (0, 0, 1))
+    )
+    return nts.System([plate, body], contacts=[on_plate, on_floor], gravity=(0, 0, -G)), 1.0
 
-    Three feet: how more of them share a weight is not unique, and with it the torque of friction.
-    """
+
+def brick(comm):
+    """On twelve nodes, whose share of the weight sets the torque of friction."""
+    plate = box(comm, (0, 0, 0), (1.0, 0.6, 0.01), (4, 3, 1), name="plate")
+    body = box(
+        comm, (0.2, 0.2, 0.01), (0.2, 0.1, 0.05), (3, 2, 1), velocity=(1, 0.2, 0),
+        angular_velocity=(0, 0, 3), name="brick",
+    )  # fmt: skip
+    return on_a_plate(plate, body)
+
+
+def contact(comm):
+    """On three feet."""
     plate = box(comm, (0, 0, 0), (1.0, 0.6, 0.01), (4, 3, 1), name="plate")
     corners = [(0.2, 0.2, 0.01), (0.5, 0.2, 0.01), (0.3, 0.4, 0.01), (0.34, 0.27, 0.11)]
     cells = np.array([[0, 1, 2, 3]]) if comm.rank == 0 else np.empty((0, 4))
@@ -33,15 +54,7 @@ def contact(comm):
     tripod = nts.RigidBody(
         mesh, density=1e3, velocity=(1, 0.2, 0), angular_velocity=(0, 0, 3), name="tripod"
     )
-    on_plate = nts.ContactPair(
-        slave=tripod.surface(lambda x: x[2] < 0.01 + 1e-9),
-        master=plate.surface(lambda x: x[2] > 0.01 - 1e-9),
-        friction=0.3,
-    )
-    on_floor = nts.ContactPair(
-        slave=plate.surface(lambda x: x[2] < 1e-9), master=nts.Plane((0, 0, 0), (0, 0, 1))
-    )
-    return nts.System([plate, tripod], contacts=[on_plate, on_floor], gravity=(0, 0, -G)), 1.0
+    return on_a_plate(plate, tripod)
 
 
 def chain(comm):
@@ -60,9 +73,11 @@ def chain(comm):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(("scene", "dt", "t_end"), [(contact, 1e-2, 0.2), (chain, 1e-2, 0.5)])
+@pytest.mark.parametrize(
+    ("scene", "dt", "t_end"), [(contact, 1e-2, 0.2), (brick, 1e-2, 0.3), (chain, 1e-2, 0.5)]
+)
 @pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
-@pytest.mark.fast_on_ranks("contact-0.01-0.2")
+@pytest.mark.fast_on_ranks("brick-0.01-0.3")
 def test_ranks_change_nothing(scene, dt, t_end):
     """The scene of these ranks against the one that every rank computes alone, to 1e-9 of it."""
     (one, size), (other, _) = scene(COMM), scene(MPI.COMM_SELF)
@@ -88,3 +103,15 @@ def test_ranks_change_nothing(scene, dt, t_end):
 def test_more_ranks_change_nothing(on_ranks, ranks):
     name = f"{__file__}::test_ranks_change_nothing"
     on_ranks(ranks, "-m", "pytest", "-q", "-p", "no:cacheprovider", name)
+
+
+@pytest.mark.parametrize("names", ["link {}", "revolute of link {} and link {}", "b{}"])
+@pytest.mark.parametrize("ranks", [2, 3, 4])
+def test_numbered_names_are_dealt_evenly(names, ranks):
+    """Rigid bodies and joints live on one rank each."""
+    class Comm:
+        size = ranks
+
+    owners = [rank_of(names.format(k, k + 1), Comm) for k in range(100)]
+    counts = np.bincount(owners, minlength=ranks)
+    assert counts.max() - counts.min() <= 1

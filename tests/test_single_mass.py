@@ -101,7 +101,7 @@ def test_what_a_body_inherits():
     n = mass.num_owned
     assert mass.mesh is None and mass.joints == () and not (mass.driven or mass.oriented)
     assert np.array_equal(mass.initial_displacement, np.zeros(n)) and mass.places.sum() == n // 3
-    assert mass.reactions(np.ones(n)).shape == (0, 3) and mass.reaction_labels == []
+    assert mass.reactions(np.ones(n), np.zeros(n)).shape == (0, 3) and mass.reaction_labels == []
     assert mass.smallest_det(np.zeros(n))[0] == np.inf and mass.file_order().tolist() == [0]
     assert np.array_equal(mass.weight(np.array([0.0, 0.0, -2.0])), [0.0, 0.0, -2.0 * MASS][:n])
     momentum = COMM.allreduce(mass.angular_momentum(np.zeros(n), MASS * mass.initial_velocity))

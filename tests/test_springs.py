@@ -635,3 +635,42 @@ def test_a_damper_that_steps_do_not_resolve_is_told(rule):
     hinge = nts.Revolute(body, None, point=(0, 0, 0), axis=(0, 0, 1))
     worst, text = told([hinge, nts.TorsionDamper.about(hinge, damping=1e4)], body, rule=rule)
     assert worst == pytest.approx(25.0, rel=1e-9) and "on 2 kg m^2" in text
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("stiffness", "way"), [(1e6, 1e-6), (1e6, 1e-8), (1.0, 1e-6), (1e9, 1e-4)]
+)
+def test_statics_of_a_stiff_spring_needs_no_cut(stiffness, way):
+    """Its force is as exact as a place 1 m from the origin is in 64 bits, and no more."""
+    body = nts.RigidBody.from_inertia(
+        1.0, (1, 1, 1), (1, 0, 0), force=lambda t: (stiffness * way * t, 0, 0)
+    )
+    held = nts.Prismatic(body, None, point=(1, 0, 0), axis=(1, 0, 0))
+    spring = nts.Spring(body, None, [(1, 0, 0), (0, 0, 0)], stiffness=stiffness, length=1.0)
+    found = nts.equilibrium(nts.System([body], joints=[held, spring]), load_steps=10)
+    assert found.status == "completed" and found.retries == 0
+    assert found.balance["newton_iterations"].max() <= 3
+    assert abs(body.position[0] - 1.0 - way) < 4e-16
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("stiffness", [5e-3, 5e3])
+def test_stabilization_of_springs_is_that_of_the_springs(stiffness):
+    """No gravity and no flexible body: in any unit the same number of relaxations."""
+    iterations = []
+    for unit in (1e-3, 1.0, 1e6):
+        pull = 0.2 * stiffness * unit
+        body = nts.RigidBody.from_inertia(
+            1.0, 3 * (unit**2,), (unit, 0, 0), force=lambda t, f=pull: (f * t, 0, 0)
+        )
+        ends = [(unit, 0, 0), (0, 0, 0)]
+        joints = [
+            nts.Prismatic(body, None, point=ends[0], axis=(1, 0, 0)),
+            nts.Spring(body, None, ends, stiffness=stiffness, length=unit),
+        ]
+        found = nts.equilibrium(nts.System([body], joints=joints), stabilization=0.1)
+        assert found.status == "completed" and found.retries == 0
+        assert body.position[0] == pytest.approx(1.2 * unit, rel=1e-12)
+        iterations.append(found.balance["newton_iterations"].tolist())
+    assert iterations[0] == iterations[1] == iterations[2]

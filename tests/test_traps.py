@@ -348,8 +348,7 @@ def test_nodes_that_flip_are_named_with_their_states(friction, row, states, inte
             text = contact.describe(step.parts[0], flips)[1]
             assert text.startswith("contact 'cube-plate': node ")
             assert (f"flips between {states} and settles in neither" in text) == (count == 8)
-            assert ("try another dt" in text) == (count == 8)
-            assert ("smaller coefficient of friction" in text) == (count == 8 and friction > 0)
+            assert text.endswith("settles in neither; try another dt") == (count == 8)
     stepper.close()
 
 

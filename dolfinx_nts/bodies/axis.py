@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +10,7 @@ from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.mesh_check import check_any_mesh
-from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.bodies.skeleton import Skeleton, nodes_and_cells
 from dolfinx_nts.validation import at_points, floats
 
 FloatArray = npt.NDArray[np.float64]
@@ -23,22 +23,6 @@ _STRAIGHT = 0.5
 _PARALLEL = 1e-6
 #: Part of the mesh's size below which a cell has no length.
 _SHORT = 1e-12
-
-
-class Axis(NamedTuple):
-    """The axis in the reference, the same on all ranks; axis 0 = node in the global numbering.
-
-    Attributes:
-        x: Nodes [m], shape (n, 3).
-        order: Nodes as they follow each other, shape (n,).
-        cells: Nodes of the cells of all ranks in rank order, in the axis' direction, shape (c, 2).
-        directors: d_1, d_2, d_3, the last one along the axis, shape (n, 3, 3).
-    """
-
-    x: FloatArray
-    order: IntArray
-    cells: IntArray
-    directors: FloatArray
 
 
 def check_line(mesh: Any, name: str) -> None:
@@ -58,8 +42,8 @@ def check_line(mesh: Any, name: str) -> None:
     check_any_mesh(mesh, name)
 
 
-def axis_of(space: Any, direction: Any, name: str) -> Axis:
-    """The axis of a mesh that `check_line` let pass. Collective.
+def axis_of(space: Any, direction: Any, name: str) -> Skeleton:
+    """The axis of a mesh that `check_line` let pass; nodes follow it, d_3 is along it. Collective.
 
     Args:
         space: Lagrange space of degree 1 on it.
@@ -70,22 +54,14 @@ def axis_of(space: Any, direction: Any, name: str) -> Axis:
         ValueError: A cell without length, a node of three cells, an angle above 60 degrees, or a
             direction along the axis.
     """
-    mesh, comm, index_map = space.mesh, space.mesh.comm, space.dofmap.index_map
-    owned, own_cells = index_map.size_local, mesh.topology.index_map(1).size_local
-    x = gather_rows(comm, space.tabulate_dof_coordinates()[:owned])
-    dofs = compat.cell_dofs(space)[:own_cells]
-    numbers = index_map.local_to_global(dofs.ravel().astype(np.int32)).reshape(-1, 2)
-    cells = gather_rows(comm, np.asarray(numbers, dtype=np.int64))
-    blocks = compat.node_blocks(mesh, space)
-    here = (blocks >= 0) & (blocks < owned)
-    given = np.empty(owned, dtype=np.int64)
-    given[blocks[here]] = np.asarray(mesh.geometry.input_global_indices)[here]
+    x, cells, given = nodes_and_cells(space)
     _check_cells(x, cells, name)
-    order, forward = _walk(cells, gather_rows(comm, given), len(x))
+    order, forward = _walk(cells, given, len(x))
     cells = np.where(forward[:, None], cells, cells[:, ::-1])
     tangent = _tangents(x, cells, name)
-    first = _first(comm, x, tangent, direction, name)
-    return Axis(x, order, cells, np.stack([first, np.cross(tangent, first), tangent], axis=1))
+    first = _first(space.mesh.comm, x, tangent, direction, name)
+    directors = np.stack([first, np.cross(tangent, first), tangent], axis=1)
+    return Skeleton(x, order, cells, directors, cells)
 
 
 def _check_cells(x: FloatArray, cells: IntArray, name: str) -> None:

@@ -1,45 +1,30 @@
-"""What a System asks of a body, and what a body knows of a step."""
+"""What a System asks of a body."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.points import Points
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 
-class Moment(NamedTuple):
-    """Where a step evaluates the forces of a body.
-
-    Attributes:
-        u0: Displacement at t_n [m], owned coordinates.
-        time: Of the loads [s].
-        ramp: Part of constant loads that acts.
-        rate: Change of the velocity there with u_1 [1/s]; 0 in statics.
-        drift: Velocity there for u_1 = u_0 [m/s]; None: zero.
-    """
-
-    u0: FloatArray
-    time: float
-    ramp: float = 1.0
-    rate: float = 0.0
-    drift: FloatArray | None = None
-
-
 class Body:
     """A body with coordinates q = X + u and a constant mass matrix (39); what all bodies inherit.
 
     A body knows neither the step's length nor the name of its integrator, which is the `rule` that
-    tells how forces follow from two states. A body of one's own sets the first seven attributes and
+    tells how forces follow from two states. A body of one's own sets the first six attributes and
     has the first seven methods. All else has a default here, which is that of a body whose
     coordinates are the places of material points, free of conditions, without a mesh.
 
@@ -48,7 +33,6 @@ class Body:
         comm: MPI communicator.
         num_owned: Coordinates this rank owns; the global numbering is contiguous by rank.
         reference: X [m], shape (num_owned,).
-        initial_velocity: v at the start [m/s], shape (num_owned,).
         nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
         fixed: Positions of the prescribed coordinates among the owned ones.
         mesh: DOLFINx mesh whose nodes move with the body; None: it has none, hence no surface, no
@@ -60,8 +44,8 @@ class Body:
         rigid: Whether no motion changes distances in it, so that `directions` turn with it.
         oriented: Whether it has directors, and with them `length`, `directions_at` and `turn`.
         length: What its directors are multiples of [m].
-        rounded: Length [m], the same on all ranks, whose rounding the forces hold beside that of u;
-            None: that of the positions.
+        rounded: Length [m] whose rounding enters the forces in addition to that of u, the same on
+            all ranks; None: the size of the positions.
         allow_inversion: Whether steps are accepted that end with `smallest_det` <= 0.
         has_massless: Whether coordinates on any rank have no mass.
         destroyed: Whether `destroy` was called.
@@ -71,7 +55,6 @@ class Body:
     comm: Any
     num_owned: int
     reference: FloatArray
-    initial_velocity: FloatArray
     nodal_mass: FloatArray
     fixed: IntArray
 
@@ -134,6 +117,11 @@ class Body:
         return np.zeros(self.num_owned)
 
     @cached_property
+    def initial_velocity(self) -> FloatArray:
+        """Velocity v at the start [m/s], shape (num_owned,)."""
+        return np.zeros(self.num_owned)
+
+    @cached_property
     def places(self) -> BoolArray:
         """Which of this rank's nodes are places, t_a = 1, shape (num_owned / 3,).
 
@@ -190,7 +178,7 @@ class Body:
                 "make it anew, or destroy it later"
             )
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
+    def nodal_stiffness(self) -> FloatArray:
         """Stiffness of each node's neighbourhood at rest [N/m], shape (num_owned,).
 
         What the nodal mass is in dynamics, a scale, is this in statics, which alone asks for it.
@@ -201,11 +189,12 @@ class Body:
         """
         raise self._missing("nodal_stiffness")
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultant of a force [N] on the coordinates of each condition, this rank's part.
 
         Args:
-            residual: Force on all owned coordinates, shape (num_owned,).
+            residual: Force of the step on all owned coordinates, shape (num_owned,).
+            u1: Displacement at the end of the step, from which moments take their arms [m].
 
         Returns:
             Shape (conditions, 3).
@@ -215,7 +204,8 @@ class Body:
     @property
     def reaction_labels(self) -> list[tuple[str, str]]:
         """Name and unit of each row of `reactions`."""
-        count = len(self.reactions(np.zeros(self.num_owned)))
+        zero = np.zeros(self.num_owned)
+        count = len(self.reactions(zero, zero))
         return [(str(k), "N") for k in range(count)]
 
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
@@ -247,6 +237,12 @@ class Body:
     def parameters(self) -> FloatArray:
         """Values of the material that a caller may change during a run, shape (n,)."""
         return np.empty(0)
+
+    def take_parameters(self) -> None:
+        """Take over changed `parameters` where not all that is made of them is asked for anew.
+
+        Collective; a run calls it before its first step, and whenever `parameters` have changed.
+        """
 
     def file_order(self) -> IntArray:
         """Numbers of the nodes, counted rank after rank, in the order of files; on rank 0.
@@ -305,6 +301,18 @@ class Body:
         prescribed = np.zeros(self.num_owned, dtype=bool)
         prescribed[self.fixed] = True
         return replace(points, fixed=points.nodal(prescribed))
+
+    def boundary(self) -> Surface:
+        """The whole boundary of a body with a mesh, for looks at what lies inside. Collective."""
+        return Surface(self, skin_of_mesh(self, compat.exterior_facets(self.mesh)))
+
+    def boundary_now(self, u: FloatArray) -> FloatArray:
+        """This rank's part of the whole boundary, corners of facets [m], (m, nc, 3). Collective.
+
+        Args:
+            u: Owned displacements [m].
+        """
+        return boundary_of_mesh(self, u)
 
     def at_mesh(self, values: FloatArray) -> FloatArray:
         """Values at the nodes of its mesh on this rank, as of its `space`. Collective.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from dolfinx_nts.contact.surfaces import locate_facets
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import (
     UserFunctionError,
+    at_points,
     is_whole,
     items,
     known_options,
@@ -27,6 +29,15 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 VectorInTime = Vector | Callable[[float], Vector]
+#: Of a body's nodes: one for all, or one for each.
+NodalVectors: TypeAlias = (
+    VectorInTime | Callable[[FloatArray, float], FloatArray] | fem.Constant | fem.Function
+)
+#: What the values of `Dirichlet` may be beside three numbers.
+_ELSE = (
+    "a function of time t -> (3,), a function of place and time x (3, n), t -> (3, n), or a "
+    "Constant or Function of DOLFINx with three components"
+)
 
 #: Rounding of displacements over them and over the distance of the body from the origin.
 _ROUNDING = 64 * float(np.finfo(float).eps)
@@ -39,16 +50,21 @@ class Dirichlet:
 
     Attributes:
         where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
-        value: Displacement [m]: a vector, or a function of time; its work is external work. The
-            nodes start where and as fast as the value says at the start.
+        value: Displacement [m], whose work is external work; the nodes start where and as fast as
+            it says at the start. It is
+            - a vector, or a function of time t -> (3,), the same for all nodes;
+            - a function of two arguments, x (3, n) and time, -> (3, n), with x in the reference;
+            - a Constant of three components, or a Function of vectors on the body's mesh, asked
+              whenever the displacement is: who changes it between steps moves the nodes.
         components: Which of x, y, z are prescribed.
 
     Raises:
-        ValueError: Unknown component, or `value` is neither three finite numbers nor a function.
+        TypeError: `value` is a UFL expression.
+        ValueError: Unknown component, or `value` is none of these.
     """
 
     where: Any
-    value: VectorInTime = (0.0, 0.0, 0.0)
+    value: NodalVectors = (0.0, 0.0, 0.0)
     components: tuple[int, ...] = (0, 1, 2)
 
     def __post_init__(self) -> None:
@@ -56,7 +72,14 @@ class Dirichlet:
         listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
         if not listed or not given:
             raise ValueError(f"components={given!r}: pass a tuple of some of 0, 1, 2")
-        _check_value("Dirichlet.value", self.value, "m")
+        if isinstance(self.value, fem.Constant | fem.Function):
+            if self.value.ufl_shape != (3,):
+                raise ValueError(
+                    f"Dirichlet.value={self.value!s}: has shape {self.value.ufl_shape}; pass "
+                    f"{_ELSE}"
+                )
+        else:
+            _check_value("Dirichlet.value", self.value, "m", _ELSE)
 
 
 @known_options
@@ -76,13 +99,28 @@ class Traction:
     value: VectorInTime
 
     def __post_init__(self) -> None:
-        _check_value("Traction.value", self.value, "Pa")
+        _check_value("Traction.value", self.value, "Pa", "a function of time that returns them")
 
 
-def _check_value(name: str, value: Any, unit: str) -> None:
-    """Raise ValueError unless it is a vector or may be a function of time."""
+def _check_value(name: str, value: Any, unit: str, or_else: str) -> None:
+    """Raise unless it is a vector or may be a function; what UFL has can be called, but is none."""
+    if hasattr(value, "ufl_shape"):
+        raise TypeError(
+            f"{name}={value!s}: is of UFL ({type(value).__name__}); pass three finite components "
+            f"[{unit}], or {or_else}"
+        )
     if not callable(value):
-        vector(name, value, unit, or_else="a function of time that returns them")
+        vector(name, value, unit, or_else=or_else)
+
+
+def _takes_place(value: Any) -> bool:
+    """Return whether a function has two arguments that must be given: place and time."""
+    try:
+        parameters = inspect.signature(value).parameters.values()
+    except (TypeError, ValueError):  # one that does not say
+        return False
+    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in places and p.default is p.empty for p in parameters) == 2
 
 
 def facets_of(mesh: Any, where: Any, what: str) -> IntArray:
@@ -90,6 +128,28 @@ def facets_of(mesh: Any, where: Any, what: str) -> IntArray:
     if isinstance(where, tuple) and len(where) == 2:
         return locate_facets(mesh, *where, what)
     return locate_facets(mesh, where, None, what)
+
+
+def at_nodes(space: Any, what: str, value: Any) -> FloatArray:
+    """Values of a Function of vectors at all nodes of this rank, shape (nodes, 3). Collective.
+
+    Args:
+        space: Lagrange space of 3-vectors.
+        what: Argument and its value.
+        value: The Function.
+
+    Raises:
+        ValueError: It is on another mesh, or not finite.
+    """
+    if value.function_space.mesh.ufl_domain() != space.mesh.ufl_domain():
+        raise ValueError(f"{what}: is on another mesh; make it on that of the body")
+    here = fem.Function(space)
+    here.interpolate(value)
+    found: FloatArray = here.x.array.reshape(-1, 3)
+    bad = not np.isfinite(found).all()
+    text = f"{what}: is not finite; check it for NaN"
+    raise_together(space.mesh.comm, text if bad else None, UserFunctionError)
+    return found
 
 
 class Meetings:
@@ -105,57 +165,54 @@ class Meetings:
     """
 
     def __init__(
-        self, comm: Any, name: str, values: Sequence[VectorInTime], dofs: Sequence[IntArray],
+        self, comm: Any, name: str, values: Sequence[Any], dofs: Sequence[IntArray],
         x: FloatArray, width: int = 3,
     ) -> None:  # fmt: skip
-        self._comm, self._name = comm, name
-        owner = np.full(width * len(x), -1)
-        found: dict[tuple[int, int, int], tuple[float, ...]] = {}
-        for k, here in enumerate(dofs):
-            # Three conditions at one coordinate are of one mind if neighbours in the list are.
-            for dof in here[owner[here] >= 0].tolist():
-                key = int(owner[dof]), k, dof % width
-                place = tuple(x[dof // width].tolist())
-                found[key] = min(found.get(key, place), place)
-            owner[here] = k
-        self._places: dict[tuple[int, int, int], tuple[float, ...]] = {}
-        if len(dofs) > 1:
-            for key, place in sorted(i for part in comm.allgather(found) for i in part.items()):
-                self._places.setdefault(key, place)
-            self._size = float(comm.allreduce(np.abs(x).max(initial=0.0), op=MPI.MAX))
-        self._moving = any(
-            callable(value) for j, k, _ in self._places for value in (values[j], values[k])
-        )
+        self._comm, self._name, self._dofs, self._x, self._width = comm, name, dofs, x, width
+        times = np.zeros(width * len(x), dtype=int)
+        for here in dofs:
+            times[here] += 1
+        local = [np.any(times[here] > 1) for here in dofs]
+        meet = comm.allreduce(np.array(local, dtype=int)) > 0
+        self._any = bool(meet.any())
+        self._moving = any(m and callable(v) for m, v in zip(meet, values, strict=True))
+        self._size = float(comm.allreduce(np.abs(x).max(initial=0.0), op=MPI.MAX))
 
-    def check(
-        self, now: Sequence[FloatArray] | FloatArray, time: float, *, anew: bool = True
-    ) -> None:
+    def check(self, now: Sequence[FloatArray], time: float, *, anew: bool = True) -> None:
         """Raise on every rank where two conditions prescribe different displacements.
 
         Args:
-            now: Values of all conditions [m], shape (width,) each.
+            now: Of each condition the displacements at its positions [m].
             time: When [s].
             anew: Whether those that do not depend on time were found to be of one mind.
 
         Raises:
             UserFunctionError: They do; not tried again in smaller steps.
         """
-        if not self._places or (anew and not self._moving):
+        if not self._any or (anew and not self._moving):
             return
         problem = None
-        for (j, k, c), place in self._places.items():
-            one, other = float(now[j][c]), float(now[k][c])
-            if abs(one - other) > _ROUNDING * max(self._size, abs(one), abs(other)):
-                near = _ROUNDING * self._size
-                where = ", ".join(f"{x if abs(x) > near else 0.0:.4g}" for x in place)
-                problem = (
-                    f"bcs[{j}] and bcs[{k}] of {self._name!r}: at t={time:.6g} they prescribe "
-                    f"{one:.6g} m and {other:.6g} m along {'xyz'[c % 3]} of the node at "
-                    f"X = ({where}); leave that place or component out of one of them, or give "
-                    "both one value"
-                )
-                break
+        owner = np.full(self._width * len(self._x), -1)
+        before = np.zeros(len(owner))
+        for k, (dofs, new) in enumerate(zip(self._dofs, now, strict=True)):
+            old = before[dofs]
+            limit = _ROUNDING * np.maximum(self._size, np.maximum(np.abs(old), np.abs(new)))
+            apart = np.flatnonzero((owner[dofs] >= 0) & (np.abs(old - new) > limit))
+            if apart.size and problem is None:
+                i = apart[0]
+                problem = self._sentence(int(owner[dofs[i]]), k, int(dofs[i]), old[i], new[i], time)
+            owner[dofs], before[dofs] = k, new
         raise_together(self._comm, problem, UserFunctionError)
+
+    def _sentence(self, j: int, k: int, dof: int, one: float, other: float, time: float) -> str:
+        near = _ROUNDING * self._size
+        place = self._x[dof // self._width].tolist()
+        where = ", ".join(f"{x if abs(x) > near else 0.0:.4g}" for x in place)
+        return (
+            f"bcs[{j}] and bcs[{k}] of {self._name!r}: at t={time:.6g} they prescribe {one:.6g} m "
+            f"and {other:.6g} m along {'xyz'[dof % self._width % 3]} of the node at X = ({where}); "
+            "leave that place or component out of one of them, or give both one value"
+        )
 
 
 class Supports:
@@ -175,7 +232,7 @@ class Supports:
 
     Raises:
         TypeError: An item is no condition.
-        ValueError: A condition selects no facet, or has no vector at t = 0, or two of them
+        ValueError: A condition selects no facet, or has no values at t = 0, or two of them
             prescribe different values of one coordinate.
     """
 
@@ -183,49 +240,74 @@ class Supports:
         self._comm, self._name = comm, name
         self._num_owned = 3 * space.dofmap.index_map.size_local
         bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")
-        start = [self._value(k, bc.value, 0.0) for k, bc in enumerate(bcs)]
+        self._space, self._nodes = space, space.tabulate_dof_coordinates()
+        start = []
         self.masks: list[Any] = []
-        self._parts: list[tuple[VectorInTime, list[tuple[int, IntArray]]]] = []
+        self._parts: list[tuple[Any, IntArray, list[tuple[int, IntArray]]]] = []
         owner, dim = np.full(self._num_owned, -1), space.mesh.topology.dim
         for number, bc in enumerate(bcs):
             what = f"Dirichlet.where of bcs[{number}] of {name!r}"
             facets = facets_of(space.mesh, bc.where, what)
-            blocks = np.asarray(fem.locate_dofs_topological(space, dim - 1, facets))
-            self._parts.append((bc.value, []))
+            blocks = np.sort(np.asarray(fem.locate_dofs_topological(space, dim - 1, facets)))
+            owned = blocks[3 * blocks < self._num_owned]
+            self._parts.append((bc.value, owned, []))
+            try:
+                start.append(self._values(number, bc.value, owned, 0.0))
+            except UserFunctionError as error:
+                one = callable(bc.value) and not _takes_place(bc.value)
+                hint = "; it is called with the time: one that varies in space takes (x, t)"
+                raise UserFunctionError(f"{error}{hint * one}") from error.__cause__
             for component in bc.components:
                 self.masks.append(compat.subspace_component_bc(space, component, blocks))
-                dofs = np.sort(blocks * 3 + component)
-                dofs = dofs[dofs < self._num_owned]
-                self._parts[-1][1].append((component, dofs))
+                dofs = owned * 3 + component
+                self._parts[-1][2].append((component, dofs))
                 owner[dofs] = number
         self.fixed = np.flatnonzero(owner >= 0)
-        self.driven = any(callable(value) for value, _ in self._parts)
-        still = [d for value, parts in self._parts if not callable(value) for _, d in parts]
+        # What UFL has can be called, too.
+        self.driven = any(callable(value) for value, _, _ in self._parts)
+        still = [d for value, _, parts in self._parts if not callable(value) for _, d in parts]
         self.still: IntArray = np.concatenate([np.empty(0, dtype=int), *still])
         # Where two conditions meet, the later one carries the force.
         self._condition = owner[self.fixed]
-        x = space.tabulate_dof_coordinates()[: self._num_owned // 3]
-        of_each = [np.concatenate([d for _, d in parts]) for _, parts in self._parts]
+        x = self._nodes[: self._num_owned // 3]
+        of_each = [np.concatenate([d for _, d in parts]) for _, _, parts in self._parts]
         self._meetings = Meetings(comm, name, [bc.value for bc in bcs], of_each, x)
-        self._meetings.check(start, 0.0, anew=False)
+        self._meetings.check([self._at_dofs(*both) for both in enumerate(start)], 0.0, anew=False)
 
     @property
     def settings(self) -> list[Any]:
         """Of each condition value and components."""
-        return [(value, [c for c, _ in parts]) for value, parts in self._parts]
+        return [(value, [c for c, _ in parts]) for value, _, parts in self._parts]
 
-    def _value(self, k: int, value: VectorInTime, time: float) -> FloatArray:
+    def _values(self, k: int, value: Any, nodes: IntArray, time: float) -> FloatArray:
+        """Displacements of a condition at a time [m], shape (3,) or (nodes, 3). Collective."""
         what = f"Dirichlet.value of bcs[{k}] of {self._name!r}"
+        if isinstance(value, fem.Constant):
+            return np.array(value.value)
+        if isinstance(value, fem.Function):
+            return at_nodes(self._space, f"{what}={value!s}", value)[nodes]
+        if callable(value) and _takes_place(value):
+            x, at = self._nodes[nodes].T, f"{what} at t={float(time)!r}"
+            found: FloatArray = at_points(
+                self._comm, at, lambda x: value(x, time), x, (3,), error=UserFunctionError
+            )
+            return found.T
         return vector_in_time(self._comm, what, value, time, "m")
+
+    def _at_dofs(self, k: int, now: FloatArray) -> FloatArray:
+        """Displacements of a condition, (3,) or (nodes, 3), at its positions [m]."""
+        _, nodes, parts = self._parts[k]
+        of_nodes = np.broadcast_to(now, (len(nodes), 3))
+        return np.concatenate([of_nodes[:, component] for component, _ in parts])
 
     def prescribed(self, time: float) -> FloatArray:
         """Displacements at a time, in the order of `fixed` [m]. Collective."""
         values = np.zeros(self._num_owned)
-        now = [self._value(k, value, time) for k, (value, _) in enumerate(self._parts)]
-        self._meetings.check(now, time)
-        for here, (_, parts) in zip(now, self._parts, strict=True):
+        now = [self._values(k, v, n, time) for k, (v, n, _) in enumerate(self._parts)]
+        self._meetings.check([self._at_dofs(*both) for both in enumerate(now)], time)
+        for here, (_, _, parts) in zip(now, self._parts, strict=True):
             for component, dofs in parts:
-                values[dofs] = here[component]
+                values[dofs] = here[..., component]
         return values[self.fixed]
 
     def reactions(self, residual: FloatArray) -> FloatArray:

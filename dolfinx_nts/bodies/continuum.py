@@ -13,11 +13,12 @@ from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.materials import misfit, with_constants
 from dolfinx_nts.bodies.mesh_check import check_mesh
+from dolfinx_nts.bodies.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.ufl_body import UflBody
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.parallel import raise_together
@@ -26,7 +27,6 @@ from dolfinx_nts.validation import (
     items,
     known_options,
     require_name,
-    require_positive,
     vector_in_time,
 )
 
@@ -46,9 +46,12 @@ class Continuum(UflBody):
         mesh: 3D hexahedral or tetrahedral mesh.
         material: Strain energy W(C) [J/m^3]: a material of this package, an `Isotropic` of one's
             own, or any callable C -> UFL scalar.
-        density: Reference density [kg/m^3], > 0.
-        velocity: Initial velocity [m/s]: a vector, or a callable x (3, n) -> (3, n) as in DOLFINx's
-            interpolate.
+        density: Reference density [kg/m^3], > 0: a number, or a Constant or Function on the mesh.
+            What it or a parameter of the material is changed to between steps, e.g. by
+            `before_step`, holds in the next one; what that does to the energy is
+            `material_change` in the balance.
+        velocity: Initial velocity [m/s]: a vector, a callable x (3, n) -> (3, n) as in DOLFINx's
+            interpolate, or a Function of vectors on the mesh.
         displacement: Displacement [m] from the stress-free mesh in which the body starts, as
             `velocity`; prescribed coordinates start where their condition says. `equilibrium` takes
             it as its first guess, so that its ledger misses the energy stored in the guess.
@@ -71,6 +74,8 @@ class Continuum(UflBody):
         u: Displacement [m], dolfinx Function of the last accepted state.
         v: Velocity [m/s], dolfinx Function.
         space: Their function space.
+        law: W as a function of Green's strain in UFL, with Constants for numbers of the package's
+            materials.
         stressed: Stress of the undeformed body over its stiffness, and a sentence about it; None:
             it has none, or no step was made yet.
 
@@ -86,7 +91,7 @@ class Continuum(UflBody):
         mesh: Any,
         material: Callable[[Any], Any],
         *,
-        density: float,
+        density: Parameter,
         velocity: Any = (0.0, 0.0, 0.0),
         displacement: Any = (0.0, 0.0, 0.0),
         bcs: Sequence[Dirichlet] = (),
@@ -103,7 +108,7 @@ class Continuum(UflBody):
                 f"material={material!r}: pass a callable C -> W(C), "
                 "e.g. NeoHookean(young=1e6, poisson=0.3)"
             )
-        require_positive("density", density, "kg/m^3")
+        require_positive_parameter("density", density, "kg/m^3")
         for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
             default = option == "quadrature_degree" and value is None
             if not default and not (is_whole(value) and value > 0):
@@ -125,9 +130,8 @@ class Continuum(UflBody):
         self._ds = self._boundary_measure(quadrature_degree)
         self._loads_at(0.0)
         self._stand(bcs, velocity, displacement)
-        # Constants, not numbers: bodies of any density and stiffness share compiled forms.
-        self._rho = fem.Constant(self.mesh, float(self.density))
-        self._law = strain_energy(with_constants(self.material, self.mesh))
+        self._rho = self._density(density)
+        self.law = strain_energy(with_constants(material, self.mesh))
         load = self._load_in_ufl()
         (self._load_form,) = self._set_forms(self._energy() * self._dx, load)
         self._assembled_loads = np.zeros(3 * len(self._loads))
@@ -171,7 +175,7 @@ class Continuum(UflBody):
         """W of the displacement in UFL; what is wrong with it raises on every rank."""
         problem, cause, energy = None, None, None
         try:
-            energy = ufl.as_ufl(self._law(green_strain(ufl.grad(self.u))))
+            energy = ufl.as_ufl(self.law(green_strain(ufl.grad(self.u))))
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
             problem, cause = f"raised {error!r}; return a UFL scalar", error
         else:
@@ -191,7 +195,7 @@ class Continuum(UflBody):
     def _virtual_work(self, rule: Integrator, w: Any) -> Any:
         """Virtual work of the rule's stress in UFL."""
         h0, h1 = ufl.grad(self._u0), ufl.grad(self._u1)
-        return ufl.inner(rule.piola(self._law, h0, h1), ufl.grad(w)) * self._dx
+        return ufl.inner(rule.piola(self.law, h0, h1), ufl.grad(w)) * self._dx
 
     # ---- as of Body
     @property

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import ufl
-from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.mesh_check import check_any_mesh
+from dolfinx_nts.bodies.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.ufl_body import UflBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.validation import is_whole, known_options, require_positive
+from dolfinx_nts.validation import is_whole, known_options
 
 #: Part of the mass that rounding may add where two directions, or two orders of nodes, differ.
 _ROUNDING = 1e-12
@@ -52,7 +52,8 @@ class FormBody(UflBody):
         energy: Callable u -> stored energy Pi [J] as a UFL form, or of what `strain` returns.
         strain: Callable u -> what the energy depends on, a UFL expression or a tuple of them, each
             of which `energy` gets as an argument; best of degree <= 2 in u.
-        density: Mass per reference volume, area or length [kg/m^d], > 0; or
+        density: Mass per reference volume, area or length [kg/m^d], > 0: a number, or a Constant or
+            Function on the mesh, which may change between steps; or
         mass: callable (v, w) -> bilinear form [kg m/s . m/s], symmetric and positive definite, the
             same in all directions.
         velocity: Initial velocity [m/s], as of `Continuum`.
@@ -83,7 +84,7 @@ class FormBody(UflBody):
         energy: Callable[..., Any],
         *,
         strain: Callable[[Any], Any] | None = None,
-        density: float | None = None,
+        density: Parameter | None = None,
         mass: Callable[[Any, Any], Any] | None = None,
         velocity: Any = (0.0, 0.0, 0.0),
         displacement: Any = (0.0, 0.0, 0.0),
@@ -97,7 +98,7 @@ class FormBody(UflBody):
         if (density is None) == (mass is None):
             raise ValueError(f"density={density!r}, mass={mass!r}: pass one of the two")
         if density is not None:
-            require_positive("density", density, "kg/m^d")
+            require_positive_parameter("density", density, "kg/m^d")
         if quadrature_degree is not None and not (
             is_whole(quadrature_degree) and quadrature_degree > 0
         ):
@@ -113,8 +114,7 @@ class FormBody(UflBody):
         # With one point a cell could turn for nothing.
         self._of_mass = max(self._quadrature, 2 * degree)
         super().__init__(space, degree, name, extra_form, self._quadrature, allow_inversion)
-        # A Constant, not a number: bodies of any density share compiled forms.
-        self._rho = None if density is None else fem.Constant(self.mesh, float(density))
+        self._rho = None if density is None else self._density(density)
         self.rounded = self._size()
         self._potential = Potential(
             lambda *strains: self._integrated(energy(*strains), self._quadrature),

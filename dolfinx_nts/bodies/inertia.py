@@ -10,6 +10,7 @@ import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.parameters import Parameter, is_number
 from dolfinx_nts.validation import floats
 
 FloatArray = npt.NDArray[np.float64]
@@ -20,10 +21,10 @@ ROUNDED = 1e-9
 _EQUAL = 1e-9
 
 
-def measure(space: Any, density: float) -> tuple[float, FloatArray, FloatArray]:
+def measure(space: Any, density: Parameter) -> tuple[float, FloatArray, FloatArray]:
     """Mass [kg], centre [m] and Euler tensor about it [kg m^2] of a mesh. Collective."""
     mesh = space.mesh
-    rho = fem.Constant(mesh, float(density))
+    rho = fem.Constant(mesh, float(density)) if is_number(density) else density
     v, w = ufl.TrialFunction(space), ufl.TestFunction(space)
     dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
     (form,) = compat.compile_forms([rho * ufl.inner(v, w) * dx])

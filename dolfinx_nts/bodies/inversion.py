@@ -11,6 +11,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.points import of_nodes
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -47,8 +48,8 @@ class Determinants:
         self._middles = np.concatenate([middles, np.full((1, 3), np.nan)])
         self._parts = []
         for first in range(0, len(cells), _CELLS):
-            of_cell = 3 * cells[first : first + _CELLS].T
-            numbers = (of_cell[:, None] + np.arange(3)[:, None]).reshape(len(of_cell), -1)
+            of_cell = of_nodes(cells[first : first + _CELLS].T)
+            numbers = of_cell.swapaxes(1, 2).reshape(len(of_cell), -1)
             self._parts.append((numbers, 1.0 / self._det(self._reference, numbers)))
 
     def _det(self, x: FloatArray, numbers: npt.NDArray[Any]) -> FloatArray:

@@ -20,6 +20,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.points import of_nodes
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -119,7 +120,7 @@ def _parents(mass: Any, level: IntArray, x: FloatArray) -> Any:
         distance[at[:, 3] != level[r] - 1] = np.inf
         parents[r] = nodes[distance <= (1.0 + _AS_NEAR) * distance.min()]
     counts = np.repeat([len(nodes) for nodes in parents], 3)
-    cols = [3 * nodes + i for nodes in parents for i in range(3)]
+    cols = [column for nodes in parents for column in of_nodes(nodes).T]
     start = np.concatenate([[0], np.cumsum(counts)])
     columns = np.concatenate([np.empty(0, int), *cols])
     return compat.with_entries(mass, start, columns, 1.0 / np.repeat(counts, counts))

@@ -21,7 +21,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -31,20 +31,27 @@ from dolfinx import fem
 from ufl.constantvalue import RealValue
 from ufl.corealg.traversal import traverse_unique_terminals
 
+from dolfinx_nts.bodies.parameters import (
+    Parameter,
+    is_number,
+    require_finite_parameter,
+    require_parameter,
+    require_positive_parameter,
+)
 from dolfinx_nts.kernels.precise import log1p, log1p_remainder
 from dolfinx_nts.kernels.strain_energy import Isotropic
-from dolfinx_nts.validation import is_finite, known_options, require_positive
+from dolfinx_nts.validation import is_finite, known_options
 
 
-def _lame(young: float, poisson: float) -> tuple[float, float]:
+def _lame(young: Any, poisson: Any) -> tuple[Any, Any]:
     """Lame's mu and lambda [Pa]."""
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
-def _check_elastic(young: float, poisson: float) -> None:
-    require_positive("young", young, "Pa")
-    if not (is_finite(poisson) and -1 < poisson < 0.5):
-        raise ValueError(f"poisson={poisson!r}: must lie in (-1, 0.5); use e.g. 0.49 for rubber")
+def _check_elastic(young: Any, poisson: Any) -> None:
+    require_positive_parameter("young", young, "Pa")
+    wanted = "must lie in (-1, 0.5); use e.g. 0.49 for rubber"
+    require_parameter("poisson", poisson, lambda v: is_finite(v) and -1 < v < 0.5, wanted)
 
 
 def misfit(expressions: Iterable[Any], domain: Any) -> str | None:
@@ -69,15 +76,15 @@ class StVenantKirchhoff(Isotropic):
     """W = lam/2 (tr E)^2 + mu E : E with E = (C - 1)/2; for moderate strains only.
 
     Attributes:
-        young: Young's modulus [Pa], > 0.
-        poisson: Poisson's ratio [-], in (-1, 0.5).
+        young: Young's modulus [Pa], > 0; a number, or a Constant or Function on the body's mesh.
+        poisson: Poisson's ratio [-], in (-1, 0.5), likewise.
 
     Raises:
         ValueError: An argument is out of range.
     """
 
-    young: float
-    poisson: float
+    young: Parameter
+    poisson: Parameter
 
     def __post_init__(self) -> None:
         _check_elastic(self.young, self.poisson)
@@ -104,15 +111,16 @@ class NeoHookean(Isotropic):
     """W = mu/2 (tr C - 3 - ln det C) + lam/8 (ln det C)^2.
 
     Attributes:
-        young: Young's modulus at small strain [Pa], > 0.
-        poisson: Poisson's ratio at small strain [-], in (-1, 0.5).
+        young: Young's modulus at small strain [Pa], > 0; a number, or a Constant or Function on
+            the body's mesh.
+        poisson: Poisson's ratio at small strain [-], in (-1, 0.5), likewise.
 
     Raises:
         ValueError: An argument is out of range.
     """
 
-    young: float
-    poisson: float
+    young: Parameter
+    poisson: Parameter
 
     def __post_init__(self) -> None:
         _check_elastic(self.young, self.poisson)
@@ -144,9 +152,10 @@ class MooneyRivlin(Isotropic):
     This d makes the undeformed body free of stress.
 
     Attributes:
-        a: Coefficient of the first invariant [Pa], a + b > 0.
-        b: Coefficient of the second invariant [Pa].
-        c: Volumetric stiffness [Pa], > 0.
+        a: Coefficient of the first invariant [Pa], a + b > 0; a number, or a Constant or Function
+            on the body's mesh.
+        b: Coefficient of the second invariant [Pa], likewise.
+        c: Volumetric stiffness [Pa], > 0, likewise.
 
     Raises:
         ValueError: An argument is out of range.
@@ -154,18 +163,17 @@ class MooneyRivlin(Isotropic):
     Source: Simo and Tarnow (1992), the flying L-block.
     """
 
-    a: float
-    b: float
-    c: float
+    a: Parameter
+    b: Parameter
+    c: Parameter
 
     def __post_init__(self) -> None:
         for name, value in (("a", self.a), ("b", self.b)):
-            if not is_finite(value):
-                raise ValueError(f"{name}={value!r}: pass a finite number [Pa]")
-        if not self.a + self.b > 0:
+            require_finite_parameter(name, value, "Pa")
+        if is_number(self.a) and is_number(self.b) and not self.a + self.b > 0:
             shear = self.a + self.b
             raise ValueError(f"a + b={shear!r}: must be positive [Pa]: half the shear modulus")
-        require_positive("c", self.c, "Pa")
+        require_positive_parameter("c", self.c, "Pa")
 
     @cached_property
     def moduli(self) -> tuple[Any, ...]:
@@ -191,7 +199,7 @@ class MooneyRivlin(Isotropic):
 
 
 def with_constants(material: Any, mesh: Any) -> Any:
-    """A material of this package with its moduli in a Constant: all moduli share compiled forms.
+    """A material of this package with its numbers in a Constant: all moduli share compiled forms.
 
     Args:
         material: Any; others are returned as they are.
@@ -199,8 +207,16 @@ def with_constants(material: Any, mesh: Any) -> Any:
     """
     if type(material) not in (StVenantKirchhoff, NeoHookean, MooneyRivlin):
         return material
-    shared, moduli = copy.copy(material), material.moduli
-    # In one: UFL sorts several by their counts as text, and compiles again where 9 and 10 meet.
-    constants = fem.Constant(mesh, np.array(moduli, dtype=np.float64))
-    vars(shared)["moduli"] = tuple(constants[k] for k in range(len(moduli)))
+    shared = copy.copy(material)
+    given = {f.name: getattr(material, f.name) for f in fields(material)}
+    numbers = [name for name, value in given.items() if is_number(value)]
+    if len(numbers) == len(given):
+        # Moduli are made of numbers once, and of others wherever a form asks for them.
+        moduli = fem.Constant(mesh, np.array(material.moduli, dtype=np.float64))
+        vars(shared)["moduli"] = tuple(moduli[k] for k in range(len(material.moduli)))
+        return shared
+    vars(shared).pop("moduli", None)
+    if numbers:
+        constants = fem.Constant(mesh, np.array([given[n] for n in numbers], dtype=np.float64))
+        vars(shared).update({name: constants[k] for k, name in enumerate(numbers)})
     return shared

@@ -48,8 +48,15 @@ def check_mesh(mesh: Any, name: str) -> None:
         raise TypeError(f"mesh={mesh!r}: pass a dolfinx mesh")
     kind = compat.cell_name(mesh)
     if kind not in ("hexahedron", "tetrahedron") or mesh.geometry.dim != 3:
+        remedy = ""
+        if kind in ("triangle", "quadrilateral"):
+            remedy = (
+                "; for plane strain pass nts.extrude(mesh, thickness), one cell thick, and hold "
+                "both its sides in z; FormBody takes surfaces"
+            )
         raise ValueError(
             f"mesh of {name!r}: {kind} in {mesh.geometry.dim}D; pass 3D hexahedra or tetrahedra"
+            f"{remedy}"
         )
     _check_nodes(mesh, name)
     cells = compat.geometry_dofmap(mesh)
@@ -82,7 +89,8 @@ def _check_nodes(mesh: Any, name: str) -> None:
     nodes = mesh.comm.allreduce(cells.shape[1], op=MPI.MAX)
     if nodes != corners:
         raise ValueError(
-            f"mesh of {name!r}: {nodes} nodes per {kind}, not {corners}; pass a mesh of degree 1"
+            f"mesh of {name!r}: {nodes} nodes per {kind}, not {corners}; pass a mesh of degree 1, "
+            "e.g. nts.linear(mesh), which keeps its corners, or mesh with order 1 in Gmsh"
         )
     nan = np.flatnonzero(~np.isfinite(mesh.geometry.x).all(axis=1))
     text = f"mesh of {name!r}: {len(nan)} nodes are not finite, e.g. {mesh.geometry.x[nan[:1]]}"

@@ -8,43 +8,38 @@ Every body gets a mesh of its own, built anew from the cells of its volume:
 - nodes are numbered by their order in the input, so `mesh.geometry.input_global_indices`, and with
   it every contact surface, does not depend on the number of ranks.
 
-The input passes through rank 0. Gmsh is imported when a Gmsh input is read, on rank 0 alone.
+The input passes through rank 0.
 """
 
 from __future__ import annotations
 
-import importlib
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.continuum import Continuum
+from dolfinx_nts.bodies.gmsh_input import Input, Volume, listed, read_gmsh
+from dolfinx_nts.bodies.parameters import Parameter
 from dolfinx_nts.bodies.rigid import RigidBody
 from dolfinx_nts.parallel import on_root
 from dolfinx_nts.validation import is_whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
-T = TypeVar("T")
 
-#: Gmsh element type -> cell name, DOLFINx vertex k = Gmsh vertex order[k].
-_GMSH_CELLS = {4: ("tetrahedron", [0, 1, 2, 3]), 5: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
-#: Gmsh element types of facets -> their corners.
-_GMSH_FACETS = {2: 3, 3: 4}
 _CORNERS = {"tetrahedron": 4, "hexahedron": 8}
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The mesh of one body, with the tags of its facets.
+    """The mesh of one body, with the tags of its cells and facets.
 
     Attributes:
         name: Name of the volume.
@@ -52,12 +47,16 @@ class Part:
         facet_tags: dolfinx meshtags of its tagged facets, interior ones included.
         surfaces: Name of a surface -> its tag, for the named surfaces of the input that this body
             has facets of.
+        cell_tags: dolfinx meshtags of its cells: their tags in the input.
+        regions: Name of a volume of the input -> its tag, for the named ones in this body.
     """
 
     name: str
     mesh: Any
     facet_tags: Any
     surfaces: Mapping[str, int]
+    cell_tags: Any
+    regions: Mapping[str, int]
 
     def where(self, surface: str | int) -> tuple[Any, int]:
         """A tagged surface, as `Dirichlet`, `Traction` and (with *) `Continuum.surface` take it.
@@ -76,28 +75,58 @@ class Part:
         # of the tags, who asks all ranks.
         if not is_whole(tag):
             raise ValueError(
-                f"surface={surface!r}: body {self.name!r} has {_listed(self.surfaces)}; "
+                f"surface={surface!r}: body {self.name!r} has {listed(self.surfaces)}; "
                 "pass one of these names, or a tag"
             )
         return self.facet_tags, int(tag)
 
+    def by_region(self, values: Mapping[str | int, float]) -> Any:
+        """A parameter that differs between the volumes of this body. Collective.
+
+            young = part.by_region({"rubber": 1e6, "belt": 1e9})  # [Pa]
+            tyre = part.continuum(nts.NeoHookean(young, 0.4), density=1.1e3)
+
+        Args:
+            values: By name or tag of each volume, the same on all ranks.
+
+        Returns:
+            dolfinx Function of degree 0, as parameters of materials and densities may be.
+
+        Raises:
+            ValueError: A volume has no value, or is not in the body.
+        """
+        here = self.cell_tags.values
+        tags = sorted(set().union(*self.mesh.comm.allgather(set(here.tolist()))))
+        known = {self.regions.get(k, k) if isinstance(k, str) else k: k for k in values}
+        names = {tag: name for name, tag in self.regions.items()}
+        wanted = listed(names.get(tag, tag) for tag in tags)
+        if set(known) != set(tags):
+            raise ValueError(
+                f"values={dict(values)!r}: body {self.name!r} is made of {wanted}; pass a value "
+                "for each of them and for nothing else"
+            )
+        found = fem.Function(compat.scalar_space(self.mesh, "DG", 0))
+        dofs = compat.cell_dofs(found.function_space)[self.cell_tags.indices, 0]
+        found.x.array[dofs] = [values[known[tag]] for tag in here.tolist()]
+        return found
+
     def continuum(
-        self, material: Callable[[Any], Any], *, density: float, **options: Any
+        self, material: Callable[[Any], Any], *, density: Parameter, **options: Any
     ) -> Continuum:
         """The flexible body on this mesh, under this name.
 
         Args:
             material: Strain energy W(C) [J/m^3].
-            density: Reference density [kg/m^3].
+            density: Reference density [kg/m^3], as of `Continuum`.
             **options: Further arguments of `Continuum`.
         """
         return Continuum(self.mesh, material, density=density, **{"name": self.name, **options})
 
-    def rigid(self, *, density: float, **options: Any) -> RigidBody:
+    def rigid(self, *, density: Parameter, **options: Any) -> RigidBody:
         """The rigid body on this mesh, under this name.
 
         Args:
-            density: [kg/m^3].
+            density: [kg/m^3], as of `RigidBody`.
             **options: Further arguments of `RigidBody`.
         """
         return RigidBody(self.mesh, density=density, **{"name": self.name, **options})
@@ -107,45 +136,13 @@ class Parts(dict[str, Part]):
     """Name of a volume -> its part; an unknown name is answered with the known ones."""
 
     def __missing__(self, name: str) -> Part:
-        raise KeyError(f"no body {name!r} in this mesh; it has {_listed(self)}")
+        raise KeyError(f"no body {name!r} in this mesh; it has {listed(self)}")
 
 
-class _Volume(NamedTuple):
-    """One body of the input.
-
-    Attributes:
-        name: Its name.
-        kind: DOLFINx cell name.
-        cells: Input node numbers in DOLFINx order, shape (m, corners).
-        facets: Tagged facets by input node numbers, any order, shape (k, facet corners).
-        tags: Tags of the facets, shape (k,).
-    """
-
-    name: str
-    kind: str
-    cells: IntArray
-    facets: IntArray
-    tags: IntArray
-
-
-class _Input(NamedTuple):
-    """All bodies of an input.
-
-    Attributes:
-        nodes: Input numbers of the nodes, ascending, shape (n,).
-        x: Their positions [m], shape (n, 3).
-        volumes: The bodies.
-        surfaces: Name of a surface -> tag.
-    """
-
-    nodes: IntArray
-    x: FloatArray
-    volumes: list[_Volume]
-    surfaces: dict[str, int]
-
-
-def bodies_from_gmsh(file_or_model: Any, comm: Any) -> Parts:
-    """One mesh per physical volume of a Gmsh file or model.
+def bodies_from_gmsh(
+    file_or_model: Any, comm: Any, *, bodies: Mapping[str, Sequence[str]] | None = None
+) -> Parts:
+    """One mesh per physical volume of a Gmsh file or model, or of several of them.
 
     Physical surfaces become facet tags of every body that has facets of them, so an interface of
     two volumes is a surface of both.
@@ -154,19 +151,31 @@ def bodies_from_gmsh(file_or_model: Any, comm: Any) -> Parts:
         file_or_model: Path of a .msh file (or of anything with a mesh that Gmsh opens), or a live
             `gmsh.model` with a mesh. Only rank 0's value is looked at; others may pass None.
         comm: MPI communicator of the bodies; every rank must call this.
+        bodies: Name of a body -> names of the volumes that it is made of, whose cells stay
+            connected and keep their tags, see `Part.by_region`. Other volumes are bodies of their
+            own.
 
     Returns:
         Physical name of a volume ("volume_<tag>" if it has none) -> Part.
 
     Raises:
         ImportError: There is no Gmsh on rank 0.
-        TypeError: `comm` is no communicator.
-        ValueError: No such file or no physical volume; a volume is not all hexahedra or all
-            tetrahedra of degree 1, or has no mesh; physical groups overlap. Raised on every rank.
+        TypeError: `comm` is no communicator, or `bodies` no dict of sequences.
+        ValueError: `bodies` names an unknown volume, or one twice; no such file or no physical
+            volume; a volume is not all hexahedra or all tetrahedra of degree 1, or has no mesh;
+            physical groups overlap. Raised on every rank.
     """
     if not isinstance(comm, MPI.Comm):
         raise TypeError(f"comm={comm!r}: pass an MPI communicator, e.g. MPI.COMM_WORLD")
-    return _parts(comm, on_root(comm, lambda: _read_gmsh(file_or_model)))
+    if not isinstance(bodies, Mapping | None) or any(
+        isinstance(names, str) or not isinstance(names, Sequence)
+        for names in (bodies or {}).values()
+    ):
+        raise TypeError(
+            f"bodies={bodies!r}: pass a dict of names of bodies and of their volumes, e.g. "
+            "{'tyre': ('rubber', 'belt')}"
+        )
+    return _parts(comm, on_root(comm, lambda: _united(read_gmsh(file_or_model), bodies or {})))
 
 
 def bodies_from_tags(
@@ -174,7 +183,7 @@ def bodies_from_tags(
     cell_tags: Any,
     facet_tags: Any = None,
     *,
-    names: Mapping[str, int] | None = None,
+    names: Mapping[str, int | Sequence[int]] | None = None,
     surfaces: Mapping[str, int] | None = None,
 ) -> Parts:
     """One mesh per cell tag of a DOLFINx mesh.
@@ -183,8 +192,9 @@ def bodies_from_tags(
         mesh: 3D hexahedral or tetrahedral mesh of degree 1.
         cell_tags: dolfinx meshtags; each value is a body, cells without one belong to none.
         facet_tags: dolfinx meshtags of facets; a facet between two bodies becomes one of each.
-        names: Name of a body -> its cell tag; only these are made. By default every tag is, under
-            the name "volume_<tag>".
+        names: Name of a body -> its cell tag, or several, which its cells keep, see
+            `Part.by_region`; only these are made. By default every tag is a body, under the name
+            "volume_<tag>".
         surfaces: Name of a surface -> its facet tag, for `Part.where`.
 
     Returns:
@@ -216,7 +226,7 @@ def bodies_from_tags(
     return _parts(mesh.comm, on_root(mesh.comm, lambda: _merge(kind, gathered, bodies, named)))
 
 
-def _parts(comm: Any, data: _Input | None) -> Parts:
+def _parts(comm: Any, data: Input | None) -> Parts:
     """Distribute the bodies that rank 0 holds."""
     names = comm.bcast(None if data is None else [v.name for v in data.volumes])
     surfaces = comm.bcast(None if data is None else data.surfaces)
@@ -226,8 +236,36 @@ def _parts(comm: Any, data: _Input | None) -> Parts:
     return parts
 
 
-def _body(data: _Input, index: int) -> tuple[str, IntArray, FloatArray, IntArray, IntArray]:
-    """Cell name, cells, positions, facets and tags of a body in its own node numbers."""
+def _united(data: Input, bodies: Mapping[str, Sequence[str]]) -> Input:
+    """The input with some of its volumes in one body; on rank 0."""
+    left, made = {v.name: v for v in data.volumes}, []
+    for body, names in bodies.items():
+        parts = []
+        for name in names:
+            if name not in left:
+                raise ValueError(
+                    f"bodies[{body!r}]={list(names)!r}: {name!r} is no volume that is left; there "
+                    f"are {listed(left)}"
+                )
+            parts.append(left.pop(name))
+        kinds = {part.kind for part in parts}
+        if len(kinds) != 1:
+            raise ValueError(
+                f"bodies[{body!r}]={list(names)!r}: has cells of {len(kinds)} kinds; pass volumes "
+                "of hexahedra only, or of tetrahedra only"
+            )
+        cells, regions = (
+            np.concatenate([getattr(p, which) for p in parts]) for which in ("cells", "regions")
+        )
+        known = {name: tag for part in parts for name, tag in part.names.items()}
+        made.append(parts[0]._replace(name=body, cells=cells, regions=regions, names=known))
+    if shared := [v.name for v in made if v.name in left]:
+        raise ValueError(f"bodies[{shared[0]!r}]: there is a volume of this name, too; rename it")
+    return data._replace(volumes=[*made, *left.values()])
+
+
+def _body(data: Input, index: int) -> tuple[Any, ...]:
+    """Cell name, cells, positions, facets, tags, regions, names of a body in its node numbers."""
     volume = data.volumes[index]
     nodes = np.unique(volume.cells)
     facets = volume.facets
@@ -238,12 +276,15 @@ def _body(data: _Input, index: int) -> tuple[str, IntArray, FloatArray, IntArray
         data.x[np.searchsorted(data.nodes, nodes)],
         np.sort(np.searchsorted(nodes, facets[inside]), axis=1),
         volume.tags[inside],
+        volume.regions,
+        volume.names,
     )
 
 
 def _part(comm: Any, name: str, body: Any, surfaces: Mapping[str, int]) -> Part:
-    """Mesh and facet tags of one body whose arrays rank 0 holds."""
-    kind, facets, tags = comm.bcast(None if body is None else (body[0], *body[3:]))
+    """Mesh and tags of one body whose arrays rank 0 holds."""
+    shared = comm.bcast(None if body is None else (body[0], *body[3:]))
+    kind, facets, tags, regions, names = shared
     if body is None:
         cells, x = np.empty((0, _CORNERS[kind]), np.int64), np.empty((0, 3))
     else:
@@ -254,7 +295,11 @@ def _part(comm: Any, name: str, body: Any, surfaces: Mapping[str, int]) -> Part:
     found, values = _find_facets(mesh, facets, tags)
     known = set(comm.allreduce(np.unique(values).tolist()))
     here = {surface: tag for surface, tag in surfaces.items() if tag in known}
-    return Part(name, mesh, dolfinx_mesh.meshtags(mesh, 2, found, values), here)
+    facet_tags = dolfinx_mesh.meshtags(mesh, 2, found, values)
+    original = np.asarray(mesh.topology.original_cell_index, dtype=np.int64)
+    every = np.arange(len(original), dtype=np.int32)
+    cell_tags = dolfinx_mesh.meshtags(mesh, 3, every, regions[original].astype(np.int32))
+    return Part(name, mesh, facet_tags, here, cell_tags, names)
 
 
 def _find_facets(mesh: Any, facets: IntArray, tags: IntArray) -> tuple[IntArray, IntArray]:
@@ -301,8 +346,8 @@ def _tagged_facets(mesh: Any, facet_tags: Any) -> tuple[IntArray, IntArray]:
 
 
 def _merge(
-    kind: str, gathered: list[Any], names: dict[str, int], surfaces: dict[str, int]
-) -> _Input:
+    kind: str, gathered: list[Any], names: dict[str, Any], surfaces: dict[str, int]
+) -> Input:
     """The input from the tagged cells and facets of all ranks; on rank 0."""
     tags, cells, x, values, facets = (_joined(tables) for tables in zip(*gathered, strict=True))
     if not len(tags):
@@ -314,154 +359,22 @@ def _merge(
     tags, cells, x = tags[order], cells[order], x[order]
     names = names or {f"volume_{tag}": int(tag) for tag in np.unique(tags)}
     for what, mapping, known in (("names", names, tags), ("surfaces", surfaces, values)):
-        for name, tag in mapping.items():
-            if tag not in known:
-                present = _listed(np.unique(known).tolist())
-                raise ValueError(f"{what}[{name!r}]={tag!r}: no such tag; the mesh has {present}")
+        for name, given in mapping.items():
+            group: list[Any] = [given]
+            if what == "names" and isinstance(given, Sequence) and not isinstance(given, str):
+                group = list(given)
+            if not group or any(tag not in known for tag in group):
+                present = listed(np.unique(known).tolist())
+                raise ValueError(f"{what}[{name!r}]={given!r}: no such tag; the mesh has {present}")
     nodes, first = np.unique(cells, return_index=True)
-    volumes = [_Volume(n, kind, cells[tags == tag], facets, values) for n, tag in names.items()]
-    return _Input(nodes, x.reshape(-1, 3)[first], volumes, surfaces)
+    volumes = []
+    for name, given in names.items():
+        own = np.isin(tags, given)
+        volumes.append(Volume(name, kind, cells[own], facets, values, tags[own], {}))
+    return Input(nodes, x.reshape(-1, 3)[first], volumes, surfaces)
 
 
 def _joined(tables: Iterable[npt.NDArray[Any]]) -> npt.NDArray[Any]:
     """Rows of all ranks; ranks without rows may not know how wide they are."""
     tables = list(tables)
     return np.concatenate([t for t in tables if len(t)] or tables[:1])
-
-
-# ---- Gmsh
-def _read_gmsh(file_or_model: Any) -> _Input:
-    """The input from a file or a live model; on rank 0."""
-    try:
-        gmsh = importlib.import_module("gmsh")
-    except ImportError as error:
-        raise ImportError(
-            f"Gmsh input needs the module gmsh ({error}); on Debian: apt install python3-gmsh"
-        ) from None
-    if not isinstance(file_or_model, str | os.PathLike):
-        if not hasattr(file_or_model, "getPhysicalGroups"):
-            raise ValueError(f"file_or_model={file_or_model!r}: pass a path or gmsh.model")
-        return _read_model(file_or_model, "this model")
-    path = os.fspath(file_or_model)
-    if not os.path.isfile(path):
-        raise ValueError(f"file_or_model={path!r}: no such file in {os.getcwd()}")
-    with _opened(gmsh, path) as model:
-        return _read_model(model, path)
-
-
-@contextmanager
-def _opened(gmsh: Any, path: str) -> Iterator[Any]:
-    """The model in a file; the caller's own Gmsh session, if there is one, is left as it was."""
-    running = _is_running(gmsh)
-    if not running:
-        gmsh.initialize(readConfigFiles=False)
-    current = gmsh.model.getCurrent()
-    verbosity = gmsh.option.getNumber("General.Verbosity")
-    gmsh.option.setNumber("General.Verbosity", 0)
-    gmsh.model.add("dolfinx_nts input")
-    try:
-        try:
-            gmsh.merge(path)
-        except Exception as error:
-            raise ValueError(f"file_or_model={path!r}: Gmsh cannot read it ({error})") from None
-        yield gmsh.model
-    finally:
-        gmsh.model.remove()
-        gmsh.option.setNumber("General.Verbosity", verbosity)
-        if running:
-            gmsh.model.setCurrent(current)
-        elif hasattr(gmsh, "isInitialized"):
-            gmsh.finalize()
-
-
-def _is_running(gmsh: Any) -> bool:
-    """Return whether Gmsh is initialised."""
-    if hasattr(gmsh, "isInitialized"):
-        return bool(gmsh.isInitialized())
-    # 4.8 must be probed: an initialised one has a model. A finalised one prints errors when probed,
-    # so on 4.8 a session begun here is left open.
-    try:
-        return bool(gmsh.model.list())
-    except Exception:
-        return False
-
-
-def _read_model(model: Any, source: str) -> _Input:
-    """Physical volumes and surfaces of a model's mesh."""
-    groups = model.getPhysicalGroups(3)
-    if not groups:
-        raise ValueError(
-            f"file_or_model: no physical volume in {source}; make one per body with "
-            "gmsh.model.addPhysicalGroup(3, volumes)"
-        )
-    nodes, x, _ = model.mesh.getNodes()
-    nodes, first = np.unique(np.asarray(nodes, np.int64), return_index=True)
-    surfaces, facets, tags = _read_surfaces(model)
-    volumes = [_read_volume(model, tag, facets, tags) for _, tag in groups]
-    names = [v.name for v in volumes]
-    if len(set(names)) < len(names):
-        raise ValueError(f"file_or_model: the physical volumes {names} of {source} share a name")
-    entities = [e for _, tag in groups for e in model.getEntitiesForPhysicalGroup(3, tag)]
-    if len(set(entities)) < len(entities):
-        raise ValueError(
-            f"file_or_model: physical volumes {names} of {source} overlap; a cell has one body"
-        )
-    return _Input(nodes, np.asarray(x).reshape(-1, 3)[first], volumes, surfaces)
-
-
-def _elements(model: Any, dim: int, tag: int) -> dict[int, IntArray]:
-    """Element type -> node numbers, shape (m, nodes), of a physical group."""
-    found: dict[int, list[IntArray]] = {}
-    for entity in model.getEntitiesForPhysicalGroup(dim, tag):
-        types, numbers, nodes = model.mesh.getElements(dim, entity)
-        for kind, n, table in zip(types, numbers, nodes, strict=True):
-            found.setdefault(int(kind), []).append(np.asarray(table, np.int64).reshape(len(n), -1))
-    return {kind: np.concatenate(tables) for kind, tables in found.items()}
-
-
-def _read_volume(
-    model: Any, tag: int, facets: dict[int, IntArray], tags: dict[int, IntArray]
-) -> _Volume:
-    """Cells of a physical volume, with all tagged facets of its shape."""
-    name = model.getPhysicalName(3, tag) or f"volume_{tag}"
-    elements = _elements(model, 3, tag)
-    if len(elements) != 1 or not set(elements) <= set(_GMSH_CELLS):
-        kinds = [model.mesh.getElementProperties(kind)[0] for kind in elements]
-        raise ValueError(
-            f"file_or_model: physical volume {name!r} holds {_listed(kinds)}; it must be meshed "
-            "with hexahedra or with tetrahedra only, of degree 1"
-        )
-    ((number, cells),) = elements.items()
-    kind, order = _GMSH_CELLS[number]
-    corners = 4 if kind == "hexahedron" else 3
-    return _Volume(name, kind, cells[:, order], facets[corners], tags[corners])
-
-
-def _read_surfaces(
-    model: Any,
-) -> tuple[dict[str, int], dict[int, IntArray], dict[int, IntArray]]:
-    """Names of the physical surfaces, and their facets and tags by number of corners."""
-    surfaces: dict[str, int] = {}
-    owner: dict[int, int] = {}
-    facets = {n: [np.empty((0, n), np.int64)] for n in _GMSH_FACETS.values()}
-    tags = {n: [np.empty(0, np.int32)] for n in _GMSH_FACETS.values()}
-    for _, tag in model.getPhysicalGroups(2):
-        name = model.getPhysicalName(2, tag)
-        if name:
-            surfaces[name] = int(tag)
-        for entity in model.getEntitiesForPhysicalGroup(2, tag):
-            if owner.setdefault(entity, tag) != tag:
-                raise ValueError(
-                    f"file_or_model: physical surfaces {owner[entity]} and {tag} overlap; a facet "
-                    "has one tag, so make them disjoint"
-                )
-        for kind, table in _elements(model, 2, tag).items():
-            if kind in _GMSH_FACETS:
-                facets[_GMSH_FACETS[kind]].append(table)
-                tags[_GMSH_FACETS[kind]].append(np.full(len(table), tag, np.int32))
-    join = {n: np.concatenate(tables) for n, tables in facets.items()}
-    return surfaces, join, {n: np.concatenate(values) for n, values in tags.items()}
-
-
-def _listed(names: Iterable[Any]) -> str:
-    return ", ".join(repr(name) for name in names) or "none"

@@ -1,15 +1,13 @@
-"""Cross-sections of beams, what holds their nodes, and forces on them."""
+"""Cross-sections of beams."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.conditions import VectorInTime
 from dolfinx_nts.validation import floats, is_finite, known_options, require_positive
 
 FloatArray = npt.NDArray[np.float64]
@@ -27,9 +25,11 @@ class Section:
         EI: Against bending about 1 and 2 [N m^2].
         rhoA: Mass per length [kg/m].
         rhoI: Moments of inertia per length about 1 and 2, int rho x_2^2 and int rho x_1^2 [kg m].
+        outline: For contact and pictures, corners (x_1, x_2) of a polygon about the axis [m],
+            counter-clockwise, an even number, at least 6; empty: none.
 
     Raises:
-        ValueError: A value is not positive and finite.
+        ValueError: A value is not positive and finite, or the outline is no such polygon.
     """
 
     EA: float
@@ -38,8 +38,10 @@ class Section:
     EI: Sequence[float]
     rhoA: float
     rhoI: Sequence[float]
+    outline: Sequence[Sequence[float]] = ()
 
     def __post_init__(self) -> None:
+        _check_outline(self.outline)
         for name, unit in (("EA", "N"), ("GJ", "N m^2"), ("rhoA", "kg/m")):
             require_positive(name, getattr(self, name), unit)
         for name, unit in (("GA", "N"), ("EI", "N m^2"), ("rhoI", "kg m")):
@@ -66,6 +68,21 @@ class Section:
         """Per length, of the place and of the directors times `radius` [kg/m], shape (4,)."""
         square = self.radius**2
         return np.array([self.rhoA, self.rhoI[1] / square, self.rhoI[0] / square, 0.0])
+
+
+def _check_outline(outline: Sequence[Sequence[float]]) -> None:
+    corners = floats(outline)
+    if not corners.size and np.iterable(outline):
+        return
+    good = corners.ndim == 2 and corners.shape[1] == 2 and len(corners) in range(6, 1000, 2)
+    if good and np.isfinite(corners).all():
+        x, y = corners.T
+        good = bool((x * np.roll(y, -1) - y * np.roll(x, -1) > 0.0).all())
+    if not good:
+        raise ValueError(
+            f"outline={outline!r}: pass corners (x_1, x_2) [m] that run counter-clockwise around "
+            "the axis, an even number of at least 6"
+        )
 
 
 @known_options
@@ -101,8 +118,10 @@ class Circle:
         _check(young, poisson, density)
         bending = 0.25 * np.pi * self.radius**4
         shear = 6 * (1 + poisson) / (7 + 6 * poisson)
+        angle = np.pi / 6 * np.arange(12)
+        outline = self.radius * np.column_stack([np.cos(angle), np.sin(angle)])
         return _section(np.pi * self.radius**2, (bending, bending), 2 * bending, shear,
-                        young, poisson, density)  # fmt: skip
+                        young, poisson, density, outline)  # fmt: skip
 
 
 @known_options
@@ -146,8 +165,12 @@ class Rectangle:
         series = (np.tanh(0.5 * np.pi * odd * long / short) / odd**5).sum()
         twist = long * short**3 / 3 * (1 - 192 / np.pi**5 * short / long * series)
         shear = 10 * (1 + poisson) / (12 + 11 * poisson)
+        # Every second corner lies in the middle of a side.
+        outline = 0.5 * np.array([b, h]) * np.array(
+            [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]]
+        )
         return _section(b * h, (b * h**3 / 12, h * b**3 / 12), twist, shear,
-                        young, poisson, density)  # fmt: skip
+                        young, poisson, density, outline)  # fmt: skip
 
 
 def _check(young: float, poisson: float, density: float) -> None:
@@ -159,7 +182,7 @@ def _check(young: float, poisson: float, density: float) -> None:
 
 def _section(
     area: float, second: tuple[float, float], twist: float, shear: float,
-    young: float, poisson: float, density: float,
+    young: float, poisson: float, density: float, outline: FloatArray,
 ) -> Section:  # fmt: skip
     """A section of one material.
 
@@ -171,6 +194,7 @@ def _section(
         young: Young's modulus [Pa].
         poisson: Poisson's ratio.
         density: [kg/m^3].
+        outline: [m], shape (k, 2).
     """
     modulus = young / (2 * (1 + poisson))
     return Section(
@@ -180,45 +204,5 @@ def _section(
         EI=(young * second[0], young * second[1]),
         rhoA=density * area,
         rhoI=(density * second[0], density * second[1]),
+        outline=tuple(map(tuple, outline.tolist())),
     )
-
-
-@known_options
-@dataclass(frozen=True)
-class Clamp:
-    """Nodes of a beam that neither move nor turn.
-
-    Attributes:
-        where: Function x (3, n) -> bool (n,).
-    """
-
-    where: Any
-
-
-@known_options
-@dataclass(frozen=True)
-class PointForce:
-    """Dead force on a node of a beam.
-
-    Attributes:
-        where: Function x (3, n) -> bool (n,) that is true at one node.
-        value: [N]: a vector, or a function of time.
-    """
-
-    where: Any
-    value: VectorInTime
-
-
-@known_options
-@dataclass(frozen=True)
-class LineForce:
-    """Dead force per length of a beam's reference.
-
-    Attributes:
-        value: [N/m]: a vector, or a function of time.
-        where: Function x (3, n) -> bool (n,): it acts between neighbours for which it is true;
-            None: everywhere.
-    """
-
-    value: VectorInTime
-    where: Any = None

@@ -12,21 +12,30 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.body import Body, Moment
-from dolfinx_nts.bodies.conditions import Dirichlet, Supports
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.conditions import Dirichlet, Supports, at_nodes
 from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.mesh_check import places_of
-from dolfinx_nts.bodies.points import Points, in_mesh
-from dolfinx_nts.contact.surfaces import Surface, locate_facets
+from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
+from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import gather_on_root, raise_together
-from dolfinx_nts.validation import at_points, require_bool, require_name, vector, vectors
+from dolfinx_nts.points import Points, in_mesh
+from dolfinx_nts.validation import (
+    UserFunctionError,
+    at_points,
+    require_bool,
+    require_name,
+    vector,
+    vectors,
+)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -153,10 +162,11 @@ class UflBody(Body):
             )
         if self.degree != 1:
             raise ValueError(
-                f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1"
+                f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1; "
+                "pass degree=1, on a finer mesh for the same accuracy"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
-        surface = Surface(self, found, smoothing)
+        surface = Surface(self, skin_of_mesh(self, found), smoothing)
         if mass == "redistributed":
             self._make_massless(surface)
         return surface
@@ -245,40 +255,65 @@ class UflBody(Body):
             )
 
     def _interpolate(self, function: Any, name: str, given: Any, unit: str) -> None:
-        """Fill a Function from a vector or a callable x (3, n) -> (3, n)."""
+        """Fill a Function from another, a vector or a callable x (3, n) -> (3, n)."""
         values = function.x.array
-        if callable(given):
+        if isinstance(given, fem.Function) and given.ufl_shape == (3,):
+            what = f"{name}={given!s} of {self.name!r}"
+            values[:] = at_nodes(self.space, what, given).ravel()
+        elif callable(given) and not hasattr(given, "ufl_shape"):
             # The nodes of Lagrange elements are their interpolation points.
             x = self.space.tabulate_dof_coordinates().T
             found = at_points(self.comm, f"{name} of {self.name!r}", given, x, (3,))
             values[:] = found.T.ravel()
         else:
-            constant = vector(name, given, unit, or_else="a callable x (3, n) -> (3, n)")
+            else_ = "a callable x (3, n) -> (3, n), or a Function of vectors"
+            constant = vector(name, given, unit, or_else=else_)
             values[:] = np.tile(constant, len(values) // 3)
 
     def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
         """Compile mass and energy in UFL and any loads, which are returned."""
-        integrands = [part.integrand() for part in energy.integrals()]
-        self._parameters = [
-            t
-            for t in dict.fromkeys(t for i in integrands for t in traverse_unique_terminals(i))
-            if isinstance(t, fem.Constant | fem.Function) and t is not self.u
-        ]
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+        mass = self._mass_form(v, w)
+        of_energy, of_mass = (
+            in_expressions((part.integrand() for part in form.integrals()), [self.u])
+            for form in (energy, mass)
+        )
+        self._mass_parameters = of_mass
+        self._parameters = [*of_energy, *of_mass]
         if self._extra_form is not None:
             self._check_extra_form(self._extra_form, w)
-        mass, *compiled, self._energy_form = compat.compile_forms(
-            [self._mass_form(v, w), *loads, energy]
+        self._mass_compiled, *compiled, self._energy_form = compat.compile_forms(
+            [mass, *loads, energy]
         )
-        full = compat.create_matrix(mass)
-        compat.assemble_matrix(full, mass, (), 0.0)
+        self._load = np.zeros(self.num_owned)
+        self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
+        self._make_mass()
+        return compiled
+
+    def _make_mass(self) -> None:
+        """Assemble the mass matrix. Collective."""
+        full = compat.create_matrix(self._mass_compiled)
+        compat.assemble_matrix(full, self._mass_compiled, (), 0.0)
+        if self._mass is not None:
+            self._mass.destroy()
         # Directions do not mix: two of three entries of the blocks are zero.
         self._mass = compat.without_zeros(full)
         full.destroy()
-        self._load = np.zeros(self.num_owned)
-        self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
         self.nodal_mass = self.inertia(np.ones(self.num_owned))
-        return compiled
+        self._mass_values = values_of(self._mass_parameters)
+
+    def _density(self, density: Any) -> Any:
+        """A density as the forms take it: bodies of any number share compiled forms.
+
+        Raises:
+            ValueError: It is on another mesh.
+        """
+        if is_number(density):
+            return fem.Constant(self.mesh, float(density))
+        problem = misfit([density], self.mesh.ufl_domain())
+        if problem:
+            raise ValueError(f"density={density!s} of {self.name!r}: {problem}")
+        return density
 
     def _check_extra_form(self, extra_form: ExtraForm, w: Any) -> None:
         # Sums, as those that it will be given.
@@ -356,7 +391,7 @@ class UflBody(Body):
     # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n."""
-        self._rule, self._forms = rule, self._compile(rule)
+        self._forms = self._compile(rule)
         self._fill(self._u0, moment.u0)
         if self._extra_form is not None:
             self._rate.value, self._time.value = moment.rate, moment.time
@@ -390,7 +425,7 @@ class UflBody(Body):
         self.check_alive()
         diagonal = mass * self._mean(self.nodal_mass)
         if not mass:
-            diagonal = stiffness * self._mean(self.nodal_stiffness(self._rule))
+            diagonal = stiffness * self._mean(self.nodal_stiffness())
         self._fill(self._u1, u1)
         self._factors.value = mass, stiffness
         compat.assemble_matrix(self._matrix, self._forms[1], self._supports.masks, diagonal)
@@ -416,10 +451,11 @@ class UflBody(Body):
         total = self.comm.allreduce(np.array([values.sum(), self.num_owned]))
         return float(total[0] / total[1])
 
-    def nodal_stiffness(self, rule: Integrator) -> FloatArray:
-        """Mean diagonal of a rule's tangent at each node of the undeformed body [N/m]."""
+    def nodal_stiffness(self) -> FloatArray:
+        """Mean diagonal of the tangent in equilibrium at each node, without deformation [N/m]."""
         self.check_alive()
         if self._stiffness is None:
+            rule: Any = Static()
             tangent = self._compile(rule)[1]
             kept = [f.x.array.copy() for f in (self._u0, self._u1)]
             for u in (self._u0, self._u1):
@@ -434,7 +470,7 @@ class UflBody(Body):
                 u.x.array[:] = values
         return self._stiffness
 
-    def reactions(self, residual: FloatArray) -> FloatArray:
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the coordinates of each `Dirichlet` condition, this rank's part [N]."""
         return self._supports.reactions(residual)
 
@@ -469,11 +505,32 @@ class UflBody(Body):
         return {"bcs": self._supports.settings, "constants in the material": constants}
 
     def parameters(self) -> FloatArray:
-        """Values of the Constants and Functions in W(C), which a caller may change, shape (n,)."""
-        values = [
-            t.value if isinstance(t, fem.Constant) else t.x.array for t in self._parameters
-        ]
-        return np.concatenate([np.empty(0), *map(np.ravel, values)])
+        """Values of Constants and Functions in energy and mass, which a caller may change, (n,)."""
+        return values_of(self._parameters)
+
+    def take_parameters(self) -> None:
+        """Assemble the mass anew if what it is made of has changed. Collective.
+
+        Raises:
+            UserFunctionError: There is no mass left, or it has been moved between nodes.
+        """
+        if not self._mass_parameters:
+            return
+        changed = not np.array_equal(values_of(self._mass_parameters), self._mass_values)
+        if not self.comm.allreduce(changed, op=MPI.LOR):
+            return
+        if self.has_massless:
+            raise UserFunctionError(
+                f"density of {self.name!r}: has changed after mass='redistributed' of a surface "
+                "took it from its nodes; keep it, or use mass='consistent'"
+            )
+        self._make_mass()
+        total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
+        if not total > 0.0:
+            raise UserFunctionError(
+                f"density of {self.name!r}: its new values make a mass of {total:.3g} kg; it must "
+                "be positive"
+            )
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Write the accepted state into the dolfinx Functions u and v."""

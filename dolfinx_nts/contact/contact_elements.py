@@ -15,19 +15,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution
 from dolfinx_nts.contact.coulomb import Slip
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.elements import over
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.points import Points
+from dolfinx_nts.state import ContactHistory
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Changes of one node's state in a step that are no search any more.
-_CYCLE = 8
+CYCLE = 8
 _EPS = float(np.finfo(float).eps)
 
 
@@ -260,7 +260,10 @@ class ContactElements(ContactLaws):
         """Sizes that `ratios` compares: augmented rows, gaps, multipliers and scale."""
         gaps = self.rows(part, "constraints") / self.scale[:, None]
         arrays = (self.rows(part, "augmented"), gaps, part.multiplier, self.scale)
-        return [float(np.abs(a).max(initial=0.0)) for a in arrays]
+        found = [float(np.abs(a).max(initial=0.0)) for a in arrays]
+        # Rows of gaps that repeat each other miss what no motion closes, see `step.shared_weight`.
+        found[1] = max(found[1], float(np.abs(part.gap[part.active]).max(initial=0.0)))
+        return found
 
     def ratios(
         self, largest: FloatArray, motion: float, rounded: float, rtol: float
@@ -329,13 +332,43 @@ class ContactElements(ContactLaws):
         total: FloatArray = cross(x, part.force).sum(axis=0)
         return total
 
+    @property
+    def gap_row(self) -> int:
+        """Row of the gap in the residual of a pair."""
+        return self.num_coordinates + self.num_augmented
+
+    def wrenches(self, part: Contribution, x: FloatArray, on: IntArray) -> list[FloatArray]:
+        """What unit forces that open gaps at t_{n+1} do to each body, if both are rigid.
+
+        Args:
+            part: Contribution at an iterate.
+            x: Nodes at t_{n+1} [m], shape (n, k, 3).
+            on: Numbers of the pairs.
+
+        Returns:
+            Of each body force [-] and moment about its place [m], where these may move it, shape
+            (len(on), 6).
+        """
+        rows = part.tangent[on, self.gap_row, : self.num_coordinates] / self.scale[on, None]
+        y, start, found = x[on], 0, []
+        force = rows.reshape(y.shape)
+        for side in self._nodes:
+            here = slice(start, start + side.nodes.shape[1])
+            if side.fixed.any():
+                force[:, here] *= ~side.fixed[on]
+            # The first node of a rigid body is its place, the others are directors.
+            moment = cross(y[:, start + 1 : here.stop], force[:, start + 1 : here.stop])
+            found.append(np.concatenate([force[:, start], moment.sum(axis=1)], axis=1))
+            start = here.stop
+        return found
+
     def gap_slopes(self, part: Contribution) -> tuple[FloatArray, FloatArray]:
         """Derivative of active gaps at t_{n+1} by the nodes (n, coordinates), and normals (n, 3).
 
         Where a gap is closed, a change of the foot or of the normal does not change it.
         """
-        row, width = self.num_coordinates + self.num_augmented, self.num_coordinates
-        gradient: FloatArray = part.tangent[:, row, :width] / self.scale[:, None]
+        width = self.num_coordinates
+        gradient: FloatArray = part.tangent[:, self.gap_row, :width] / self.scale[:, None]
         slave = self._nodes[0]
         own = gradient[:, : 3 * slave.nodes.shape[1]].reshape(*slave.nodes.shape, 3)
         normal: FloatArray = (own * slave.places[:, :, None]).sum(axis=1)
@@ -405,11 +438,11 @@ class ContactElements(ContactLaws):
         text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
         if slide:
             text += f" and {slide} between stick and slip"
-        if max(touch, slide) >= _CYCLE:
+        if max(touch, slide) >= CYCLE:
             states = "stick and slip" if slide > touch else "contact and none"
-            text += (
-                f": it flips between {states} and settles in neither; try another dt"
-                f"{', a smaller coefficient of friction' if self.pair.friction else ''} or a finer "
-                "surface"
-            )
+            remedy = "try another dt"
+            if not self._free[i, 0].any():
+                # Several such nodes on one facet share the little that its nodes can give way.
+                remedy = "its motion is prescribed, so make its surface the master"
+            text += f": it flips between {states} and settles in neither; {remedy}"
         return float(weight[i]), text

@@ -14,11 +14,11 @@ from mpi4py import MPI
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import no_pull
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.validation import StepFailedError
 
 FloatArray = npt.NDArray[np.float64]
@@ -151,9 +151,9 @@ class ContactSearch:
         elements: ContactElements = pair.elements(found, positions, path, step)
         gap = _EPS * (elements.extent + float(max(step.length[b] for b in bodies)))
         if elements.strong:
-            # What touches as far as its coordinates tell would stick by their rounding.
+            # Else nodes whose gap is the rounding of given coordinates would stick.
             gap += _EPS * pair.given
-        # A force that is rounding of the bodies' own would stick or slip by its sign.
+        # The sign of a force that is rounding must not decide on stick or slip.
         force = step.force_rounding(bodies) if pair.friction else 0.0
         elements = replace(elements, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
         massless = self._massless[k][found.node]
@@ -203,7 +203,7 @@ class ContactSearch:
             closes = self._gap(k, c, self._step.first) < -_SURELY * reach
             return closes | (force > no_pull(self._old[k].tangential[node]))
         # What goes to and fro at the limit would change the layout in every step.
-        # Of nodes that rest all or none: whether rounding closes their gaps must not divide forces.
+        # All nodes that rest, or none: rounding of their gaps must not decide which carry forces.
         near = reach + c.rounding if c.pair.redundant else reach
         awake: BoolArray = had[node] | (c.candidates.gap < near) | (force > 0.0)
         return awake
@@ -330,7 +330,7 @@ class ContactSearch:
         """
         c, multipliers = self.elements[k], self.carried(k)
         if c.pair.redundant:
-            # Else rounding adds up over the steps in what sticking nodes hold among themselves.
+            # Else rounding adds up over steps in forces that sticking nodes exert on each other.
             multipliers[:, 1:] = 0.0
         if not self._step.integrator.inertia:
             near = _TOUCHING * c.candidates.length

@@ -218,10 +218,10 @@ class Coulomb:
     ) -> BoolArray:
         """Write the rows of lambda_T [m], the last two, behind that of the gap.
 
-        Of a pair that carries nothing yet, the bound of strong friction, and that of a rigid body,
-        is mu times the force that its depth asks for, as in the active set: with none it would have
-        to slip at first, by the slope of the bound, which is mu for all active pairs. Points of a
-        rigid body that rest would go on so, by rounding and against each other.
+        For a pair without force yet under strong friction, and for rigid bodies, the bound is mu
+        times the force that the gap asks for, as in the active set. With a bound of zero the pair
+        would have to slip at first, by the slope of the bound, which is mu for all active pairs.
+        Points of a rigid body that rest would go on so, by rounding and against each other.
 
         Args:
             x: Slave and control points at t_{n+1} [m], shape (n, control + 1, 3).

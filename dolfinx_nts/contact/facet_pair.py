@@ -45,7 +45,8 @@ class FacetPair(ContactPair, master=Surface):
 
     def _set_up(self) -> None:
         slave, master = self.slave, self.master
-        if slave.body is master.body and np.intersect1d(slave.points, master.points).size:
+        nodes = slave.material.nodes, master.material.nodes
+        if slave.body is master.body and np.intersect1d(*nodes).size:
             raise ValueError(
                 f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
                 "choose disjoint markers"
@@ -62,12 +63,12 @@ class FacetPair(ContactPair, master=Surface):
     @property
     def redundant(self) -> bool:
         """Whether more points may touch than their bodies have freedom for, as of rigid ones."""
-        return super().redundant or not self.master.material.are_nodes
+        return super().redundant or self.master.redundant
 
     @property
     def yields(self) -> bool:
         """Whether points of a surface can move against each other, as of `ContactPair`."""
-        return super().yields or self.master.material.are_nodes
+        return super().yields or not self.master.body.rigid
 
     @property
     def master_name(self) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +16,8 @@ import numpy.typing as npt
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import Slip
-from dolfinx_nts.contact.obstacles import inverse
+from dolfinx_nts.contact.obstacles import Obstacle, inverse
 from dolfinx_nts.kernels.nts_element import Gap
-
-if TYPE_CHECKING:
-    from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -35,11 +32,12 @@ class ObstacleElements(ContactElements):
     gradient is in closed form.
 
     Attributes:
+        obstacle: The master relative to the pair's origin.
         x0: Slave at t_n relative to the obstacle's motion [m], shape (n, 1, 3).
         displacement: c(t_n) and c(t_{n+1}) [m], shape (2, 3).
     """
 
-    pair: ObstaclePair
+    obstacle: Obstacle
     displacement: FloatArray
 
     @property
@@ -72,7 +70,7 @@ class ObstacleElements(ContactElements):
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves at t_{n+1}, shape (n, 1, 3)."""
-        value: FloatArray = self.pair.obstacle.gap(x[:, 0] - self.displacement[1]).value
+        value: FloatArray = self.obstacle.gap(x[:, 0] - self.displacement[1]).value
         return value
 
     def _control(self, y: FloatArray) -> FloatArray:
@@ -82,7 +80,7 @@ class ObstacleElements(ContactElements):
     @property
     def extent(self) -> float:
         """Size of the slave, the obstacle and its path [m]."""
-        extent: float = self.pair.extent + self.pair.obstacle.extent
+        extent: float = self.pair.extent + self.obstacle.extent
         return extent + float(np.abs(self.displacement).max())
 
     def external_work(self, part: Contribution) -> float:
@@ -100,7 +98,7 @@ class ObstacleElements(ContactElements):
 
     def _middle(self, x: FloatArray) -> Gap:
         """Gap and normal where the contact force acts."""
-        gap: Gap = self.pair.obstacle.gap((self.x0 + self.theta * (x - self.x0))[:, 0])
+        gap: Gap = self.obstacle.gap((self.x0 + self.theta * (x - self.x0))[:, 0])
         return gap
 
     def _normal(self, x: FloatArray) -> FloatArray:
@@ -111,7 +109,7 @@ class ObstacleElements(ContactElements):
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
         """Residual and tangent of (x, lambda_N, lambda_T) in [kg m] and [m], gap and slip."""
-        master, normal = self.pair.obstacle, multiplier[:, :1]
+        master, normal = self.obstacle, multiplier[:, :1]
         end = master.gap(x[:, 0])
         if self.direct:
             middle = self._middle(x)

@@ -80,6 +80,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
         rule = step.integrator
         return ObstacleElements(
             pair=self,
+            obstacle=self.obstacle,
             candidates=found,
             contact_gradient=rule.contact_gradient,
             condense=step.condense,

@@ -296,7 +296,7 @@ class _Round(Obstacle):
         return lowest
 
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(y_0 + y_1) / (|y_0| + |y_1|): the discrete gradient of the root of y . y."""
+        """(y_0 + y_1) / (r_0 + r_1): the discrete gradient of r, the root of y . y."""
         y0, r0, projection, side = self._radial(x0)
         y1, r1, _, _ = self._radial(x1)
         per_sum = inverse(r0 + r1)[:, None]

@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.crossings import STEPS, BodyPair, Finding, Pause
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.surfaces import Surface
@@ -33,11 +32,13 @@ class _Looked:
     Attributes:
         where: What was where, as of `where`.
         pause: Until the next look.
+        both: Whether it was one at both of the pair.
         steps: Since then.
     """
 
     where: list[FloatArray]
     pause: Pause
+    both: bool
     steps: int = 0
 
 
@@ -86,7 +87,7 @@ class OverlapWatch:
         Args:
             u: Owned displacements of all bodies [m]; kept until the next look, not to be changed.
             time: At which they are so [s].
-            last: Look again wherever anything has moved.
+            last: Look again wherever anything has moved, or was looked at from one side only.
         """
         now = [pair.where(u, time) for pair in self._pairs]
         findings: list[Finding] = []
@@ -94,9 +95,10 @@ class OverlapWatch:
             before = self._looked.get(k)
             if before and way > before.pause.clear + before.pause.through:
                 findings += self._pairs[k].passed(before.where, now[k], way, before.pause.through)
-            found, pause = self._pairs[k].look(now[k], last or k not in self._looked)
+            both = last or k not in self._looked
+            found, pause = self._pairs[k].look(now[k], both)
             findings += found
-            self._looked[k] = _Looked(now[k], pause)
+            self._looked[k] = _Looked(now[k], pause, both)
         worst: dict[str, Finding] = {}
         for f in findings:
             if f.kind not in worst or f.size > worst[f.kind].size:
@@ -131,15 +133,14 @@ class OverlapWatch:
         for (k, looked), way in zip(self._looked.items(), ways.tolist(), strict=True):
             looked.steps += 1
             enough = way > (looked.pause.least if looked.steps >= STEPS else looked.pause.most)
-            if enough or (last and way > 0.0):
+            if enough or (last and (way > 0.0 or not looked.both)):
                 due.append((k, way))
         return fresh + due
 
     def _boundary(self, k: int) -> Surface:
         """The whole boundary of a body with a mesh. Collective."""
         if k not in self._surfaces:
-            body = self._bodies[k]
-            self._surfaces[k] = Surface(body, compat.exterior_facets(body.mesh))
+            self._surfaces[k] = self._bodies[k].boundary()
         return self._surfaces[k]
 
 

@@ -146,11 +146,11 @@ class ContactPair:
     def between(cls, a: Any, b: Any, **options: Any) -> ContactPair:
         """A pair whose slave is the surface that is finer where both are near. Collective.
 
-        Master nodes may enter the slave between its nodes, the farther the fewer these are. Of
-        surfaces whose node spacings are within 10 % the softer one is the slave, of those that are
-        as stiff, too, the first one. An obstacle is always the master, and a rigid body that of
-        one that is not. All is measured in the reference, on all ranks alike; where contact moves
-        to parts that are meshed differently, choose yourself.
+        Master nodes may enter the slave between its nodes, the farther the fewer these are. If the
+        spacings of the nodes differ by less than 10 %, the softer surface is the slave; if the
+        stiffnesses do, too, the first one. An obstacle is always the master, and so is a rigid body
+        beside one that is not. All is measured in the reference, on all ranks alike; where contact
+        moves to parts that are meshed differently, choose yourself.
 
         Args:
             a: A surface, or a `Plane`, `Sphere` or `Cylinder`.
@@ -180,13 +180,13 @@ class ContactPair:
 
     @property
     def redundant(self) -> bool:
-        """Whether more points may touch than their bodies have freedom for, as of rigid ones."""
-        return not self.slave.material.are_nodes
+        """Whether more points may touch than their bodies have freedom for, see `Surface`."""
+        return self.slave.redundant
 
     @property
     def yields(self) -> bool:
         """Whether points of a surface may move against each other; rigid bodies' may not."""
-        return self.slave.material.are_nodes
+        return not self.slave.body.rigid
 
     @property
     def master_name(self) -> str:

@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.integrators import EnergyMomentum
 from dolfinx_nts.kernels import facets as facet_math
 
 FloatArray = npt.NDArray[np.float64]
@@ -56,7 +55,7 @@ def slave_and_master(a: Any, b: Any) -> tuple[Any, Any]:
         )
     if isinstance(a, Obstacle) or isinstance(b, Obstacle):
         return (b, a) if isinstance(a, Obstacle) else (a, b)
-    rigid = [not s.material.are_nodes for s in (a, b)]
+    rigid = [s.body.rigid for s in (a, b)]
     if rigid[0] != rigid[1]:
         return (b, a) if rigid[0] else (a, b)
     zones = _zones(a, b)
@@ -98,5 +97,5 @@ def _spacing(surface: Surface, zone: BoolArray) -> float:
 
 def _stiffness(surface: Surface, zone: BoolArray) -> float:
     """Mean nodal stiffness of the nodes of some facets [N/m]. Collective."""
-    values = surface.material.divided(surface.body.nodal_stiffness(EnergyMomentum()))
+    values = surface.material.divided(surface.body.nodal_stiffness())
     return float(values[np.unique(surface.facets[zone])].mean())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.contact import search
 from dolfinx_nts.kernels import facets as facet_math
 from dolfinx_nts.kernels import patches, triangle_patches
 from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import at_points, is_whole
 
 logger = logging.getLogger(__name__)
@@ -84,70 +84,117 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
     return found
 
 
+class Skin(NamedTuple):
+    """Oriented facets and the points at their corners, which every rank knows.
+
+    Attributes:
+        points: Numbers of the points in the body, ascending, those of a rank's nodes together,
+            shape (p,).
+        facets: Corners as positions in `points`, cyclic and counter-clockwise seen from outside, in
+            an order that does not depend on the partition, shape (m, nc).
+        original: Numbers that do not depend on the partition, shape (p,).
+        reference: Reference positions [m], shape (p, 3).
+        rows: Of the points at nodes of the mesh that this rank owns, in order, those nodes'
+            positions among the owned ones, shape (n,).
+        material: The points as functions of the body's coordinates.
+    """
+
+    points: IntArray
+    facets: IntArray
+    original: IntArray
+    reference: FloatArray
+    rows: IntArray
+    material: Points
+
+
+def skin_of_mesh(body: Any, local_facets: IntArray) -> Skin:
+    """Facets of a body's mesh, whose corners are nodes. Collective.
+
+    Args:
+        body: The body.
+        local_facets: This rank's owned facets.
+    """
+    mesh, space = body.mesh, body.space
+    nodes = oriented_nodes(mesh, local_facets)
+    local = compat.node_blocks(mesh, space)[nodes]
+    index_map = space.dofmap.index_map
+    corners = index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
+    # An empty rank's list would become an array of floats.
+    ids = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[nodes]
+    table = gather_rows(mesh.comm, np.stack([corners, ids], axis=-1))
+    x = gather_rows(mesh.comm, mesh.geometry.x[nodes])
+    roll, order = in_order(table[..., 1])
+    table = np.take_along_axis(table, roll[..., None], axis=1)[order]
+    x = np.take_along_axis(x, roll[..., None], axis=1)[order]
+    points, at, inverse = np.unique(table[..., 0], return_index=True, return_inverse=True)
+    reference = x.reshape(-1, 3)[at]
+    low, high = index_map.local_range
+    rows = points[(points >= low) & (points < high)] - low
+    return Skin(
+        points, inverse.reshape(table.shape[:2]), table[..., 1].ravel()[at], reference, rows,
+        body.at_nodes(points, reference),
+    )  # fmt: skip
+
+
+def in_order(ids: IntArray) -> tuple[IntArray, IntArray]:
+    """How to order facets whatever the partition, by numbers (m, nc) of their corners.
+
+    Returns:
+        Order of the corners of each facet, (m, nc), the lowest first, and of the facets, (m,).
+    """
+    first = ids.argmin(axis=1)
+    roll = (first[:, None] + np.arange(ids.shape[1])) % ids.shape[1]
+    return roll, np.lexsort(np.sort(ids, axis=1).T[::-1])
+
+
 class Surface:
-    """Oriented facets of a body's boundary. Create with `Continuum.surface`.
+    """Oriented facets of a body's boundary. Create with `body.surface`.
 
     Args:
         body: Its body.
-        local_facets: This rank's owned facets.
+        skin: The facets.
         smoothing: Whether slaves touch the smooth patches over the facets.
+        redundant: Whether more points may touch at once than the body has freedom for; None: so it
+            is where points are not nodes, as of rigid bodies.
 
     Attributes:
         body: The body it belongs to.
-        points: Global node numbers of the corner points, sorted, shape (p,).
-        facets: Corner points of the facets as positions in `points`, cyclic and counter-clockwise
-            seen from outside, shape (m, nc); the order does not depend on the partition.
+        points: As of `Skin`, and so are facets, original, reference, rows and material.
         patches: Points that each patch depends on, the corners of its facet first: one patch a
             facet, (m, nc), or with smoothing (m, 16) over quadrilaterals, and three over each
             triangle, one after another, (3 m, q).
         weights: With smoothing, the patches' control points from these points, shape (m, 16, 16) or
             (3 m, 15, q); else None, as corners and control points are the same.
-        original: Input numbers of the points, the same for every number of ranks, shape (p,).
-        reference: Reference positions [m], shape (p, 3).
         area: Tributary area of each point [m^2], shape (p,).
-        material: Its points as functions of the body's coordinates.
-        rows: Points that this rank owns among the mesh's nodes that it owns, in the order of
-            `points`, shape (n,).
         share: Positions in `points` of the nodes whose contact this rank computes, wherever their
             coordinates are: all ranks have as much to do, however the mesh is divided.
         fixed: Which coordinates of the points are prescribed, shape (p, 3).
     """
 
-    def __init__(self, body: Any, local_facets: IntArray, smoothing: bool = False) -> None:
-        mesh, space = body.mesh, body.space
-        self.body = body
-        nodes = oriented_nodes(mesh, local_facets)
-        local = compat.node_blocks(mesh, space)[nodes]
-        index_map = space.dofmap.index_map
-        corners = index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
-        # An empty rank's list would become an array of floats.
-        ids = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[nodes]
-        table = np.stack([corners, ids], axis=-1)
-        table = gather_rows(mesh.comm, table)
-        x = gather_rows(mesh.comm, mesh.geometry.x[nodes])
-        first = table[..., 1].argmin(axis=1)
-        roll = (first[:, None] + np.arange(table.shape[1])) % table.shape[1]
-        table = np.take_along_axis(table, roll[..., None], axis=1)
-        x = np.take_along_axis(x, roll[..., None], axis=1)
-        order = np.lexsort(np.sort(table[..., 1], axis=1).T[::-1])
-        table, x = table[order], x[order]
+    _redundant: bool | None = None
 
-        self.points, at, inverse = np.unique(table[..., 0], return_index=True, return_inverse=True)
-        self.facets = inverse.reshape(table.shape[:2])
-        self.original = table[..., 1].ravel()[at]
-        self.reference = x.reshape(-1, 3)[at]
+    def __init__(
+        self, body: Any, skin: Skin, smoothing: bool = False, redundant: bool | None = None
+    ) -> None:
+        self.body = body
+        (
+            self.points, self.facets, self.original, self.reference, self.rows, self.material
+        ) = skin  # fmt: skip
+        x = self.reference[self.facets]
         self.area = facet_math.tributary_areas(self.facets, x, len(self.points))
         self.patches: IntArray = self.facets
         self.weights: FloatArray | None = None
         if smoothing:
             self._smooth(x)
-        low, high = index_map.local_range
-        own = self.points[(self.points >= low) & (self.points < high)]
-        self.rows = own - low
-        self.share = np.flatnonzero(_rank_of(self.original, mesh.comm.size) == mesh.comm.rank)
-        self.material = body.at_nodes(self.points, self.reference)
+        self._redundant = redundant
+        self.share = np.flatnonzero(_rank_of(self.original, body.comm.size) == body.comm.rank)
         free = ~self.material.fixed & (self.material.weights != 0.0)[:, :, None]
         self.fixed = ~free.any(axis=1)
+
+    @property
+    def redundant(self) -> bool:
+        """Whether more points may touch at once than the body has freedom for."""
+        return not self.material.are_nodes if self._redundant is None else self._redundant
 
     def _smooth(self, corners: FloatArray) -> None:
         """Lay patches over the facets with reference corners (m, nc, 3)."""
@@ -272,23 +319,16 @@ class Surface:
         Returns:
             Shape (n,), the same on all ranks.
         """
-        mesh, space = self.body.mesh, self.body.space
-        nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
-        moved = fem.Function(space)
-        here = self.body.at_mesh(u)
-        moved.x.array[: len(here)] = here
-        moved.x.scatter_forward()
-        blocks = compat.node_blocks(mesh, space)[nodes]
-        corners = mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
+        comm, corners = self.body.comm, self.body.boundary_now(u)
         box = np.array(
             [corners.min(axis=(0, 1), initial=np.inf), -corners.max(axis=(0, 1), initial=-np.inf)]
         )
-        mesh.comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
+        comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
         near = np.flatnonzero(((x >= box[0]) & (x <= -box[1])).all(axis=1))
         closest = search.closest_facets(x[near], corners, reach=np.inf)
         distance = closest.distance / np.append(facet_math.size(corners), 1.0)[closest.facet]
         nearest = distance.copy()
-        mesh.comm.Allreduce(MPI.IN_PLACE, distance, op=MPI.MIN)
+        comm.Allreduce(MPI.IN_PLACE, distance, op=MPI.MIN)
         # Only a point behind its nearest facet can be inside, and few are; a winding number costs
         # all facets.
         behind = np.zeros(len(near), dtype=np.int32)
@@ -296,10 +336,10 @@ class Surface:
         foot, _, normal = facet_math.frame(corners[closest.facet[mine]], closest.xi[mine])
         side = np.einsum("ni,ni->n", normal, x[near][mine] - foot)
         behind[mine] = (side < 0.0) & (distance[mine] > 1e-3)
-        mesh.comm.Allreduce(MPI.IN_PLACE, behind, op=MPI.MAX)
+        comm.Allreduce(MPI.IN_PLACE, behind, op=MPI.MAX)
         near, distance = near[behind > 0], distance[behind > 0]
         turns = np.array([winding(p, corners) for p in x[near]])
-        mesh.comm.Allreduce(MPI.IN_PLACE, turns, op=MPI.SUM)
+        comm.Allreduce(MPI.IN_PLACE, turns, op=MPI.SUM)
         depth = np.zeros(len(x))
         depth[near] = np.where(turns > 0.5, distance, 0.0)
         return depth
@@ -308,6 +348,26 @@ class Surface:
         """Positions of all points [m], shape (p, 3), from this rank's owned displacements."""
         x: FloatArray = self.reference + self.gather(u)
         return x
+
+
+def boundary_of_mesh(body: Any, u: FloatArray) -> FloatArray:
+    """Corners of the exterior facets of a body's mesh that this rank has [m], (m, nc, 3).
+
+    Collective.
+
+    Args:
+        body: The body.
+        u: Its owned displacements [m].
+    """
+    mesh = body.mesh
+    nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
+    moved = fem.Function(body.space)
+    here = body.at_mesh(u)
+    moved.x.array[: len(here)] = here
+    moved.x.scatter_forward()
+    blocks = compat.node_blocks(mesh, body.space)[nodes]
+    corners: FloatArray = mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
+    return corners
 
 
 def _distinct(rows: IntArray) -> IntArray:

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.elements import Slopes, Step
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
 from dolfinx_nts.point_elements import EveryStep, PointElements
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import StepFailedError, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]
@@ -92,8 +92,8 @@ class Move(NamedTuple):
     Attributes:
         ends: Between which its gradient is taken, two of shape (n,).
         gradient: Its gradient.
-        share: Part of a change at t_{n+1} that is one of the second end, for what is the same if
-            both ends change places.
+        share: Derivative by the vectors at t_{n+1} over that by the second end, of what is
+            symmetric in both ends.
         speed: Of the vectors where forces are taken, shape (n, 3 v).
         rate: Its change with the vectors at t_{n+1} [1/s].
         time: Length of the step [s] if the ends are those of the step; else None.

@@ -310,7 +310,7 @@ class Fixed(Between):
 
 @known_options
 class Distance(Between):
-    """A rod without mass between two points: (|p_A - p_B|^2 - L^2)/(2 L_0) = 0.
+    """A rod without mass between two points: (r . r - L^2)/(2 L_0) = 0, r = p_A - p_B.
 
     Args:
         a: A body, or None.

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.points import Points
 from dolfinx_nts.constraints import Constraints, Equations
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.joints.between import FloatArray, named
+from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options
 
 

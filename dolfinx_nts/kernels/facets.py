@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.kernels import patches, triangle_patches
+from dolfinx_nts.kernels.vectors import solve_2x2
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
@@ -179,14 +180,10 @@ def tributary_areas(facets: IntArray, corners: FloatArray, num_points: int) -> F
     return total
 
 
-def _solve_2x2(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions (2, n) of symmetric 2 x 2 systems (11, 12, 22; n).
-
-    Not finite where singular, of which numpy warns.
-    """
+def _symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solutions (2, n) of symmetric systems (11, 12, 22; n), see `solve_2x2`."""
     m11, m12, m22 = matrix
-    result: FloatArray = (matrix[::-2] * right - m12 * right[::-1]) / (m11 * m22 - m12 * m12)
-    return result
+    return solve_2x2((m11, m12, m12, m22), (right[0], right[1]))
 
 
 #: Of |xbar - x|^2 / 2 at the current coordinates: gradient (2, n), metric and Hessian (11, 12, 22)
@@ -274,7 +271,7 @@ def _descent_step(gradient: FloatArray, metric: FloatArray, hessian: FloatArray)
         limit = 0.9 * np.sqrt(metric[0, bad] * metric[2, bad])
         mixed[bad] = np.clip(mixed[bad], -limit, limit)
         in_a[bad], in_b[bad] = metric[0, bad], metric[2, bad]
-    return -_solve_2x2(hessian, gradient)
+    return -_symmetric(hessian, gradient)
 
 
 def _step_length(change: list[FloatArray]) -> FloatArray:
@@ -408,7 +405,7 @@ def _closest_edge(start: FloatArray, spans: FloatArray) -> FloatArray:
 def _closest_triangle(start: FloatArray, spans: FloatArray) -> FloatArray:
     """Closest point on triangles [-], shape (n, 2)."""
     gradient, metric, _, _ = _bilinear(_modes(start, spans), np.zeros((2, len(start))))
-    xi = -_solve_2x2(metric, gradient).T
+    xi = -_symmetric(metric, gradient).T
     square = metric[0] * metric[2]
     flat = square - metric[1] ** 2 <= COLLINEAR * square
     xi[flat] = -1.0

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.kernels import discrete_gradient, facets, patches, triangle_patches
+from dolfinx_nts.kernels.vectors import solve_2x2
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -164,9 +165,10 @@ def projection(x: FloatArray, xi: FloatArray, multiplier: FloatArray) -> Project
 
 
 def _solve2(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Solve the 2x2 systems a (n, 2, 2) for b (n, 2, ...)."""
-    columns = int(np.prod(b.shape[2:]))
-    return solve(a, b.reshape(len(b), 2, columns)).reshape(b.shape)
+    """Solve the 2x2 systems a (n, 2, 2) for b (n, 2, ...); not finite where singular."""
+    a11, a12, a21, a22 = a.reshape(-1, 4, *[1] * (b.ndim - 2)).swapaxes(0, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return solve_2x2((a11, a12, a21, a22), (b[:, 0], b[:, 1])).swapaxes(0, 1)
 
 
 def solve(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.director_body import DirectorBody
 from dolfinx_nts.bodies.stress import von_mises
 from dolfinx_nts.contact.surfaces import oriented_nodes
 from dolfinx_nts.output.plots import save_figure
@@ -34,9 +35,10 @@ def picture(
     """Draw the boundary of the deformed bodies; every rank calls it, rank 0 writes.
 
     Args:
-        bodies: Continua; they are drawn in the state of `body.u`, `body.v`.
+        bodies: Continua and rigid bodies, in the state of `body.u`, `body.v`; beams and shells, of
+            which the skin is drawn.
         path: Picture file; its ending chooses the format.
-        colour: "speed" |v| [m/s] or "stress" (von Mises of the Cauchy stress) [Pa].
+        colour: "speed" [m/s] or "stress" (von Mises of the Cauchy stress) [Pa].
         title: Text above the picture.
         labels: Whether to write the bodies' names beside them.
         view: Elevation above the x-y plane and azimuth from the x axis, of the viewer [degrees].
@@ -45,14 +47,21 @@ def picture(
 
     Raises:
         TypeError: A body without a mesh.
-        ValueError: Unknown colour, no body, one whose mesh is not 3D, or an argument out of range.
+        ValueError: Unknown colour, or one that a body has not, no body, one without a skin, or an
+            argument out of range.
         OSError: On all ranks: the file cannot be written.
     """
     bodies = items("bodies", bodies, _has_mesh, "Continuum bodies")
     _check_picture(bodies, colour, view, limits, width)
     require_bool("labels", labels)
     for body in bodies:
-        if body.mesh.topology.dim != 3:
+        thin = isinstance(body, DirectorBody)
+        if thin and colour != "speed":
+            raise ValueError(
+                f"colour={colour!r}: {body.kind} {body.name!r} has none; colour by 'speed', or see "
+                "its resultants()"
+            )
+        if not (body.has_skin if thin else body.mesh.topology.dim == 3):
             raise ValueError(f"bodies: {body.name!r} has no volume; leave it out")
     file = as_path("path", path)
     comm = bodies[0].comm
@@ -115,6 +124,8 @@ def _coloured_facets(body: Any, colour: str) -> tuple[FloatArray, FloatArray]:
         Deformed corners [m], shape (m, 4, 3), a triangle's last one twice, and the values there,
         shape (m, 4).
     """
+    if isinstance(body, DirectorBody):
+        return _skin(body)
     mesh, local = body.mesh, compat.exterior_facets(body.mesh)
     nodes = oriented_nodes(mesh, local)[:, [0, 1, 2, -1]]
     blocks = compat.node_blocks(body.mesh, body.space)[nodes]
@@ -127,6 +138,14 @@ def _coloured_facets(body: Any, colour: str) -> tuple[FloatArray, FloatArray]:
     dofs = compat.cell_dofs(stress.function_space)
     value = stress.x.array[dofs[cells, 0]] if len(cells) else np.empty(0)
     return corners, np.tile(value[:, None], 4)
+
+
+def _skin(body: DirectorBody) -> tuple[FloatArray, FloatArray]:
+    """This rank's part of a skin, deformed corners [m], (m, 4, 3), and the speed there, (m, 4)."""
+    skin, (u, v) = body.boundary(), body.last_accepted()
+    speed = np.linalg.norm(skin.gather(v), axis=1)
+    mine = skin.facets[body.comm.rank :: body.comm.size]
+    return skin.positions(u)[mine], speed[mine]
 
 
 def _axes_of(elevation: float, azimuth: float) -> FloatArray:

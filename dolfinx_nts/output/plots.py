@@ -34,6 +34,10 @@ _ROUND_OFF = 0.1 * float(np.finfo(float).eps)
 _STYLES = ("-", "--", ":", "-.")
 
 
+#: Of a figure; to let matplotlib find them takes as long as to draw it.
+_MARGINS = {"left": 0.08, "right": 0.99, "bottom": 0.07, "top": 0.96, "hspace": 0.22, "wspace": 0.2}
+
+
 def _panels(balance: Balance, several: bool) -> list[_Panel]:
     missing = sorted(set(ledger.COLUMNS) - set(balance))
     if missing:
@@ -69,27 +73,33 @@ def _panels(balance: Balance, several: bool) -> list[_Panel]:
     return panels
 
 
-def plot_balance(balance: Balance, path: StrPath) -> None:
+def plot_balance(balance: Balance, path: StrPath | None = None) -> Any:
     """Plot energies, ledger residual, defect and work, active nodes, momentum changes over time.
 
     Call it on one rank; `Solution.plot` sees to that.
 
     Args:
         balance: `Solution.balance`.
-        path: Picture file; its ending chooses the format.
+        path: Picture file; its ending chooses the format. None: no file.
+
+    Returns:
+        matplotlib's Figure.
 
     Raises:
         ValueError: Columns are missing.
     """
-    _plot({"": balance}, path)
+    return _plot({"": balance}, path)
 
 
-def compare_balances(balances: Mapping[str, Balance], path: StrPath) -> None:
+def compare_balances(balances: Mapping[str, Balance], path: StrPath | None = None) -> Any:
     """Plot several runs together, e.g. both integrators. Call it on one rank.
 
     Args:
         balances: Label -> `Solution.balance`.
-        path: Picture file; its ending chooses the format.
+        path: Picture file; its ending chooses the format. None: no file.
+
+    Returns:
+        matplotlib's Figure.
 
     Raises:
         ValueError: No run, or columns are missing.
@@ -98,14 +108,21 @@ def compare_balances(balances: Mapping[str, Balance], path: StrPath) -> None:
         raise ValueError(
             f"balances={balances!r}: pass at least one, as {{label: Solution.balance}}"
         )
-    _plot(balances, path)
+    return _plot(balances, path)
 
 
-def _plot(balances: Mapping[str, Balance], path: StrPath) -> None:
+def picture_of(figure: Any, dpi: int = 150, kind: str = "png") -> bytes:
+    """A figure of matplotlib in the bytes of a picture file."""
+    image = io.BytesIO()
+    figure.savefig(image, format=kind, dpi=dpi)
+    return image.getvalue()
+
+
+def _plot(balances: Mapping[str, Balance], path: StrPath | None) -> Any:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.5, 7.5), constrained_layout=True)
-    grid = figure.subplots(3, 2, sharex=True)
+    figure = Figure(figsize=(9.5, 7.5))
+    grid = figure.subplots(3, 2, sharex=True, gridspec_kw=_MARGINS)
     runs = [(run, b["time"], _panels(b, len(balances) > 1)) for run, b in balances.items()]
     for k, axes in enumerate(grid.T.ravel()):
         for r, (run, time, panels) in enumerate(runs):
@@ -115,7 +132,9 @@ def _plot(balances: Mapping[str, Balance], path: StrPath) -> None:
             axes.legend(fontsize=8, frameon=False)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]", fontsize=9)
-    save_figure(figure, Path(path), dpi=150)
+    if path is not None:
+        save_figure(figure, Path(path), dpi=150)
+    return figure
 
 
 def _lines(axes: Any, panel: _Panel, time: FloatArray, run: str, number: int | None) -> None:
@@ -144,6 +163,7 @@ def _style(axes: Any, panel: _Panel) -> None:
     axes.set_axisbelow(True)
     if panel.floor is not None:
         axes.set_yscale("log")
+        axes.minorticks_off()
 
 
 def save_figure(figure: Any, path: Path, **options: Any) -> None:

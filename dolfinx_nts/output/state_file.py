@@ -39,9 +39,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
-from dolfinx_nts.state import State
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.step import balance, resultants
 from dolfinx_nts.system import System
 

@@ -10,23 +10,22 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.output.own_functions import Own, checked, of_body
+from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
 from dolfinx_nts.step import balance as ledger
 from dolfinx_nts.step import contact_fields, resultants
 from dolfinx_nts.validation import StrPath, as_path, is_whole, require_positive
-
-if TYPE_CHECKING:
-    from dolfinx_nts.run.stepper import Stepper
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -45,7 +44,9 @@ _XDMF_HEAD = (
 _XDMF_TAIL = "</Grid>\n</Domain></Xdmf>\n"
 #: Part of a body's size by which places of its nodes may differ on other ranks.
 _ROUNDED = 1e-9
-_XDMF_TIME = r'<Grid><Time Value="([^"]*)"/>'
+#: XDMF's names of scalars, vectors and tensors.
+_RANKS = ("Scalar", "Vector", "Tensor")
+_XDMF_TIME = r'<Grid GridType="Uniform"><Time Value="([^"]*)"/>'
 #: XDMF's name of DOLFINx's cells and its order of their vertices.
 _CELLS = {
     "interval": ('Polyline" NodesPerElement="2', [0, 1]),
@@ -56,17 +57,29 @@ _CELLS = {
 }
 
 
+def _shape(values: FloatArray) -> tuple[int, ...]:
+    """Shape in a file, where a tensor has its rows one after another."""
+    return (*values.shape[:1], *([int(np.prod(values.shape[1:]))] if values.ndim > 1 else []))
+
+
 class _Series:
     """Files of one body: NAME.h5 holds the numbers, NAME.xdmf tells ParaView what they are."""
 
-    def __init__(self, body: Any, index: int, contacts: Mapping[str, int], folder: Path) -> None:
-        self.body, self.index, self.contacts = body, index, contacts
+    def __init__(
+        self,
+        body: Any,
+        index: int,
+        contacts: Mapping[str, int],
+        folder: Path,
+        functions: Sequence[Own] = (),
+    ) -> None:
+        self.body, self.index, self.contacts, self._functions = body, index, contacts, functions
         self.path = folder / _file_name(body.name)
         self._times = 0
         blocks = compat.node_blocks(body.mesh, body.space)
         self._owned = body.space.dofmap.index_map.size_local
         nodes = np.flatnonzero((blocks >= 0) & (blocks < self._owned))
-        self._blocks = blocks[nodes]
+        self._nodes, self._blocks = nodes, blocks[nodes]
         original = np.asarray(body.mesh.geometry.input_global_indices)
         everywhere = gather_on_root(body.comm, original[nodes])
         numbers, self._order = np.unique(everywhere, return_index=True)
@@ -76,7 +89,8 @@ class _Series:
         order = gather_on_root(
             body.comm, np.asarray(body.mesh.topology.original_cell_index[:owned], dtype=np.int64)
         )
-        self._cells = np.searchsorted(numbers, cells[np.argsort(order)])
+        self._cell_order = np.argsort(order)
+        self._cells = np.searchsorted(numbers, cells[self._cell_order])
         self._kind, self._corners = _CELLS[compat.cell_name(body.mesh)]
 
     def _nodal(self, values: FloatArray) -> FloatArray:
@@ -137,7 +151,7 @@ class _Series:
             replace_file(path, (text[: times[len(kept)][1]] + _XDMF_TAIL).encode())
         self._times = len(kept)
 
-    def fields(self, stepper: Stepper) -> dict[str, FloatArray]:
+    def fields(self, stepper: Running) -> dict[str, FloatArray]:
         """Nodal fields of the last accepted state on rank 0; collective."""
         state = stepper.state
         u, v = (self.body.at_mesh(w[self.index]) for w in (state.u, state.v))
@@ -150,11 +164,32 @@ class _Series:
         for label, k in self.contacts.items():
             slave, mean = system.contacts[k].slave, stepper.mean_force(k)
             for name, values in (("force", mean), ("pressure", mean / slave.area[slave.share])):
-                found[f"contact_{name}_mean_{label}"] = contact_fields.spread(slave, 0.0, values)
+                found[f"contact_{name}_mean_{label}"] = contact_fields.spread(
+                    slave, 0.0, values, values
+                )
         return fields | {name: self._nodal(values) for name, values in found.items()}
 
-    def append(self, time: float, fields: Mapping[str, FloatArray]) -> None:
+    def own(self) -> dict[str, tuple[bool, FloatArray]]:
+        """The user's functions: whether on cells, and values on rank 0. Collective."""
+        found = {}
+        for name, on_cells, values in of_body(self._functions, self.body):
+            here = values if on_cells else values[self._nodes]
+            order = self._cell_order if on_cells else self._order
+            found[name] = on_cells, gather_on_root(self.body.comm, here)[order]
+        return found
+
+    def append(
+        self,
+        time: float,
+        fields: Mapping[str, FloatArray],
+        own: Mapping[str, tuple[bool, FloatArray]],
+    ) -> None:
         """Add one time; rank 0 only. Both files are complete and closed afterwards.
+
+        Args:
+            time: [s].
+            fields: Nodal ones by name.
+            own: As of `own`.
 
         Raises:
             OSError: They cannot be written; the times before are still whole.
@@ -162,25 +197,26 @@ class _Series:
         import h5py
 
         group, numbers = f"{self._times:06d}", Path(f"{self.path}.h5")
+        placed = {name: (False, values) for name, values in fields.items()} | dict(own)
         with Draft(open(numbers, "rb")) as draft:
             with h5py.File(draft, "r+") as file:
                 if group in file:  # from a call that failed for want of space for the other file
                     del file[group]
-                for name, values in fields.items():
-                    file[f"{group}/{name}"] = values
+                for name, (_, values) in placed.items():
+                    file[f"{group}/{name}"] = values.reshape(_shape(values))
             amend_file(numbers, draft.parts)
         cells = self._item("mesh/cells", self._cells.shape, "Int")
         points = self._item("mesh/points", self._points.shape, "Float")
         lines = [
-            f'<Grid><Time Value="{time:.17g}"/>',
+            f'<Grid GridType="Uniform"><Time Value="{time:.17g}"/>',
             f'<Topology TopologyType="{self._kind}" NumberOfElements="{len(self._cells)}">'
             f"{cells}</Topology>",
             f'<Geometry GeometryType="XYZ">{points}</Geometry>',
         ]
-        for name, values in fields.items():
-            kind = "Vector" if values.ndim == 2 else "Scalar"
-            item = self._item(f"{group}/{name}", values.shape, "Float")
-            head = f'<Attribute Name="{name}" AttributeType="{kind}" Center="Node">'
+        for name, (on_cells, values) in placed.items():
+            kind, centre = _RANKS[values.ndim - 1], "Cell" if on_cells else "Node"
+            item = self._item(f"{group}/{name}", _shape(values), "Float")
+            head = f'<Attribute Name="{name}" AttributeType="{kind}" Center="{centre}">'
             lines.append(f"{head}{item}</Attribute>")
         # One write over the old tail: the file is well-formed whenever the run dies.
         text, path = "\n".join([*lines, "</Grid>", _XDMF_TAIL]).encode(), Path(f"{self.path}.xdmf")
@@ -216,16 +252,28 @@ class Fields:
         every: Write after every `every`-th step, >= 1.
         interval: Instead of `every`: write after the first step that reaches each multiple of this
             time [s].
+        functions: More to write: scalars, 3-vectors or 3 x 3 tensors, in cells (DG 0) or at nodes
+            (Lagrange 1), under their names. A Function is written with the body on whose mesh it
+            is, as it then is; a callable body -> Function such as `dolfinx_nts.von_mises` is
+            called of each body with a material.
 
     Raises:
+        TypeError: An item of `functions` is none.
         ValueError: The cadence is out of range or given twice; from `start`: no body has a mesh,
-            or two bodies' names give one file.
+            two bodies' names give one file, or a Function has no values in cells or at nodes.
         OSError: From `start`, before any step and on all ranks: the folder cannot be written, or
             what a run from a checkpoint would go on with is of another mesh or run, or is not
             complete.
     """
 
-    def __init__(self, folder: StrPath, *, every: int = 1, interval: float | None = None) -> None:
+    def __init__(
+        self,
+        folder: StrPath,
+        *,
+        every: int = 1,
+        interval: float | None = None,
+        functions: Iterable[Own] = (),
+    ) -> None:
         if not is_whole(every) or every < 1:
             raise ValueError(f"every={every!r}: pass a whole number of steps >= 1")
         if interval is not None:
@@ -233,9 +281,10 @@ class Fields:
             if every != 1:
                 raise ValueError(f"every={every!r}, interval={interval!r}: pass one of the two")
         self.folder, self.every, self.interval = as_path("folder", folder), every, interval
+        self.functions = checked(functions)
         self._series: list[_Series] = []
 
-    def start(self, stepper: Stepper) -> None:
+    def start(self, stepper: Running) -> None:
         """Create the files with the initial state."""
         system, contacts = stepper.system, stepper.system.contacts
         label = contact_fields.labels(system)
@@ -243,7 +292,7 @@ class Fields:
         for i, body in enumerate(system.bodies):
             if body.mesh is not None:
                 own = {n: k for k, n in enumerate(label) if contacts[k].slave.body is body}
-                self._series.append(_Series(body, i, own, self.folder))
+                self._series.append(_Series(body, i, own, self.folder, self.functions))
         if not self._series:
             raise ValueError(f"folder={str(self.folder)!r}: no body has a mesh; leave Fields out")
         files = [s.path.name for s in self._series]
@@ -257,7 +306,7 @@ class Fields:
             self._root(stepper, series.create)
         self._append(stepper)
 
-    def _go_on(self, stepper: Stepper, due: bool) -> bool:
+    def _go_on(self, stepper: Running, due: bool) -> bool:
         """Go on with the files of an earlier part of the run; tells whether they are there."""
         comm = stepper.system.comm
         files = [Path(f"{s.path}.{kind}") for s in self._series for kind in ("xdmf", "h5")]
@@ -276,12 +325,12 @@ class Fields:
             on_root(comm, partial(series.go_on, times, due))
         return True
 
-    def write(self, stepper: Stepper, *, last: bool = False) -> None:
+    def write(self, stepper: Running, *, last: bool = False) -> None:
         """Write the accepted state if the cadence asks for it, or if it is the last."""
         if self._due(stepper) or last:
             self._append(stepper)
 
-    def _due(self, stepper: Stepper) -> bool:
+    def _due(self, stepper: Running) -> bool:
         """Return whether the cadence asks for this state; the first one of a run is due."""
         times = stepper.solution.rows.column("time")
         before, self._seen = self._seen, len(times)
@@ -293,19 +342,20 @@ class Fields:
         then, now = np.floor(multiples + 1e-12 * np.abs(multiples))
         return bool(now > then)
 
-    def close(self, stepper: Stepper) -> None:
+    def close(self, stepper: Running) -> None:
         """Write the last accepted state of a run that failed."""
         # Unlike an exception, a status is the same on all ranks, so that all come here.
         failed = not stepper.solution.status.startswith(("running", "completed"))
         if self._series and failed and stepper.state.time > self._tried:
             self._append(stepper)
 
-    def _append(self, stepper: Stepper) -> None:
+    def _append(self, stepper: Running) -> None:
         self._tried = time = stepper.state.time
         for series in self._series:
-            self._root(stepper, partial(series.append, time, series.fields(stepper)))
+            fields, own = series.fields(stepper), series.own()
+            self._root(stepper, partial(series.append, time, fields, own))
 
-    def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
+    def _root(self, stepper: Running, action: Callable[[], Any]) -> None:
         write_on_root(stepper.system.comm, f"folder={str(self.folder)!r}", action)
 
 
@@ -331,7 +381,7 @@ class BalanceCSV:
         self.path = as_path("path", path)
         self._open = False
 
-    def start(self, stepper: Stepper) -> None:
+    def start(self, stepper: Running) -> None:
         """Write the header and the row of the initial state."""
         self._rows = 0
         self._columns, header = self._of(stepper)
@@ -339,7 +389,7 @@ class BalanceCSV:
         self._root(stepper, lambda: replace_file(self.path, line.encode()))
         self.write(stepper)
 
-    def _of(self, stepper: Stepper) -> tuple[tuple[str, ...], list[str]]:
+    def _of(self, stepper: Running) -> tuple[tuple[str, ...], list[str]]:
         """Columns of the table to write, and their headings."""
         columns, header = ledger.columns(stepper.system), []
         for name in columns:
@@ -348,11 +398,11 @@ class BalanceCSV:
             header += [f"{name}{s} [{unit}]" for s in (("_x", "_y", "_z") if vector else ("",))]
         return columns, header
 
-    def write(self, stepper: Stepper, *, last: bool = False) -> None:
+    def write(self, stepper: Running, *, last: bool = False) -> None:
         """Add the rows of the steps accepted since the last call."""
         self._root(stepper, lambda: self._append(stepper))
 
-    def close(self, stepper: Stepper) -> None:
+    def close(self, stepper: Running) -> None:
         """Add rows that are still missing and the warnings, unless the file could not be written.
 
         Raises:
@@ -362,7 +412,7 @@ class BalanceCSV:
             self._append(stepper, (f"# {w}" for w in stepper.solution.warnings.lines))
         self._open = False
 
-    def _append(self, stepper: Stepper, footer: Iterable[str] = ()) -> None:
+    def _append(self, stepper: Running, footer: Iterable[str] = ()) -> None:
         self._open = False
         lines = []
         for row in stepper.solution.rows[self._rows :]:
@@ -372,16 +422,18 @@ class BalanceCSV:
         self._rows += len(lines)
         self._open = True
 
-    def _root(self, stepper: Stepper, action: Callable[[], Any]) -> None:
+    def _root(self, stepper: Running, action: Callable[[], Any]) -> None:
         write_on_root(stepper.system.comm, f"path={str(self.path)!r}", action)
 
 
 class ForcesCSV(BalanceCSV):
     """Writes the forces of supports, joints and contacts: a row for the start and one per step.
 
-    Of each body the force of each of its conditions, of each joint force and moment on the first of
-    its bodies, about its point, of each contact force and moment about the origin on its slave; see
-    `Solution.reactions`, `Solution.contact_forces` and `Solution.contact_moments`.
+    - Of each body: the force or moment of each of its conditions.
+    - Of each joint: force, and moment about its point, on the first of its bodies.
+    - Of each contact: force, and moment about the origin, on its slave.
+
+    See `Solution.reactions`, `Solution.contact_forces` and `Solution.contact_moments`.
 
     Args:
         path: File; its folder is made if missing, an existing file is replaced.
@@ -390,7 +442,7 @@ class ForcesCSV(BalanceCSV):
         OSError: From `start`, before any step and on all ranks: the file cannot be written.
     """
 
-    def _of(self, stepper: Stepper) -> tuple[tuple[str, ...], list[str]]:
+    def _of(self, stepper: Running) -> tuple[tuple[str, ...], list[str]]:
         system, header = stepper.system, ["time [s]"]
         joints = system.declared_joints
         columns = [resultants.reactions_of(item) for item in (*system.bodies, *joints)]

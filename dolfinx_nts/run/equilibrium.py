@@ -66,11 +66,11 @@ _ROUNDING = 16 * float(np.finfo(float).eps)
 class Equilibrium(Solution):
     """What `equilibrium` computed, complete up to where it ended.
 
-    `balance` has one row per accepted load step: "time" is the pseudo time, "potential" and
-    "energy" the strain energy, "external_work" that of loads and prescribed motion (of the mean of
-    the forces at both ends of each step), "ledger_residual" what energy and
-    friction_dissipation miss of it; "kinetic" and the momenta are 0, and changes of facet, which
-    cost nothing, are not listed.
+    `balance` has one row per accepted load step. "time" is the pseudo time. "potential" and
+    "energy" are the strain energy. "external_work" is that of loads and prescribed motion, of the
+    mean of the forces at both ends of each step. "ledger_residual" is what energy and
+    friction_dissipation miss of it. "kinetic" and the momenta are 0. Changes of facet cost nothing
+    and are not listed.
     """
 
     moving: ClassVar[bool] = False

@@ -17,7 +17,7 @@ def intercept(run: Callable[..., Any]) -> Iterator[None]:
     """Let `run` take the place of `simulate` within, however a script has imported it.
 
     Args:
-        run: Called as run(simulate, *arguments) with what `simulate` is called with; what it
+        run: Called with `simulate` and the arguments that this was called with; what it
             returns is the result. The `simulate` that it is given, and calls within, are the real
             ones.
     """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import html
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -50,6 +52,20 @@ class Record:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.summary}>"
+
+    def _repr_html_(self) -> str:
+        """Summary and a small plot, which Jupyter shows."""
+        text = f"<pre>{html.escape(self.summary)}</pre>"
+        if len(self.rows) < 2 or np.isnan(self.rows[-1]["energy"]):
+            return text
+        try:
+            from dolfinx_nts.output.plots import picture_of, plot_balance
+
+            image = picture_of(plot_balance(self.balance), dpi=70)
+        except ImportError:  # matplotlib is optional
+            return text
+        source = base64.b64encode(image).decode()
+        return f'{text}<img alt="energy, ledger and momenta" src="data:image/png;base64,{source}">'
 
     @property
     def balance(self) -> dict[str, FloatArray]:

@@ -43,15 +43,18 @@ class Saved(Record):
     scene: Mapping[str, Any]
     versions: Mapping[str, str]
 
-    def plot(self, path: StrPath) -> None:
-        """Write a picture of energies, ledger and momenta over time.
+    def plot(self, path: StrPath | None = None) -> Any:
+        """Plot energies, ledger and momenta over time.
 
         Args:
-            path: Picture file; its ending chooses the format.
+            path: Picture file; its ending chooses the format. None: no file.
+
+        Returns:
+            matplotlib's Figure.
         """
         from dolfinx_nts.output.plots import plot_balance
 
-        plot_balance(self.balance, as_path("path", path))
+        return plot_balance(self.balance, None if path is None else as_path("path", path))
 
 
 def save(record: Record, system: System, state: State, path: Path) -> None:

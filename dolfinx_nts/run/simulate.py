@@ -11,6 +11,7 @@ from dolfinx_nts.parallel import first_problem
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.intercept import interceptable
 from dolfinx_nts.run.interrupts import Interrupts
+from dolfinx_nts.run.progress import progress_bar
 from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_size import Adapt, Pace
@@ -187,7 +188,7 @@ def simulate(
     begin = stepper.state.time
     if not t_end > begin:
         raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
-    remedy = "Try a smaller dt, a softer start, or inspect the nodes named here"
+    remedy = "Try a smaller dt"
     end, dt = float(t_end), float(dt)
     stepper.solution.settings |= {"dt": dt, "t_end": end, "adapt": adapt and repr(adapt)}
     if adapt is not None:
@@ -248,7 +249,7 @@ def run(
         steps: Length and end of each [s], one after another; with `adapt` the largest and the end.
         output: Writers.
         progress: Show a progress line on rank 0.
-        remedy: What to do if a step fails, for `status`.
+        remedy: What to do if a step fails and says nothing better, for `status`.
         adapt: How to choose the steps between, each of which is written.
         checkpoint: Where and how often to write what `restart` needs.
     """
@@ -268,22 +269,24 @@ def _run(
 ) -> Solution:
     """`run` while signals are noted."""
     solution, root = stepper.solution, stepper.system.comm.rank == 0
-    bar = _progress_bar(None if adapt else len(steps), progress and root)
     started: list[Writer] = []
     saver = None
     try:
         try:
             saver = None if checkpoint is None else Saver(checkpoint, stepper)
-            signal = _march(stepper, steps, output, started, adapt, bar, saver, interrupts)
+            with progress_bar(None if adapt else len(steps), progress and root) as bar:
+                signal = _march(stepper, steps, output, started, adapt, bar, saver, interrupts)
             stepper.look(last=True)
             if signal is None:
                 solution.finish()
             else:
                 _stop(stepper, _interrupted(stepper, signal, checkpoint))
         except UserFunctionError as failure:
+            _last_look(stepper)
             _stop(stepper, str(failure), failure.__cause__)
         except StepFailedError as failure:
-            _stop(stepper, f"{failure}. {remedy}")
+            _last_look(stepper)
+            _stop(stepper, str(failure) if failure.advises else f"{failure}. {remedy}")
         except BaseException:
             # Where one rank alone comes here, no other answers.
             _call(stepper, started, "close")
@@ -295,9 +298,16 @@ def _run(
             _stop(stepper, problem, cause)
     finally:
         stepper.close()
-        if bar is not None:
-            bar.close()
     return solution
+
+
+def _last_look(stepper: Stepper) -> None:
+    """Warn if bodies are inside each other where a run stops, which may be why. Collective."""
+    try:
+        stepper.look(last=True)
+    except UserFunctionError:
+        # An obstacle whose motion raises again, as the status says.
+        logger.debug("no last look for overlaps", exc_info=True)
 
 
 def _march(
@@ -409,11 +419,3 @@ def writers(output: Any) -> tuple[Writer, ...]:
     """The argument `output`, checked."""
     wanted = "writers of dolfinx_nts.output, or others with the Writer protocol"
     return items("output", output, _is_writer, wanted)
-
-
-def _progress_bar(steps: int | None, wanted: bool) -> Any:
-    if not wanted:
-        return None
-    from tqdm import tqdm
-
-    return tqdm(total=steps, unit="step")

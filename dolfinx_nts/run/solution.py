@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from dolfinx_nts.parallel import write_on_root
+from dolfinx_nts.parallel import on_root, write_on_root
 from dolfinx_nts.run.record import Record
 from dolfinx_nts.run.run_warnings import RunWarnings
 from dolfinx_nts.run.saved import save
@@ -77,16 +77,23 @@ class Solution(Record):
         grave = "; ".join(w.text for w in self.warnings.grave)
         self.status = f"completed, but {grave}" if grave else "completed"
 
-    def plot(self, path: str) -> None:
-        """Write a picture of energies, ledger and momenta over time. Every rank must call it.
+    def plot(self, path: StrPath | None = None) -> Any:
+        """Plot energies, ledger and momenta over time. Every rank must call it.
 
         Args:
-            path: Picture file; its ending chooses the format.
+            path: Picture file; its ending chooses the format. None: no file.
+
+        Returns:
+            matplotlib's Figure on rank 0, which Jupyter shows; None on the others.
         """
         from dolfinx_nts.output.plots import plot_balance
 
+        if path is None:
+            return on_root(self.system.comm, lambda: plot_balance(self.balance))
         as_path("path", path)
-        write_on_root(self.system.comm, f"path={path!r}", lambda: plot_balance(self.balance, path))
+        return write_on_root(
+            self.system.comm, f"path={path!r}", lambda: plot_balance(self.balance, path)
+        )
 
     def save(self, path: StrPath) -> None:
         """Write what `load` reads without the scene: tables, last state, warnings. Collective.

@@ -223,6 +223,7 @@ def consistent_start(
     if found is not None:
         raise ValueError(
             f"project_start=True: no velocities fit joint {found[1]!r}, which stays violated "
-            f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it"
+            f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it: leave "
+            "one of them out"
         )
     return state

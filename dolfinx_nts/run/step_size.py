@@ -153,7 +153,8 @@ class Pace:
         """Part of the step that `problem.begin` fixed after which a contact begins, or 1.
 
         In free flight a node whose gap closes after a part theta of the step would be pushed back
-        by 1 - theta of its way, by a force that follows from its mass, and lose force x gap. Nodes
+        by 1 - theta of its way. The force for that follows from its mass, and force x gap is lost.
+        Nodes
         that close within the shortest step count as touching. Contacts that carry at t_n are left
         out: a consistent mass makes their nodes bounce in turn, and to meet each bounce costs many
         steps and saves no energy (measured). Every rank must call it.

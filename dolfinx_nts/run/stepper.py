@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import count
@@ -15,7 +14,8 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.evaluation import Evaluation
-from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme
+from dolfinx_nts.run.last_steps import LastSteps
 from dolfinx_nts.run.promises import MaterialWatch, Promises
 from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.solution import Restart, Solution
@@ -24,7 +24,6 @@ from dolfinx_nts.run.start import (
     check_restart,
     consistent_start,
     first_state,
-    refuse_moved,
     refuse_moved_meshes,
     refuse_overwritten,
     with_prescribed_rates,
@@ -37,8 +36,8 @@ from dolfinx_nts.step import balance, consistent, resultants
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
 from dolfinx_nts.step.guards import check_momentum
-from dolfinx_nts.step.impact import IMPACTS, Impact, restored
-from dolfinx_nts.step.massless import check_massless, off_balance
+from dolfinx_nts.step.impact import Impact, restored
+from dolfinx_nts.step.massless import off_balance
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.resting import with_resting_forces
@@ -48,9 +47,7 @@ from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
     call_together,
-    is_finite,
     known_options,
-    require_bool,
     require_positive,
 )
 
@@ -64,8 +61,6 @@ _CUT = 0.4
 _CUTS = 3
 #: Searches for contact, each along the motion that came of the one before.
 _SEARCHES = 4
-#: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
-_WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
 
 
 class Trial(NamedTuple):
@@ -131,59 +126,26 @@ class Stepper:
         impact: str = "published",
         restitution: float = 1.0,
     ) -> None:
-        if not isinstance(system, System):
-            raise TypeError(f"system={system!r}: pass a System([body, ...])")
         same_run(
             system, integrator=integrator, newton=newton, petsc_options=petsc_options,
             start=start is not None, start_time=start_time, sleep=sleep,
             watch_overlap=watch_overlap, before_step=before_step, project_start=project_start,
             ledger=ledger, impact=impact, restitution=restitution,
         )  # fmt: skip
-        system.check_alive()
-        if not isinstance(integrator, Integrator) or isinstance(integrator, type):
-            raise TypeError(
-                f"integrator={integrator!r}: pass EnergyMomentum(), Midpoint() or another one with "
-                "the Integrator protocol"
-            )
-        if not isinstance(newton, Newton | None):
-            raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")
-        given = {} if petsc_options is None else petsc_options
-        if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
-            raise TypeError(
-                f"petsc_options={petsc_options!r}: pass a dict of names and values, e.g. "
-                "{'pc_type': 'lu'}"
-            )
-        for name in sorted(name for name in given if name.lower() in _WITHOUT_EFFECT):
-            raise ValueError(
-                f"petsc_options[{name!r}]={given[name]!r}: each block of the residual is tested by "
-                "itself, not by PETSc; pass newton=Newton(rtol=...)"
-            )
-        require_bool("sleep", sleep)
-        require_bool("watch_overlap", watch_overlap)
-        require_bool("project_start", project_start)
-        require_bool("ledger", ledger)
-        if not isinstance(impact, str) or impact not in IMPACTS:
-            known = ", ".join(map(repr, IMPACTS))
-            raise ValueError(f"impact={impact!r}: choose one of {known}")
-        if not (is_finite(restitution) and 0.0 <= restitution <= 1.0):
-            raise ValueError(f"restitution={restitution!r}: must lie between 0 and 1")
-        if impact == "published" and restitution != 1.0:
-            raise ValueError(f"restitution={restitution!r}: pass impact='restored', too")
-        if impact != "published" and not integrator.keeps_energy:
-            raise ValueError(
-                f"impact={impact!r}: {integrator!r} keeps no energy in contact that could be given "
-                "back; choose EnergyMomentum() or Midpoint()"
-            )
-        if impact != "published":
-            refuse_moved(system)
-        check_massless(system, integrator, impact)
+        check_scheme(system, integrator, newton, petsc_options)
+        check_run(
+            before_step, sleep=sleep, watch_overlap=watch_overlap, project_start=project_start,
+            ledger=ledger,
+        )  # fmt: skip
+        check_impact(system, integrator, impact, restitution)
+        given = petsc_options or {}
         self._restitution = float(restitution) if impact == "restored" else None
         self._keeps_ledger = ledger
         self._project_start = project_start
-        if not callable(before_step) and before_step is not None:
-            raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
         self._before_step = before_step
         self.newton = newton or Newton()
+        self._materials, self._material_change = MaterialWatch(system), 0.0
+        self._restated: dict[str, Any] | None = None
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
             system,
@@ -196,7 +158,7 @@ class Stepper:
         self.system = system
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._measured: dict[str, balance.Measured] = {}
-        self._recent: deque[tuple[float, tuple[FloatArray, ...]]] = deque(maxlen=2)
+        self._last_steps = LastSteps()
         self.restart = start if isinstance(start, Restart) else None
         check_restart(self.restart, system, start_time, ledger)
         self.solution = self.restart.go_on() if self.restart else Solution(system)
@@ -220,8 +182,6 @@ class Stepper:
         if self.restart is None:
             self.solution.rows = Table([self._first_row()])
         self._promises = Promises(self.solution, integrator, self.newton.rtol)
-        self._materials, self._material_change = MaterialWatch(system), 0.0
-        self._last_step: tuple[float, float] | None = None
 
     @property
     def memory(self) -> dict[str, Any]:
@@ -232,11 +192,11 @@ class Stepper:
         recent: lengths of the last two steps [s].
         """
         return {
-            "last": self._last_step,
+            "last": self._last_steps.last,
             "promised": self._promises.memory,
             "bounded": self.problem.contacts.bounded,
             "measured": self.problem.rounding.measured,
-            "recent": [dt for dt, _ in self._recent],
+            "recent": self._last_steps.lengths,
         }
 
     @property
@@ -246,21 +206,19 @@ class Stepper:
         unknowns: whether they had any in the last step; force_before: p_N in the step before [N].
         """
         found: dict[str, Any] = {"unknowns": self.problem.contacts.had_unknowns}
-        if len(self._recent) > 1:
-            found["force_before"] = self._recent[0][1]
+        if (force := self._last_steps.force_before) is not None:
+            found["force_before"] = force
         return found
 
     def _resume(self, restart: Restart, dt: float) -> None:
         """Begin where a checkpoint was written, with the materials of its last step."""
         memory, nodal = restart.memory, restart.nodal_memory
-        forces = [nodal["force_before"]] if "force_before" in nodal else []
-        forces.append([contact.force for contact in self.state.contacts])
-        self._recent.extend(zip(memory["recent"], map(tuple, forces), strict=False))
+        self._last_steps.resume(memory, nodal, self.state)
         self.problem.contacts.resume(nodal["unknowns"], memory["bounded"])
         self._promises.resume(memory["promised"])
         self.problem.rounding.measured = memory["measured"]
-        if memory["last"] is not None:
-            begin, length = self._last_step = tuple(memory["last"])
+        if self._last_steps.last is not None:
+            begin, length = self._last_steps.last
             self._call_before(length, begin)
         self._materials.changed()
         if self.problem.integrator.accelerations and not self.state.a:
@@ -273,7 +231,7 @@ class Stepper:
     def advance(self, dt: float, *, end: float | None = None) -> State:
         """Advance by dt; a step that is not solved is cut, up to `newton.max_retries` times.
 
-        What is left is then cut into one part more than twice as many.
+        Where n parts are left, they become 2 n + 1.
 
         Args:
             dt: Time to advance [s], > 0.
@@ -327,7 +285,7 @@ class Stepper:
                 yield not parts
 
     def _bind(self, retries: int) -> bool:
-        """Let couplings give way once cuts are of no use; tells whether any does anew."""
+        """After enough cuts, let couplings give way; return whether one newly does."""
         return retries >= _CUTS and self.problem.give_way()
 
     def paced(self, pace: Pace, end: float) -> Iterator[None]:
@@ -490,20 +448,21 @@ class Stepper:
             call_together(self.system.comm, name, self._before_step, time, dt)
 
     def _note_materials(self) -> None:
-        """Name in the ledger what changed parameters of materials do to the stored energy."""
+        """Name in the ledger what changed parameters of materials do to the energy."""
         names = self._materials.changed()
         if names:
             self.problem.forget_forces()
         if not names or not self._keeps_ledger:
             return
         self._measured.clear()
-        stored = balance.measure(self.system, self.state, self._measured)["potential"]
-        change = stored - self.solution.rows[-1]["potential"] - self._material_change
+        self._restated = balance.measure(self.system, self.state, self._measured)
+        now = self._restated["kinetic"] + self._restated["potential"]
+        change = now - self.solution.rows[-1]["energy"] - self._material_change
         self._material_change += change
         self.solution.warn(
             "material changed", self.state.time, abs(change),
             f"a changed parameter of the material of {', '.join(map(repr, names))} adds "
-            f"{change:.3g} J to the stored energy without work; see material_change in the balance",
+            f"{change:.3g} J to its energy without work; see material_change in the balance",
         )  # fmt: skip
 
     def _attempt(self, dt: float, time: float) -> Trial:
@@ -516,7 +475,7 @@ class Stepper:
         state = self._accepted(step, dt, time)
         impact = None
         if self._keeps_ledger:
-            before: Mapping[str, Any] = self.solution.rows[-1]
+            before: Mapping[str, Any] = self._restated or self.solution.rows[-1]
             measured: dict[str, Any] = balance.measure(self.system, state, self._measured)
         else:
             before, measured = (balance.momenta(self.system, s) for s in (self.state, state))
@@ -559,6 +518,7 @@ class Stepper:
             terms = balance.step_terms(self.problem, step) | known
             terms["impact_restored"] = 0.0 if impact is None else impact.energy
             terms["material_change"], self._material_change = self._material_change, 0.0
+            self._restated = None
             row = balance.next_row(rows[0], rows[-1], trial.measured, terms)
         else:
             row = balance.unknown_row(self.system) | known
@@ -571,9 +531,7 @@ class Stepper:
         if self._keeps_ledger:
             self._promises.hold(self.problem, step, trial.impulses)
             self.solution.switches.extend(balance.switches(self.problem, step, time))
-        forces = tuple(contact.force for contact in state.contacts)
-        self._last_step = self.state.time, self.problem.dt
-        self._recent.append((time - self.state.time, forces))
+        self._last_steps.take(self.state, self.problem.dt, state)
         self._accept(state)
         tell_step(self.solution, self.problem, step, state)
         if impact is not None:
@@ -610,11 +568,8 @@ class Stepper:
         Returns:
             At this rank's slave nodes, as in `state.contacts`.
         """
-        if not self._recent:
-            return self.state.contacts[k].force
-        steps, forces = zip(*self._recent, strict=True)
-        mean: FloatArray = np.average([force[k] for force in forces], axis=0, weights=steps)
-        return mean
+        mean = self._last_steps.mean_force(k)
+        return self.state.contacts[k].force if mean is None else mean
 
     def close(self) -> None:
         """Free the PETSc objects of the last step."""

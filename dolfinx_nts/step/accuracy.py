@@ -26,11 +26,11 @@ class Newton:
             and a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth.
             Its incomplete factors weaken as dt grows beyond the time a wave needs through an
             element.
-            "auto" takes "krylov" while that is the faster one: not below 600 coordinates (100
-            where no contact is declared), nor in statics, nor with `petsc_options` beyond those of
-            SNES, nor for the next steps after a solve that needed more iterations than MUMPS is
-            worth. Where MUMPS fails, it leaves out equations that repeat others for some steps;
-            "krylov" is left alone.
+            "auto" starts with "krylov", except below 600 coordinates (100 where no contact is
+            declared), in statics, and with `petsc_options` beyond those of SNES; after a solve that
+            needed more iterations than MUMPS is worth it takes MUMPS for some steps. Where MUMPS
+            fails, it leaves out equations that repeat others for some steps; "krylov" is left
+            alone.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew.
 

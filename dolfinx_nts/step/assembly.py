@@ -1,9 +1,4 @@
-"""The PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> solvers.
-
-No other file creates any. Fields of the step problem are the bodies, then (with the energy-momentum
-scheme) the augmented unknowns (d, f), then the multipliers. A rank's unknowns are contiguous: its
-part of body 1, body 2, .., (d, f), multipliers.
-"""
+"""The PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> solvers."""
 
 from __future__ import annotations
 
@@ -15,7 +10,10 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.points import of_nodes
 from dolfinx_nts.step import node_blocks
+from dolfinx_nts.step.layout import ElementBlocks, Layout
+from dolfinx_nts.step.schur import SchurApproximation
 
 #: Coordinates of the busiest rank over the mean; parts of the mesh with their overlap come to more.
 _EVENLY = 1.25
@@ -24,68 +22,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
-class Layout:
-    """Where the fields' unknowns stand in the system vector.
-
-    Args:
-        comm: MPI communicator.
-        sizes: Unknowns of each field on this rank.
-    """
-
-    def __init__(self, comm: Any, sizes: Sequence[int]) -> None:
-        counts = np.asarray(comm.allgather(list(sizes)), dtype=np.int64)
-        zero = np.zeros((1, counts.shape[1]), np.int64)
-        self.comm, self.counts, self._rank = comm, counts, comm.rank
-        self._field_start = np.concatenate([zero, counts.cumsum(axis=0)])
-        self._rank_start = np.concatenate([[0], counts.sum(axis=1).cumsum()])
-        self._offset = counts.cumsum(axis=1) - counts
-
-    @property
-    def num_owned(self) -> int:
-        """Unknowns on this rank."""
-        return int(self.counts[self._rank].sum())
-
-    @property
-    def first_owned(self) -> int:
-        """Number of this rank's first unknown in the system vector."""
-        return int(self._rank_start[self._rank])
-
-    def owned(self, field: int) -> slice:
-        """Where a field stands among this rank's unknowns."""
-        start = int(self._offset[self._rank, field])
-        return slice(start, start + int(self.counts[self._rank, field]))
-
-    def start(self, field: int) -> int:
-        """First number of this rank's unknowns within a field."""
-        return int(self._field_start[self._rank, field])
-
-    def to_system(self, field: int, index: IntArray) -> IntArray:
-        """Numbers within a field -> numbers in the system vector."""
-        start = self._field_start[:, field]
-        rank = np.searchsorted(start, index, side="right") - 1
-        system: IntArray = self._rank_start[rank] + self._offset[rank, field] + index - start[rank]
-        return system
-
-
-class ElementBlocks(NamedTuple):
-    """Unknowns of a batch of elements: their fields, columns and numbers, part by part.
-
-    Attributes:
-        fields: Field of each part.
-        columns: Slice of each part in the element's unknowns.
-        numbers: Numbers in the field, shape (n, columns); negative ones are left out.
-        pattern: Which entries of an element's tangent can be non-zero, shape (r, r); all of those
-            that couple coordinates of bodies with anything.
-    """
-
-    fields: tuple[int, ...]
-    columns: tuple[slice, ...]
-    numbers: tuple[IntArray, ...]
-    pattern: npt.NDArray[np.bool_]
-
-
 class Entries(NamedTuple):
-    """Entries of a batch of contact tangents, and where they stand in a matrix.
+    """Entries of the tangents of a batch of elements, and where they stand in a matrix.
 
     Attributes:
         batch: Number of the batch.
@@ -103,7 +41,7 @@ class Entries(NamedTuple):
 
 
 class Triplets:
-    """An AIJ matrix made of certain entries of the contact tangents, whoever owns their rows.
+    """An AIJ matrix made of certain entries of elements' tangents, whoever owns their rows.
 
     Args:
         comm: MPI communicator.
@@ -138,83 +76,18 @@ class Triplets:
         self.matrix.destroy()
 
 
-class SchurApproximation:
-    """Schur complements D - C W B and D - C W A W B, approximate: see `linear_solver.SchurInverse`.
-
-    They take the coordinates in contact alone: A is their block of the bodies' matrix, W the
-    diagonal matrix of one over the sums of the moduli of its rows, D the contact's own block, B and
-    C stand above and below.
-
-    Args:
-        rows: Index set of this rank's coordinates in contact, in the bodies' part.
-        cols: Of its contact unknowns, in the contact's part.
-
-    Attributes:
-        first: D - C W B, after `renew`.
-        second: D - C W A W B.
-    """
-
-    def __init__(self, rows: Any, cols: Any) -> None:
-        self._rows, self._cols = rows, cols
-        # Made when first needed, then kept with their patterns.
-        self._near: Any = None
-        self._inverse: Any = None
-        self._above: Any = None
-        self._below: Any = None
-        self._between: Any = None
-        self.first: Any = None
-        self.second: Any = None
-
-    def renew_bodies(self, bodies: Any) -> None:
-        """Take A from the bodies' matrix. Collective."""
-        if bodies.getType().endswith("baij"):
-            # PETSc has no product of the two formats, nor renews a part of MPIBAIJ.
-            square = bodies.createSubMatrix(self._rows, self._rows)
-            self._near = square.convert("aij", out=self._near or PETSc.Mat())
-            square.destroy()
-        else:
-            self._near = bodies.createSubMatrix(self._rows, self._rows, submat=self._near)
-        if self._inverse is None:
-            self._inverse = self._near.createVecLeft()
-        pointer, _, values = self._near.getValuesCSR()
-        self._inverse.array_w[:] = 1.0 / np.add.reduceat(np.abs(values), pointer[:-1])
-
-    def renew(self, above: Any, below: Any, contact: Any) -> None:
-        """Compute both complements from the other blocks, A as it is. Collective."""
-        self._above = above.createSubMatrix(self._rows, self._cols, submat=self._above)
-        self._below = below.createSubMatrix(self._cols, self._rows, submat=self._below)
-        self._above.diagonalScale(self._inverse, None)
-        self._between = self._near.matMult(self._above, result=self._between)
-        self._between.diagonalScale(self._inverse, None)
-        self.first = self._below.matMult(self._above, result=self.first)
-        self.second = self._below.matMult(self._between, result=self.second)
-        for product in (self.first, self.second):
-            # All coordinates of an element are coupled with all its unknowns (`ElementBlocks`), so
-            # that D's pattern lies in that of C W B.
-            product.aypx(-1.0, contact, structure=PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-
-    def destroy(self) -> None:
-        """Free the PETSc objects."""
-        for a in (
-            self._rows, self._cols, self._near, self._inverse, self._above, self._below,
-            self._between, self.first, self.second,
-        ):  # fmt: skip
-            if a:
-                a.destroy()
-
-
 class StepMatrix:
     """Nested Jacobian of the step problem, and the form of it that the solvers see.
 
     Args:
         layout: Fields of the problem.
         bodies: PETSc matrices of the body fields, which are not changed.
-        elements: Unknowns of each batch of contact elements.
+        elements: Unknowns of each batch of elements.
         split: Whether solvers see a nest of two fields, "bodies" and "constraints", from which a
             field split takes its blocks without a copy; else one matrix.
         blocked: Whether the bodies' part may be stored in the 3 x 3 blocks of nodes (BAIJ), with
             which a product takes a third of the time; few of PETSc's preconditioners take it. With
-            contact it needs `split`.
+            constraints it needs `split`.
 
     Attributes:
         nest: Blocks of the fields, as of the last fresh assembly, that are converted to one matrix:
@@ -248,7 +121,7 @@ class StepMatrix:
             for key in self._sources
             if key[0] != key[1] or key[0] >= len(bodies)
         }
-        # Bodies' matrices with room for contact within the body, which may fill more entries.
+        # Bodies' matrices with room for elements within the body, which may fill more entries.
         self._copies = {
             i: self._bodies[i].duplicate(copy=False) for i, j in self._sources
             if i == j and i < len(bodies)
@@ -267,16 +140,18 @@ class StepMatrix:
         # each batch the columns of its elements that are in it, and their numbers there.
         self._corner_numbers = numbers[0]
         quarters = [(i, j) for i in range(len(halves)) for j in range(len(halves))][1:]
-        self._contact = []
+        self._constraints = []
         for i, j in quarters:
             size = (layouts[i].num_owned, layouts[j].num_owned)
             parts = [self._entries(e, numbers[i][e], numbers[j][e]) for e in range(len(elements))]
-            self._contact.append(Triplets(layout.comm, size, parts))
+            self._constraints.append(Triplets(layout.comm, size, parts))
         self._by_nodes: node_blocks.NodeBlocks | None = None
         self._corner = PETSc.Mat()
         if found is not None:
-            contact = [number for _, number in self._corner_numbers]
-            self._by_nodes = node_blocks.NodeBlocks(bodies, found, layouts[0].to_system, contact)
+            of_elements = [number for _, number in self._corner_numbers]
+            self._by_nodes = node_blocks.NodeBlocks(
+                bodies, found, layouts[0].to_system, of_elements
+            )
             own = (self._by_nodes.size, None)
             self._corner.createBAIJ((own, own), 3, nnz=self._by_nodes.room, comm=layout.comm)
         self._schur: SchurApproximation | None = None
@@ -304,11 +179,11 @@ class StepMatrix:
         return Entries(e, rows[0][i], cols[0][j], rows[1][:, i], cols[1][:, j])
 
     def assemble(self, tangents: Sequence[FloatArray], *, fresh: bool = True) -> None:
-        """Add the contact tangents (n, r, r); refresh nest and operator.
+        """Add the elements' tangents (n, r, r); refresh nest and operator.
 
         Args:
             tangents: Of each batch of elements.
-            fresh: The bodies' matrices are without contact, newly assembled; else they are as the
+            fresh: The bodies' matrices are without elements, newly assembled; else they are as the
                 last call left them, and only the operator is changed.
         """
         if self.operator is None or fresh:
@@ -320,12 +195,12 @@ class StepMatrix:
             self._corner.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
             self._add([a - b for a, b in zip(tangents, self._in_operator, strict=True)])
         self._in_operator = list(tangents)
-        for part in self._contact:
+        for part in self._constraints:
             part.set(tangents)
         if self.operator is None:
             self.operator = self._corner
             if self._split:
-                b, c, d = (part.matrix for part in self._contact)
+                b, c, d = (part.matrix for part in self._constraints)
                 grid = [[self._corner, b], [c, d]]
                 self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
             self.operator.assemble()
@@ -333,7 +208,7 @@ class StepMatrix:
         self.operator.stateIncrease()
 
     def _renew(self, tangents: Sequence[FloatArray]) -> None:
-        """Bring nest and operator's corner up to the bodies' matrices, with contact."""
+        """Bring nest and operator's corner up to the bodies' matrices, with elements."""
         if self._by_nodes:
             self._by_nodes.fill(self._corner)
             self._add(tangents)
@@ -348,7 +223,7 @@ class StepMatrix:
         self.nest.convert("aij", out=self._corner)
 
     def _add(self, tangents: Sequence[FloatArray]) -> None:
-        """Add contact tangents to the operator's corner."""
+        """Add elements' tangents to the operator's corner."""
         for (columns, numbers), tangent in zip(self._corner_numbers, tangents, strict=True):
             values = tangent[:, columns][:, :, columns]
             if self._by_nodes:
@@ -358,18 +233,18 @@ class StepMatrix:
         self._corner.assemble()
 
     def schur(self) -> SchurApproximation:
-        """Approximate Schur complements of the contact unknowns, as the operator is. Collective.
+        """Approximate Schur complements of the constraints, as the operator is. Collective.
 
         What they take of the bodies is of the first call or, if later, the last fresh assembly.
         """
         if self._schur is None:
             self._schur = SchurApproximation(*self._touched())
             self._schur.renew_bodies(self._corner)
-        self._schur.renew(*(part.matrix for part in self._contact))
+        self._schur.renew(*(part.matrix for part in self._constraints))
         return self._schur
 
     def _touched(self) -> tuple[Any, Any]:
-        """Index sets of this rank's coordinates in contact and of its contact unknowns."""
+        """Index sets of this rank's coordinates that elements touch, and of its constraints."""
         comm, mark = self._layout.comm, self._corner.createVecLeft()
         for _, numbers in self._corner_numbers:
             index = numbers[numbers >= 0].astype(PETSc.IntType)
@@ -379,10 +254,10 @@ class StepMatrix:
         touched = np.flatnonzero(mark.array_r)
         if self._by_nodes:
             # PETSc takes a part of a BAIJ matrix by whole blocks.
-            touched = (3 * np.unique(touched // 3)[:, None] + np.arange(3)).ravel()
+            touched = of_nodes(np.unique(touched // 3)).ravel()
         touched = (start + touched).astype(PETSc.IntType)
         mark.destroy()
-        start, stop = self._contact[2].matrix.getOwnershipRange()
+        start, stop = self._constraints[2].matrix.getOwnershipRange()
         cols = PETSc.IS().createStride(stop - start, start, 1, comm=comm)
         return PETSc.IS().createGeneral(touched, comm=comm), cols
 
@@ -403,7 +278,7 @@ class StepMatrix:
     def _fill_copy(
         self, k: int, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]
     ) -> None:
-        """Bring the copy of a body's matrix up to it and to contact within the body. Collective."""
+        """Bring the copy of a body's matrix up to it and to elements within it. Collective."""
         body, a = self._bodies[k], self._copies[k]
         kinds = PETSc.Mat.Structure
         same = self._same.get(k, True)
@@ -453,7 +328,7 @@ class StepMatrix:
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
-        made = [self._corner, *self._contact, *self._blocks.values(), *self._copies.values()]
+        made = [self._corner, *self._constraints, *self._blocks.values(), *self._copies.values()]
         made += [self.operator] if self._split and self.operator else []
         made += [a for a in (self.nest, self._schur) if a]
         for a in made:
@@ -470,106 +345,3 @@ def _add_block(a: Any, rows: IntArray, cols: IntArray, values: FloatArray) -> No
         addv=PETSc.InsertMode.ADD_VALUES,
         rowmap=rows.ravel().astype(PETSc.IntType),
     )
-
-
-def model_problem(
-    comm: Any, *, constraint: bool
-) -> tuple[Any, tuple[tuple[str, Any], tuple[str, Any]]]:
-    """A chain of masses and springs, small but large enough for an algebraic multigrid.
-
-    Args:
-        comm: MPI communicator.
-        constraint: Whether a multiplier holds the first mass of each rank.
-
-    Returns:
-        Its matrix, and the index sets "bodies" and "constraints" of its unknowns.
-    """
-    count, extra = 300, int(constraint)
-    a = PETSc.Mat().createAIJ(((count + extra, None), (count + extra, None)), nnz=4, comm=comm)
-    start, _ = a.getOwnershipRange()
-    for i in range(start, start + count):
-        a.setValue(i, i, 3.0)
-        if i > start:
-            a.setValue(i, i - 1, -1.0)
-            a.setValue(i - 1, i, -1.0)
-    if constraint:
-        a.setValue(start, start + count, 1.0)
-        a.setValue(start + count, start, 1.0)
-        a.setValue(start + count, start + count, 0.0)
-    a.assemble()
-    bodies = PETSc.IS().createStride(count, start, 1, comm=comm)
-    contact = PETSc.IS().createStride(extra, start + count, 1, comm=comm)
-    return a, (("bodies", bodies), ("constraints", contact))
-
-
-class Saddle:
-    """Factors of a matrix by MUMPS, without equations that repeat others. Collective.
-
-    Args:
-        matrix: PETSc AIJ matrix.
-    """
-
-    def __init__(self, matrix: Any) -> None:
-        self._x, self._b = matrix.createVecs()
-        self._ksp = PETSc.KSP().create(matrix.getComm())
-        self._ksp.setType("preonly")
-        self._ksp.setOperators(matrix)
-        pc = self._ksp.getPC()
-        pc.setType("lu")
-        pc.setFactorSolverType("mumps")
-        pc.setFactorSetUpSolverType()
-        for option, value in ((14, 2000), (24, 1)):
-            pc.getFactorMatrix().setMumpsIcntl(option, value)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solution of A x = right, owned entries. Collective."""
-        self._b.array_w[:] = right
-        self._ksp.solve(self._b, self._x)
-        solution: FloatArray = self._x.array_r.copy()
-        return solution
-
-    def destroy(self) -> None:
-        """Free the PETSc objects, which Python's collector does not."""
-        for a in (self._x, self._b, self._ksp):
-            a.destroy()
-
-
-class _Mass:
-    """The mass of a body as a PETSc matrix, with zeros at prescribed coordinates."""
-
-    def __init__(self, body: Any) -> None:
-        self._body = body
-
-    def mult(self, _matrix: Any, x: Any, y: Any) -> None:
-        """M x."""
-        y.array_w[:] = self._body.inertia(x.array_r.copy())
-        y.array_w[self._body.fixed] = 0.0
-
-    def getDiagonal(self, _matrix: Any, diagonal: Any) -> None:  # noqa: N802 (PETSc's name)
-        """What serves as the diagonal for preconditioning."""
-        diagonal.array_w[:] = self._body.nodal_mass
-
-
-def solve_mass(body: Any, right: FloatArray) -> FloatArray:
-    """Solution of M x = right, owned entries, zero at prescribed coordinates. Collective.
-
-    Args:
-        body: Its inertia is positive definite.
-        right: Owned entries.
-    """
-    size = (body.num_owned, None)
-    mass = PETSc.Mat().createPython((size, size), _Mass(body), comm=body.comm)
-    mass.setUp()
-    x, b = mass.createVecs()
-    b.array_w[:] = right
-    b.array_w[body.fixed] = 0.0
-    ksp = PETSc.KSP().create(mass.getComm())
-    ksp.setType("cg")
-    ksp.getPC().setType("jacobi")
-    ksp.setTolerances(rtol=1e-14, max_it=1000)
-    ksp.setOperators(mass)
-    ksp.solve(b, x)
-    solution: FloatArray = x.array_r.copy()
-    for a in (x, b, ksp, mass):
-        a.destroy()
-    return solution

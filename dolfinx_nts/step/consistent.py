@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.body import Moment
+from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.kinematics import Kinematics
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
-from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
+from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.mass_solves import Saddle, solve_mass
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
 
@@ -72,7 +73,7 @@ def accelerating_forces(
 
     Returns:
         Of each body the forces [N], less the inertia of its prescribed coordinates, and
-        accelerations that hold but those [m/s^2].
+        accelerations [m/s^2], zero except at prescribed coordinates.
     """
     still = tuple(np.zeros_like(v) for v in state.v)
     ramp = problem.integrator.ramp(state.time)

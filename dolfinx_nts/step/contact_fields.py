@@ -80,19 +80,36 @@ def at_nodes(
         load = np.zeros((body.space.dofmap.index_map.size_local, 3))
         for surface, force in [] if loads is None else loads.on(k):
             if surface.body is body:
-                load[surface.rows] += surface.owned(force)
+                np.add.at(load, surface.rows, surface.owned(force))
         fields[f"contact_load_{label}"] = load
         if pair.slave.body is body:
+            own = state.contacts[k]
+            first = np.where(own.force > 0.0, own.force, -own.gap)
             for name, (elsewhere, values) in _of_slave(pair, state, k).items():
-                fields[f"{name}_{label}"] = spread(pair.slave, elsewhere, values)
+                fields[f"{name}_{label}"] = spread(pair.slave, elsewhere, values, first)
     return fields
 
 
-def spread(slave: Surface, elsewhere: float, values: FloatArray) -> FloatArray:
-    """Values at this rank's share of a slave's points, at the nodes it owns. Collective."""
+def spread(
+    slave: Surface, elsewhere: float, values: FloatArray, order: FloatArray | None = None
+) -> FloatArray:
+    """Values at this rank's share of a slave's points, at the nodes it owns. Collective.
+
+    Args:
+        slave: The slave.
+        elsewhere: Value at other nodes.
+        values: At the points.
+        order: Of several points at a node, as of beams, that with the largest counts.
+    """
     owned = slave.body.space.dofmap.index_map.size_local
     nodal = np.full((owned, *values.shape[1:]), elsewhere)
-    nodal[slave.rows] = slave.at_own(values)
+    own, rows = slave.at_own(values), slave.rows
+    if order is not None and not slave.material.are_nodes:
+        last = np.argsort(slave.at_own(order), kind="stable")
+        own, rows = own[last], rows[last]
+        first = np.unique(rows[::-1], return_index=True)[1]
+        own, rows = own[::-1][first], rows[::-1][first]
+    nodal[rows] = own
     return nodal
 
 

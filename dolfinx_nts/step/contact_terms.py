@@ -31,8 +31,8 @@ class ContactTerms:
     `demos/own_problem.py`.
 
     Args:
-        bodies: Bodies of the user's own, `nts.Body`, with its first seven attributes, `prescribed`
-            and `nodal_stiffness`; their velocity and mass play no part.
+        bodies: Bodies of the user's own, `nts.Body`, with its first six attributes but for
+            `nodal_mass`, with `prescribed` and `nodal_stiffness`.
         contacts: Contacts between them and with obstacles.
 
     Raises:
@@ -81,7 +81,7 @@ class ContactTerms:
             ahead=[np.zeros_like(a) for a in u],
             motion=np.full(len(u), float(reach)),
             length=global_max(system.comm, size),
-            stiffness=lambda body: body.nodal_stiffness(rule),
+            stiffness=lambda body: body.nodal_stiffness(),
             moments=[],
             force_rounding=lambda bodies: 0.0,
         )

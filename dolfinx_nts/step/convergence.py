@@ -69,7 +69,8 @@ def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     """`ratios` of the elements' own unknowns."""
     moved = max(float(np.abs(b.du).max(initial=0.0)) for b in e.bodies)
     # MPI's maximum may swallow a NaN, so it travels as a flag.
-    local = [moved, float(any(np.isnan(p.residual).any() for p in e.parts))]
+    rows = np.concatenate([np.empty(0), *(p.residual.ravel() for p in e.parts)])
+    local = [moved, float(np.isnan(rows).any())]
     for c, part in zip(problem.elements, e.parts, strict=True):
         local += c.largest(part)
     top = global_max(problem.system.comm, np.array(local))

@@ -65,7 +65,7 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
         combination = np.eye(len(modes))[alone[0]]
     else:
         combination = scipy.linalg.eigh(sizes[0], sizes[1])[1][:, 0]
-    # Its square knows half the digits.
+    # The matrix has the squares of resistances, which keep half the digits of these.
     direction.set(0.0)
     for part, (k, mode) in zip(combination, modes, strict=True):
         direction.array_w[problem.of_body(k)] += part / stiffness[k] * mode

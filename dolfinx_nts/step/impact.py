@@ -2,9 +2,9 @@
 
 A node that comes into contact within a step is stopped at the surface, and the energy of its
 normal motion is lost. An impulse along the forces that stopped it gives the energy back, or the
-part of it that a coefficient of restitution e leaves: in multiples of these impulses the energy of
-bodies that touch or are joined is a parabola, its minimum is a plastic impact, and what lies above
-it is scaled by e^2. The impulses on slave and master are opposite and act at one place, so they
+part of it that a coefficient of restitution e leaves. The energy of bodies that touch or are joined
+is a parabola in the multiple of these impulses. Its minimum is a plastic impact; what lies above it
+is scaled by e^2. The impulses on slave and master are opposite and act at one place, so they
 change neither momentum. They act along the normals alone, also where there is friction.
 """
 
@@ -24,7 +24,8 @@ from dolfinx_nts.constraints import SHIFT
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
-from dolfinx_nts.step.assembly import Saddle, StepMatrix, solve_mass
+from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.mass_solves import Saddle, solve_mass
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.validation import StepFailedError

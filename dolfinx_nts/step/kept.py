@@ -16,8 +16,8 @@ _EQUAL = 1e-6
 class KeptTangents:
     """Assembles the matrices of a step's bodies when they are due, see `Newton.reuse`.
 
-    A body has one matrix for all who ask. What others made of it since, such as another run, is not
-    used: PETSc counts the changes of a matrix.
+    All runs of a body share its matrix. If another run has changed it, which PETSc counts, this run
+    assembles it again: two runs in turns differ by what reuse leaves, without reuse by nothing.
 
     Args:
         problem: Equations of the step.

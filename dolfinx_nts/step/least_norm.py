@@ -8,7 +8,7 @@ method leaves it depends on the path of the iterates; here it is taken out.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -51,8 +51,33 @@ def form_tree(joints: Sequence[Sequence[int]]) -> bool:
     return True
 
 
+def hanging(joints: Sequence[Sequence[int]], free: Collection[int]) -> list[bool]:
+    """Whether a free body hangs on each joint, by it alone, once what hangs below is taken away.
+
+    Such joints repeat no other constraint.
+
+    Args:
+        joints: Numbers of the bodies of each joint.
+        free: Rigid bodies without prescribed motion.
+    """
+    held: dict[int, set[int]] = {}
+    for j, bodies in enumerate(joints):
+        for b in bodies:
+            held.setdefault(b, set()).add(j)
+    hangs = [False] * len(joints)
+    ends = [b for b in held if b in free and len(held[b]) == 1]
+    while ends:
+        for j in list(held[ends.pop()]):
+            hangs[j] = True
+            for b in joints[j]:
+                held[b].discard(j)
+                if b in free and len(held[b]) == 1:
+                    ends.append(b)
+    return hangs
+
+
 class NullSpace:
-    """Null space of what bilateral constraints of a solved step push the bodies with.
+    """Multipliers of bilateral constraints that exert no force on any body.
 
     Args:
         comm: MPI communicator.

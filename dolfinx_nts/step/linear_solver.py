@@ -9,7 +9,9 @@ from typing import Any
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.step.assembly import SchurApproximation, StepMatrix, model_problem
+from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.model_problem import model_problem
+from dolfinx_nts.step.schur import SchurApproximation
 
 _BODIES = "fieldsplit_bodies_"
 _CONSTRAINTS = "fieldsplit_constraints_"
@@ -21,13 +23,14 @@ _SECOND = "dolfinx_nts_second"
 SOLVERS = ("auto", "direct", "krylov")
 #: Presets; a user's `petsc_options` override them one by one.
 PRESETS: dict[str, dict[str, Any]] = {
-    # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses.
+    # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses, most on
+    # thin bodies, whose nodes have about as many constraints as coordinates where they touch.
     "direct": {
         "snes_linesearch_type": "basic",
         "ksp_type": "preonly",
         "pc_type": "lu",
         "pc_factor_mat_solver_type": "mumps",
-        "mat_mumps_icntl_14": 80,
+        "mat_mumps_icntl_14": 300,
     },
     # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good. "selfp" is
     # replaced by `SchurApproximation`, but for a user who asks for it, and where options are
@@ -112,8 +115,8 @@ def most_iterations(size: int) -> int:
     return int(60 * max(1.0, size / 1e3) ** 0.4)
 
 
-#: In place of the preset's where the contact unknowns are condensed: without zeros on its diagonal
-#: their small block needs no pivoting, and starting MUMPS takes longer than all else.
+#: In place of the preset's where the augmented unknowns are condensed: without zeros on its
+#: diagonal their small block needs no pivoting, and starting MUMPS takes longer than all else.
 _CONDENSED: Mapping[str, Mapping[str, Any]] = {
     "krylov": {_CONSTRAINTS + _FACTORS + "pc_type": "redundant"},
 }
@@ -128,7 +131,7 @@ class SolverOptions:
     Args:
         comm: MPI communicator.
         preset: Name of a preset.
-        condense: Whether the contact unknowns are condensed.
+        condense: Whether the augmented unknowns are condensed.
         given: The user's options without prefix; they override the preset.
         limit: Krylov iterations of a solve that are one too many, the preset's if None.
     """
@@ -181,11 +184,11 @@ class SolverOptions:
     ) -> None:
         """Set a SNES up from the options.
 
-        Without contact unknowns a field split has one part only, so the bodies' options are used.
+        Without constraints a field split has one part only, so the bodies' options are used.
 
         Args:
             snes: The SNES.
-            matrix: Its matrix, if there are contact unknowns to split off.
+            matrix: Its matrix, if there are constraints to split off.
             num_bodies: Fields of the matrix that are bodies.
             whole: Whether each rank's preconditioner takes whole bodies, see `take_bodies`.
 
@@ -221,8 +224,8 @@ class SolverOptions:
 
         Nothing is solved yet: most options are asked for when the solver is set up. If some are
         not, a small model problem with a constraint is solved, which asks for those of the solve
-        itself and of a field split that waits for contact. PETSc has no list of the names it knows:
-        it marks an option as used when the code that reads it runs.
+        itself and of a field split that waits for constraints. PETSc has no list of the names it
+        knows: it marks an option as used when the code that reads it runs.
 
         Args:
             snes: The configured SNES.
@@ -290,7 +293,7 @@ def _split(snes: Any, *parts: tuple[str, Any]) -> None:
 
 
 class SchurInverse:
-    """Preconditioner of the contact part: S^-1 ~ F^-1 M F^-1 from two approximations of S.
+    """Preconditioner of the constraints: S^-1 ~ F^-1 M F^-1 from two approximations of S.
 
     With F = D - C W B and M = D - C W A W B this is Newton's (Schulz's) step from F^-1 towards the
     inverse of D - C (2 W - W A W) B. Where A W maps what B spans into itself, and D = 0, it is
@@ -338,7 +341,7 @@ class SchurInverse:
 
 
 def set_schur(snes: Any, approximation: SchurApproximation) -> None:
-    """Give a Schur field split what its contact part is preconditioned with.
+    """Give a Schur field split what its constraints are preconditioned with.
 
     Args:
         snes: The SNES.
@@ -349,19 +352,19 @@ def set_schur(snes: Any, approximation: SchurApproximation) -> None:
     snes.getKSP().getPC().setFieldSplitSchurPreType(user, approximation.first)
 
 
-def take_bodies(snes: Any, operator: Any, bodies: Sequence[Any], contact: bool) -> None:
+def take_bodies(snes: Any, operator: Any, bodies: Sequence[Any], split: bool) -> None:
     """Let this rank's preconditioner take whole bodies. Collective, before the first solve.
 
     Args:
         snes: Configured with `whole`.
         operator: What it solves with.
         bodies: Numbers of each body in the bodies' part of the operator.
-        contact: Whether the preconditioner is a field split.
+        split: Whether the preconditioner is a field split.
     """
     ksp = snes.getKSP()
     ksp.setOperators(operator, operator)
     pc = ksp.getPC()
-    if contact:
+    if split:
         pc.setUp()
         pc = pc.getFieldSplitSubKSP()[0].getPC()
     index = [numbers.astype(PETSc.IntType) for numbers in bodies]

@@ -53,8 +53,8 @@ def check_massless(system: System, integrator: Any, impact: str) -> None:
 def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, str]:
     """The largest force that massless nodes start under, and a warning for it. Collective.
 
-    The mean of both ends of a step is balanced, so what one end misses the other has too much of,
-    step after step.
+    A step balances the mean of its ends. A force missing at one end returns with the other sign at
+    the next.
 
     Args:
         problem: Equations of the run.
@@ -78,7 +78,7 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
         off = np.abs(force[body.massless])
         arrays = (off, body.internal(u), body.reference + u)
         sizes = [np.abs(a).max(initial=0.0) for a in arrays]
-        sizes.append(body.nodal_stiffness(problem.integrator).max(initial=0.0))
+        sizes.append(body.nodal_stiffness().max(initial=0.0))
         top = global_max(problem.system.comm, np.array(sizes))
         missing, internal, length, stiffness = top.tolist()
         if missing > max(worst, _BALANCED * internal) and internal > _ROUNDED * stiffness * length:

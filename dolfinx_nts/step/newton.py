@@ -144,10 +144,10 @@ class StepSolver:
             if unsolved and self._presets.has_next:
                 return self._attempt_otherwise(iterations)
         self._tangents.due = True
-        message = self._failure(last, reason, iterations)
+        failure = self._failure(last, reason, iterations)
         if unsolved:
             self.destroy()
-        raise StepFailedError(message)
+        raise failure
 
     def _of_least_norm(self, solved: Evaluation) -> Evaluation:
         """The solution with multipliers of least norm, where constraints repeat each other."""
@@ -224,16 +224,16 @@ class StepSolver:
         self.snes.setConvergenceTest(self._converged)
         self.snes.setLineSearchPreCheck(self._upright.shorten)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
-        contact = self.matrix if self.problem.laid.own else None
+        split = self.matrix if self.problem.laid.own else None
         self._solved = False
         options = self._presets.options
         ours = options.blocked and self.problem.system.comm.size > 1
         bodies = self.matrix.whole_bodies() if ours else None
         whole = bodies is not None
-        options.configure(self.snes, contact, len(self.problem.awake), whole=whole)
+        options.configure(self.snes, split, len(self.problem.awake), whole=whole)
         self._refresh_schur()
         if bodies is not None:
-            take_bodies(self.snes, self.matrix.operator, bodies, contact is not None)
+            take_bodies(self.snes, self.matrix.operator, bodies, split is not None)
 
     def _refresh_schur(self) -> None:
         """Give the preset's field split the Schur complement of the matrix as it is now."""
@@ -306,18 +306,21 @@ class StepSolver:
         return self.newton.reuse and not self.problem.system.comm.allreduce(acts, op=MPI.LOR)
 
     # ---- failure
-    def _failure(self, e: Evaluation, reason: int, iterations: int) -> str:
+    def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:
         """What failed, and where a body is inside out or nearly so; every rank must call it."""
         problem = self.problem
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
-            return (
+            return StepFailedError(
                 f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
-                f"{iterations} iterations: {self._upright.describe_inverted(e.x)}"
+                f"{iterations} iterations: {self._upright.describe_inverted(e.x)}",
+                advises=True,
             )
         why = self._presets.why_failed(self.snes, reason)
         message = diagnosis(problem, e, self.iterates.flips, why, iterations)
         flat = self._upright.describe_flat(e.x)
-        return f"{message}; {flat}" if flat else message
+        if flat:
+            return StepFailedError(f"{message}; {flat}", advises=True)
+        return StepFailedError(message, advises=self.iterates.cycles)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

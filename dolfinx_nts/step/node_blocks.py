@@ -1,7 +1,7 @@
 """The bodies' matrices side by side in the 3 x 3 blocks of their nodes (PETSc's BAIJ).
 
 They are filled from the bodies' AIJ matrices block by block: by way of a nest and PETSc's
-conversions a new layout of contact would cost as much as several Newton iterations.
+conversions a new layout of the elements would cost as much as several Newton iterations.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.points import of_nodes
 
 IntArray = npt.NDArray[np.signedinteger[Any]]
 #: Nodes at a time.
@@ -42,7 +43,7 @@ def patterns(bodies: Sequence[Any]) -> list[Pattern] | None:
 def _pattern(a: Any) -> Pattern | None:
     """Block rows of this rank's parts of an AIJ matrix, if its entries are whole blocks.
 
-    The matrix keeps it: contact has a new layout much more often than a body has.
+    The matrix keeps it: elements have a new layout much more often than a body has.
     """
     known: Pattern | None = a.getAttr(_PATTERN)
     if known is None:
@@ -58,7 +59,7 @@ def _find_pattern(a: Any) -> Pattern | None:
         if len(number) % 3 or (length % 3).any() or (length != length[:, :1]).any():
             return None
         node = number[::3] // 3
-        if (number.reshape(-1, 3) != 3 * node[:, None] + np.arange(3)).any():
+        if (number.reshape(-1, 3) != of_nodes(node)).any():
             return None
         start, blocks = pointer[::3] // 9, [np.empty(0, column.dtype)]
         for chunk in _chunks(start):
@@ -97,14 +98,14 @@ def _blocks(start: IntArray, entries: npt.NDArray[Any], chunk: slice) -> npt.NDA
 
 
 class NodeBlocks:
-    """What a BAIJ matrix of all bodies, with room for contact between their nodes, is made of.
+    """What a BAIJ matrix of all bodies, with room for elements between their nodes, is made of.
 
     Args:
         bodies: Their PETSc matrices.
         found: What `patterns` says of them.
         to_whole: (body, numbers in it) -> numbers in the new matrix.
-        contact: Of each batch of elements the numbers in the new matrix, three to a node, shape
-            (n, 3 nodes); negative ones are left out.
+        elements: Of each batch the numbers in the new matrix, three to a node, shape (n, 3 nodes);
+            negative ones are left out.
 
     Attributes:
         size: Rows on this rank.
@@ -116,7 +117,7 @@ class NodeBlocks:
         bodies: Sequence[Any],
         found: Sequence[Pattern],
         to_whole: Callable[[int, IntArray], IntArray],
-        contact: Sequence[IntArray],
+        elements: Sequence[IntArray],
     ) -> None:
         comm, index = bodies[0].comm.tompi4py(), PETSc.IntType
         self._bodies, self._rows, self._patterns = list(bodies), [], []
@@ -132,7 +133,7 @@ class NodeBlocks:
             self._patterns.append(
                 [(p, (to_whole(k, 3 * n.astype(np.int64)) // 3).astype(index)) for p, n in parts]
             )
-        blocks += _most_couplings(comm, first, contact)
+        blocks += _most_couplings(comm, first, elements)
         np.minimum(blocks, (local, first[-1] - local), out=blocks)
         self.size = 3 * local
         self.room = [b.astype(index) for b in np.ascontiguousarray(blocks.T)]
@@ -179,20 +180,20 @@ def add(matrix: Any, numbers: IntArray, values: npt.NDArray[np.float64]) -> None
     )
 
 
-def _most_couplings(comm: Any, first: IntArray, contact: Sequence[IntArray]) -> IntArray:
-    """Upper bound of the blocks that contact needs in each of this rank's rows. Collective.
+def _most_couplings(comm: Any, first: IntArray, elements: Sequence[IntArray]) -> IntArray:
+    """Upper bound of the blocks that elements need in each of this rank's rows. Collective.
 
     Args:
         comm: MPI communicator.
         first: First node of each rank, and the number of all.
-        contact: As of `NodeBlocks`.
+        elements: As of `NodeBlocks`.
 
     Returns:
         In the rank's own columns and in those of others, shape (nodes, 2).
     """
     local = int(first[comm.rank + 1] - first[comm.rank])
     count = PETSc.Vec().createMPI((2 * local, None), comm=comm)
-    for numbers in contact:
+    for numbers in elements:
         node = numbers.reshape(len(numbers), numbers.shape[1] // 3, 3).max(axis=2) // 3
         row, col = np.broadcast_arrays(node[:, :, None], node[:, None, :])
         kept = (row >= 0) & (col >= 0) & (row != col)

@@ -23,6 +23,14 @@ _KEPT = 1e-3
 _LAST = 1e5
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
+#: What MUMPS says in INFOG(1) where it or the machine has not the memory that it needs.
+_NO_MEMORY = (-5, -7, -8, -9, -11, -13, -14, -19, -20)
+
+
+def _mumps_lacks_memory(pc: Any) -> bool:
+    """Whether a factorisation by MUMPS failed for want of memory, the same on all ranks."""
+    factors = pc.getType() in ("lu", "cholesky") and pc.getFactorSolverType() == "mumps"
+    return factors and pc.getFactorMatrix().getMumpsInfog(1) in _NO_MEMORY
 
 
 class Presets:
@@ -118,8 +126,14 @@ class Presets:
         """
         if reason != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
             return f"SNES reason {reason}"
-        ksp = snes.getKSP().getConvergedReason()
-        why = f"the linear solver {self.name!r} failed, KSP reason {ksp}{self.with_options}"
+        ksp = snes.getKSP()
+        why = f"the linear solver {self.name!r} failed, KSP reason {ksp.getConvergedReason()}"
+        why += self.with_options
+        if _mumps_lacks_memory(ksp.getPC()):
+            why += (
+                "; MUMPS did not get the memory for its factors: use more ranks or memory, "
+                "Newton(linear_solver='krylov'), or a coarser mesh"
+            )
         if self._names == ("krylov",):
             why += "; linear_solver='auto' goes on with MUMPS where that happens"
         return why

@@ -18,16 +18,16 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.body import Moment
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.contact.history import ContactHistory
 from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_together
-from dolfinx_nts.evaluation import BodyTerms, Evaluation, free
+from dolfinx_nts.evaluation import BodyTerms, Evaluation, Moment, free
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.state import State
+from dolfinx_nts.state import ContactHistory, State
+from dolfinx_nts.step.least_norm import hanging
 from dolfinx_nts.step.rounding import Rounding
+from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.stabilization import Stabilization
 from dolfinx_nts.step.unknowns import Unknowns
@@ -64,8 +64,8 @@ class StepProblem:
 
     Attributes:
         awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
-        contacts: What makes the elements of contacts. Asked by itself where contact is meant: by
-            `touching`, for when gaps close, and for what a checkpoint keeps of slave nodes.
+        contacts: What makes the elements of contacts. Used directly only for what contacts alone
+            have: `touching`, closing gaps, checkpoints.
         joints: What makes those of each joint.
         couplings: All that makes elements.
         unknowns: Their layout; made anew whenever the elements' coordinates change.
@@ -89,16 +89,35 @@ class StepProblem:
         self.awake: tuple[int, ...] = ()
         self._numbers: tuple[Any, ...] | None = None
         self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
+        self._shared = SharedWeight(system.comm, system.contacts, system.contact_bodies)
         both = zip(system.joints, system.joint_bodies, strict=True)
         self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
+        self._lend_less()
         self.couplings: list[Coupling] = [self.contacts, *self.joints]
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.centre, self._span = _box(system)
-        self.stabilization = Stabilization(system, integrator, self._span)
+        self.stabilization = Stabilization(system, self._span)
         self.rounding = Rounding(
-            system.bodies, lambda k: self.body_tangent(k, self.state.u[k])
+            system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
+
+    def _lend_less(self) -> None:
+        """Lend no compliance to joints of rigid bodies that form no loop. Collective."""
+        system = self.system
+        found: list[tuple[Any, tuple[int, ...]]] = []
+        of = zip(system.declared_joints, self.joints, system.joint_bodies, strict=False)
+        for joint, coupling, bodies in of:
+            if hasattr(joint, "slopes"):  # a spring holds nothing
+                continue
+            rigid = all(body.rigid for body in joint.bodies)
+            found.append((getattr(coupling, "hold_alone", None) if rigid else None, bodies))
+        moved = system.comm.allreduce(np.array([b.fixed.sum() for b in system.bodies]))
+        free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
+        alone = hanging([bodies for _, bodies in found], free)
+        for (hold_alone, _), hangs in zip(found, alone, strict=True):
+            if hold_alone is not None and hangs:
+                hold_alone()
 
     # ---- set-up of a step
     def begin(
@@ -128,33 +147,13 @@ class StepProblem:
         for body, moment in zip(system.bodies, moments, strict=True):
             body.begin_step(self.integrator, moment)
         self._gravity = self.integrator.ramp(self._when) * system.gravity
-        flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
-        self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
-        for body, u1 in zip(system.bodies, self.first, strict=True):
-            u1[body.fixed] = body.prescribed(state.time + dt)
-        local = [
-            [
-                b.motion_of_points(u1 - u),
-                *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
-            ]
-            for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
-        ]
-        top = global_max(system.comm, np.array(local)).T
-        motion, extent, speed, moved = top
-        if state.a:
-            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
-            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
-        # In statics v only predicts the first guess.
-        moves = (speed > 0.0) & self.integrator.inertia
-        self.flight = [
-            self._inertial(b, ahead) if top else np.zeros_like(ahead)
-            for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
-        ]
+        self.lengths, speed = self._fly()
         way = [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
         if again is not None:
-            motion = np.maximum(motion, self.motion(again))
+            motion = np.maximum(self.lengths.motion, self.motion(again))
+            self.lengths = self.lengths._replace(motion=motion)
             way = [terms.du for terms in again.bodies]
-        self.lengths = Lengths(motion, extent, moved)
+        motion, extent, moved = self.lengths
         # Bodies at rest may fall.
         length = moved + motion + dt**2 * float(np.linalg.norm(self._gravity))
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
@@ -170,6 +169,36 @@ class StepProblem:
             coupling.begin(step, history, again, search)
         self._asleep = self._find_asleep(np.maximum(motion, speed) == 0.0)
         self._lay_out()
+
+    def _fly(self) -> tuple[Lengths, FloatArray]:
+        """Set `first` and `flight`, the step without forces. Collective.
+
+        Returns:
+            Its lengths, and the largest speed of each body [m/s], shape (bodies,).
+        """
+        system, state, dt = self.system, self.state, self.dt
+        flight = [self.integrator.ahead(v, self.acceleration(k), dt) for k, v in enumerate(state.v)]
+        self.first = [u + ahead for u, ahead in zip(state.u, flight, strict=True)]
+        for body, u1 in zip(system.bodies, self.first, strict=True):
+            u1[body.fixed] = body.prescribed(state.time + dt)
+        local = [
+            [
+                b.motion_of_points(u1 - u),
+                *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
+            ]
+            for b, u1, u, v in zip(system.bodies, self.first, state.u, state.v, strict=True)
+        ]
+        motion, extent, speed, moved = global_max(system.comm, np.array(local)).T
+        if state.a:
+            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
+            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
+        # In statics v only predicts the first guess.
+        moves = (speed > 0.0) & self.integrator.inertia
+        self.flight = [
+            self._inertial(b, ahead) if top else np.zeros_like(ahead)
+            for b, ahead, top in zip(system.bodies, flight, moves, strict=True)
+        ]
+        return Lengths(motion, extent, moved), speed
 
     @property
     def elements(self) -> list[Any]:
@@ -246,7 +275,7 @@ class StepProblem:
             coupling.let_slip()
 
     def give_way(self) -> bool:
-        """Limit forces that had no limit from the next step on; tells whether one had none."""
+        """From the next step on, limit forces that had no limit; return whether there was one."""
         return any([coupling.give_way() for coupling in self.couplings])
 
     def _touched(self) -> set[int]:
@@ -362,8 +391,8 @@ class StepProblem:
             flight: Free flight from t_n under the contact forces of the last step; else the
                 positions of t_n, which free flight of a fast turning or vibrating body may invert,
                 and no forces. Prescribed coordinates are at t_{n+1}.
-            carried: Take the contact forces of the last step as they were, whatever `flight` is,
-                also what is no good as a guess.
+            carried: Take the contact forces of the last step unchanged, whatever `flight` is, even
+                where they are a poor guess.
         """
         laid, elements = self.laid, self.elements
         with self.x as x:
@@ -402,6 +431,10 @@ class StepProblem:
         positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
         own = laid.own_values(values, elements)
         parts = evaluate_together(self.system.comm, elements, positions, own)
+        touching = len(self.contacts.elements)
+        self._shared.divide(
+            self.contacts.elements, self.contacts.bodies, parts[:touching], positions[:touching]
+        )
         force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
         bodies = dict(self._asleep)
         for k in self.awake:
@@ -448,6 +481,29 @@ class StepProblem:
         """
         self.rounding.length = np.maximum(self.rounding.length, self.displacement(e))
         self.rounding.measure(self.awake)
+        self.rounding.measure_springs()
+
+    def _springs(self) -> FloatArray:
+        """Stiffness at t_n of elements without unknowns of their own, of each body. Collective."""
+        laid, elements, start = self.laid, self.elements, self.x.duplicate()
+        local = np.zeros(len(self.system.bodies))
+        start.set(0.0)
+        for k in self.awake:
+            start.array_w[laid.of_body(k)] = self.state.u[k]
+        positions = laid.positions(start, elements)
+        own = laid.own_values(start.array_r, elements)
+        start.destroy()
+        for batch, numbers, x, mine in zip(elements, self.bodies, positions, own, strict=True):
+            if any(batch.widths.values()):
+                continue
+            stiffness, first = batch.evaluate(x, mine).tangent, 0
+            for k, dofs in zip(numbers, batch.dofs(), strict=True):
+                stop = first + dofs.shape[1]
+                along = stiffness[:, first:stop, first:stop].diagonal(axis1=1, axis2=2)
+                local[k] += float(np.linalg.norm(along[dofs >= 0]))
+                first = stop
+        found: FloatArray = self.system.comm.allreduce(local)
+        return found
 
     # ---- lengths and rounding
     def displacement(self, e: Evaluation) -> FloatArray:

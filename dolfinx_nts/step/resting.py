@@ -67,6 +67,7 @@ def with_resting_forces(
     touches = any(_closed(c).any() for c in batches)
     if not system.comm.allreduce(touches, op=MPI.LOR):
         return state
+    # With beta = 1/2 a step moves by h v_0 + h^2/2 a_1: a_0, which is sought, plays no part.
     rule = Newmark(beta=0.5, gamma=1.0)
     short = StepProblem(system, rule, rtol=newton.rtol, condense=newton.condense)
     solver = StepSolver(short, newton, newton.preset(system, True, options), options)

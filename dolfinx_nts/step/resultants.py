@@ -38,8 +38,7 @@ def is_resultant(column: str) -> bool:
 
 def at_start(system: System) -> dict[str, FloatArray]:
     """Zeros of the right shapes, for the row of the start."""
-    row = {reactions_of(b): np.zeros_like(b.reactions(np.zeros(b.num_owned)))
-           for b in system.bodies}  # fmt: skip
+    row = {reactions_of(b): np.zeros((len(b.reaction_labels), 3)) for b in system.bodies}
     row |= {reactions_of(joint): np.zeros((2, 3)) for joint in system.declared_joints}
     none = np.zeros((len(system.contacts), 3))
     return row | {CONTACT_FORCES: none, CONTACT_MOMENTS: none}
@@ -53,14 +52,16 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
         step: Their solution.
 
     Returns:
-        By column: of each body's conditions, shape (conditions, 3), of each joint on the first of
-        its bodies, force [N] and moment about its point [N m], shape (2, 3), NaN where its elements
-        do not say them, and of each contact on
-        its slave body forces [N] and moments about the origin [N m], shape (contacts, 3) each.
+        By column:
+            - of each body: forces of its conditions [N], or their moments [N m], (conditions, 3);
+            - of each joint: force [N] and moment about its point [N m] on the first of its bodies,
+              shape (2, 3), NaN where its elements do not say them;
+            - of all contacts: forces [N] on the slaves, and their moments about the origin [N m],
+              shape (contacts, 3) each.
     """
     bodies, contacts = problem.system.bodies, problem.touching(step)
     joints = problem.system.declared_joints
-    parts = [b.reactions(t.residual) for b, t in zip(bodies, step.bodies, strict=True)]
+    parts = [b.reactions(t.residual, t.u1) for b, t in zip(bodies, step.bodies, strict=True)]
     forces = [part.force.sum(axis=0) for _, part, _ in contacts]
     parts.append(np.reshape(forces, (len(contacts), 3)))
     moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]

@@ -13,6 +13,8 @@ FloatArray = npt.NDArray[np.float64]
 _EPS = float(np.finfo(float).eps)
 #: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.
 _ANOTHER_STEP = 4.0
+#: Roundings in a force between bodies: of both places, of the distance, and of the law itself.
+_ENDS = 4.0
 
 
 class Rounding:
@@ -21,19 +23,27 @@ class Rounding:
     The stiffness is the diagonal of a body's matrix in an accepted state, never in an iterate: one
     that runs off may be stiffer by any factor, and its rounding excuses no residual. Forces come
     from displacement gradients, so the length is that of the displacement, wherever the body lies
-    and however large it is.
+    and however large it is. Forces between bodies come from places.
 
     Args:
         bodies: Bodies of the system.
         tangent: PETSc matrix of a body at the start of the step, by the body's number.
+        springs: Stiffness there of what acts between bodies, of each body [kg], (bodies,).
+            Collective.
 
     Attributes:
         length: Displacement of each body in the step [m], at most, shape (bodies,).
     """
 
-    def __init__(self, bodies: Sequence[Any], tangent: Callable[[int], Any]) -> None:
-        self._bodies, self._tangent = bodies, tangent
+    def __init__(
+        self,
+        bodies: Sequence[Any],
+        tangent: Callable[[int], Any],
+        springs: Callable[[], FloatArray],
+    ) -> None:
+        self._bodies, self._tangent, self._springs = bodies, tangent, springs
         self._diagonal, self._of_factor = np.zeros((2, len(bodies)))
+        self._between = np.zeros(len(bodies))
         self.length = self._extent = self._moved = np.zeros(len(bodies))
         self._factor = 1.0
 
@@ -52,6 +62,7 @@ class Rounding:
         # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
         old = self._of_factor
         self._diagonal[(factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * factor)] = 0.0
+        self._between[:] = 0.0
 
     @property
     def measured(self) -> list[list[float]]:
@@ -67,11 +78,22 @@ class Rounding:
         return bool((self._diagonal[list(bodies)] > 0.0).all())
 
     def measure(self, bodies: Iterable[int]) -> None:
-        """Measure it anew, for bodies that have stiffened. Collective."""
+        """Measure it anew, for bodies that have stiffened. Collective.
+
+        A director is rounded as its own length is, not as a position: the stiffness of thin bodies
+        against what turns it alone counts by that part.
+        """
         for k in bodies:
-            diagonal = self._tangent(k).getDiagonal()
+            body, diagonal = self._bodies[k], self._tangent(k).getDiagonal()
+            if body.oriented and not body.rigid:
+                of_nodes = np.where(body.places, 1.0, body.length / self._extent[k])
+                diagonal.array_w[:] *= np.repeat(of_nodes, 3)
             self._diagonal[k], self._of_factor[k] = diagonal.norm(), self._factor
             diagonal.destroy()
+
+    def measure_springs(self) -> None:
+        """Measure that of forces between bodies in this step. Collective."""
+        self._between = self._springs()
 
     @property
     def forces(self) -> FloatArray:
@@ -82,7 +104,8 @@ class Rounding:
         """`forces` at displacements of these lengths [m], shape (bodies,)."""
         bodies = zip(self._bodies, self._extent, strict=True)
         beside = np.array([e if body.rounded is None else body.rounded for body, e in bodies])
-        rounding: FloatArray = _EPS * self._diagonal * (length + beside)
+        between = _ENDS * self._between * (length + self._extent)
+        rounding: FloatArray = _EPS * (self._diagonal * (length + beside) + between)
         return rounding
 
     def of(self, bodies: Sequence[int]) -> float:

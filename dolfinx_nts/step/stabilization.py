@@ -18,15 +18,14 @@ class Stabilization:
 
     Args:
         system: The scene.
-        integrator: Rules of the step.
         span: Size of the scene [m].
 
     Attributes:
         share: That part [-], zero in dynamics.
     """
 
-    def __init__(self, system: System, integrator: Any, span: float) -> None:
-        self._system, self._integrator, self._span = system, integrator, span
+    def __init__(self, system: System, span: float) -> None:
+        self._system, self._span = system, span
         self.share = 0.0
 
     def of(self, body: Any) -> FloatArray:
@@ -37,18 +36,40 @@ class Stabilization:
 
     def stiffness(self, body: Any) -> FloatArray:
         """Stiffness of each coordinate's surroundings [N/m]; where there is none, of the others."""
-        own: FloatArray = body.nodal_stiffness(self._integrator)
-        return np.where(own > 0.0, own, self._mean)
+        own: FloatArray = body.nodal_stiffness()
+        # Nothing moves what nothing pushes: any number does there.
+        return np.where(own > 0.0, own, self._of_others or self._of_loads() or 1.0)
 
     @cached_property
-    def _mean(self) -> float:
-        """Of all flexible bodies [N/m], or weight over size where all are rigid. Collective."""
+    def _of_others(self) -> float:
+        """Of all flexible bodies in the mean, or of springs beside weight [N/m]. Collective."""
+        system = self._system
         local = np.zeros(3)
-        for body in self._system.bodies:
-            own = body.nodal_stiffness(self._integrator)
+        for body in system.bodies:
+            own = body.nodal_stiffness()
             local += own.sum(), np.count_nonzero(own), body.nodal_mass.max(initial=0.0)
-        total, number, mass = self._system.comm.allreduce(local).tolist()
+        total, number, mass = system.comm.allreduce(local).tolist()
         if number:
             return float(total / number)
-        weight = mass * float(np.linalg.norm(self._system.gravity))
-        return weight / self._span if weight and self._span else 1.0
+        return self._of_springs() + self._over_span(mass * float(np.linalg.norm(system.gravity)))
+
+    def _of_springs(self) -> float:
+        """Of all springs in the mean, as they are in the reference [N/m]. Collective."""
+        found, comm = [], self._system.comm
+        for joint in self._system.joints:
+            if hasattr(joint, "slopes"):
+                still = [np.zeros(body.num_owned) for body in joint.bodies]
+                gradients, stiffness, *_ = joint.slopes(still, joint.start())
+                slope = comm.allgather(max(np.abs(g).max(initial=0.0) for g in gradients))
+                found.append(abs(stiffness) * max(slope) ** 2)
+        found = [stiffness for stiffness in found if stiffness]
+        return float(np.mean(found)) if found else 0.0
+
+    def _of_loads(self) -> float:
+        """Largest load in the step over the size of the scene [N/m]. Collective."""
+        bodies, none = self._system.bodies, np.zeros(3)
+        loads = [np.abs(b.external(np.zeros(b.num_owned), none)).max(initial=0.0) for b in bodies]
+        return self._over_span(max(self._system.comm.allgather(float(max(loads)))))
+
+    def _over_span(self, force: float) -> float:
+        return force / self._span if force and self._span else 0.0

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from dolfinx_nts.step.assembly import ElementBlocks, Layout
+from dolfinx_nts.step.layout import ElementBlocks, Layout
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

@@ -18,7 +18,7 @@ _KEPT_DET = 0.1
 _HALVINGS = 10
 #: ... and in so many iterations in a row before the step is dropped.
 _SHORTENED = 5
-_REMEDY = "smaller loads, a finer mesh or another energy may prevent it"
+_REMEDY = "smaller loads or speeds may prevent it"
 
 
 class Upright:

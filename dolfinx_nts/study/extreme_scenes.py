@@ -21,6 +21,8 @@ _YOUNG, _DENSITY, _EDGE = 1e6, 1e3, 1.0
 #: How long the cubes touch, about: there and back of a wave [s].
 CONTACT = 2.0 * _EDGE * math.sqrt(_DENSITY / _YOUNG)
 _GRAVITY = 9.81
+#: Speed [m/s] and step over the duration of contact of `strips`.
+_GENTLE, _COARSE = 0.1, 0.1
 #: Steps of `long_run`.
 _LONG = 20_000
 
@@ -76,6 +78,7 @@ class Scene:
         stiffness: Young's modulus of the first over that of the second.
         density: Likewise.
         cells: Along an edge of the first cube and of the others, in turn.
+        strip: Cells in the other two directions, where `cells` are along y only; 0: as along y.
         height: Of the second's cells over their length.
         poisson: Of all.
         material: Of all, a name in `MATERIALS`.
@@ -97,6 +100,7 @@ class Scene:
     stiffness: float = 1.0
     density: float = 1.0
     cells: tuple[int, int] = (3, 2)
+    strip: int = 0
     height: float = 1.0
     poisson: float = 0.3
     material: str = "neo-Hookean"
@@ -133,9 +137,10 @@ class Scene:
                 start[1:], size[1:] = self._beside(edge)
                 start[1:] += far
             start[0] += k * (edge + gap)
+            number = self.cells[k % 2]
             mesh = create_box(
-                comm, [start, start + size], [self.cells[k % 2]] * 3, CellType.hexahedron,
-                ghost_mode=GhostMode.shared_facet,
+                comm, [start, start + size], [self.strip or number, number, self.strip or number],
+                CellType.hexahedron, ghost_mode=GhostMode.shared_facet,
             )  # fmt: skip
             if k == 1:
                 self._distort(mesh.geometry.x, start, size)
@@ -181,6 +186,16 @@ class Scene:
             number = np.rint(relative * self.cells[1]).astype(int)
             odd = (number[:, 0] == 0) & ((number[:, 1] + number[:, 2]) % 2 == 1)
             x[odd, 0] += 0.2 * size[0] / self.cells[1]
+
+
+def strips(comm: Any, cells: tuple[int, int]) -> Case:
+    """Surfaces of very different meshes, at a speed that forces on single nodes allow.
+
+    Args:
+        comm: MPI communicator.
+        cells: Along y of both bodies; two in the other directions.
+    """
+    return Scene(cells=cells, strip=2, speed=_GENTLE, dt=_COARSE).case(comm)
 
 
 def closing(comm: Any, dt: float) -> Case:

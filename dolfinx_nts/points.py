@@ -18,6 +18,12 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 
+def of_nodes(nodes: IntArray) -> IntArray:
+    """Numbers of the coordinates of nodes, shape (*nodes.shape, 3)."""
+    numbers: IntArray = 3 * nodes[..., None] + np.arange(3, dtype=nodes.dtype)
+    return numbers
+
+
 @dataclass(frozen=True, eq=False)
 class Points:
     """Material points of a body, or directions in it, the same on all ranks; axis 0 = point.
@@ -45,8 +51,7 @@ class Points:
     @property
     def dofs(self) -> IntArray:
         """Global coordinates of the nodes, shape (n, k, 3)."""
-        dofs: IntArray = 3 * self.nodes[:, :, None] + np.arange(3)
-        return dofs
+        return of_nodes(self.nodes)
 
     def flat(self, prescribed: int | None = None) -> IntArray:
         """`dofs` as (n, 3 k), with `prescribed` in place of coordinates that are."""
@@ -57,6 +62,10 @@ class Points:
         """Return some of the points, chosen by numbers, a slice or a mask; ranks may differ."""
         arrays = (self.nodes, self.weights, self.reference, self.fixed, self.places)
         return Points(self.body, *(a[chosen] for a in arrays))
+
+    def columns(self, chosen: IntArray) -> Points:
+        """Return the points by some of the nodes each depends on; the others have no weight."""
+        return self.part((slice(None), chosen))
 
     @cached_property
     def _table(self) -> tuple[IntArray, IntArray]:

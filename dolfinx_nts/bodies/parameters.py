@@ -1,0 +1,78 @@
+"""Parameters of materials: numbers, or Constants and Functions that may change between steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from ufl.corealg.traversal import traverse_unique_terminals
+
+from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.validation import is_finite
+
+FloatArray = npt.NDArray[np.float64]
+#: What a parameter may be; the latter two of a scalar, a Function e.g. of degree 0.
+Parameter = float | fem.Constant | fem.Function
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a parameter is a number, which stays what it is."""
+    return not isinstance(value, fem.Constant | fem.Function)
+
+
+def require_parameter(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> None:
+    """Raise ValueError unless all values of a parameter fit; of a Function on all ranks.
+
+    Args:
+        name: Of the parameter.
+        value: A number, or a scalar Constant or Function.
+        fits: Tells of a value whether it lies in an interval.
+        wanted: What to say else, e.g. "must be positive and finite [Pa]".
+    """
+    if is_number(value):
+        if not fits(value):
+            raise ValueError(f"{name}={value!r}: {wanted}")
+        return
+    is_field, problem = isinstance(value, fem.Function), None
+    if value.ufl_shape != ():
+        problem = f"{name}={value!s}: has shape {value.ufl_shape}; pass a scalar"
+    else:
+        values = np.ravel(value.x.array if is_field else value.value)
+        unfit = [v for v in (values.min(), values.max()) if not fits(v)] if len(values) else []
+        if unfit:
+            problem = f"{name}={value!s} with a value of {float(unfit[0])!r}: {wanted}"
+    if is_field:
+        raise_together(value.function_space.mesh.comm, problem)
+    elif problem is not None:
+        raise ValueError(problem)
+
+
+def require_positive_parameter(name: str, value: Any, unit: str) -> None:
+    """Raise ValueError unless all values of a parameter are positive and finite."""
+    wanted = f"must be positive and finite [{unit}]"
+    require_parameter(name, value, lambda v: is_finite(v) and v > 0, wanted)
+
+
+def require_finite_parameter(name: str, value: Any, unit: str) -> None:
+    """Raise ValueError unless all values of a parameter are finite."""
+    require_parameter(name, value, is_finite, f"pass a finite number [{unit}]")
+
+
+def in_expressions(expressions: Iterable[Any], unknowns: Iterable[Any] = ()) -> list[Any]:
+    """Constants and Functions in UFL expressions, but for the body's own unknowns."""
+    found = dict.fromkeys(t for e in expressions for t in traverse_unique_terminals(e))
+    own = list(unknowns)
+    return [
+        t
+        for t in found
+        if isinstance(t, fem.Constant | fem.Function) and not any(t is u for u in own)
+    ]
+
+
+def values_of(parameters: Iterable[Any]) -> FloatArray:
+    """Values of Constants and Functions one after another, shape (n,)."""
+    values = [p.value if isinstance(p, fem.Constant) else p.x.array for p in parameters]
+    return np.concatenate([np.empty(0), *map(np.ravel, values)])

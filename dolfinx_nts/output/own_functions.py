@@ -1,0 +1,84 @@
+"""Functions of a user's own beside the fields of a body: stress, damage, temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.validation import items
+
+FloatArray = npt.NDArray[np.float64]
+#: A Function, or what makes one of a body, as `von_mises` does.
+Own: TypeAlias = fem.Function | Callable[[Any], fem.Function]
+
+
+class OwnField(NamedTuple):
+    """Values of a Function on this rank.
+
+    Attributes:
+        name: Its name.
+        on_cells: Whether there is one of each owned cell, else of each local node of the mesh.
+        values: Shape (cells or nodes,), (..., 3) or (..., 3, 3).
+    """
+
+    name: str
+    on_cells: bool
+    values: FloatArray
+
+
+def checked(functions: Iterable[Any]) -> tuple[Own, ...]:
+    """The argument `functions` of a writer."""
+    wanted = "Functions, or callables body -> Function such as dolfinx_nts.von_mises"
+    return items("functions", functions, callable, wanted)
+
+
+def of_body(functions: Sequence[Own], body: Any) -> list[OwnField]:
+    """What is to be written of a body. Collective.
+
+    Args:
+        functions: A Function is written with the body on whose mesh it is; a callable is called of
+            each body with a material.
+        body: A body with a mesh.
+
+    Raises:
+        ValueError: A Function has no value at each node or in each cell.
+    """
+    found, domain = [], body.mesh.ufl_domain()
+    for k, given in enumerate(functions):
+        function: Any = given
+        if not isinstance(given, fem.Function):
+            if not hasattr(body, "law"):
+                continue
+            function = given(body)
+        if function.function_space.mesh.ufl_domain() == domain:
+            found.append(_field(f"functions[{k}]", function, body))
+    return found
+
+
+def _field(what: str, function: Any, body: Any) -> OwnField:
+    space, shape = function.function_space, function.ufl_shape
+    function.x.scatter_forward()
+    values = function.x.array.reshape(-1, int(np.prod(shape, dtype=int)))
+    dofs, owned = compat.cell_dofs(space), body.mesh.topology.index_map(body.mesh.topology.dim)
+    on_cells = dofs.shape[1] == 1
+    problem = None
+    if shape not in ((), (3,), (3, 3)) or space.dofmap.index_map_bs != values.shape[1]:
+        problem = f"has shape {shape}; pass scalars, 3-vectors or 3 x 3 tensors"
+    elif on_cells:
+        values = values[dofs[: owned.size_local, 0]]
+    elif compat.is_nodal(space, body.mesh):
+        values = values[compat.node_blocks(body.mesh, space)]
+    else:
+        problem = (
+            "has other values than one at each node or in each cell; interpolate it into a "
+            "Lagrange space of degree 1, or a DG space of degree 0"
+        )
+    text = f"{what}={function!s} of body {body.name!r}: {problem}"
+    raise_together(body.comm, text if problem else None)
+    return OwnField(function.name, on_cells, values.reshape(-1, *shape))

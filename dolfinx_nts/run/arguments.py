@@ -1,0 +1,79 @@
+"""Checks of what a `Stepper` is asked for, before any work and on all ranks alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.run.start import refuse_moved
+from dolfinx_nts.step.accuracy import Newton
+from dolfinx_nts.step.impact import IMPACTS
+from dolfinx_nts.step.massless import check_massless
+from dolfinx_nts.system import System
+from dolfinx_nts.validation import is_finite, require_bool
+
+#: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
+_WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
+
+
+def check_scheme(system: Any, integrator: Any, newton: Any, petsc_options: Any) -> None:
+    """Raise where the equations of steps, or their solver, are not asked for as they should be.
+
+    Arguments are those of `Stepper`.
+
+    Raises:
+        TypeError: One is of another kind.
+        ValueError: An option of PETSc has no effect, or a body was destroyed.
+    """
+    if not isinstance(system, System):
+        raise TypeError(f"system={system!r}: pass a System([body, ...])")
+    system.check_alive()
+    if not isinstance(integrator, Integrator) or isinstance(integrator, type):
+        raise TypeError(
+            f"integrator={integrator!r}: pass EnergyMomentum(), Midpoint() or another one with "
+            "the Integrator protocol"
+        )
+    if not isinstance(newton, Newton | None):
+        raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")
+    given = {} if petsc_options is None else petsc_options
+    if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+        raise TypeError(
+            f"petsc_options={petsc_options!r}: pass a dict of names and values, e.g. "
+            "{'pc_type': 'lu'}"
+        )
+    for name in sorted(name for name in given if name.lower() in _WITHOUT_EFFECT):
+        raise ValueError(
+            f"petsc_options[{name!r}]={given[name]!r}: each block of the residual is tested by "
+            "itself, not by PETSc; pass newton=Newton(rtol=...)"
+        )
+
+
+def check_run(before_step: Any, **flags: Any) -> None:
+    """Raise a TypeError where a hook is no function, or a flag no truth value."""
+    for name, flag in flags.items():
+        require_bool(name, flag)
+    if not callable(before_step) and before_step is not None:
+        raise TypeError(f"before_step={before_step!r}: pass a callable (time, dt)")
+
+
+def check_impact(system: System, integrator: Integrator, impact: Any, restitution: Any) -> None:
+    """Raise a ValueError where impacts cannot be treated as asked for. Collective.
+
+    Arguments are those of `Stepper`.
+    """
+    if not isinstance(impact, str) or impact not in IMPACTS:
+        known = ", ".join(map(repr, IMPACTS))
+        raise ValueError(f"impact={impact!r}: choose one of {known}")
+    if not (is_finite(restitution) and 0.0 <= restitution <= 1.0):
+        raise ValueError(f"restitution={restitution!r}: must lie between 0 and 1")
+    if impact == "published" and restitution != 1.0:
+        raise ValueError(f"restitution={restitution!r}: pass impact='restored', too")
+    if impact != "published" and not integrator.keeps_energy:
+        raise ValueError(
+            f"impact={impact!r}: {integrator!r} keeps no energy in contact that could be given "
+            "back; choose EnergyMomentum() or Midpoint()"
+        )
+    if impact != "published":
+        refuse_moved(system)
+    check_massless(system, integrator, impact)

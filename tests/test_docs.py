@@ -1,0 +1,146 @@
+"""What pages say exists: files, commands, tests, options and names; and their scripts run."""
+
+import ast
+import functools
+import importlib
+import importlib.util
+import inspect
+import re
+import shlex
+
+import pages
+import pytest
+
+import dolfinx_nts as nts
+
+ROOT = pages.ROOT
+PAGES = pages.pages()
+BLOCKS = list(pages.blocks())
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
+#: Where a path that a page mentions may begin.
+ROOTS = [ROOT, ROOT / "dolfinx_nts", ROOT / "docs"]
+FOLDERS = (
+    "demos", "docs", "tests", "benchmarks", "meshes", "scripts", "dolfinx_nts", "debian",
+    *(p.name for p in (ROOT / "dolfinx_nts").iterdir() if p.is_dir()),
+)  # fmt: skip
+
+
+def by_name(page):
+    return str(page.relative_to(ROOT))
+
+
+def commands(page):
+    """What a page says in code: spans, and lines of blocks that are not Python."""
+    text = pages.BLOCK.sub("", page.read_text())
+    lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
+    fences = re.findall(r"^```\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [*CODE.findall(text), *lines, *"".join(fences).splitlines()]
+
+
+def exists(name):
+    """Whether there is such a file or folder, or one of such files if it has a star."""
+    return any(list(root.glob(name.rstrip("/"))) for root in ROOTS)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_links_lead_somewhere(page):
+    for target in LINK.findall(page.read_text()):
+        path = target.partition("#")[0]
+        if path and "://" not in path and "made/" not in path:
+            assert (page.parent / path).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_files_exist(page):
+    mentioned = re.compile(rf"(?<![\w./-])(?:{'|'.join(FOLDERS)})/[\w./*-]*[\w*/]")
+    for name in mentioned.findall("\n".join(commands(page))):
+        assert "_build" in name or exists(name), name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_commands_exist(page):
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for command in commands(page):
+        for target in re.findall(r"^make ([a-z][\w-]*)", command):
+            assert target in targets, command
+        for module in re.findall(r"python -m (dolfinx_nts[\w.]*)", command):
+            assert importlib.util.find_spec(module), command
+        for name in re.findall(r"(?:^|\s)((?:demos|benchmarks)/\w+\.py)", command):
+            check_options(ROOT / name, command)
+        if re.match(r"(\S*python -m )?pytest", command):
+            check_tests(command)
+
+
+def check_options(script, command):
+    """Options of a demo or benchmark are in its text, or in that of a demo that it imports."""
+    text = pages.source(script)
+    of_script = command.split(script.name, 1)[1] if "tradeoff" not in command else ""
+    for option in re.findall(r"(?<!\S)--[a-z-]+", of_script):
+        assert f'"{option}"' in text, f"{option} of {script.name}"
+
+
+@pytest.mark.parametrize("demo", pages.SHORT)
+def test_short_runs_have_options_of_their_demos(demo):
+    check_options(ROOT / "demos" / f"{demo}.py", f"{demo}.py {pages.SHORT[demo]}")
+
+
+@functools.cache
+def names_in(path):
+    """Names of a file's tests and of their cases, as far as its text has them."""
+    text = path.read_text()
+    return (text if "def test_" in text else "").lower()
+
+
+def check_tests(command):
+    """A command's files exist, and words of its -k are in one of them."""
+    words = shlex.split(command)
+    files = [ROOT / w.partition("::")[0] for w in words if w.startswith("tests/")]
+    assert all(path.is_file() for path in files), command
+    files = files or sorted((ROOT / "tests").glob("test_*.py"))
+    chosen = words[words.index("-k") + 1] if "-k" in words else ""
+    for word in re.findall(r"\w+", chosen):
+        found = word in ("or", "and", "not") or any(word.lower() in names_in(f) for f in files)
+        assert found, f"{word!r} of {command}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_names_of_the_package_exist(page):
+    for name in re.findall(r"\bnts\.(\w+)", page.read_text()):
+        assert hasattr(nts, name), name
+    for name in re.findall(r"`dolfinx_nts\.([\w.]+)`", page.read_text()):
+        module, _, attribute = f"dolfinx_nts.{name}".rpartition(".")
+        whole = importlib.util.find_spec(module) and importlib.import_module(module)
+        assert hasattr(whole, attribute) or importlib.util.find_spec(f"{module}.{attribute}"), name
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda b: b.name)
+def test_calls_have_these_arguments(block):
+    """Also of blocks that are no whole scripts."""
+    for node in ast.walk(ast.parse(block.code)):
+        called = node.func if isinstance(node, ast.Call) else None
+        of_package = isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name)
+        if not (of_package and called.value.id == "nts"):
+            continue
+        function = getattr(nts, called.attr)
+        known = inspect.signature(getattr(function, "__init__", function)).parameters
+        if isinstance(function, type) and "args" in known:
+            continue
+        if not isinstance(function, type):
+            known = inspect.signature(function).parameters
+        for word in node.keywords:
+            assert word.arg is None or word.arg in known, f"{called.attr}({word.arg}=)"
+
+
+def test_every_docstring_section_of_theory_is_there():
+    theory = (ROOT / "docs/theory.md").read_text()
+    sections = set(map(int, re.findall(r"^## (\d+)\. ", theory, re.MULTILINE)))
+    for path in (ROOT / "dolfinx_nts").rglob("*.py"):
+        for number in re.findall(r"theory (?:section )?(\d+)", path.read_text()):
+            assert int(number) in sections, path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", [b for b in BLOCKS if b.whole], ids=lambda b: b.name)
+def test_whole_scripts_run(block, tmp_path):
+    pages.run_block(block, tmp_path)

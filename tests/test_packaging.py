@@ -1,0 +1,44 @@
+"""The version is the same wherever a release states it, and files that tests need are shipped."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import dolfinx_nts as nts
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def stated():
+    """Version by file."""
+    changes = re.search(r"^## (\d\S*), (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    cite = (ROOT / "CITATION.cff").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return {
+        "pyproject.toml": project["version"],
+        "CHANGELOG.md": changes[1],
+        "CITATION.cff": re.search(r"^version: (\S+)$", cite, re.MULTILINE)[1],
+        "debian/changelog": re.match(r"\S+ \((\S+?)(?:-\d+)?\)", debian())[1],
+    }, (changes[2], re.search(r'^date-released: "(\S+)"$', cite, re.MULTILINE)[1])
+
+
+def debian():
+    return (ROOT / "debian/changelog").read_text()
+
+
+def test_the_version_is_one():
+    versions, dates = stated()
+    assert set(versions.values()) == {nts.__version__}, versions
+    assert len(set(dates)) == 1, dates
+
+
+@pytest.mark.parametrize("folder", ["tests", "demos", "meshes", "benchmarks", "docs", "scripts"])
+def test_the_sdist_has_what_tests_need(folder):
+    text = (ROOT / "MANIFEST.in").read_text()
+    endings = set(re.search(rf"^recursive-include {folder} (.*)$", text, re.MULTILINE)[1].split())
+    made = {"__pycache__", "_build", "made"}
+    files = [p for p in (ROOT / folder).rglob("*") if p.is_file() and not made & set(p.parts)]
+    missing = {p for p in files if f"*{p.suffix}" not in endings}
+    assert files and not missing, missing

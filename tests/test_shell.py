@@ -1,0 +1,573 @@
+"""Shells: theory section 15; benchmarks B28, B30."""
+
+import logging
+
+import numpy as np
+import pytest
+import scipy.linalg
+from dolfinx.mesh import CellType, create_box
+from integrators import INTEGRATORS
+from mpi4py import MPI
+from scipy.spatial.transform import Rotation
+from shells import grid, plate, plate_nodes, surface_mesh
+
+import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.kernels import quadratic_energy as kernel
+from dolfinx_nts.kernels import shell as shell_kernel
+from dolfinx_nts.output.pictures import picture
+
+EM, MID = nts.EnergyMomentum(), nts.Midpoint()
+RUBBER = {"young": 1e5, "poisson": 0.3, "thickness": 0.05, "density": 10.0}
+
+
+def at(axis, value, size=1.0):
+    return lambda x: np.abs(x[axis] - value) < 1e-9 * size
+
+
+# ---- kernel
+HALF = 0.05
+
+
+def elements(seed=0, n=3):
+    """Curved distorted elements, and two states of theirs."""
+    rng = np.random.default_rng(seed)
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    x = corners + 0.2 * rng.standard_normal((n, 4, 3))
+    d = np.array([0, 0, 1]) + 0.2 * rng.standard_normal((n, 4, 3))
+    d *= HALF / np.linalg.norm(d, axis=2, keepdims=True)
+    y = np.stack([x, d], axis=2).reshape(n, 8, 3)
+    of, _ = shell_kernel.shells(y, HALF, shell_kernel.stiffness(3.0, 0.3, 2 * HALF))
+    size = np.tile([1.0, HALF], 4)[:, None]
+    return of, *(y + 0.3 * size * rng.standard_normal((2, n, 8, 3))), y
+
+
+@pytest.mark.parametrize("theta", [None, 0.5, 0.7, 1.0])
+def test_the_tangent_is_the_derivative_of_the_force(theta):
+    of, y0, y1, _ = elements()
+    way = np.random.default_rng(5).standard_normal(y1.shape)
+    step = 1e-7
+    ahead, behind = (kernel.force(of, y0, y1 + s * way, theta) for s in (step, -step))
+    found = np.einsum("nij,nj->ni", kernel.tangent(of, y0, y1, theta), way.reshape(-1, 24))
+    assert found == pytest.approx((ahead - behind) / (2 * step), rel=1e-7, abs=1e-6)
+
+
+def test_the_force_is_the_derivative_of_the_energy():
+    of, _, y, _ = elements(1)
+    way = np.random.default_rng(6).standard_normal(y.shape)
+    change = kernel.energy(of, y + 1e-7 * way) - kernel.energy(of, y - 1e-7 * way)
+    work = (kernel.force(of, y, y, 1.0) * way.reshape(-1, 24)).sum(axis=1)
+    assert work == pytest.approx(change / 2e-7, rel=1e-6)
+
+
+def test_the_work_of_the_discrete_gradient_is_the_change_of_the_energy():
+    of, y0, y1, _ = elements(2)
+    work = (kernel.force(of, y0, y1, None) * (y1 - y0).reshape(-1, 24)).sum(axis=1)
+    assert work == pytest.approx(kernel.energy(of, y1) - kernel.energy(of, y0), rel=1e-12)
+
+
+def test_the_energy_is_that_of_the_strains():
+    """By the strains at the points, each in axes of its own."""
+    of, y, _, rest = elements(3)
+    c = shell_kernel.stiffness(3.0, 0.3, 2 * HALF)
+    e = shell_kernel.strains(y, rest, HALF, shell_kernel.POINTS)
+    whole = scipy.linalg.block_diag(c.membrane, c.bending, c.shear * np.eye(2))
+    _, jacobian = shell_kernel.axes(rest[:, ::2], shell_kernel.POINTS)
+    density = 0.5 * np.einsum("npi,ij,npj->np", e, whole, e)
+    energy = (np.linalg.det(jacobian) * density).sum(axis=1)
+    assert kernel.energy(of, y) == pytest.approx(energy, rel=1e-12)
+
+
+def test_a_rigid_motion_strains_nothing():
+    *_, rest = elements(4, 20)
+    turn = Rotation.from_rotvec((0.3, -1.2, 2.0)).as_matrix()
+    moved = rest @ turn.T
+    moved[:, ::2] += (3.0, -2.0, 1.0)
+    e = shell_kernel.strains(moved, rest, HALF, shell_kernel.POINTS)
+    # Curvatures are per length and times the thickness strains.
+    assert np.abs(e * np.repeat([1, 2 * HALF, 1], [3, 3, 2])).max() < 1e-14
+
+
+def patch():
+    """Five distorted elements in the plane (MacNeal and Harder 1985), and who is inside."""
+    x = np.array([[0, 0], [0.24, 0], [0.24, 0.12], [0, 0.12],
+                  [0.04, 0.02], [0.18, 0.03], [0.16, 0.08], [0.08, 0.08]])  # fmt: skip
+    cells = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5, 6, 7]])
+    return np.column_stack([x, 0 * x[:, 0]]), cells, np.arange(4, 8)
+
+
+PATCH = {
+    # Displacements of the place and of d, and the strains in the axes of x and y.
+    "membrane": (lambda x, y: (1e-3 * x + 2e-3 * y, 3e-3 * x - 1e-3 * y, 0 * x),
+                 lambda x, y: (0 * x, 0 * x), (1e-3, -1e-3, 5e-3, 0, 0, 0, 0, 0)),
+    "bending": (lambda x, y: (0 * x, 0 * x, 0.5 * x**2 - y**2 + 0.7 * x * y),
+                lambda x, y: (-x - 0.7 * y, 2 * y - 0.7 * x), (0, 0, 0, -1, 2, -1.4, 0, 0)),
+    "shear": (lambda x, y: (0 * x, 0 * x, 2e-3 * x + 1e-3 * y),
+              lambda x, y: (0 * x, 0 * x), (0, 0, 0, 0, 0, 0, 2e-3, 1e-3)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("state", PATCH)
+def test_constant_states_are_exact_on_distorted_elements(state):
+    """The linear energy of the whole patch, and no force on the nodes inside."""
+    x, cells, inside = patch()
+    place, director, e = PATCH[state]
+    c = shell_kernel.stiffness(2e6, 0.25, 2 * HALF)
+    rest = np.zeros((8, 2, 3))
+    rest[:, 0], rest[:, 1, 2] = x, HALF
+    of, _ = shell_kernel.shells(rest[cells].reshape(5, 8, 3), HALF, c)
+    u = np.zeros((8, 2, 3))
+    u[:, 0] = np.stack(place(x[:, 0], x[:, 1]), axis=-1)
+    u[:, 1, :2] = HALF * np.stack(director(x[:, 0], x[:, 1]), axis=-1)
+    y = rest[cells].reshape(5, 8, 3)
+    k = kernel.tangent(of, y, y, 1.0)
+    of_cells = u[cells].reshape(5, 24)
+    force = np.einsum("nij,nj->ni", k, of_cells)
+    whole = scipy.linalg.block_diag(c.membrane, c.bending, c.shear * np.eye(2))
+    area = 0.24 * 0.12
+    assert 0.5 * (force * of_cells).sum() == pytest.approx(
+        0.5 * area * np.array(e) @ whole @ np.array(e), rel=1e-12
+    )
+    total = np.zeros((8, 2, 3))
+    np.add.at(total, cells, force.reshape(5, 4, 2, 3))
+    # Constant shear needs moments that grow: there the nodes' directors are pushed.
+    pushed = total[inside] if state != "shear" else total[inside, 0]
+    assert np.abs(pushed).max() < 1e-13 * np.abs(force).max()
+
+
+# ---- equilibrium
+def strip(n, thickness=0.1, length=10.0, forces=(), comm=MPI.COMM_WORLD):
+    """The cantilever of B28."""
+    return nts.Shell(
+        plate(n, 1, length, 1.0, comm), young=1.2e6, poisson=0.0, thickness=thickness, density=1.0,
+        bcs=[nts.Clamp(at(0, 0.0))], forces=forces,
+    )  # fmt: skip
+
+
+def moved(body):
+    start, now = body.midsurface()
+    return now - start
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("n", "up", "back"), [(16, 6.70470, -3.29297), (32, 6.70129, -3.29052)], ids=["16", "32"]
+)
+@pytest.mark.fast_on_ranks("16")
+def test_the_cantilever_of_sze(n, up, back):
+    force = nts.LineForce((0, 0, 4), where=at(0, 10.0))
+    body = strip(n, forces=[force])
+    run = nts.equilibrium(nts.System([body]), load_steps=10)
+    assert run.status == "completed"
+    assert moved(body)[-1] == pytest.approx((back, 0, up), abs=6e-6)
+    assert run.reactions["shell"][-1].ravel() == pytest.approx((0, 0, -4), abs=1e-7)
+
+
+def test_a_thin_strip_does_not_lock():
+    """L/t = 1e4: the deflection of a slender cantilever, 4 P L^3 / (E b t^3)."""
+    thickness, tip = 1e-3, 1e-3
+    load = tip * 1.2e6 * thickness**3 / (4 * 10.0**3)
+    body = strip(8, thickness, forces=[nts.LineForce((0, 0, load), where=at(0, 10.0))])
+    run = nts.equilibrium(nts.System([body]))
+    assert run.status == "completed"
+    assert moved(body)[-1, 2] == pytest.approx(tip, rel=0.01)
+
+
+@pytest.mark.parametrize(("n", "gap"), [(32, 0.01), (64, 0.0025)])
+@pytest.mark.slow
+def test_an_end_moment_rolls_a_strip_up(n, gap):
+    """2 pi EI / L: a full circle, the ends of which meet; by order 2."""
+    moment = 2 * np.pi * 1.2e6 * 0.1**3 / 12 / 12.0
+    load = nts.LineMoment((0, -moment, 0), where=at(0, 12.0))
+    body = strip(n, length=12.0, forces=[load])
+    run = nts.equilibrium(nts.System([body]), load_steps=10)
+    _, now = body.midsurface()
+    assert run.status == "completed"
+    assert np.linalg.norm(now[-1] - now[1]) < gap * 12
+    assert now[:, 2].max() == pytest.approx(12 / np.pi, rel=gap)
+
+
+def hemisphere(n, force, comm=MPI.COMM_WORLD):
+    """A quarter of Sze, Liu, Lo's: 18 degrees open at the top, pinched at the equator."""
+    a, b = np.linspace(0, np.pi / 2, n + 1), np.linspace(0, np.deg2rad(72), n + 1)
+    a, b = np.meshgrid(a, b, indexing="ij")
+    x = 10 * np.stack([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)], axis=-1)
+    x = x.reshape(-1, 3)
+    x[np.abs(x) < 1e-12] = 0.0
+    ends = at(0, 10.0, 10), at(1, 10.0, 10)
+    return nts.Shell(
+        surface_mesh(x, grid(n, n), comm), young=6.825e7, poisson=0.3, thickness=0.04, density=1.0,
+        bcs=[
+            nts.Clamp(at(0, 0.0, 10), components=(0,)),
+            nts.Clamp(at(1, 0.0, 10), components=(1,)),
+            nts.Dirichlet(ends[0], components=(2,)),
+        ],
+        forces=[
+            # A plane of symmetry halves it.
+            nts.PointForce(ends[0], (force / 2, 0, 0)),
+            nts.PointForce(ends[1], (0, -force / 2, 0)),
+        ],
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_pinched_hemisphere():
+    """Sze, Liu, Lo, Finite Elem. Anal. Des. 40 (2004): 4.067 outwards, 8.178 inwards at P = 400."""
+    body = hemisphere(24, 400.0)
+    run = nts.equilibrium(nts.System([body]), load_steps=10)
+    start, now = body.midsurface()
+    out, into = (start[:, k].argmax() for k in (0, 1))
+    assert run.status == "completed"
+    assert now[out, 0] - start[out, 0] == pytest.approx(4.067, rel=0.02)
+    assert start[into, 1] - now[into, 1] == pytest.approx(8.178, rel=0.02)
+
+
+@pytest.mark.mpi
+def test_weight_on_a_hinged_plate():
+    """All of it on the edges, which hold places and leave directors free: 5/384 q L^4 / EI."""
+    held = [
+        nts.Dirichlet(lambda x: (x[0] < 1e-9) & (x[1] < 1e-9)),
+        nts.Dirichlet(lambda x: (x[0] < 1e-9) & (x[1] > 2 - 1e-9), components=(0, 2)),
+    ]
+    edges = [nts.Dirichlet(at(0, e), components=(2,)) for e in (0.0, 3.0)]
+    body = nts.Shell(plate(24, 4, 3.0, 2.0), **RUBBER | {"poisson": 0.0}, bcs=edges + held)
+    run = nts.equilibrium(nts.System([body], gravity=(0, 0, -1e-3)))
+    weight = 10 * 0.05 * 6 * 1e-3
+    total = run.reactions["shell"][-1].sum(axis=0)
+    assert run.status == "completed"
+    assert total == pytest.approx((0, 0, weight), abs=1e-7 * weight)
+    sag = 5 / 384 * weight * 3**3 / (1e5 * 2 * 0.05**3 / 12)
+    assert moved(body)[62] == pytest.approx((0, 0, -sag), rel=0.01, abs=0.01 * sag)
+
+
+def lowest_frequency(n, thickness):
+    """Of a square plate on hard simple supports [rad/s], by its matrices at rest."""
+    edges = [(k, e) for k in (0, 1) for e in (0.0, 1.0)]
+    body = nts.Shell(
+        plate(n, n, 1.0, 1.0, MPI.COMM_SELF), young=2e11, poisson=0.3, thickness=thickness,
+        density=7800.0,
+        bcs=[nts.Dirichlet(at(k, e), components=(2,)) for k, e in edges]
+        + [nts.Clamp(at(k, e), components=(1 - k,)) for k, e in edges],
+    )  # fmt: skip
+    body.begin_step(EM, nts.Moment(u0=np.zeros(body.num_owned), time=0.0))
+    both = []
+    for mass, stiffness in ((0.0, 1.0 / EM.theta), (1.0, 0.0)):
+        a = body.tangent(np.zeros(body.num_owned), mass, stiffness)
+        both.append(a.getValues(range(body.num_owned), range(body.num_owned)))
+    held = np.zeros(body.num_owned, dtype=bool)
+    held[body.fixed] = True
+    held[5::6] = True  # the director's length
+    held[0::6] = held[1::6] = True  # motion in the plane
+    k, m = (a[np.ix_(~held, ~held)] for a in both)
+    return np.sqrt(scipy.linalg.eigh(k, m, eigvals_only=True, subset_by_index=(0, 0))[0])
+
+
+@pytest.mark.parametrize("thickness", [0.2, 0.01])
+def test_the_first_frequency_of_a_simply_supported_plate(thickness):
+    """Mindlin's equations; the error falls by order 2."""
+    t, g, k2 = thickness, 2e11 / 2.6, 2 * np.pi**2
+    shear, bending = 5 / 6 * g * t, 2e11 * t**3 / (12 * (1 - 0.3**2))
+    mass, inertia = 7800 * t, 7800 * t**3 / 12
+    # (shear k2 - mass w2) (bending k2 + shear - inertia w2) = shear^2 k2
+    b = -(shear * k2 * inertia + mass * (bending * k2 + shear))
+    exact = np.sqrt(np.roots([mass * inertia, b, shear * bending * k2**2]).min())
+    coarse, fine = (lowest_frequency(n, t) / exact - 1 for n in (6, 12))
+    assert abs(fine) < 0.01
+    assert coarse / fine == pytest.approx(4, rel=0.1)
+
+
+def test_moments_at_a_node_of_a_beam_and_of_a_shell():
+    """A slender cantilever turns by M L / EI, whichever body it is."""
+    line = np.column_stack([np.linspace(0, 1, 9), np.zeros(9), np.zeros(9)])
+    mesh = surface_mesh(line, np.column_stack([np.arange(8), np.arange(1, 9)]), kind="interval")
+    section = nts.Rectangle(1.0, 0.01).section(young=12e6, poisson=0.0, density=1.0)
+    clamp, moment = nts.Clamp(at(0, 0.0)), (0, -0.1, 0)
+    beam = nts.Beam(mesh, section, bcs=[clamp], forces=[nts.PointMoment(at(0, 1.0), moment)],
+                    direction=(0, 1, 0))  # fmt: skip
+    half = nts.LineMoment(moment, where=at(0, 1.0))
+    shell = nts.Shell(plate(8, 1, 1.0, 1.0), young=12e6, poisson=0.0, thickness=0.01, density=1.0,
+                      bcs=[clamp], forces=[half])  # fmt: skip
+    nts.equilibrium(nts.System([beam, shell]), load_steps=2)
+    turn = 0.1 / (12e6 * 0.01**3 / 12)
+    expected = (np.sin(turn) / turn - 1, 0, (1 - np.cos(turn)) / turn)
+    assert moved(shell)[-1] == pytest.approx(expected, abs=5e-5)
+    start, now = beam.centreline()
+    assert now[-1] - start[-1] == pytest.approx(expected, abs=5e-5)
+
+
+# ---- dynamics
+def flying(scale=1.0, comm=MPI.COMM_WORLD, n=(8, 4)):
+    """B30 in a unit of length 1/scale m."""
+    s = scale
+    x = s * (plate_nodes(*n, 4.0, 2.0) - np.array([2.0, 1.0, 0.0]))
+    return nts.Shell(
+        surface_mesh(x, grid(*n), comm), young=1e5 / s, poisson=0.3, thickness=0.05 * s,
+        density=10 / s**3, angular_velocity=(0.5, 1, 2),
+        velocity=lambda x: np.array([0, 0, -s])[:, None] * np.sin(np.pi * x[0] / (4 * s)),
+    )  # fmt: skip
+
+
+def fly(rule, dt, t_end, newton=None, **options):
+    body = flying(**options)
+    run = nts.simulate(
+        nts.System([body]), rule, dt=dt, t_end=t_end, newton=newton or nts.Newton(rtol=1e-13)
+    )
+    return run, body.midsurface()[1]
+
+
+def off(run):
+    """Errors of E and J over their size."""
+    energy, spin = run.balance["energy"], run.balance["angular_momentum"]
+    return (
+        np.abs(energy / energy[0] - 1).max(),
+        np.abs(spin - spin[0]).max() / np.linalg.norm(spin[0]),
+    )
+
+
+TIMES = [(0.01, 0.1), (0.1, 0.5), (0.01, 5), (0.05, 5), (0.1, 5)]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("dt", "t_end"), TIMES)
+@pytest.mark.fast("0.01-0.1", "0.1-0.5")
+@pytest.mark.fast_on_ranks("0.1-0.5")
+def test_a_flying_plate_keeps_energy_and_angular_momentum(dt, t_end):
+    run, _ = fly(EM, dt, t_end)
+    assert run.status == "completed" and run.retries == 0
+    assert max(off(run)) < 1e-12
+
+
+@pytest.mark.slow
+def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
+    """It loses the energy or its solution; without cuts of the step it stops at h = 0.1."""
+    with caplog.at_level(logging.ERROR):
+        run, _ = fly(MID, 0.05, 2)
+        coarse, _ = fly(MID, 0.1, 5, nts.Newton(max_retries=0))
+    energy, spin = off(run)
+    assert energy > 0.03 and spin < 1e-11 and "energy has changed" in run.status
+    assert not coarse.status.startswith("completed") and len(coarse.balance["time"]) < 20
+
+
+@pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)
+@pytest.mark.slow
+def test_the_order_in_time_is_two(rule):
+    coarse, middle, fine = (fly(rule, dt, 0.02, n=(4, 2))[1] for dt in (1e-3, 5e-4, 2.5e-4))
+    ratio = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)
+    assert np.log2(ratio) == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e6])
+@pytest.mark.slow
+def test_units_of_length_take_the_same_iterations(scale):
+    (metres, x), (others, y) = (
+        fly(EM, 0.05, 0.5, nts.Newton(), scale=s) for s in (1.0, scale)
+    )
+    assert np.abs(y / scale - x).max() < 1e-10 * np.abs(x).max()
+    assert (others.balance["newton_iterations"] == metres.balance["newton_iterations"]).all()
+
+
+@pytest.mark.mpi
+def test_ranks_give_the_motion_of_one():
+    several, x = fly(EM, 0.05, 0.25)
+    alone, y = fly(EM, 0.05, 0.25, comm=MPI.COMM_SELF)
+    assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
+    assert several.balance["energy"] == pytest.approx(alone.balance["energy"], rel=1e-12)
+
+
+@pytest.mark.mpi
+def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path):
+    """As if nothing had stopped it."""
+    path = mpi_tmp_path / "shell.h5"
+    whole = flying(n=(4, 2))
+    nts.simulate(nts.System([whole]), EM, dt=0.05, t_end=0.3)
+    first, second = (nts.System([flying(n=(4, 2))]) for _ in range(2))
+    nts.simulate(first, EM, dt=0.05, t_end=0.15, checkpoint=nts.Checkpoint(path, every=3))
+    start = nts.restart(path, second)
+    nts.simulate(second, EM, dt=0.05, t_end=0.3, start=start)
+    assert second.bodies[0].midsurface()[1] == pytest.approx(whole.midsurface()[1], abs=1e-11)
+
+
+@pytest.mark.mpi
+def test_the_order_and_the_directions_of_cells_do_not_matter():
+    """Of a cylinder whose cells are shuffled, and every third seen from its other side."""
+    a, z = np.meshgrid(np.linspace(0, 2, 7), np.linspace(0, 1, 4), indexing="ij")
+    x = np.stack([np.cos(a), np.sin(a), z], axis=-1).reshape(-1, 3)
+    ends = []
+    for turned in (False, True):
+        cells = grid(6, 3)
+        if turned:
+            cells[1::3] = cells[1::3][:, [2, 3, 0, 1]]
+            cells = np.random.default_rng(0).permutation(cells)
+        body = nts.Shell(
+            surface_mesh(x, cells), **RUBBER, bcs=[nts.Clamp(at(2, 0.0))],
+            forces=[nts.PointForce(lambda x: (x[0] > 1 - 1e-9) & (x[2] > 1 - 1e-9), (3, 1, 2))],
+        )  # fmt: skip
+        nts.equilibrium(nts.System([body]), load_steps=2)
+        ends.append(moved(body))
+    assert np.abs(ends[0]).max() > 1e-3
+    assert ends[1] == pytest.approx(ends[0], abs=1e-10)
+
+
+# ---- joints
+@pytest.mark.mpi
+def test_a_plate_on_joints_swings():
+    """Two spherical joints at a corner each are a hinge: energy is kept in gravity."""
+    body = nts.Shell(plate(4, 2, 4.0, 2.0), **RUBBER)
+    joints = [nts.Spherical(body, None, point=(0, y, 0), name=f"hinge {y}") for y in (0, 2)]
+    system = nts.System([body], joints=joints, gravity=(0, 0, -1))
+    run = nts.simulate(system, EM, dt=0.05, t_end=0.5)
+    assert run.status == "completed"
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * run.balance["kinetic"].max()
+    assert moved(body)[-1, 2] < -0.1
+
+
+def test_directions_of_a_shell_are_its_directors():
+    body = nts.Shell(plate(4, 2, 4.0, 2.0), **RUBBER)
+    with pytest.raises(ValueError, match="only its director .* turns with it; hold it by Spher"):
+        nts.Fixed(body, None, point=(0, 0, 0))
+    with pytest.raises(ValueError, match="is no node of shell 'shell'; the nearest one is"):
+        nts.Spherical(body, None, point=(0.1, 0, 0))
+
+
+# ---- bad input
+def box():
+    return create_box(MPI.COMM_WORLD, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)
+
+
+def triangles():
+    return surface_mesh(plate_nodes(1, 1, 1, 1), [[0, 1, 2], [1, 2, 3]], kind="triangle")
+
+
+def joined(angle):
+    """Two cells at an angle [degrees]."""
+    c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    x = [[-1, 0, 0], [-1, 1, 0], [0, 0, 0], [0, 1, 0], [c, 0, s], [c, 1, s]]
+    return surface_mesh(x, grid(2, 1))
+
+
+def t_junction():
+    x = [[-1, 0, 0], [-1, 1, 0], [0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 0, 1], [0, 1, 1]]
+    return surface_mesh(x, [[0, 2, 1, 3], [2, 4, 3, 5], [2, 6, 3, 7]])
+
+
+def moebius():
+    """A band of twelve cells that turns by half a turn."""
+    a = np.linspace(0, 2 * np.pi, 13)[:-1]
+    out = np.stack([np.cos(a), np.sin(a), 0 * a], axis=-1)
+    way = np.cos(a / 2)[:, None] * out + np.sin(a / 2)[:, None] * np.array([0, 0, 1])
+    x = np.concatenate([3 * out - 0.3 * way, 3 * out + 0.3 * way])
+    k = np.arange(12)
+    far = np.roll(k, -1)
+    cells = np.stack([k, far, k + 12, far + 12], axis=-1)
+    cells[-1] = [11, 12, 23, 0]
+    return surface_mesh(x, cells)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("given", "kind", "text"),
+    [
+        ({"mesh": lambda: "plate"}, TypeError, "pass a dolfinx mesh"),
+        ({"mesh": box}, ValueError, "hexahedron in 3D; pass quadrilaterals"),
+        ({"mesh": lambda: surface_mesh(plate_nodes(2, 1, 1, 1)[:, :2], grid(2, 1))}, ValueError,
+         "quadrilateral in 2D"),
+        ({"mesh": triangles}, ValueError, "triangle cells would lock; .*Mesh.RecombineAll = 1"),
+        ({"mesh": lambda: surface_mesh(plate_nodes(2, 1, 0, 1), grid(2, 1))}, ValueError,
+         "2 cells are flat, concave or twisted"),
+        ({"mesh": lambda: joined(70)}, ValueError, "folds by 70 degrees at x=.*a shell of each"),
+        ({"mesh": t_junction}, ValueError, "3 cells meet in an edge|folds by 90 degrees"),
+        ({"mesh": moebius}, ValueError, "one side alone"),
+        ({"young": 0.0}, ValueError, "^young=0.0: must be positive"),
+        ({"poisson": 0.6}, ValueError, "^poisson=0.6: must lie above"),
+        ({"thickness": -1}, ValueError, "^thickness=-1: must be positive"),
+        ({"density": np.inf}, ValueError, "^density=inf"),
+        ({"bcs": [3]}, TypeError, r"bcs\[0\]=3: pass a sequence of Clamp or Dirichlet"),
+        ({"bcs": [nts.Clamp(lambda x: x[0] > 7)]}, ValueError, "selects no node between"),
+        ({"bcs": [nts.Clamp("root")]}, TypeError, "pass a function"),
+        ({"forces": [nts.PointForce(lambda x: x[0] > 0.9, (1, 0, 0))]}, ValueError,
+         "selects 2 nodes; select one"),
+        ({"forces": [nts.LineForce((1, 0, 0), lambda x: x[0] + x[1] > 1.9)]}, ValueError,
+         "selects no two neighbours; select both ends"),
+        ({"forces": [nts.LineMoment(1.0)]}, ValueError, "three finite"),
+        ({"forces": ["push"]}, TypeError, "PointForce, PointMoment, LineForce or LineMoment"),
+        ({"velocity": "fast"}, ValueError, "velocity='fast'"),
+        ({"spin": 1}, TypeError, "unknown option of Shell"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_told(given, kind, text):
+    options = {"mesh": lambda: plate(4, 1, 1.0, 1.0)} | RUBBER | given
+    mesh = options.pop("mesh")()
+    with pytest.raises(kind, match=text):
+        nts.Shell(mesh, **options)
+
+
+def test_components_of_clamps():
+    with pytest.raises(ValueError, match=r"^components=\(3,\): pass a tuple of some of 0, 1, 2"):
+        nts.Clamp(at(0, 0.0), components=(3,))
+    line = np.column_stack([np.linspace(0, 1, 3), np.zeros(3), np.zeros(3)])
+    mesh = surface_mesh(line, [[0, 1], [1, 2]], kind="interval")
+    section = nts.Circle(0.1).section(young=1.0, poisson=0.0, density=1.0)
+    with pytest.raises(ValueError, match="three directors of a beam are held as a whole"):
+        nts.Beam(mesh, section, bcs=[nts.Clamp(at(0, 0.0), components=(0,))])
+
+
+# ---- results
+@pytest.mark.mpi
+def test_stress_resultants_of_a_beam_and_of_a_shell():
+    """Of cantilevers with a small force at the end: constant shear, a moment that grows."""
+    clamp, load = nts.Clamp(at(0, 0.0)), (0, 0, 1e-4)
+    line = np.column_stack([np.linspace(0, 1, 9), np.zeros(9), np.zeros(9)])
+    mesh = surface_mesh(line, np.column_stack([np.arange(8), np.arange(1, 9)]), kind="interval")
+    section = nts.Rectangle(1.0, 0.1).section(young=1e6, poisson=0.0, density=1.0)
+    beam = nts.Beam(mesh, section, bcs=[clamp], direction=(0, 1, 0),
+                    forces=[nts.PointForce(at(0, 1.0), load)])  # fmt: skip
+    plate_ = nts.Shell(plate(8, 1, 1.0, 1.0), young=1e6, poisson=0.0, thickness=0.1, density=1.0,
+                       bcs=[clamp], forces=[nts.LineForce(load, where=at(0, 1.0))])  # fmt: skip
+    nts.equilibrium(nts.System([beam, plate_]))
+    for body, shape in ((beam, (3,)), (plate_, (3, 3))):
+        found = body.resultants()
+        own = body.mesh.topology.index_map(body.mesh.topology.dim).size_local
+        force, moment = (
+            found[name].x.array.reshape(-1, *shape)[
+                compat.cell_dofs(found[name].function_space)[:own, 0]
+            ]
+            for name in ("force", "moment")
+        )
+        dofs = body.mesh.geometry.x[compat.geometry_dofmap(body.mesh)[:own]]
+        arm = 1.0 - dofs[:, :, 0].mean(axis=1)
+        if shape == (3,):
+            assert force[:, 2] == pytest.approx(1e-4, rel=1e-4)
+            assert moment[:, 1] == pytest.approx(-1e-4 * arm, rel=1e-4)
+        else:
+            assert force[:, 0, 2] == pytest.approx(1e-4, rel=1e-4)
+            assert np.abs(moment[:, 0, 0]) == pytest.approx(1e-4 * arm, rel=1e-4)
+            assert np.abs(moment[:, 1]).max(initial=0.0) < 1e-9
+
+
+@pytest.mark.mpi
+def test_a_picture_of_skins(mpi_tmp_path):
+    line = np.column_stack([np.linspace(0, 1, 9), np.zeros(9), np.zeros(9) + 0.1])
+    mesh = surface_mesh(line, np.column_stack([np.arange(8), np.arange(1, 9)]), kind="interval")
+    beam = nts.Beam(mesh, nts.Circle(0.03).section(young=1.0, poisson=0.0, density=1.0))
+    body = nts.Shell(plate(4, 4, 1.0, 1.0), **RUBBER)
+    file = mpi_tmp_path / "thin.png"
+    picture([beam, body], file)
+    assert file.stat().st_size > 5000
+    with pytest.raises(ValueError, match="shell 'shell' has none; colour by 'speed'"):
+        picture([body], file, colour="stress")
+    bare = nts.Section(EA=1, GA=(1, 1), GJ=1, EI=(1, 1), rhoA=1, rhoI=(1, 1))
+    with pytest.raises(ValueError, match="'beam' has no volume; leave it out"):
+        picture([nts.Beam(mesh, bare)], file)
+
+
+@pytest.mark.mpi
+def test_a_shell_at_rest_sleeps():
+    """While another one flies; the motion is the same."""
+    ends = []
+    for sleep in (False, True):
+        body, other = flying(n=(4, 2)), nts.Shell(plate(2, 2, 1.0, 1.0), **RUBBER, name="still")
+        run = nts.simulate(nts.System([body, other]), EM, dt=0.05, t_end=0.3, sleep=sleep)
+        assert run.status == "completed"
+        ends.append(body.midsurface()[1])
+        assert moved(other) == pytest.approx(0.0, abs=1e-14)
+    assert ends[1] == pytest.approx(ends[0], abs=1e-10)

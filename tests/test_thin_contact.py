@@ -1,0 +1,269 @@
+"""Contact of beams and shells with everything: skins that are linear in places and directors."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, create_box
+from mpi4py import MPI
+from shells import grid, plate_nodes, surface_mesh
+
+import dolfinx_nts as nts
+
+EM = nts.EnergyMomentum()
+FAST = (0.3, 0.1, -1.0)
+MU = 0.3
+
+
+def shell(z=0.0, n=6, side=1.0, scale=1.0, comm=MPI.COMM_WORLD, name="shell", **options):
+    """A plate of thickness 0.05 about z, in a unit of length 1/scale m."""
+    x = scale * (plate_nodes(n, n, side, side) + np.array([0, 0, z]))
+    return nts.Shell(
+        surface_mesh(x, grid(n, n), comm), young=1e6 / scale, poisson=0.3, thickness=0.05 * scale,
+        density=1e3 / scale**3, name=name, **options,
+    )  # fmt: skip
+
+
+def line(start, end, n=8, comm=MPI.COMM_WORLD):
+    x = np.linspace(start, end, n + 1)
+    return surface_mesh(x, np.column_stack([np.arange(n), np.arange(1, n + 1)]), comm, "interval")
+
+
+def beam(z, comm=MPI.COMM_WORLD, **options):
+    """Along x over the plate; 0.06 wide and 0.05 high."""
+    shape = nts.Rectangle(0.05, 0.06).section(young=1e6, poisson=0.3, density=1e3)
+    mesh = line((0.05, 0.5, z), (0.95, 0.5, z), comm=comm)
+    return nts.Beam(mesh, shape, direction=(0, 0, 1), **options)
+
+
+def box(low, high, n, rigid, **options):
+    mesh = create_box(MPI.COMM_WORLD, [low, high], n, CellType.hexahedron)
+    if rigid:
+        return nts.RigidBody(mesh, density=1e3, name="box", **options)
+    return nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, name="box", **options
+    )
+
+
+def below(z):
+    return lambda x: x[2] < z + 1e-9
+
+
+def over(z):
+    return lambda x: x[2] > z - 1e-9
+
+
+def block(rigid, n=2):
+    """It comes down on the plate's top."""
+    return box((0.3, 0.3, 0.03), (0.7, 0.7, 0.3), (n, n, 1), rigid, velocity=FAST)
+
+
+def table(rigid):
+    return box((0, 0, 0), (1, 1, 0.2), (6, 6, 1), rigid)
+
+
+def rod(z):
+    shape = nts.Circle(0.03).section(young=1e6, poisson=0.3, density=1e3)
+    return nts.Beam(line((0.5, 0.1, z), (0.53, 0.9, z)), shape, velocity=FAST, name="rod")
+
+
+def meeting(case):
+    """Bodies, slave and master of an impact."""
+    down = {"velocity": FAST}
+    rigid = "rigid" in case
+    match case:
+        case "shell on rigid" | "shell on continuum":
+            a, b = shell(), block(rigid)
+            return [a, b], a.surface(side="top"), b.surface(below(0.03))
+        case "rigid on shell" | "continuum on shell":
+            a, b = block(rigid, 3), shell()
+            return [a, b], a.surface(below(0.03)), b.surface(side="top")
+        case "shell on shell":
+            a, b = shell(), shell(0.06, 5, 0.9, name="upper", **down)
+            return [a, b], b.surface(side="bottom"), a.surface(side="top")
+        case "beam on shell":
+            a, b = beam(0.06, **down), shell()
+            return [a, b], a.surface(), b.surface(side="top")
+        case "shell on beam":
+            a, b = shell(n=12), beam(0.06, **down)
+            return [a, b], a.surface(side="top"), b.surface()
+        case "beam on rigid" | "beam on continuum":
+            a, b = beam(0.23, **down), table(rigid)
+            return [a, b], a.surface(), b.surface(over(0.2))
+        case "beam on beam":
+            a, b = rod(0.06), beam(0.0)
+            return [a, b], a.surface(), b.surface()
+        case "shell on obstacle":
+            a = shell(0.0303, **down)
+            return [a], a.surface(side="bottom"), nts.Plane((0, 0, 0), (0, 0, 1))
+    a = beam(0.0303, **down)
+    return [a], a.surface(), nts.Plane((0, 0, 0), (0, 0, 1))
+
+
+CASES = [
+    "shell on rigid", "shell on continuum", "rigid on shell", "continuum on shell",
+    "shell on shell", "beam on shell", "shell on beam", "beam on rigid", "beam on continuum",
+    "beam on beam", "shell on obstacle", "beam on obstacle",
+]  # fmt: skip
+
+
+ON_RANKS = {"shell on obstacle", "shell on shell", "beam on continuum"}
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=[pytest.mark.mpi] if c in ON_RANKS else []) for c in CASES]
+)
+@pytest.mark.fast("shell on rigid", "shell on obstacle", "beam on beam")
+@pytest.mark.fast_on_ranks("shell on obstacle")
+def test_impacts_keep_the_ledger_and_the_momenta(case):
+    bodies, slave, master = meeting(case)
+    contact = nts.ContactPair(slave=slave, master=master, friction=MU)
+    run = nts.simulate(nts.System(bodies, contacts=[contact]), EM, dt=1e-3, t_end=0.012)
+    balance = run.balance
+    assert run.status == "completed"
+    assert balance["active"].max() > 0
+    assert np.abs(balance["ledger_residual"]).max() < 1e-11 * balance["energy"][0]
+    if not isinstance(master, nts.Plane):
+        for name in ("linear_momentum", "angular_momentum"):
+            size = np.abs(balance[name]).max()
+            assert np.abs(balance[name] - balance[name][0]).max() < 1e-12 * size
+
+
+def rest(body, surface, weight, friction=0.0):
+    """Height at which a body comes to rest on a plane, and the force there."""
+    plane = nts.Plane((0, 0, 0), (0, 0, 1))
+    system = nts.System(
+        [body], contacts=[nts.ContactPair(surface, plane, friction=friction)], gravity=(0, 0, -1)
+    )
+    run = nts.equilibrium(system, load_steps=1)
+    force = run.contact_forces[-1].reshape(-1, 3)[0, 2]
+    assert run.status.startswith("completed")
+    assert abs(force) == pytest.approx(weight, rel=1e-8)
+
+
+@pytest.mark.mpi
+def test_thickness_and_section_count():
+    """A shell lies half its thickness above a plane, a beam half its height: by friction held."""
+    held = [nts.Dirichlet(lambda x: x[0] > -1, components=(0, 1))]
+    plate = shell(0.025, 3, bcs=held)
+    rest(plate, plate.surface(side="bottom"), 1e3 * 0.05)
+    assert plate.midsurface()[1][:, 2] == pytest.approx(0.025, abs=1e-4)
+    bar = beam(0.025, bcs=held)
+    rest(bar, bar.surface(), 1e3 * 0.05 * 0.06 * 0.9)
+    assert bar.centreline()[1][:, 2] == pytest.approx(0.025, abs=1e-4)
+
+
+def test_skins_are_closed_and_as_large_as_their_bodies():
+    """Their fluxes are the volumes, their areas those of the boxes; all nodes count."""
+    from dolfinx_nts.contact.surfaces import flux, winding
+
+    for body, size in ((shell(), (1, 1, 0.05)), (beam(0.0), (0.9, 0.06, 0.05))):
+        skin = body.boundary()
+        corners = skin.reference[skin.facets]
+        assert flux(corners).sum() == pytest.approx(np.prod(size), rel=1e-12)
+        a, b, c = size
+        assert skin.area.sum() == pytest.approx(2 * (a * b + b * c + c * a), rel=1e-12)
+        assert winding(corners.mean(axis=(0, 1)), corners) == pytest.approx(1.0)
+        assert (skin.boundary_edges == 0).all()
+    x, _ = shell().midsurface()
+    for side, z in (("top", 0.025), ("bottom", -0.025)):
+        part = shell().surface(side=side)
+        assert np.sort(part.reference[:, 0]) == pytest.approx(np.sort(x[:, 0]))
+        assert part.reference[:, 2] == pytest.approx(z)
+        assert part.area.sum() == pytest.approx(1.0)
+    chosen = shell().surface(lambda x: x[0] < 0.5 + 1e-9, side="top")
+    assert chosen.area.sum() == pytest.approx(0.5)
+
+
+def drop(scale=1.0, comm=MPI.COMM_WORLD):
+    upper = shell(0.06, 5, 0.9, scale, comm, "upper", velocity=tuple(scale * v for v in FAST))
+    lower = shell(0.0, 6, 1.0, scale, comm)
+    contact = nts.ContactPair(upper.surface(side="bottom"), lower.surface(side="top"), friction=MU)
+    run = nts.simulate(
+        nts.System([upper, lower], contacts=[contact]), EM, dt=1e-3, t_end=0.012
+    )
+    return run, upper.midsurface()[1] / scale
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1e3, 1e6])
+def test_units_of_length_take_the_same_iterations(scale):
+    (metres, x), (others, y) = (drop(s) for s in (1.0, scale))
+    assert y == pytest.approx(x, abs=1e-10)
+    assert (others.balance["newton_iterations"] == metres.balance["newton_iterations"]).all()
+
+
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_ranks_give_the_impact_of_one():
+    (several, x), (alone, y) = drop(), drop(comm=MPI.COMM_SELF)
+    assert x == pytest.approx(y, abs=1e-9)
+    assert several.balance["active"] == pytest.approx(alone.balance["active"])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("make", "kind", "text"),
+    [
+        (lambda: shell().surface(side="left"), ValueError, "side='left': choose one of"),
+        (lambda: shell().surface(lambda x: x[0] > 7), ValueError, "selects no facet"),
+        (lambda: shell().surface("top"), TypeError, "pass a function of x"),
+        (lambda: beam(0).surface(lambda x: x[0] > 7), ValueError, "selects no facet"),
+        (lambda: beam(0).surface(smoothing=1), TypeError, "smoothing"),
+        (lambda: nts.Beam(line((0, 0, 0), (1, 0, 0)), nts.Section(
+            EA=1, GA=(1, 1), GJ=1, EI=(1, 1), rhoA=1, rhoI=(1, 1))).surface(), ValueError,
+         "has no outline, so no surface; pass Section"),
+        (lambda: nts.Section(EA=1, GA=(1, 1), GJ=1, EI=(1, 1), rhoA=1, rhoI=(1, 1),
+                             outline=[(0, 0), (1, 0), (1, 1)]), ValueError,
+         "outline=.*counter-clockwise around the axis, an even number of at least 6"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_told(make, kind, text):
+    with pytest.raises(kind, match=text):
+        make()
+
+
+def test_both_sides_of_one_shell_are_no_contact():
+    body = shell()
+    with pytest.raises(ValueError, match="both surfaces of 'shell' share nodes"):
+        nts.ContactPair(body.surface(side="top"), body.surface(side="bottom"))
+
+
+@pytest.mark.mpi
+def test_contact_fields_of_a_beam_on_a_plane():
+    """Loads at nodes are sums over a section's points; of forces the largest one is told."""
+    bar = beam(0.0253, velocity=(0, 0, -1))
+    contact = nts.ContactPair(bar.surface(), nts.Plane((0, 0, 0), (0, 0, 1)))
+    stepper = nts.Stepper(nts.System([bar], contacts=[contact]), EM)
+    stepper.advance(1e-3)
+    solution, own = stepper.solution, bar.space.dofmap.index_map.size_local
+    fields = solution.contact_fields(bar)
+    (load,), (force,), (status,) = (
+        [f.x.array for name, f in fields.items() if name.startswith(kind)]
+        for kind in ("contact_load", "contact_force", "contact_status")
+    )
+    stepper.close()
+    momentum = solution.balance["linear_momentum"][:, 2]
+    pushed = load.reshape(-1, 3)[:own, 2]
+    assert bar.comm.allreduce(pushed.sum()) == pytest.approx((momentum[1] - momentum[0]) / 1e-3)
+    assert (status[:own] == 2).all() and (pushed > 0.0).all()
+    assert (force[:own] <= pushed * (1 + 1e-9)).all() and (force[:own] >= pushed / 8).all()
+
+
+@pytest.mark.mpi
+def test_a_run_goes_on_from_a_checkpoint_in_contact(mpi_tmp_path):
+    """Of a beam that slides on a plate, as if nothing had stopped it."""
+    path = mpi_tmp_path / "thin.h5"
+
+    def scene():
+        bar = beam(0.0505, velocity=(0.2, 0.0, -0.5))
+        plate = shell(n=4)
+        return nts.System([bar, plate], contacts=[
+            nts.ContactPair(bar.surface(), plate.surface(side="top"), friction=MU)
+        ])  # fmt: skip
+
+    whole, first, second = scene(), scene(), scene()
+    run = nts.simulate(whole, EM, dt=1e-3, t_end=4e-3)
+    nts.simulate(first, EM, dt=1e-3, t_end=2e-3, checkpoint=nts.Checkpoint(path, every=2))
+    nts.simulate(second, EM, dt=1e-3, t_end=4e-3, start=nts.restart(path, second))
+    assert run.balance["active"][1:].max() > 0
+    for a, b in zip(whole.bodies, second.bodies, strict=True):
+        assert a.comm.allreduce(np.abs(a.u.x.array - b.u.x.array).max(initial=0.0)) < 1e-11

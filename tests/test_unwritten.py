@@ -1,0 +1,186 @@
+"""Scenes that no one wrote, drawn by hypothesis: refused, stopped, warned of, or right.
+
+`SCENES=5000 SEED=1 pytest tests/test_unwritten.py` tries others and more. All that fail are named
+at the end, as text that `unwritten_judge.judge` takes. What was found is in the regression tests.
+"""
+
+import os
+import time
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from mpi4py import MPI
+from solids import Solid
+from unwritten_judge import judge, judge_restart, law_of
+from unwritten_scenes import NONSENSE, Body, Contact, Floor, Scene, scenes
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+SCENES, SEED = (int(os.environ.get(name, 0)) for name in ("SCENES", "SEED"))
+#: Time [s] that a rank waits for the others to end a scene.
+PATIENCE = 60.0
+
+
+def together(verdict):
+    """All ranks' verdicts; aborts if the others do not come to the end of the scene."""
+    request = COMM.Ibarrier()
+    limit = time.monotonic() + PATIENCE
+    while not request.Test():
+        time.sleep(1e-4)
+        if time.monotonic() > limit:
+            print(f"rank {COMM.rank} waits for the others: {verdict}", flush=True)
+            COMM.Abort(1)
+    return COMM.allgather(verdict)
+
+
+def run_many(count, number, judged=judge):
+    """Draw and judge so many scenes; every rank draws the same. Returns counts and failures."""
+    counts, failures = Counter(), []
+
+    # The generator alone, without its database and clock: its draws depend on the seed alone.
+    @seed(number)
+    @settings(max_examples=count, deadline=None, database=None, phases=[Phase.generate],
+              suppress_health_check=list(HealthCheck))  # fmt: skip
+    @given(scenes())
+    def run(scene):
+        verdicts = together(judged(scene, COMM))
+        first = verdicts[0]
+        counts.update([first.outcome, *(["touched"] if first.touched else [])])
+        if len({(v.outcome, v.said) for v in verdicts}) > 1:
+            failures.append(f"{scene}: ranks differ, {verdicts}")
+        for k, v in enumerate(verdicts):
+            if v.wrong:
+                failures.append(f"{scene}\n  rank {k}, {v.outcome}: {v.wrong}\n  {v.said}")
+
+    run()
+    return counts, failures
+
+
+# ---- the judge itself
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+def test_what_the_judge_knows_of_a_box(cell):
+    """Mass, energy of a uniform stretch, and depths, against closed forms."""
+    solid, rng = Solid.of("box", (2, 3, 1), cell), np.random.default_rng(1)
+    assert solid.mass.sum() == pytest.approx(1.0, rel=1e-14)
+    body, stretch = Body(law="neo-Hookean"), np.array([1.1, 0.9, 1.05])
+    mu, lame, log = 1e6 / 2.6, 0.3e6 / (1.3 * 0.4), np.log(stretch).sum()
+    stored = mu / 2 * ((stretch**2).sum() - 3 - 2 * log) + lame / 2 * log**2
+    assert solid.energy(solid.x * stretch, law_of(body)) == pytest.approx(stored, rel=1e-12)
+    points = rng.uniform(-0.7, 0.7, (200, 3))
+    depth = np.maximum(0.0, (0.5 - np.abs(points)).min(axis=1))
+    assert np.allclose(solid.depth(solid.x, points), depth, atol=1e-12)
+
+
+METEOR = Scene(
+    bodies=(Body(speed=0.0), Body(speed=30.0)), contacts=(Contact(),), dt=2e-3, steps=8
+)  # fmt: skip
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({}, None),
+        ({"contacts": ()}, "inside body"),
+        ({"gravity": (0, 0, -9.81)}, "linear momentum changes"),
+    ],
+)
+def test_the_judge_sees_what_is_wrong(change, text, monkeypatch):
+    """Where the package is given another scene than the judge."""
+    system = nts.System
+    monkeypatch.setattr(nts, "System", lambda bodies, **given: system(bodies, **given | change))
+    verdict = judge(METEOR, COMM)
+    assert verdict.outcome == "completed"
+    assert verdict.touched == ("contacts" not in change)
+    assert not verdict.wrong if text is None else any(text in w for w in verdict.wrong)
+
+
+@pytest.mark.mpi
+def test_the_judge_sees_a_wrong_energy(monkeypatch):
+    """Bodies heavier than the judge believes."""
+    monkeypatch.setitem(NONSENSE, "density", 1.01e3)
+    wrong = " ".join(judge(replace(METEOR, nonsense="density"), COMM).wrong)
+    assert "kinetic of the balance" in wrong and "density was accepted" in wrong
+
+
+# ---- what was found
+RING = Body(shape="ring", cells=(5, 1, 1), cell="tetrahedron", size=(0.3, 0.3, 0.3), turn=1.0,
+            speed=0.0)  # fmt: skip
+CUBE = Body(cells=(2, 1, 1), size=(0.3, 0.3, 0.3), poisson=0.0, density=1e4, gap=0.0, speed=30.0,
+            held="at rest")  # fmt: skip
+PLATE = Body(cells=(1, 3, 3), size=(1.5, 1.5, 0.3), law="", density=1e2, speed=-0.5,
+             drift=(0.0, 5.0), spin=(10.0, -20.0, 5.0))  # fmt: skip
+BALL = Body(shape="ball", cells=(3, 3, 3), cell="tetrahedron", law="", density=1e4, gap=-0.1,
+            speed=30.0, drift=(0.0, 5.0))  # fmt: skip
+FOUND = {
+    # The fourth step's look, at the nodes and edges of one of both bodies, counted as the last one.
+    "last look at both": Scene(bodies=(RING, CUBE), contacts=(Contact(swapped=True),), steps=4),
+    # A run that stopped had no last look: what the steps before had done was told by no one.
+    "last look of a run that stops": Scene(
+        row=(0.0, 0.0, 1.0), bodies=(PLATE, BALL),
+        contacts=(Contact(friction=0.3, smoothing=True),),
+        floor=Floor(radius=0.2, gap=0.03), dt=0.02, steps=6,
+        newton=(("max_retries", 1), ("linear_solver", "krylov")),
+    ),
+    # The refusal said what is wrong, but not what to do.
+    "remedy where no start fits": Scene(
+        bodies=(Body(law="", held="moving"),), joints=(("Planar", 0, False),), steps=3,
+        options=(("project_start", True),),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", FOUND)
+@pytest.mark.fast("last look at both", "remedy where no start fits")
+@pytest.mark.fast_on_ranks()
+def test_what_was_found_is_mended(name):
+    verdict = judge(FOUND[name], COMM)
+    assert not verdict.wrong, f"{verdict.wrong} {verdict.said}"
+
+
+# ---- the scenes
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(10))
+def test_five_hundred_scenes(part):
+    """Fifty for each seed, as later draws are variations of earlier ones."""
+    if COMM.size > 1:
+        pytest.skip("takes no less time on 2 ranks")
+    counts, failures = run_many(max(50, SCENES // 10), 10 * SEED + part)
+    print(dict(counts))
+    assert not failures, "\n".join(failures)
+    # It is no test if nearly all are refused, or nothing touches.
+    assert counts["completed"] > 0.4 * sum(counts.values()) and counts["touched"] > 5
+
+
+@pytest.mark.slow
+def test_scenes_that_go_on_from_a_checkpoint(tmp_path):
+    """They end as without, in serial to the bit; the judge says how else."""
+    if COMM.size > 1:
+        pytest.skip("takes no less time on 2 ranks")
+
+    def judged(scene, comm):
+        for file in tmp_path.iterdir():
+            file.unlink()
+        return judge_restart(scene, comm, tmp_path / "run.h5")
+
+    counts, failures = run_many(max(50, SCENES // 10), 200 + SEED, judged)
+    assert not failures, "\n".join(failures)
+    assert counts["completed"] > 20
+
+
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_scenes_on_all_ranks():
+    counts, failures = run_many(max(40, SCENES // 10), 100 + SEED)
+    assert not failures, "\n".join(failures)
+    assert counts["completed"] > 10
+
+
+@pytest.mark.slow
+def test_scenes_on_three_ranks(on_ranks):
+    on_ranks(3, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "all_ranks")
