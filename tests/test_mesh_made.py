@@ -27,6 +27,7 @@ def cells_of(mesh):
     return mesh.topology.index_map(mesh.topology.dim).size_global
 
 
+@pytest.mark.fast("triangle-6-3")
 @pytest.mark.parametrize("layers", [1, 3])
 @pytest.mark.parametrize(("kind", "each"), [("triangle", 6), ("quadrilateral", 1)])
 def test_an_extruded_plane(kind, each, layers):
@@ -39,6 +40,7 @@ def test_an_extruded_plane(kind, each, layers):
     assert np.isclose(nts.motion_of(body).mass, 500.0)
 
 
+@pytest.mark.fast("quadrilateral")
 @pytest.mark.parametrize("kind", KINDS)
 def test_plane_strain(kind):
     """A sheet pulled in x, free in y: the stiffness E/(1 - nu^2) of plane strain, not E."""

@@ -31,6 +31,7 @@ def moving(cell="hexahedron"):
 
 
 @mpi
+@pytest.mark.fast("hexahedron")
 @pytest.mark.parametrize("cell", CELLS)
 def test_they_are_as_they_were(cell, mpi_tmp_path):
     """Scalars, vectors and tensors in cells and at nodes, at their places on any ranks."""

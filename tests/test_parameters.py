@@ -40,6 +40,7 @@ def stretched(mesh, material, density=DENSITY):
     return body, COMM.allreduce(body.potential(u))
 
 
+@pytest.mark.fast("NeoHookean-values1-constant")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     ("law", "values"),
@@ -77,6 +78,7 @@ def test_a_rigid_body_of_two_densities():
     np.testing.assert_allclose(body.centre, [0.5, 0.5, (0.25 + 3.75) / 6], rtol=1e-13)
 
 
+@pytest.mark.fast("constant")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_modulus_changed_between_steps(kind):
     """The energy that it adds is that of the body as it stands, and the ledger names it."""
@@ -103,6 +105,7 @@ def test_a_modulus_changed_between_steps(kind):
     assert "material changed" in stepper.solution.warnings
 
 
+@pytest.mark.fast("constant-integrator0")
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Midpoint(), nts.Newmark()])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_density_changed_between_steps(kind, integrator):

@@ -42,6 +42,7 @@ def stored():
     return 0.5 * lam * np.trace(e) ** 2 + mu * (e * e).sum()
 
 
+@pytest.mark.fast("integrator0")
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Newmark()])
 def test_a_function_of_place_and_time(integrator):
     """All nodes move with velocities linear in x: kinetic and stored energy in closed form."""

@@ -52,42 +52,25 @@ def picture(
         OSError: On all ranks: the file cannot be written.
     """
     bodies = items("bodies", bodies, _has_mesh, "Continuum bodies")
-    _check_picture(bodies, colour, view, limits, width)
+    check_picture(bodies, colour, view, limits, width)
     require_bool("labels", labels)
-    for body in bodies:
-        thin = isinstance(body, DirectorBody)
-        if thin and colour != "speed":
-            raise ValueError(
-                f"colour={colour!r}: {body.kind} {body.name!r} has none; colour by 'speed', or see "
-                "its resultants()"
-            )
-        if not (body.has_skin if thin else body.mesh.topology.dim == 3):
-            raise ValueError(f"bodies: {body.name!r} has no volume; leave it out")
     file = as_path("path", path)
-    comm = bodies[0].comm
-    drawn = []
-    for body in bodies:
-        corners, values = _coloured_facets(body, colour)
-        corners = corners @ _axes_of(*view).T
-        drawn.append(_Drawn(body.name, gather_on_root(comm, corners), gather_on_root(comm, values)))
+    drawn = seen(bodies, colour, view)
 
     def draw() -> None:
-        figure, axes = _figure(drawn, width, title)
-        scale = _colour_scale(drawn, colour, limits)
-        axes.add_collection(_painted(drawn, scale))
-        _furnish(figure, axes, scale, _COLOURS[colour][1], view, drawn if labels else ())
+        scale = colour_scale(drawn, colour, limits)
+        figure = painted(drawn, scale, bounds(drawn), colour, view, width, title, labels)
         save_figure(figure, file, dpi=200, bbox_inches="tight", pad_inches=0.05)
 
-    write_on_root(comm, f"path={str(path)!r}", draw)
+    write_on_root(bodies[0].comm, f"path={str(path)!r}", draw)
 
 
 def _has_mesh(body: Any) -> bool:
     return isinstance(body, Body) and body.mesh is not None
 
 
-def _check_picture(
-    bodies: Sequence[Any], colour: str, view: Any, limits: Any, width: float
-) -> None:
+def check_picture(bodies: Sequence[Any], colour: str, view: Any, limits: Any, width: float) -> None:
+    """Raise unless the arguments of `picture` fit."""
     if not (isinstance(colour, str) and colour in _COLOURS):
         raise ValueError(f"colour={colour!r}: choose one of {', '.join(map(repr, _COLOURS))}")
     if not bodies:
@@ -98,9 +81,18 @@ def _check_picture(
     if limits is not None and limits[0] >= limits[1]:
         raise ValueError(f"limits={limits!r}: the first must be below the second")
     require_positive("width", width, "inch")
+    for body in bodies:
+        thin = isinstance(body, DirectorBody)
+        if thin and colour != "speed":
+            raise ValueError(
+                f"colour={colour!r}: {body.kind} {body.name!r} has none; colour by 'speed', or see "
+                "its resultants()"
+            )
+        if not (body.has_skin if thin else body.mesh.topology.dim == 3):
+            raise ValueError(f"bodies: {body.name!r} has no volume; leave it out")
 
 
-class _Drawn(NamedTuple):
+class Drawn(NamedTuple):
     """Facets of a body as the viewer sees them.
 
     Attributes:
@@ -112,6 +104,35 @@ class _Drawn(NamedTuple):
     name: str
     corners: FloatArray
     values: FloatArray
+
+
+def seen(bodies: Sequence[Any], colour: str, view: tuple[float, float]) -> list[Drawn]:
+    """What a viewer sees of bodies as they stand, on rank 0; as of `picture`. Collective."""
+    drawn = []
+    for body in bodies:
+        corners, values = _coloured_facets(body, colour)
+        corners = corners @ axes_of(*view).T
+        drawn.append(
+            Drawn(body.name, gather_on_root(body.comm, corners), gather_on_root(body.comm, values))
+        )
+    return drawn
+
+
+def painted(
+    drawn: Sequence[Drawn],
+    scale: Any,
+    ends: tuple[FloatArray, FloatArray],
+    colour: str,
+    view: tuple[float, float],
+    width: float,
+    title: str,
+    labels: bool,
+) -> Any:
+    """A figure of what is seen; of the same `ends` (`bounds`) and width it has the same size."""
+    figure, axes = _figure(ends, width, title)
+    axes.add_collection(_shapes(drawn, scale))
+    _furnish(figure, axes, scale, _COLOURS[colour][1], view, drawn if labels else ())
+    return figure
 
 
 _COLOURS = {"speed": ("viridis", "speed [m/s]"), "stress": ("plasma", "von Mises stress [Pa]")}
@@ -148,7 +169,7 @@ def _skin(body: DirectorBody) -> tuple[FloatArray, FloatArray]:
     return skin.positions(u)[mine], speed[mine]
 
 
-def _axes_of(elevation: float, azimuth: float) -> FloatArray:
+def axes_of(elevation: float, azimuth: float) -> FloatArray:
     """Rows: right, up and towards the viewer."""
     e, a = math.radians(elevation), math.radians(azimuth)
     right = np.array([-math.sin(a), math.cos(a), 0.0])
@@ -205,7 +226,8 @@ def _normals(x: FloatArray) -> FloatArray:
     return unit
 
 
-def _colour_scale(drawn: Sequence[_Drawn], colour: str, limits: Any) -> Any:
+def colour_scale(drawn: Sequence[Drawn], colour: str, limits: Any) -> Any:
+    """Colours of what is seen, between given limits or its own."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -218,7 +240,7 @@ def _colour_scale(drawn: Sequence[_Drawn], colour: str, limits: Any) -> Any:
     return ScalarMappable(Normalize(low, high), colormaps[_COLOURS[colour][0]])
 
 
-def _painted(drawn: Sequence[_Drawn], scale: Any) -> Any:
+def _shapes(drawn: Sequence[Drawn], scale: Any) -> Any:
     """Return what faces the viewer, from back to front."""
     from matplotlib.collections import PolyCollection
 
@@ -237,12 +259,17 @@ def _painted(drawn: Sequence[_Drawn], scale: Any) -> Any:
     return PolyCollection(shapes, facecolors=rgba[order], edgecolors=rgba[order], linewidths=0.35)
 
 
-def _figure(drawn: Sequence[_Drawn], width: float, title: str) -> tuple[Any, Any]:
+def bounds(drawn: Sequence[Drawn]) -> tuple[FloatArray, FloatArray]:
+    """Smallest and largest coordinates right and up of what is seen [m], shape (2,) each."""
+    points = np.concatenate([d.corners for d in drawn])[..., :2].reshape(-1, 2)
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _figure(ends: tuple[FloatArray, FloatArray], width: float, title: str) -> tuple[Any, Any]:
     """Figure and axes of the bodies: one length unit is the same in both directions."""
     from matplotlib.figure import Figure
 
-    points = np.concatenate([d.corners for d in drawn])[..., :2].reshape(-1, 2)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = ends
     height = width * (high[1] - low[1]) / (high[0] - low[0])
     # Tall scenes keep their height; the rest of the figure has fixed sizes on paper [inch].
     shrink = min(1.0, 1.3 * width / height)
@@ -262,7 +289,7 @@ def _furnish(
     scale: Any,
     text: str,
     view: tuple[float, float],
-    named: Sequence[_Drawn],
+    named: Sequence[Drawn],
 ) -> None:
     """Colour bar, axes' directions, scale bar and names."""
     from matplotlib.transforms import Affine2D
@@ -282,7 +309,7 @@ def _furnish(
     def line(start: tuple[float, float], end: tuple[float, float], **look: Any) -> None:
         axes.annotate("", end, start, inch, inch, annotation_clip=False, arrowprops=look)
 
-    for name, (x, y) in zip("xyz", 0.32 * _axes_of(*view)[:2].T, strict=True):
+    for name, (x, y) in zip("xyz", 0.32 * axes_of(*view)[:2].T, strict=True):
         line((0.5, 0.35), (0.5 + x, 0.35 + y), arrowstyle="->", lw=0.8, shrinkA=0, shrinkB=0)
         axes.text(
             0.5 + 1.35 * x,
