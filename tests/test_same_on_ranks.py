@@ -70,7 +70,6 @@ OTHER = {
 
 
 @pytest.mark.parametrize("name", OTHER)
-@pytest.mark.fast_on_ranks()
 def test_other_numbers_on_other_ranks_are_refused(name):
     if COMM.size == 1:
         pytest.skip("needs ranks")
