@@ -101,7 +101,8 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
     steps = len(solution.rows) - 1
     often = steps % _SELDOM == 0 or (steps < _SELDOM and steps & (steps - 1) == 0)
     measured = often or "turns" in solution.warnings
-    turning = [k for k, body in enumerate(system.bodies) if body.oriented or measured]
+    awake = problem.awake if measured else ()
+    turning = [k for k, body in enumerate(system.bodies) if body.oriented or k in awake]
     if not turning:
         return
     seen, driven, far = (np.zeros(len(turning)) for _ in range(3))
