@@ -375,6 +375,27 @@ def test_ranks_give_the_motion_of_one():
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("kind", ["shell", "beam"])
+@pytest.mark.fast_on_ranks()
+def test_one_cell_on_any_ranks(kind):
+    """Ranks without a cell take part; free fall of a spinning body keeps the energy."""
+    options = {"angular_velocity": (1, 2, 3)}
+    if kind == "shell":
+        body = nts.Shell(plate(1, 1, 1.0, 1.0), **RUBBER, **options)
+        expected = 0.5 * 0.5 * (1 * (1 + 0.05**2) + 4 * (1 + 0.05**2) + 9 * 2) / 12
+    else:
+        section = nts.Rectangle(0.1, 0.1).section(young=1e5, poisson=0.3, density=10.0)
+        mesh = surface_mesh([[0, 0, 0], [1, 0, 0]], [[0, 1]], kind="interval")
+        body = nts.Beam(mesh, section, **options)
+        expected = 0.5 * 0.1 * (1 * 0.02 + (4 + 9) * 1.01) / 12
+    run = nts.simulate(nts.System([body], gravity=(0, 0, -1)), EM, dt=0.05, t_end=0.15)
+    assert run.status == "completed" and len(run.balance["time"]) == 4
+    energy = run.balance["energy"] - run.balance["external_work"]
+    assert energy == pytest.approx(expected, rel=1e-12)
+    assert set(body.resultants()) == {"force", "moment"}
+
+
+@pytest.mark.mpi
 def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path):
     """As if nothing had stopped it."""
     path = mpi_tmp_path / "shell.h5"
