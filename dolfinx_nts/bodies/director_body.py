@@ -68,8 +68,9 @@ class DirectorBody(Body):
         """Its whole skin."""
         raise NotImplementedError
 
-    #: Whether more points of its skin may touch at once than it has freedom for.
-    _redundant: ClassVar[bool]
+    def _redundant(self) -> bool:
+        """Whether more points of its skin may touch at once than it has freedom for."""
+        raise NotImplementedError
 
     # ---- set-up
     def _set_up_mesh(self, mesh: Any, name: str) -> None:
