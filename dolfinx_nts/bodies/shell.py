@@ -45,7 +45,8 @@ class Shell(DirectorBody):
     scheme keeps the energy to rounding. The top is where cells are seen counter-clockwise, and
     where their mesh does not agree in that, the one with the first nodes of the input.
 
-    Limits: linear elastic, isotropic, of one thickness; no T-junctions, and no folds of more than
+    Limits: linear elastic, isotropic, of one thickness; no T-junctions, no cells that share a node
+    alone, and no folds of more than
     60 degrees between neighbouring cells; a director does not feel what turns about it; `Dirichlet`
     prescribes places alone, which is a hinge; joints and springs hold nodes.
 
