@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import pytest
 import scipy.linalg
+from dolfinx import fem
 from dolfinx.mesh import CellType, create_box
 from integrators import INTEGRATORS
 from mpi4py import MPI
@@ -535,7 +536,7 @@ def moebius():
         ({"bcs": [nts.Clamp(lambda x: x[0] > 7)]}, ValueError, "selects no node between"),
         ({"bcs": [nts.Clamp("root")]}, TypeError, "pass a function"),
         ({"bcs": [nts.Dirichlet(at(0, 0.0), lambda x, t: 0 * x)]}, ValueError,
-         r"^Dirichlet.value of bcs\[0\] of 'shell': varies in space; a shell takes a vector, or"),
+         r"^Dirichlet.value of bcs\[0\] of 'shell': no function of place.*; pass a vector, or"),
         ({"forces": [nts.PointForce(lambda x: x[0] > 0.9, (1, 0, 0))]}, ValueError,
          "selects 2 nodes; select one"),
         ({"forces": [nts.LineForce((1, 0, 0), lambda x: x[0] + x[1] > 1.9)]}, ValueError,
@@ -551,6 +552,13 @@ def test_bad_input_is_told(given, kind, text):
     mesh = options.pop("mesh")()
     with pytest.raises(kind, match=text):
         nts.Shell(mesh, **options)
+
+
+def test_supports_of_a_shell_take_no_functions_of_dolfinx():
+    mesh = plate(1, 1, 1.0, 1.0)
+    for value in (fem.Constant(mesh, (0.0,) * 3), fem.Function(compat.vector_space(mesh, 1))):
+        with pytest.raises(ValueError, match="no function of place, Constant or Function for a sh"):
+            nts.Shell(mesh, **RUBBER, bcs=[nts.Dirichlet(at(0, 0.0), value)])
 
 
 def test_components_of_clamps():

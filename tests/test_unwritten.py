@@ -103,7 +103,6 @@ def test_the_judge_sees_what_is_wrong(change, text, monkeypatch):
     assert not verdict.wrong if text is None else any(text in w for w in verdict.wrong)
 
 
-@pytest.mark.mpi
 @pytest.mark.parametrize(
     ("kind", "named", "excused"),
     [
@@ -129,7 +128,6 @@ def test_a_warning_excuses_the_bodies_that_it_names(kind, named, excused, monkey
     assert any("inside body" in w for w in wrong) != excused
 
 
-@pytest.mark.mpi
 def test_what_is_raised_in_mid_run_is_no_refusal(monkeypatch):
     simulate = nts.simulate
 

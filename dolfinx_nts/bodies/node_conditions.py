@@ -86,9 +86,9 @@ class NodeConditions:
                 columns = (columns[:, None] + np.arange(0, self._width, 3)).ravel()
             elif hasattr(bc.value, "ufl_shape") or takes_place(bc.value):
                 raise ValueError(
-                    f"Dirichlet.value of bcs[{k}] of {self._name!r}: varies in space; a {kind} "
-                    "takes a vector, or a function of time t -> (3,), the same for all nodes of a "
-                    "condition: give nodes that move otherwise conditions of their own"
+                    f"Dirichlet.value of bcs[{k}] of {self._name!r}: no function of place, "
+                    f"Constant or Function for a {kind}; pass a vector, or a function of time "
+                    "t -> (3,), and give nodes that move otherwise conditions of their own"
                 )
             owner[np.ix_(chosen, columns)] = k
             self._dofs.append((self._width * chosen[:, None] + columns).ravel())
