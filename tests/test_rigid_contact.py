@@ -129,7 +129,7 @@ def test_a_box_dropped_closes_the_ledger(turn, friction, accuracy, promise):
 @pytest.mark.parametrize("uneven", [1e-8, 1e-5])
 @pytest.mark.fast_on_ranks("1e-08-1.0")
 def test_feet_in_no_plane_leave_one_in_the_air(uneven, speed):
-    """Four gaps that repeat each other but for rounding cannot all close where one foot is longer."""
+    """Four gaps that repeat each other but for rounding cannot all close: one foot is longer."""
     mesh = grid((0, 0, 0), (1, 1, 1), (1, 1, 1))
     x = mesh.geometry.x
     x[(np.abs(x) < 1e-9).all(axis=1), 2] -= uneven
