@@ -20,7 +20,7 @@ def in_fresh_python(code):
 
 
 def environment_of_ranks():
-    """Return this process' variables without those of its own MPI, which would mislead new ranks."""
+    """Return this process' variables without those of its own MPI, which would mislead others."""
     own = ("OMPI_COMM", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PRTE_", "ORTE_")
     own += ("OMPI_MCA_ess", "OMPI_MCA_orte", "OMPI_MCA_pmix")
     environment = {k: v for k, v in os.environ.items() if not k.startswith(own)}
