@@ -32,6 +32,7 @@ def test_a_flying_plate():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_blow_closes_the_ledger():
     found = drum_stick.main(cells=4, t_end=1e-3)
     assert found["status"] == "completed" and found["blows"] >= 1

@@ -397,6 +397,7 @@ def test_one_cell_on_any_ranks(kind):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path):
     """As if nothing had stopped it."""
     path = mpi_tmp_path / "shell.h5"
@@ -410,6 +411,7 @@ def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_the_order_and_the_directions_of_cells_do_not_matter():
     """Of a cylinder whose cells are shuffled, and every third seen from its other side."""
     a, z = np.meshgrid(np.linspace(0, 2, 7), np.linspace(0, 1, 4), indexing="ij")
@@ -432,6 +434,7 @@ def test_the_order_and_the_directions_of_cells_do_not_matter():
 
 # ---- joints
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_plate_on_joints_swings():
     """Two spherical joints at a corner each are a hinge: energy is kept in gravity."""
     body = nts.Shell(plate(4, 2, 4.0, 2.0), **RUBBER)
@@ -605,6 +608,7 @@ def test_stress_resultants_of_a_beam_and_of_a_shell():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_picture_of_skins(mpi_tmp_path):
     line = np.column_stack([np.linspace(0, 1, 9), np.zeros(9), np.zeros(9) + 0.1])
     mesh = surface_mesh(line, np.column_stack([np.arange(8), np.arange(1, 9)]), kind="interval")

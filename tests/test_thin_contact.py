@@ -285,6 +285,7 @@ def sliding(comm=MPI.COMM_WORLD):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_run_goes_on_from_a_checkpoint_in_contact(mpi_tmp_path):
     """Of a beam that slides on a plate, as if nothing had stopped it."""
     path = mpi_tmp_path / "thin.h5"
