@@ -383,3 +383,32 @@ def test_an_error_of_petsc_is_told_with_its_likely_cause(integrator, monkeypatch
     with pytest.raises(nts.StepFailedError, match=words):
         stepper.advance(2e-3)
     stepper.close()
+
+
+def test_an_error_of_petsc_is_not_told_as_an_earlier_one():
+    """What a residual raised in a step that was given up is none of a later solve's."""
+    body = nts.RigidBody.from_inertia(1.0, (1.0, 1.0, 1.0), velocity=(1.0, 0.0, 0.0))
+    newton = nts.Newton(linear_solver="direct", max_retries=0)
+    stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum(), newton=newton)
+    stepper.start(1e-2)
+    evaluate, solver = stepper.problem.evaluate, stepper.solver
+
+    def raising(x):
+        raise nts.StepFailedError("an early failure")
+
+    stepper.problem.begin(stepper.state, 1e-2)
+    solver.prepare()
+    stepper.problem.evaluate = raising
+    solver.iterates.forget_last()
+    with pytest.raises(nts.StepFailedError, match="an early failure"):
+        solver._function(None, stepper.problem.x, None)
+    stepper.problem.evaluate, prepare = evaluate, solver.prepare
+
+    def breaking():
+        prepare()
+        solver.snes = Breaks(solver.snes)
+
+    solver.prepare = breaking
+    with pytest.raises(nts.StepFailedError, match="PETSc stopped with error 76"):
+        stepper.advance(1e-2)
+    stepper.close()
