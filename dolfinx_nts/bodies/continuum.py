@@ -192,6 +192,12 @@ class Continuum(UflBody):
         dx = ufl.Measure("dx", self.mesh, metadata={"quadrature_degree": self._of_mass})
         return self._rho * ufl.inner(v, w) * dx
 
+    def _check_parameters(self) -> None:
+        """Raise ValueError unless density and moduli are in their ranges."""
+        super()._check_parameters()
+        if isinstance(self.material, Isotropic):
+            self.material.check()
+
     def _virtual_work(self, rule: Integrator, w: Any) -> Any:
         """Virtual work of the rule's stress in UFL."""
         h0, h1 = ufl.grad(self._u0), ufl.grad(self._u1)
