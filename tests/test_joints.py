@@ -808,6 +808,7 @@ def test_a_jump_of_half_a_turn_stops_a_run(jump):
     _, system = motor(lambda t: 4.0 * (t > jump))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=0.05, t_end=0.2)
     assert "the angle of 'motor' changes by 4 rad, half a turn or more; use a sm" in run.status
+    assert run.status.endswith("use a smaller dt")
     assert jump - 0.05 < run.balance["time"][-1] <= jump
 
 

@@ -352,6 +352,23 @@ def test_nodes_that_flip_are_named_with_their_states(friction, row, states, inte
     stepper.close()
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_a_failure_advises_only_where_its_text_does(told):
+    """Of the nodes that flip, the one that is worst solved is named, with or without a remedy."""
+    if COMM.size > 1:
+        pytest.skip("nodes 0 and 1 are of one rank")
+    stepper = nts.Stepper(scene(velocity=(0.0, 0.0, -1.0)), nts.EnergyMomentum())
+    stepper.start(2e-3)
+    stepper.problem.begin(stepper.state, 2e-3)
+    solver = stepper.solver
+    step = solver.solve()
+    solver.iterates.flips[0][0, 0] = 8
+    step.parts[0].residual[0 if told else 1, -1] = 1e3
+    failure = solver._failure(step, PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT, 9)
+    assert failure.advises == told == ("settles in neither; try another dt" in str(failure))
+    stepper.close()
+
+
 class Breaks:
     """A solver whose solves end by an error of PETSc."""
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.assembly import StepMatrix
@@ -316,12 +317,12 @@ class StepSolver:
                 f"{iterations} iterations: {self._upright.describe_inverted(e.x)}",
                 advises=True,
             )
-        why = self._presets.why_failed(self.snes, reason)
+        why, advises = self._presets.why_failed(self.snes, reason)
         message = diagnosis(problem, e, self.iterates.flips, why, iterations)
         flat = self._upright.describe_flat(e.x)
         if flat:
             return StepFailedError(f"{message}; {flat}", advises=True)
-        return StepFailedError(message, advises=self.iterates.cycles)
+        return StepFailedError(message, advises=advises or UNSETTLED in message)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
