@@ -97,7 +97,7 @@ class StepProblem:
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.centre, self._span = _box(system)
-        self.stabilization = Stabilization(system, self._span)
+        self.stabilization = Stabilization(system, self._span, self._largest_load)
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
@@ -364,6 +364,16 @@ class StepProblem:
             here = self.factor * body.external(terms.u1, self._gravity)
             works[k] = float(free(body, mean - here) @ terms.du)
         return works
+
+    def _largest_load(self) -> float:
+        """Largest load but gravity on a coordinate, all of its ramp [N]. Collective."""
+        largest, none = 0.0, np.zeros(3)
+        for body, moment in zip(self.system.bodies, self._moments, strict=True):
+            body.begin_step(self.integrator, moment._replace(ramp=1.0))
+            load = np.abs(body.external(np.zeros(body.num_owned), none))
+            largest = max(largest, float(load.max(initial=0.0)))
+            body.begin_step(self.integrator, moment)
+        return float(global_max(self.system.comm, np.array([largest]))[0])
 
     def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
         """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
