@@ -70,24 +70,27 @@ def model_to_mesh(model: Any, comm: Any, rank: int = 0) -> tuple[Any, Any, Any]:
     return m, ct, ft
 
 
-def _table(a: Any) -> IntArray:
-    if isinstance(a, np.ndarray):
-        return a
-    if not a.num_nodes:
-        return np.empty((0, 0), np.int32)
-    table: IntArray = np.asarray(a.array).reshape(a.num_nodes, -1)
+def _table(a: Any, layout: Any) -> IntArray:
+    """Rows of a list, which does not know how long they are where there is none."""
+    table: IntArray = np.asarray(a.array).reshape(a.num_nodes, layout.num_dofs)
     return table
 
 
 def geometry_dofmap(msh: Any) -> IntArray:
     """Geometry nodes of the cells, shape (cells, nodes)."""
     g = msh.geometry
-    return _table(g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap)
+    if _OLD:
+        return _table(g.dofmap, g.cmap.create_dof_layout())
+    nodes: IntArray = g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap
+    return nodes
 
 
 def cell_dofs(space: Any) -> IntArray:
     """Blocked dofs of the cells, shape (cells, dofs)."""
-    return _table(space.dofmap.list)
+    if _OLD:
+        return _table(space.dofmap.list, space.dofmap.dof_layout)
+    dofs: IntArray = space.dofmap.list
+    return dofs
 
 
 def entities_to_geometry(msh: Any, dim: int, entities: npt.ArrayLike) -> IntArray:

@@ -19,6 +19,15 @@ def in_fresh_python(code):
     return done.stdout
 
 
+def environment_of_ranks():
+    """Return this process' variables without those of its own MPI, which would mislead others."""
+    own = ("OMPI_COMM", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PRTE_", "ORTE_")
+    own += ("OMPI_MCA_ess", "OMPI_MCA_orte", "OMPI_MCA_pmix")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(own)}
+    environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    return environment | {"OMP_NUM_THREADS": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
+
+
 def on_ranks(ranks: int, *arguments: str, well: bool = True) -> str:
     """Run Python with these arguments under mpirun and return what it printed.
 
@@ -28,13 +37,7 @@ def on_ranks(ranks: int, *arguments: str, well: bool = True) -> str:
         well: Whether it must succeed; else it must fail, and what it says on stderr is returned,
             too.
     """
-    # This process is a rank itself; its own MPI variables would mislead the new ones.
-    own = ("OMPI_COMM", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PRTE_", "ORTE_")
-    own += ("OMPI_MCA_ess", "OMPI_MCA_orte", "OMPI_MCA_pmix")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(own)}
-    environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    environment |= {"OMP_NUM_THREADS": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
-    environment["PYTHONPATH"] = str(DEMOS)
+    environment = environment_of_ranks() | {"PYTHONPATH": str(DEMOS)}
     command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), sys.executable]
     done = subprocess.run(
         [*command, *arguments],

@@ -4,7 +4,6 @@ What a limit on the size of files can stand for is in test_whole_files, kills in
 """
 
 import json
-import os
 import queue
 import shutil
 import subprocess
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from processes import environment_of_ranks
 from scenes import box, thrown_block
 
 import dolfinx_nts as nts
@@ -66,11 +66,9 @@ def on_a_small_disk(tmp_path, ranks, *what):
     space = ["unshare", "--mount", "--propagation", "private", "sh", "-c"]
     if subprocess.run([*space, inside, "sh", "true"], capture_output=True, check=False).returncode:
         pytest.skip("mounting is not allowed here")
-    allowed = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
-               "OMP_NUM_THREADS": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}  # fmt: skip
     done = subprocess.run(
         [*space, inside, "sh", *command], capture_output=True, text=True, timeout=300, check=False,
-        env=os.environ | allowed,
+        env=environment_of_ranks(),
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads(done.stdout.splitlines()[-1])

@@ -92,6 +92,18 @@ def test_a_curved_mesh_is_refused_and_made_straight():
     assert 0 < lost < 4 * np.pi * 0.5**2 / 8
 
 
+@pytest.mark.fast_on_ranks()
+def test_one_cell_on_any_ranks():
+    """Also where a rank has none: the corners are those of the input."""
+    far = np.array([2.0, 1.0])
+    plane = create_rectangle(COMM, [np.zeros(2), far], [1, 1], KINDS["quadrilateral"])
+    for mesh, top in ((nts.extrude(plane, THICKNESS), THICKNESS), (nts.linear(plane), 0.0)):
+        assert cells_of(mesh) == 1
+        x = np.unique(np.concatenate(COMM.allgather(mesh.geometry.x)), axis=0)
+        expected = {(a, b, c) for a in (0.0, 2.0) for b in (0.0, 1.0) for c in (0.0, top)}
+        assert {*map(tuple, x.tolist())} == expected
+
+
 def test_what_cannot_be_made():
     plane = create_rectangle(COMM, [np.zeros(2), np.ones(2)], [3, 3], CellType.triangle)
     with pytest.raises(ValueError, match=r"triangle in 2D; .* plane strain pass nts.extrude\(mesh"):

@@ -125,6 +125,52 @@ def test_a_box_dropped_closes_the_ledger(turn, friction, accuracy, promise):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+@pytest.mark.parametrize("uneven", [1e-8, 1e-5])
+@pytest.mark.fast_on_ranks("1e-08-1.0")
+def test_feet_in_no_plane_leave_one_in_the_air(uneven, speed):
+    """Four gaps that repeat each other but for rounding cannot all close: one foot is longer."""
+    mesh = grid((0, 0, 0), (1, 1, 1), (1, 1, 1))
+    x = mesh.geometry.x
+    x[(np.abs(x) < 1e-9).all(axis=1), 2] -= uneven
+    body, dt = nts.RigidBody(mesh, density=1e3, velocity=(0, 0, -speed)), 1e-3
+    floor = nts.Plane((0, 0, -uneven - 0.5 * speed * dt), (0, 0, 1))
+    pair = nts.ContactPair(slave=below(body, 1e-4), master=floor)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=dt, t_end=5 * dt)
+    assert run.status == "completed" and run.retries == 0
+    assert run.balance["min_gap"].min() > -1e-12
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-11 * body.mass * G
+
+
+@pytest.mark.mpi
+def test_a_pinned_bar_strikes_a_plane():
+    """Its place is prescribed, so that gaps depend on its turn alone."""
+    body = rigid((-1, -0.1, -0.1), (2, 0.2, 0.2), motion=(0, 0, 0), angular_velocity=(0, 1, 0))
+    pair = nts.ContactPair(
+        slave=body.surface(lambda x: x[0] > 1 - 1e-9), master=nts.Plane((0, 0, -0.12), (0, 0, 1))
+    )
+    run = nts.simulate(
+        nts.System([body], contacts=[pair]), nts.EnergyMomentum(), dt=5e-3, t_end=0.04
+    )
+    table, before = run.balance, run.balance["energy"][0]
+    assert run.status.startswith("completed") and table["min_gap"].min() > -1e-12
+    assert body.angular_velocity[1] < 0.0
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * before
+
+
+@pytest.mark.mpi
+def test_a_body_that_may_not_turn_flies_above_a_plane():
+    """It has no constraints of its own, so that there may be no element on any rank."""
+    body = rigid((0, 0, 1), (1, 1, 1), rotation=(0, 0, 0), velocity=(1, 0, 0))
+    pair = nts.ContactPair(slave=below(body, 1.0), master=FLOOR)
+    system = nts.System([body], contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.1)
+    assert run.status == "completed" and not run.balance["active"].any()
+    assert body.position == pytest.approx([0.6, 0.5, 1.5], abs=1e-12)
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("part", [0.999, 1.001])
 @pytest.mark.fast_on_ranks("1.001")
 def test_a_brick_on_a_slope_slides_below_the_limit_alone(part):

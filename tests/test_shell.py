@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import pytest
 import scipy.linalg
+from dolfinx import fem
 from dolfinx.mesh import CellType, create_box
 from integrators import INTEGRATORS
 from mpi4py import MPI
@@ -375,6 +376,27 @@ def test_ranks_give_the_motion_of_one():
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("kind", ["shell", "beam"])
+@pytest.mark.fast_on_ranks()
+def test_one_cell_on_any_ranks(kind):
+    """Ranks without a cell take part; free fall of a spinning body keeps the energy."""
+    options = {"angular_velocity": (1, 2, 3)}
+    if kind == "shell":
+        body = nts.Shell(plate(1, 1, 1.0, 1.0), **RUBBER, **options)
+        expected = 0.5 * 0.5 * (1 * (1 + 0.05**2) + 4 * (1 + 0.05**2) + 9 * 2) / 12
+    else:
+        section = nts.Rectangle(0.1, 0.1).section(young=1e5, poisson=0.3, density=10.0)
+        mesh = surface_mesh([[0, 0, 0], [1, 0, 0]], [[0, 1]], kind="interval")
+        body = nts.Beam(mesh, section, **options)
+        expected = 0.5 * 0.1 * (1 * 0.02 + (4 + 9) * 1.01) / 12
+    run = nts.simulate(nts.System([body], gravity=(0, 0, -1)), EM, dt=0.05, t_end=0.15)
+    assert run.status == "completed" and len(run.balance["time"]) == 4
+    energy = run.balance["energy"] - run.balance["external_work"]
+    assert energy == pytest.approx(expected, rel=1e-12)
+    assert set(body.resultants()) == {"force", "moment"}
+
+
+@pytest.mark.mpi
 def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path):
     """As if nothing had stopped it."""
     path = mpi_tmp_path / "shell.h5"
@@ -450,6 +472,32 @@ def t_junction():
     return surface_mesh(x, [[0, 2, 1, 3], [2, 4, 3, 5], [2, 6, 3, 7]])
 
 
+def corner_to_corner():
+    """Two cells that share a node alone."""
+    x = [[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [1, 2, 0], [2, 1, 0], [2, 2, 0]]
+    return surface_mesh(x, [[0, 2, 1, 3], [3, 4, 5, 6]])
+
+
+def tip(height):
+    """Eight cells around the tip of a cone."""
+    a = np.arange(16) * np.pi / 8
+    r = np.where(np.arange(16) % 2, 1.2, 1.0)
+    x = np.column_stack([r * np.cos(a), r * np.sin(a), -height * r])
+    k = 2 * np.arange(8)
+    cells = np.stack([0 * k, 1 + k, 1 + (k + 2) % 16, 2 + k], axis=-1)
+    return surface_mesh(np.concatenate([np.zeros((1, 3)), x]), cells)
+
+
+@pytest.mark.mpi
+def test_the_tip_of_a_cone():
+    """Of a flat one: no other direction than its axis turns with it."""
+    body = nts.Shell(tip(0.5), **RUBBER)
+    axis, across = np.array([0, 0, 1.0]), np.array([1e-3, 0, 1.0])
+    assert body.directions_at(axis, (0, 0, 0)).body is body
+    with pytest.raises(ValueError, match="only its director"):
+        body.directions_at(across, (0, 0, 0))
+
+
 def moebius():
     """A band of twelve cells that turns by half a turn."""
     a = np.linspace(0, 2 * np.pi, 13)[:-1]
@@ -477,6 +525,9 @@ def moebius():
         ({"mesh": lambda: joined(70)}, ValueError, "folds by 70 degrees at x=.*a shell of each"),
         ({"mesh": t_junction}, ValueError, "3 cells meet in an edge|folds by 90 degrees"),
         ({"mesh": moebius}, ValueError, "one side alone"),
+        ({"mesh": corner_to_corner}, ValueError,
+         r"cells share the node at x=\[(1.0|0.9{12}\d*), .*, but no edge there; make a shell of"),
+        ({"mesh": lambda: tip(4.0)}, ValueError, "cells at the node at x=.* look in different dir"),
         ({"young": 0.0}, ValueError, "^young=0.0: must be positive"),
         ({"poisson": 0.6}, ValueError, "^poisson=0.6: must lie above"),
         ({"thickness": -1}, ValueError, "^thickness=-1: must be positive"),
@@ -484,6 +535,8 @@ def moebius():
         ({"bcs": [3]}, TypeError, r"bcs\[0\]=3: pass a sequence of Clamp or Dirichlet"),
         ({"bcs": [nts.Clamp(lambda x: x[0] > 7)]}, ValueError, "selects no node between"),
         ({"bcs": [nts.Clamp("root")]}, TypeError, "pass a function"),
+        ({"bcs": [nts.Dirichlet(at(0, 0.0), lambda x, t: 0 * x)]}, ValueError,
+         r"^Dirichlet.value of bcs\[0\] of 'shell': no function of place.*; pass a vector, or"),
         ({"forces": [nts.PointForce(lambda x: x[0] > 0.9, (1, 0, 0))]}, ValueError,
          "selects 2 nodes; select one"),
         ({"forces": [nts.LineForce((1, 0, 0), lambda x: x[0] + x[1] > 1.9)]}, ValueError,
@@ -499,6 +552,13 @@ def test_bad_input_is_told(given, kind, text):
     mesh = options.pop("mesh")()
     with pytest.raises(kind, match=text):
         nts.Shell(mesh, **options)
+
+
+def test_supports_of_a_shell_take_no_functions_of_dolfinx():
+    mesh = plate(1, 1, 1.0, 1.0)
+    for value in (fem.Constant(mesh, (0.0,) * 3), fem.Function(compat.vector_space(mesh, 1))):
+        with pytest.raises(ValueError, match="no function of place, Constant or Function for a sh"):
+            nts.Shell(mesh, **RUBBER, bcs=[nts.Dirichlet(at(0, 0.0), value)])
 
 
 def test_components_of_clamps():
@@ -561,13 +621,16 @@ def test_a_picture_of_skins(mpi_tmp_path):
 
 
 @pytest.mark.mpi
-def test_a_shell_at_rest_sleeps():
-    """While another one flies; the motion is the same."""
+def test_a_shell_at_rest_stays_awake():
+    """Its directors are held by constraints, whose unknowns stay; a sleeping scene moves alike."""
     ends = []
     for sleep in (False, True):
         body, other = flying(n=(4, 2)), nts.Shell(plate(2, 2, 1.0, 1.0), **RUBBER, name="still")
-        run = nts.simulate(nts.System([body, other]), EM, dt=0.05, t_end=0.3, sleep=sleep)
-        assert run.status == "completed"
+        stepper = nts.Stepper(nts.System([body, other]), EM, sleep=sleep)
+        for _ in range(4):
+            stepper.advance(0.05)
+            assert stepper.problem.awake == (0, 1)
+        stepper.close()
         ends.append(body.midsurface()[1])
         assert moved(other) == pytest.approx(0.0, abs=1e-14)
     assert ends[1] == pytest.approx(ends[0], abs=1e-10)

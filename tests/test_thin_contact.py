@@ -7,6 +7,7 @@ from mpi4py import MPI
 from shells import grid, plate_nodes, surface_mesh
 
 import dolfinx_nts as nts
+from dolfinx_nts.output.state_file import previous
 
 EM = nts.EnergyMomentum()
 FAST = (0.3, 0.1, -1.0)
@@ -228,6 +229,32 @@ def test_both_sides_of_one_shell_are_no_contact():
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("friction", [0.0, MU])
+@pytest.mark.fast_on_ranks("0.3")
+def test_a_shell_between_two_planes(friction):
+    """Both points of a node touch, and its director cannot give way: no step needs a cut."""
+    body = shell(n=2)
+
+    def up(t):
+        return 0.0, 0.0, 1e-3 * np.sin(40 * t)
+
+    contacts = [
+        nts.ContactPair(
+            body.surface(side=side), nts.Plane((0, 0, z), (0, 0, -z), motion=up), friction=friction
+        )
+        for side, z in (("top", 0.025), ("bottom", -0.025))
+    ]
+    run = nts.simulate(nts.System([body], contacts=contacts), EM, dt=2e-3, t_end=0.02)
+    assert run.status == "completed" and run.retries == 0 and run.balance["active"].max() > 9
+    assert run.balance["newton_iterations"].max() < 10
+    work = np.abs(run.balance["external_work"]).max()
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-10 * work
+    assert np.abs(run.balance["min_gap"][1:]).max() < 1e-13 * 0.05
+    middle = body.midsurface()[1][:, 2]
+    assert middle == pytest.approx(up(0.02)[2], rel=1e-9)
+
+
+@pytest.mark.mpi
 def test_contact_fields_of_a_beam_on_a_plane():
     """Loads at nodes are sums over a section's points; of forces the largest one is told."""
     bar = beam(0.0253, velocity=(0, 0, -1))
@@ -248,22 +275,44 @@ def test_contact_fields_of_a_beam_on_a_plane():
     assert (force[:own] <= pushed * (1 + 1e-9)).all() and (force[:own] >= pushed / 8).all()
 
 
+def sliding(comm=MPI.COMM_WORLD):
+    """A beam on a plate."""
+    bar = beam(0.0505, comm, velocity=(0.2, 0.0, -0.5))
+    plate = shell(n=4, comm=comm)
+    return nts.System([bar, plate], contacts=[
+        nts.ContactPair(bar.surface(), plate.surface(side="top"), friction=MU)
+    ])  # fmt: skip
+
+
 @pytest.mark.mpi
 def test_a_run_goes_on_from_a_checkpoint_in_contact(mpi_tmp_path):
     """Of a beam that slides on a plate, as if nothing had stopped it."""
     path = mpi_tmp_path / "thin.h5"
 
-    def scene():
-        bar = beam(0.0505, velocity=(0.2, 0.0, -0.5))
-        plate = shell(n=4)
-        return nts.System([bar, plate], contacts=[
-            nts.ContactPair(bar.surface(), plate.surface(side="top"), friction=MU)
-        ])  # fmt: skip
-
-    whole, first, second = scene(), scene(), scene()
+    whole, first, second = sliding(), sliding(), sliding()
     run = nts.simulate(whole, EM, dt=1e-3, t_end=4e-3)
     nts.simulate(first, EM, dt=1e-3, t_end=2e-3, checkpoint=nts.Checkpoint(path, every=2))
     nts.simulate(second, EM, dt=1e-3, t_end=4e-3, start=nts.restart(path, second))
     assert run.balance["active"][1:].max() > 0
     for a, b in zip(whole.bodies, second.bodies, strict=True):
         assert a.comm.allreduce(np.abs(a.u.x.array - b.u.x.array).max(initial=0.0)) < 1e-11
+
+
+@pytest.mark.mpi
+@pytest.mark.skipif(MPI.COMM_WORLD.size == 1, reason="compares ranks with a serial run")
+def test_a_checkpoint_goes_on_on_other_ranks(mpi_tmp_path):
+    """From each rank alone to all of them, of a beam that slides on a plate."""
+    here, world = MPI.COMM_SELF, MPI.COMM_WORLD
+    path = mpi_tmp_path / f"{world.rank}.h5"
+    alone, several = sliding(here), sliding(world)
+    saved = nts.Checkpoint(path, every=2)
+    run = nts.simulate(alone, EM, dt=1e-3, t_end=3e-3, checkpoint=saved)
+    world.barrier()
+    start = nts.restart(previous(mpi_tmp_path / "0.h5"), several)
+    assert len(start.rows) == 3
+    found = nts.simulate(several, EM, dt=1e-3, t_end=3e-3, start=start)
+    assert run.balance["active"].max() > 0
+    assert found.balance["energy"] == pytest.approx(run.balance["energy"], rel=1e-12)
+    for kind, k in (("centreline", 0), ("midsurface", 1)):
+        (_, x), (_, y) = (getattr(s.bodies[k], kind)() for s in (alone, several))
+        assert y == pytest.approx(x, abs=1e-12)

@@ -21,6 +21,8 @@ import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
 SCENES, SEED = (int(os.environ.get(name, 0)) for name in ("SCENES", "SEED"))
+#: Largest share of scenes that may stop before their end.
+STOPPED = 0.15
 #: Time [s] that a rank waits for the others to end a scene.
 PATIENCE = 60.0
 
@@ -50,6 +52,8 @@ def run_many(count, number, judged=judge):
         verdicts = together(judged(scene, COMM))
         first = verdicts[0]
         counts.update([first.outcome, *(["touched"] if first.touched else [])])
+        if first.outcome == "stopped":
+            print(f"stopped: {first.said[:200]}")
         if len({(v.outcome, v.said) for v in verdicts}) > 1:
             failures.append(f"{scene}: ranks differ, {verdicts}")
         for k, v in enumerate(verdicts):
@@ -97,6 +101,43 @@ def test_the_judge_sees_what_is_wrong(change, text, monkeypatch):
     assert verdict.outcome == "completed"
     assert verdict.touched == ("contacts" not in change)
     assert not verdict.wrong if text is None else any(text in w for w in verdict.wrong)
+
+
+@pytest.mark.parametrize(
+    ("kind", "named", "excused"),
+    [
+        ("node inside a body", "'body 0' inside 'body 1'", True),
+        ("node inside a body", "'body 1' inside 'body 2'", False),
+        ("node in an obstacle", "'body 0' inside 'body 1'", False),
+        ("ledger", "'body 0' behind 'body 1'", False),
+    ],
+)
+def test_a_warning_excuses_the_bodies_that_it_names(kind, named, excused, monkeypatch):
+    system, simulate = nts.System, nts.simulate
+
+    def warned(*args, output, **given):
+        def write(stepper, **options):
+            stepper.solution.warn(kind, 0.0, 1.0, named)
+
+        monkeypatch.setattr(output[0], "close", write)
+        return simulate(*args, output=output, **given)
+
+    monkeypatch.setattr(nts, "System", lambda bodies, **_: system(bodies))
+    monkeypatch.setattr(nts, "simulate", warned)
+    wrong = judge(METEOR, COMM).wrong
+    assert any("inside body" in w for w in wrong) != excused
+
+
+def test_what_is_raised_in_mid_run_is_no_refusal(monkeypatch):
+    simulate = nts.simulate
+
+    def late(*args, **given):
+        simulate(*args, **given)
+        raise ValueError("slave='body 0': pass another one")
+
+    monkeypatch.setattr(nts, "simulate", late)
+    verdict = judge(METEOR, COMM)
+    assert verdict.outcome == "refused" and "raised in mid run" in " ".join(verdict.wrong)
 
 
 @pytest.mark.mpi
@@ -154,7 +195,9 @@ def test_five_hundred_scenes(part):
     print(dict(counts))
     assert not failures, "\n".join(failures)
     # It is no test if nearly all are refused, or nothing touches.
+    scenes = sum(counts[name] for name in ("refused", "completed", "stopped"))
     assert counts["completed"] > 0.4 * sum(counts.values()) and counts["touched"] > 5
+    assert counts["stopped"] < STOPPED * scenes
 
 
 @pytest.mark.slow

@@ -60,7 +60,7 @@ class Beam(DirectorBody):
             has a cell without length, a branch or a corner.
     """
 
-    kind, _redundant = "beam", True
+    kind = "beam"
 
     def __init__(
         self,
@@ -107,6 +107,9 @@ class Beam(DirectorBody):
         """Its whole skin, see `DirectorBody`; without an outline none but the axis."""
         outline = np.array(self.section.outline, dtype=np.float64).reshape(-1, 2)
         return of_beam(self._skeleton, outline / self.length)
+
+    def _redundant(self) -> bool:
+        return True  # points of a section, see `DirectorBody`
 
     def surface(self, marker: Any = None, *, smoothing: bool = False) -> Surface:
         """A part of the skin for contact: the section's outline along the axis, and its ends.

@@ -113,7 +113,7 @@ def _check_value(name: str, value: Any, unit: str, or_else: str) -> None:
         vector(name, value, unit, or_else=or_else)
 
 
-def _takes_place(value: Any) -> bool:
+def takes_place(value: Any) -> bool:
     """Return whether a function has two arguments that must be given: place and time."""
     try:
         parameters = inspect.signature(value).parameters.values()
@@ -259,7 +259,7 @@ class Supports:
             try:
                 start.append(self._values(number, bc.value, owned, 0.0))
             except UserFunctionError as error:
-                one = callable(bc.value) and not _takes_place(bc.value)
+                one = callable(bc.value) and not takes_place(bc.value)
                 hint = "; it is called with the time: one that varies in space takes (x, t)"
                 raise UserFunctionError(f"{error}{hint * one}") from error.__cause__
             for component in bc.components:
@@ -291,7 +291,7 @@ class Supports:
             return np.array(value.value)
         if isinstance(value, fem.Function):
             return at_nodes(self._space, f"{what}={value!s}", value)[nodes]
-        if callable(value) and _takes_place(value):
+        if callable(value) and takes_place(value):
             x, at = self._nodes[nodes].T, f"{what} at t={float(time)!r}"
             found: FloatArray = at_points(
                 self._comm, at, lambda x: value(x, time), x, (3,), error=UserFunctionError

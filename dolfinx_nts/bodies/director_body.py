@@ -68,8 +68,9 @@ class DirectorBody(Body):
         """Its whole skin."""
         raise NotImplementedError
 
-    #: Whether more points of its skin may touch at once than it has freedom for.
-    _redundant: ClassVar[bool]
+    def _redundant(self) -> bool:
+        """Whether more points of its skin may touch at once than it has freedom for."""
+        raise NotImplementedError
 
     # ---- set-up
     def _set_up_mesh(self, mesh: Any, name: str) -> None:
@@ -146,7 +147,7 @@ class DirectorBody(Body):
         order = np.argsort(self._numbers)
         self._nodes = order[np.searchsorted(self._numbers[order], self._cells)]
         corners = self._cells.shape[1]
-        y = self._vectors_at(self._cells.ravel()).reshape(owned, -1, 3)
+        y = self._vectors_at(self._cells.ravel()).reshape(owned, self._corners, 3)
         self._elements, self._shares = self._elements_of(y)
         self._rest = y
         sums = self._shares.sum(axis=2)[:, :, None, None] * self._masses[:, None]

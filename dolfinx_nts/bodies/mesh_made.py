@@ -100,8 +100,8 @@ def _on_root(mesh: Any) -> tuple[IntArray, FloatArray]:
     corners, dim = _CORNERS[compat.cell_name(mesh)], mesh.topology.dim
     owned = mesh.topology.index_map(dim).size_local
     original = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)
-    own = compat.geometry_dofmap(mesh)[:owned].reshape(owned, -1)[:, :corners]
-    cells = gather_on_root(mesh.comm, original[own].reshape(-1, corners))
+    own = compat.geometry_dofmap(mesh)[:owned, :corners]
+    cells = gather_on_root(mesh.comm, original[own])
     number = np.asarray(mesh.topology.original_cell_index[:owned], dtype=np.int64)
     cells = cells[np.argsort(gather_on_root(mesh.comm, number))]
     nodes, first = np.unique(gather_on_root(mesh.comm, original), return_index=True)

@@ -61,8 +61,8 @@ def midsurface_of(space: Any, name: str) -> Skeleton:
         name: Of the shell, for messages.
 
     Raises:
-        ValueError: A flat cell, an edge of three cells, a fold above 60 degrees, or a surface with
-            one side.
+        ValueError: A flat cell, an edge of three cells, a fold above 60 degrees, a surface with one
+            side, cells that share a node alone, or a node whose cells have no common normal.
     """
     x, cells, given = nodes_and_cells(space)
     cells = cells[:, _CYCLIC]
@@ -74,12 +74,10 @@ def midsurface_of(space: Any, name: str) -> Skeleton:
             f"mesh of {name!r}: {count.max()} cells meet in an edge at x={where}; a shell has no "
             "T-junctions: make a shell of each part"
         )
+    _check_corners(x, cells, edge, given, name)
     cells = _oriented(x, cells, edge, given, name)
     _check_folds(x, cells, edge, name)
-    normals, angles = _corner_normals(x[cells])
-    directors = np.zeros_like(x)
-    np.add.at(directors, cells, angles[:, :, None] * normals)
-    directors /= np.linalg.norm(directors, axis=1, keepdims=True)
+    directors = _directors(x, cells, name)
     edge, count = _edges(cells)
     ends = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
     return Skeleton(x, np.argsort(given), cells, directors[:, None], ends[count[edge] == 1])
@@ -101,6 +99,24 @@ def _corner_normals(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     return normal / np.where(size > 0.0, size, 1.0)[:, :, None], angle
 
 
+def _directors(x: FloatArray, cells: IntArray, name: str) -> FloatArray:
+    """Unit means of the normals at the nodes, shape (n, 3)."""
+    normals, angles = _corner_normals(x[cells])
+    directors = np.zeros_like(x)
+    np.add.at(directors, cells, angles[:, :, None] * normals)
+    size = np.linalg.norm(directors, axis=1, keepdims=True)
+    directors /= np.where(size > 0.0, size, 1.0)
+    # Of neighbours folds are checked, but not of cells that face each other over a steep tip.
+    off = (normals * directors[cells]).sum(axis=2) < _SMOOTH
+    if off.any():
+        where = x[cells[off][0]].tolist()
+        raise ValueError(
+            f"mesh of {name!r}: the cells at the node at x={where} look in different directions, "
+            "by more than 60 degrees from their mean; cut the tip off, or make a shell of each part"
+        )
+    return directors
+
+
 def _centre_normals(x: FloatArray) -> FloatArray:
     """Normals in the middle of cells with corners x (c, 4, 3), of twice their area, (c, 3)."""
     return cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])
@@ -117,6 +133,21 @@ def _check_cells(x: FloatArray, cells: IntArray, name: str) -> None:
         raise ValueError(
             f"mesh of {name!r}: {bad.sum()} cells are flat, concave or twisted, e.g. the one at "
             f"x={where}; repair the mesh"
+        )
+
+
+def _check_corners(
+    x: FloatArray, cells: IntArray, edge: IntArray, given: IntArray, name: str
+) -> None:
+    """Raise where cells share a node but no edge; DOLFINx makes two nodes of it between ranks."""
+    ends = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
+    outer = np.bincount(ends[np.bincount(edge)[edge] == 1].ravel(), minlength=len(x))
+    _, first, times = np.unique(given, return_index=True, return_counts=True)
+    alone = np.concatenate([np.flatnonzero(outer > 2), first[times > 1]])
+    if alone.size:
+        raise ValueError(
+            f"mesh of {name!r}: cells share the node at x={x[alone[0]].tolist()}, but no edge "
+            "there; make a shell of each part"
         )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.conditions import Dirichlet, Meetings
+from dolfinx_nts.bodies.conditions import Dirichlet, Meetings, takes_place
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.skeleton import Skeleton
 from dolfinx_nts.validation import at_points, items, vector_in_time
@@ -84,6 +84,12 @@ class NodeConditions:
                         f"directors of a {kind} are held as a whole; leave components out"
                     )
                 columns = (columns[:, None] + np.arange(0, self._width, 3)).ravel()
+            elif hasattr(bc.value, "ufl_shape") or takes_place(bc.value):
+                raise ValueError(
+                    f"Dirichlet.value of bcs[{k}] of {self._name!r}: no function of place, "
+                    f"Constant or Function for a {kind}; pass a vector, or a function of time "
+                    "t -> (3,), and give nodes that move otherwise conditions of their own"
+                )
             owner[np.ix_(chosen, columns)] = k
             self._dofs.append((self._width * chosen[:, None] + columns).ravel())
             self._values.append((0.0,) * 3 if isinstance(bc, Clamp) else bc.value)

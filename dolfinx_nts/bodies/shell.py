@@ -45,7 +45,8 @@ class Shell(DirectorBody):
     scheme keeps the energy to rounding. The top is where cells are seen counter-clockwise, and
     where their mesh does not agree in that, the one with the first nodes of the input.
 
-    Limits: linear elastic, isotropic, of one thickness; no T-junctions, and no folds of more than
+    Limits: linear elastic, isotropic, of one thickness; no T-junctions, no cells that share a node
+    alone, and no folds of more than
     60 degrees between neighbouring cells; a director does not feel what turns about it; `Dirichlet`
     prescribes places alone, which is a hinge; joints and springs hold nodes.
 
@@ -72,7 +73,7 @@ class Shell(DirectorBody):
             or has a flat cell, a T-junction, a fold or one side alone.
     """
 
-    kind, _redundant = "shell", False
+    kind = "shell"
 
     def __init__(
         self,
@@ -98,6 +99,7 @@ class Shell(DirectorBody):
         spin = vector("angular_velocity", angular_velocity, "rad/s")
         self.young, self.poisson, self.thickness = float(young), float(poisson), float(thickness)
         self.density = float(density)
+        self._sides: set[str] = set()
         self._set_up_mesh(mesh, name)
         surface = midsurface_of(self.space, name)
         # Of the place, and of D: rho t^3/12 on d = D / (t/2).
@@ -127,6 +129,13 @@ class Shell(DirectorBody):
         """Its whole skin, see `DirectorBody`."""
         return of_shell(self._skeleton)
 
+    def _redundant(self) -> bool:
+        """Where both points of a node may touch: between two planes it cannot give way in either.
+
+        Its director's length is a third equation for two freedoms, see `DirectorBody`.
+        """
+        return len(self._sides) > 1 or "edge" in self._sides
+
     def surface(
         self, marker: Any = None, *, side: str = "top", smoothing: bool = False
     ) -> Surface:
@@ -147,6 +156,7 @@ class Shell(DirectorBody):
         choose("side", side, SIDES)
         x = self._skeleton.x[self._hull.node]
         chosen = self._marked(marker, self._hull.part == SIDES.index(side), x)
+        self._sides.add(side)
         return self._surface(chosen, smoothing)
 
     def resultants(self) -> dict[str, Any]:

@@ -353,19 +353,19 @@ class ContactElements(ContactLaws):
             on: Numbers of the pairs.
 
         Returns:
-            Of each body force [-] and moment about its place [m], where these may move it, shape
-            (len(on), 6).
+            Of each body force [-] and moment about its places' middle [m], where these may move it,
+            shape (len(on), 6).
         """
         rows = part.tangent[on, self.gap_row, : self.num_coordinates] / self.scale[on, None]
         y, start, found = x[on], 0, []
         force = rows.reshape(y.shape)
         for side in self._nodes:
             here = slice(start, start + side.nodes.shape[1])
-            if side.fixed.any():
-                force[:, here] *= ~side.fixed[on]
-            # The first node of a rigid body is its place, the others are directors.
-            moment = cross(y[:, start + 1 : here.stop], force[:, start + 1 : here.stop])
-            found.append(np.concatenate([force[:, start], moment.sum(axis=1)], axis=1))
+            push = np.where(side.fixed[on], 0.0, force[:, here])
+            places = side.places[on][:, :, None].astype(float)
+            middle = (y[:, here] * places).sum(axis=1, keepdims=True) / places.sum(axis=1)[:, None]
+            moment = cross(y[:, here] - middle * places, push).sum(axis=1)
+            found.append(np.concatenate([(push * places).sum(axis=1), moment], axis=1))
             start = here.stop
         return found
 

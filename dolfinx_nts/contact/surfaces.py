@@ -8,6 +8,7 @@ positions are gathered when a search needs them.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -154,8 +155,8 @@ class Surface:
         body: Its body.
         skin: The facets.
         smoothing: Whether slaves touch the smooth patches over the facets.
-        redundant: Whether more points may touch at once than the body has freedom for; None: so it
-            is where points are not nodes, as of rigid bodies.
+        redundant: Tells whether more points may touch at once than the body has freedom for; None:
+            so it is where points are not nodes, as of rigid bodies.
 
     Attributes:
         body: The body it belongs to.
@@ -171,10 +172,9 @@ class Surface:
         fixed: Which coordinates of the points are prescribed, shape (p, 3).
     """
 
-    _redundant: bool | None = None
-
     def __init__(
-        self, body: Any, skin: Skin, smoothing: bool = False, redundant: bool | None = None
+        self, body: Any, skin: Skin, smoothing: bool = False,
+        redundant: Callable[[], bool] | None = None,
     ) -> None:
         self.body = body
         (
@@ -194,7 +194,7 @@ class Surface:
     @property
     def redundant(self) -> bool:
         """Whether more points may touch at once than the body has freedom for."""
-        return not self.material.are_nodes if self._redundant is None else self._redundant
+        return not self.material.are_nodes if self._redundant is None else self._redundant()
 
     def _smooth(self, corners: FloatArray) -> None:
         """Lay patches over the facets with reference corners (m, nc, 3)."""

@@ -89,7 +89,7 @@ class StepProblem:
         self.awake: tuple[int, ...] = ()
         self._numbers: tuple[Any, ...] | None = None
         self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
-        self._shared = SharedWeight(system.comm, system.contacts, system.contact_bodies)
+        self._shared = SharedWeight(system.comm, system.contacts)
         both = zip(system.joints, system.joint_bodies, strict=True)
         self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
         self._lend_less()
@@ -444,8 +444,9 @@ class StepProblem:
         parts = evaluate_together(self.system.comm, elements, positions, own)
         touching = len(self.contacts.elements)
         self._shared.divide(
-            self.contacts.elements, self.contacts.bodies, parts[:touching], positions[:touching]
-        )
+            self.contacts.elements, self.contacts.bodies, parts[:touching], positions[:touching],
+            self._closed,
+        )  # fmt: skip
         force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
         bodies = dict(self._asleep)
         for k in self.awake:
@@ -457,6 +458,12 @@ class StepProblem:
             residual = self._inertial(body, du) - self.flight[k] + internal - external + coupling
             bodies[k] = BodyTerms(u1, du, internal, external, coupling, residual)
         return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
+
+    def _closed(self, batch: ContactElements) -> float:
+        """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
+        motion, moved = (float(a.max()) for a in (self.lengths.motion, self.lengths.moved))
+        limits = batch.ratios(np.array([0.0, 1.0, 0.0, 0.0]), motion, motion + moved, self.rtol)
+        return 1.0 / limits[f"{batch.name} constraints"]
 
     def residual(self, e: Evaluation) -> FloatArray:
         """This rank's part of the residual, zero at prescribed coordinates."""

@@ -8,21 +8,42 @@ Here the equations of the gaps say there that this part is zero, and nothing els
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse
+import scipy.sparse.linalg
+from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Square of the singular values that count as zero, over that of the largest.
 _NONE = 1e-12
 #: Solves by least squares, each for what that threshold has left of the one before.
 _PASSES = 3
+
+
+class _Rows(NamedTuple):
+    """Active gaps of rigid bodies; axis 0 = gap.
+
+    Attributes:
+        body: Numbers of both bodies, that of the first twice where there is no second, (n, 2).
+        push: Force and moment of a unit force on each of them, shape (n, 2, 6).
+        value: Gap [m] and multiplier, shape (n, 2).
+        limit: Gap that counts as closed [m], shape (n,).
+    """
+
+    body: IntArray
+    push: FloatArray
+    value: FloatArray
+    limit: FloatArray
 
 
 def _is_rigid(pair: Any) -> bool:
@@ -36,16 +57,11 @@ class SharedWeight:
     Args:
         comm: MPI communicator.
         contacts: Contacts of the scene.
-        bodies: Numbers of the bodies of each of them.
     """
 
-    def __init__(
-        self, comm: Any, contacts: Sequence[Any], bodies: Sequence[tuple[int, ...]]
-    ) -> None:
-        both = zip(contacts, bodies, strict=True)
-        rigid = sorted({k for pair, numbers in both if _is_rigid(pair) for k in numbers})
+    def __init__(self, comm: Any, contacts: Sequence[Any]) -> None:
         self._comm = comm
-        self._place = {k: i for i, k in enumerate(rigid)}
+        self._any = any(_is_rigid(pair) for pair in contacts)
 
     def divide(
         self,
@@ -53,55 +69,95 @@ class SharedWeight:
         bodies: Sequence[tuple[int, ...]],
         parts: Sequence[Contribution],
         places: Sequence[FloatArray],
+        closed: Callable[[ContactElements], float],
     ) -> None:
         """Write the rows of active gaps anew, (1 - P) g - c P lambda = 0. Collective.
 
         P projects on the null space of what forces along the normals push the bodies with at
         t_{n+1}, c is the compliance that the matrix lends. As c stands in the matrix, too, the
         iteration takes P lambda out, and the gaps close as without it: P g vanishes with the rest.
+        Where it does not, as of feet that lie in no plane, gaps cannot all close, and some node has
+        to leave: the rows of bodies that touch each other stay as they are then.
 
         Args:
             elements: Batches of contacts.
             bodies: Numbers of their bodies.
             parts: Their contributions at an iterate, whose residuals are changed.
             places: Nodes of the batches [m], as of `Elements.evaluate`.
+            closed: Gap of a batch that counts as closed [m].
         """
-        if not self._place:
+        if not self._any:
             return
-        found, pushes, values = [], [], []
+        found, chosen = [_none()], []
         for batch, numbers, part, x in zip(elements, bodies, parts, places, strict=True):
-            if not _is_rigid(batch.pair):
-                continue
-            on, row = np.flatnonzero(part.active), batch.gap_row
-            scale = batch.scale[on]
-            push = np.zeros((len(on), len(self._place), 6))
-            for k, wrench in zip(numbers, batch.wrenches(part, x, on), strict=True):
-                push[:, self._place[k]] += wrench
+            on = np.flatnonzero(part.active)
+            if on.size and _is_rigid(batch.pair):
+                scale = batch.scale[on]
+                found.append(_rows(batch, numbers, part, x, on, closed(batch)))
+                chosen.append((part, on, batch.gap_row, scale))
+        own = _Rows(*map(np.concatenate, zip(*found, strict=True)))
+        every = self._comm.allgather(own) if self._comm.size > 1 else [own]
+        rows = _Rows(*map(np.concatenate, zip(*every, strict=True)))
+        if not len(rows.body):
+            return
+        first = sum(len(other.body) for other in every[: self._comm.rank])
+        null = _null_part(rows)[first : first + len(own.body)]
+        ends = np.cumsum([0] + [len(on) for _, on, _, _ in chosen])
+        for (part, on, row, scale), (start, stop) in zip(chosen, pairwise(ends), strict=True):
             lent = -part.tangent[on, row, row] / scale**2
-            found.append((part, on, row, scale, lent))
-            pushes.append(push.reshape(len(on), 6 * len(self._place)))
-            values.append(np.column_stack([part.residual[on, row] / scale, part.multiplier[on, 0]]))
-        g, v = np.concatenate(pushes), np.concatenate(values)
-        null = v - g @ self._least_squares(g, v)
-        start = 0
-        for part, on, row, scale, lent in found:
-            none = null[start : start + len(on)]
+            none = null[start:stop]
             part.residual[on, row] -= scale * (none[:, 0] + lent * none[:, 1])
-            start += len(on)
 
-    def _least_squares(self, g: FloatArray, v: FloatArray) -> FloatArray:
-        """Motions of the bodies whose gaps g y fit some values v best. Collective."""
-        size, count = g.shape[1], v.shape[1]
-        sums = self._comm.allreduce(g.T @ np.concatenate([g, v], axis=1))
-        # Turns in the length that makes their gaps as large as those of translations.
-        square = sums.diagonal().reshape(-1, 2, 3).sum(axis=2)
-        unit = np.zeros((len(square), 2, 3))
-        on = square > 0.0
-        unit[on] = np.sqrt(square[:, :1] / np.where(on, square, 1.0))[on][:, None]
-        unit = unit.reshape(size, 1)
-        a, b = unit * sums[:, :size] * unit.T, unit * sums[:, size:]
-        near = np.linalg.inv(a + (_NONE * a.diagonal().max() or 1.0) * np.eye(size))
-        best = np.zeros((size, count))
-        for _ in range(_PASSES):
-            best += near @ (b - a @ best)
-        return unit * best
+
+def _none() -> _Rows:
+    return _Rows(np.empty((0, 2), dtype=int), np.empty((0, 2, 6)), np.empty((0, 2)), np.empty(0))
+
+
+def _rows(
+    batch: ContactElements,
+    numbers: tuple[int, ...],
+    part: Contribution,
+    x: FloatArray,
+    on: IntArray,
+    closed: float,
+) -> _Rows:
+    push = np.zeros((len(on), 2, 6))
+    for k, wrench in enumerate(batch.wrenches(part, x, on)):
+        push[:, k] = wrench
+    gap = part.residual[on, batch.gap_row] / batch.scale[on]
+    return _Rows(
+        np.tile([numbers[0], numbers[-1]], (len(on), 1)),
+        push,
+        np.column_stack([gap, part.multiplier[on, 0]]),
+        np.full(len(on), closed),
+    )
+
+
+def _null_part(rows: _Rows) -> FloatArray:
+    """P g and P lambda, zero where gaps cannot all close, shape (n, 2)."""
+    n = len(rows.body)
+    known, place = np.unique(rows.body, return_inverse=True)
+    place = place.reshape(n, 2)
+    columns = 6 * place[:, :, None] + np.arange(6)
+    shape = n, 6 * len(known)
+    at = np.repeat(np.arange(n), 12), columns.ravel()
+    g = scipy.sparse.csr_array((rows.push.ravel(), at), shape=shape)
+    # Turns in the length that makes their gaps as large as those of translations, if any do.
+    square = np.asarray(g.multiply(g).sum(axis=0)).reshape(-1, 2, 3).sum(axis=2)
+    wanted = np.where(square[:, :1] > 0.0, square[:, :1], 1.0)
+    unit = np.sqrt(np.divide(wanted, square, out=np.zeros_like(square), where=square > 0.0))
+    g = g @ scipy.sparse.diags(np.repeat(unit.ravel(), 3))
+    a, b = (g.T @ g).tocsc(), g.T @ rows.value
+    largest = a.diagonal().reshape(-1, 6).max(axis=1)
+    held = np.repeat(_NONE * np.where(largest > 0.0, largest, 1.0), 6)
+    near = scipy.sparse.linalg.splu(a + scipy.sparse.diags(held, format="csc"))
+    best = np.zeros_like(b)
+    for _ in range(_PASSES):
+        best += near.solve(b - a @ best)
+    null: FloatArray = rows.value - g @ best
+    touch = scipy.sparse.csr_array((np.ones(n), place.T), shape=(len(known),) * 2)
+    count, group = connected_components(touch, directed=False)
+    stuck = np.zeros(count, dtype=bool)
+    np.logical_or.at(stuck, group[place[:, 0]], np.abs(null[:, 0]) > rows.limit)
+    null[stuck[group[place[:, 0]]]] = 0.0
+    return null
