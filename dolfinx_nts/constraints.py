@@ -10,7 +10,7 @@ import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -303,7 +303,7 @@ class Constraints(EveryStep):
                 f"step from t={step.state.time:.6g} with dt={step.dt:.3g}: {self._name!r} ends "
                 "with directions turned over, which solves its equations, too; use a smaller dt"
             ),
-            StepFailedError,
+            partial(StepFailedError, advises=True),
         )  # fmt: skip
         return False
 

@@ -153,9 +153,10 @@ class Elements(Protocol):
         """Augmented unknowns that fit predicted positions, shape (n, augmented)."""
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Part:
-        """Residual and tangent; pure. All ranks call it, also those without elements.
+        """Residual and tangent. All ranks call it, also those without elements.
 
-        What it raises on one rank ends the solution on all, see `evaluate_together`.
+        No later call may depend on it. What it raises on one rank ends the solution on all, see
+        `evaluate_together`.
 
         Args:
             x: Reference plus displacement at t_{n+1} [m], shape (n, k / 3, 3).
@@ -235,13 +236,20 @@ def evaluate_together(
             parts.append(batch.evaluate(x, unknowns))
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
             if cause is None:
-                told = isinstance(error, UserFunctionError | StepFailedError)
-                what = str(error) if told else f"{batch.name!r}: its elements raised {error!r}"
-                cause, problem = error, (isinstance(error, StepFailedError), what)
+                cause, problem = error, _problem(batch, error)
     if global_max(comm, np.array([float(cause is not None)]))[0]:
-        failed, text = next(filter(None, comm.allgather(problem)))
-        raise (StepFailedError if failed else UserFunctionError)(text) from cause
+        kind, text, advises = next(filter(None, comm.allgather(problem)))
+        raise kind(text, advises=advises) from cause
     return tuple(parts)
+
+
+def _problem(batch: Any, error: Exception) -> tuple[type[StepFailedError], str, bool]:
+    """What to raise on all ranks where elements have raised on one, and whether it advises."""
+    if isinstance(error, StepFailedError):
+        kind = UserFunctionError if isinstance(error, UserFunctionError) else StepFailedError
+        return kind, str(error), error.advises
+    text = f"{batch.name!r}: its elements raised {error!r}; correct it"
+    return UserFunctionError, text, True
 
 
 class Slopes(NamedTuple):

@@ -43,7 +43,7 @@ def first_problem(comm: Any, problem: str | None) -> str | None:
 def raise_together(
     comm: Any,
     problem: str | None,
-    kind: type[Exception] = ValueError,
+    kind: Callable[[str], Exception] = ValueError,
     cause: Exception | None = None,
 ) -> None:
     """Raise with the first rank's problem on every rank, if any rank has one."""

@@ -16,7 +16,7 @@ from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
 from dolfinx_nts.elements import Joint
 from dolfinx_nts.parallel import raise_together, same_kernels
 from dolfinx_nts.state import ContactHistory, State
-from dolfinx_nts.validation import items, known_options, vector
+from dolfinx_nts.validation import items, known_options, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -57,9 +57,10 @@ class System:
 
     Raises:
         TypeError: An item is no body or no contact.
-        ValueError: No body, equal names, several communicators, `gravity` is not three numbers, a
-            contact of a body that is not in the system, initial penetration beyond one part in a
-            hundred of the facet size, or an obstacle inside a body.
+        ValueError: No body, other names on other ranks, equal names, several communicators,
+            `gravity` is not three numbers, a contact of a body that is not in the system, initial
+            penetration beyond one part in a hundred of the facet size, or an obstacle inside a
+            body.
     """
 
     def __init__(
@@ -78,6 +79,11 @@ class System:
         self.joints = items("joints", joints, lambda j: hasattr(j, "coupling"), "joints")
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
+        self.comm = self.bodies[0].comm
+        given = {"bodies": self.bodies, "contacts": self.contacts, "joints": self.joints}
+        require_same(
+            self.comm, **{f"names of {k}": [item.name for item in v] for k, v in given.items()}
+        )
         self.check_alive()
         for k, b in enumerate(self.bodies):
             if any(b is other for other in self.bodies[:k]):
@@ -86,7 +92,6 @@ class System:
         if len(set(names)) < len(names):
             raise ValueError(f"bodies: names {names} are not unique; pass name= to each body")
         self.gravity = vector("gravity", gravity, "m/s^2")
-        self.comm = self.bodies[0].comm
         for b in self.bodies:
             if MPI.Comm.Compare(b.comm, self.comm) not in (MPI.IDENT, MPI.CONGRUENT):
                 raise ValueError(

@@ -151,15 +151,16 @@ def require_same(comm: Any, **given: Any) -> None:
     Of functions only that they are some is compared.
     """
     shown = {name: as_text(value) for name, value in given.items()}
-    digest = hashlib.sha256(repr(shown).encode()).digest()
+    digest = hashlib.sha256(repr(sorted(shown.items())).encode()).digest()
     if len(set(comm.allgather(digest))) == 1:
         return
+    first = comm.bcast(shown)
     problem = None
-    for name, first in comm.bcast(shown).items():
-        here = shown.get(name, "missing")
-        if here != first and problem is None:
+    for name in first | shown:
+        here, there = (known.get(name, "missing") for known in (shown, first))
+        if here != there and problem is None:
             problem = (
-                f"{name}: is {here} on rank {comm.rank} and {first} on rank 0; pass the same on "
+                f"{name}: is {here} on rank {comm.rank} and {there} on rank 0; pass the same on "
                 "all ranks"
             )
     raise_together(comm, problem)

@@ -392,7 +392,9 @@ def test_failure_keeps_history(tmp_path, mpi_tmp_path):
         newton=nts.Newton(max_iterations=5, max_retries=2),
         output=[table, fields],
     )
-    assert run.status.startswith("step from t=0.5") and "Try more load steps" in run.status
+    # What the failure itself advises stands alone.
+    assert run.status.startswith("step from t=0.5")
+    assert run.status.endswith("smaller loads or speeds may prevent it")
     assert run.retries == 2
     assert np.array_equal(run.balance["time"], [0, 0.25, 0.5])
     assert np.allclose(run.reactions["cube"][:, 2, 2], [0, 2.5e3, 5e3], rtol=1e-11)

@@ -100,3 +100,30 @@ def test_a_rod_does_not_spin_about_itself():
     assert np.isclose(motion.mass, 4.0) and np.allclose(motion.centre, [0.1, 0.2, 0.5])
     assert np.allclose(motion.inertia, np.diag([0.16, 0.16, 0.0]), atol=1e-15)
     assert np.allclose(motion.spin, [0.0, 2.0, 0.0], rtol=1e-12)
+
+
+class Weightless(PointMass):
+    """A point without mass on a spring."""
+
+    def __init__(self):
+        super().__init__(COMM, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), name="weightless")
+
+    def internal(self, u1):
+        return 5.0 * (0.5 * (self.moment.u0 + u1) - 0.01)
+
+    def tangent(self, u1, mass, stiffness):
+        matrix = super().tangent(u1, mass, stiffness)
+        matrix.shift(0.5 * stiffness * 5.0)
+        return matrix
+
+    def potential(self, u):
+        return 2.5 * float((u - 0.01) @ (u - 0.01))
+
+
+def test_what_has_no_mass_has_no_spin_to_tell_of(recwarn):
+    """Its inertia was 0/0, whose eigenvalues ended the run by an error."""
+    fast = box(velocity=lambda x: np.cross([0.0, 0.0, 10.0], x.T - CENTRE).T, name="fast")
+    system = nts.System([Weightless(), fast])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.11, t_end=0.11)
+    assert run.status == "completed" and run.warnings["turns"].text.startswith("body 'fast' turns")
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]

@@ -207,3 +207,31 @@ def test_work_of_loads_in_time(rule, kind):
     assert work == pytest.approx(1.25, rel=1e-2)
     if rule == nts.Newmark():
         assert abs(run.balance["ledger_residual"][-1]) < 1e-2 * work
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("rule", [nts.Newmark(), nts.GeneralizedAlpha(rho_inf=0.8)], ids=repr)
+@pytest.mark.parametrize("kind", ["rigid", "continuum"])
+def test_a_support_takes_the_loads_at_it(rule, kind):
+    """Driven at 2 m/s, a body of 1 t keeps its 2000 J: supports hold what 1e4 t [N] does.
+
+    With the part of the load in time that the supports take, the work was -10 J.
+    """
+
+    def load(t):
+        return (1e4 * t, 0.0, 0.0)
+
+    def motion(t):
+        return (2.0 * t, 0.0, 0.0)
+
+    if kind == "rigid":
+        body = nts.RigidBody.from_inertia(1e3, (1e3, 1e3, 1e3), force=load, motion=motion)
+    else:
+        held = nts.Dirichlet(lambda x: x[0] > -1.0, motion)
+        material = nts.NeoHookean(1e8, 0.3)
+        body = nts.Continuum(box(cells=1), material, density=1e3, body_force=load, bcs=[held])
+    run = nts.simulate(nts.System([body]), rule, dt=1e-2, t_end=0.1)
+    assert run.status == "completed" and not run.warnings
+    assert run.balance["kinetic"][-1] == pytest.approx(2000.0)
+    for name in ("external_work", "ledger_residual"):
+        assert abs(run.balance[name]).max() < 1e-9 * 2000.0

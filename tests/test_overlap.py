@@ -543,6 +543,37 @@ class Ball(nts.Obstacle):
         return nts.Gap(r - self.radius, unit[:, None], bend)
 
 
+class Broken(Ball):
+    """A ball whose gap raises on the last rank once it is told to."""
+
+    breaks: list = []
+
+    def about(self, origin):
+        return Broken(self.centre - origin, self.radius, self._width)
+
+    def gap(self, x):
+        if self.breaks and COMM.rank == COMM.size - 1:
+            raise KeyError("no table")
+        return super().gap(x)
+
+
+@pytest.mark.mpi
+def test_a_gap_that_raises_on_one_rank_is_told_on_all(monkeypatch):
+    """A rigid slave's nodes ask all ranks what they carry, also those of the rank that raises."""
+    mesh = create_box(COMM, [np.zeros(3), np.ones(3)], [3, 3, 1], CellType.hexahedron)
+    body = nts.RigidBody(mesh, density=1e3, velocity=(0.0, 0.0, -500.0))
+    pair = nts.ContactPair(body.surface(lambda x: x[2] < 1e-9), Broken((0.5, 0.5, -5.0), 5.0))
+    stepper = nts.Stepper(nts.System([body], contacts=[pair]), nts.Midpoint())
+    stepper.start(1e-3)
+    stepper.problem.begin(stepper.state, 1e-3)
+    contact = stepper.problem.contacts.elements[0]
+    assert pair.redundant and contact.num_elements > 0
+    monkeypatch.setattr(Broken, "breaks", [True])
+    with pytest.raises(nts.UserFunctionError, match=r"its elements raised KeyError\('no table'\)"):
+        stepper.problem.evaluate(stepper.problem.x)
+    stepper.close()
+
+
 def obstacles(rng):
     """Obstacles among facets of size 1 about the origin, and distances of facets from them."""
     centre, axis = 0.5 * rng.normal(size=3), rng.normal(size=3)

@@ -12,6 +12,7 @@ from integrators import ACCELERATED
 from mpi4py import MPI
 
 import dolfinx_nts as nts
+from dolfinx_nts.elements import evaluate_together
 from dolfinx_nts.output import BalanceCSV
 
 COMM = MPI.COMM_WORLD
@@ -400,7 +401,8 @@ def test_what_elements_raise_on_one_rank_ends_the_run_on_all():
     a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b", velocity=(3.0, 1.0, 0))
     spring = Failing(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e4)
     stepper = nts.Stepper(nts.System([a, b], joints=[spring]), nts.EnergyMomentum())
-    with pytest.raises(nts.UserFunctionError, match=r"'spring': its elements raised .*no table"):
+    words = r"'spring': its elements raised .*no table.*; correct it"
+    with pytest.raises(nts.UserFunctionError, match=words):
         for _ in range(9):
             stepper.advance(2e-3)
     stepper.close()
@@ -414,6 +416,64 @@ def test_a_step_is_cut_where_elements_refuse_it_on_one_rank():
     stepper = nts.Stepper(nts.System([a, b], joints=[spring]), nts.EnergyMomentum())
     stepper.advance(2e-3)
     assert stepper.solution.retries == 1 and len(stepper.solution.rows) == 4
+    stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("error", "kind", "text", "advises"),
+    [
+        (nts.StepFailedError("long; halve dt", advises=True), nts.StepFailedError, "long", True),
+        (nts.StepFailedError("long"), nts.StepFailedError, "long", False),
+        (nts.UserFunctionError("no table"), nts.UserFunctionError, "no table", False),
+        (KeyError("no table"), nts.UserFunctionError, r"'bad': its .*no table.*; correct it", True),
+    ],
+)  # fmt: skip
+def test_what_elements_raise_keeps_its_kind_and_its_advice(error, kind, text, advises):
+    class Bad:
+        name = "bad"
+
+        def evaluate(self, x, own):
+            if COMM.rank == COMM.size - 1:
+                raise error
+
+    with pytest.raises(kind, match=text) as caught:
+        evaluate_together(COMM, [Bad()], [np.empty(0)], [{}])
+    assert caught.type is kind and caught.value.advises == advises
+
+
+@pytest.mark.mpi
+def test_the_stiffness_of_springs_is_a_norm_on_all_ranks():
+    """Of two equal springs between the same bodies it is sqrt(2) times that of one."""
+    a, b = (
+        nts.RigidBody.from_inertia(1.0, (1, 1, 1), centre=(x, 0, 0), name=name)
+        for x, name in ((0, "a"), (1, "b"))
+    )
+    norms = []
+    for count in (1, 2):
+        springs = [
+            nts.Spring(a, b, [(0, 0, 0), (1, 0, 0)], stiffness=7.0, name=f"spring {k}")
+            for k in range(count)
+        ]
+        stepper = nts.Stepper(nts.System([a, b], joints=springs), nts.EnergyMomentum())
+        stepper.start(1e-2)
+        stepper.problem.begin(stepper.state, 1e-2)
+        norms.append(stepper.problem._springs())
+        stepper.close()
+    assert norms[0].all()
+    np.testing.assert_allclose(norms[1], np.sqrt(2) * norms[0], rtol=1e-13)
+
+
+@pytest.mark.mpi
+def test_springs_that_fail_on_one_rank_alone_fail_on_all_when_measured():
+    a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b")
+    spring = Failing(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1e4)
+    spring.kind = TooLongElements
+    stepper = nts.Stepper(nts.System([a, b], joints=[spring]), nts.EnergyMomentum())
+    stepper.start(1e-3)
+    stepper.problem.begin(stepper.state, 2e-3)
+    with pytest.raises(nts.StepFailedError, match="steps are too long for a spring"):
+        stepper.problem._springs()
     stepper.close()
 
 

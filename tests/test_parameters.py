@@ -175,8 +175,42 @@ def test_a_mass_that_vanishes_ends_the_run(change):
     run = nts.simulate(
         nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=3 * DT, before_step=lose
     )
-    assert "density of 'cube': its new values make a mass of" in run.status
+    words = f"a parameter of 'cube' has changed: density={density!s} with a value of {change}: must"
+    assert words in run.status
     assert len(run.balance["time"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [("density", DENSITY, -1.0), ("young", YOUNG, np.nan)],
+)
+def test_a_value_out_of_range_in_one_cell_ends_the_run(name, good, bad):
+    """Though the mass in all would be positive."""
+    mesh = box(cells=(1, 1, 2))
+    given = {"young": YOUNG, "poisson": POISSON, "density": DENSITY} | {name: field(mesh, good)}
+    material = nts.NeoHookean(given["young"], given["poisson"])
+    body = nts.Continuum(mesh, material, density=given["density"], name="cube")
+
+    def spoil(time, dt):
+        if time > 0.0:
+            given[name].x.array[:] = field(mesh, good, bad).x.array
+
+    run = nts.simulate(
+        nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=3 * DT, before_step=spoil
+    )
+    assert f"a parameter of 'cube' has changed: {name}=" in run.status
+    assert f"with a value of {bad}: must" in run.status
+    assert len(run.balance["time"]) == 2
+
+
+def test_the_stiffness_of_nodes_is_that_of_changed_moduli():
+    mesh = box(cells=(1, 1, 1))
+    body = nts.Continuum(mesh, nts.NeoHookean(YOUNG, POISSON), density=DENSITY)
+    before = body.nodal_stiffness()
+    (moduli,) = (t for t in body._parameters if t.ufl_shape == (2,))
+    moduli.value = 3 * moduli.value
+    body.take_parameters()
+    np.testing.assert_allclose(body.nodal_stiffness(), 3 * before, rtol=1e-13)
 
 
 def test_what_is_no_parameter_is_refused():

@@ -6,6 +6,7 @@ from mpi4py import MPI
 from scenes import RUBBER, at, box
 
 import dolfinx_nts as nts
+from dolfinx_nts.validation import require_same
 
 COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.mpi
@@ -46,6 +47,20 @@ def sprung():
     return move(body, joints=[spring])
 
 
+def standing():
+    """Only rank 0 has the contact."""
+    body = cube()
+    pair = nts.ContactPair(body.surface(at(2, 0.0)), nts.Plane((0, 0, 0), (0, 0, 1)))
+    return nts.System([body], contacts=[pair][COMM.rank :])
+
+
+def holding():
+    """One joint on rank 0, two on rank 1."""
+    body = mass()
+    pins = [nts.Spherical(None, body, point=(0, 0, k), name=f"pin {k}") for k in (0, 1)]
+    return nts.System([body], joints=pins[: 1 + COMM.rank])
+
+
 OTHER = {
     "dt": lambda: move(cube(), dt=1e-2 / (1 + HERE)),
     "t_end": lambda: move(cube(), t_end=2e-2 + HERE),
@@ -60,6 +75,10 @@ OTHER = {
     "bcs of 'cube'": lambda: move(cube(bcs=[nts.Dirichlet(at(2, 0.0), (0, 0, HERE))])),
     "traction of 'cube'": lambda: move(cube(traction=[nts.Traction(at(2, 0.0), (0, 0, HERE))])),
     "names of bodies": lambda: move(cube(name=f"cube{COMM.rank}")),
+    "names of bodies, fewer": lambda: nts.System([cube(), mass()][: 1 + COMM.rank]),
+    "names of contacts": standing,
+    "names of joints": holding,
+    "b": lambda: require_same(COMM, a=0.0, **({"b": 1.0} if COMM.rank else {})),
     "friction of contacts": rubbing,
     "point of the master of contacts": on_plane,
     "stiffness of 'spring'": sprung,

@@ -18,7 +18,7 @@ SHEAR = 1e6 / 2.6
 pytestmark = pytest.mark.mpi
 
 
-def block(part, **options):
+def block(part, name="block", **options):
     """A cube of NeoHookean with a stress of this part of the shear modulus, alike everywhere."""
     low, high = np.array([[0, 0, 0], [1, 1, 1]]) + [5.0, -3.0, 2.0]
     mesh = create_box(
@@ -32,7 +32,7 @@ def block(part, **options):
         return rubber(c) + stress / 2 * (ufl.tr(c) - 3)
 
     material = energy if part else rubber
-    return nts.Continuum(mesh, material, density=1e3, name="block", **options)
+    return nts.Continuum(mesh, material, density=1e3, name=name, **options)
 
 
 def told(run):
@@ -74,6 +74,14 @@ def test_statics_and_dynamics_of_one_body_both_tell():
         nts.equilibrium(system), nts.simulate(system, nts.Midpoint(), dt=1e-4, t_end=1e-4)
     ):  # fmt: skip
         assert 0.003 < told(run) < 0.01
+
+
+def test_all_bodies_under_stress_are_named():
+    system = nts.System([block(0.3), block(1e-4, name="other"), block(0.0, name="good")])
+    run = nts.simulate(system, nts.Midpoint(), dt=1e-4, t_end=1e-4)
+    found = run.warnings["stress at rest"]
+    assert found.text.startswith("bodies 'block', 'other' are under a stress of about 0.16 of the")
+    assert found.worst == pytest.approx(np.sqrt(3 / 2) * 0.3 / 2.3, rel=0.02)
 
 
 def test_a_body_held_everywhere_does_not_move():

@@ -131,6 +131,13 @@ def test_what_fails_is_told_on_all_ranks():
         block(lambda x: 0.1 * x[0])
     with pytest.raises(ValueError, match="is on another mesh; make it on that of the body"):
         nts.Continuum(box(), MATERIAL, density=1e3, bcs=[nts.Dirichlet(top, function_of(mesh))])
+    for degree in (0, 1):
+        broken = fem.Function(compat.cell_vector_space(mesh, "DG", degree))
+        words = "may have several values at a node; interpolate it into a continuous space"
+        with pytest.raises(ValueError, match=f"^Dirichlet.value of .*: {words}"):
+            nts.Continuum(mesh, MATERIAL, density=1e3, bcs=[nts.Dirichlet(top, broken)])
+        with pytest.raises(ValueError, match=f"^velocity=.* of 'body': {words}"):
+            nts.Continuum(mesh, MATERIAL, density=1e3, velocity=broken)
     with pytest.raises(TypeError, match=r"value=.*: is of UFL \(\w+\); pass three .*Func"):
         nts.Dirichlet(top, ufl.SpatialCoordinate(mesh))
     with pytest.raises(ValueError, match=r"Dirichlet.value=.*: has shape \(\); pass a function"):

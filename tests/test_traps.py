@@ -352,6 +352,23 @@ def test_nodes_that_flip_are_named_with_their_states(friction, row, states, inte
     stepper.close()
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_a_failure_advises_only_where_its_text_does(told):
+    """Of the nodes that flip, the one that is worst solved is named, with or without a remedy."""
+    if COMM.size > 1:
+        pytest.skip("nodes 0 and 1 are of one rank")
+    stepper = nts.Stepper(scene(velocity=(0.0, 0.0, -1.0)), nts.EnergyMomentum())
+    stepper.start(2e-3)
+    stepper.problem.begin(stepper.state, 2e-3)
+    solver = stepper.solver
+    step = solver.solve()
+    solver.iterates.flips[0][0, 0] = 8
+    step.parts[0].residual[0 if told else 1, -1] = 1e3
+    failure = solver._failure(step, PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT, 9)
+    assert failure.advises == told == ("settles in neither; try another dt" in str(failure))
+    stepper.close()
+
+
 class Breaks:
     """A solver whose solves end by an error of PETSc."""
 
@@ -382,4 +399,33 @@ def test_an_error_of_petsc_is_told_with_its_likely_cause(integrator, monkeypatch
     words = "PETSc stopped with error 76; two contacts, or a contact and a support, may hold the"
     with pytest.raises(nts.StepFailedError, match=words):
         stepper.advance(2e-3)
+    stepper.close()
+
+
+def test_an_error_of_petsc_is_not_told_as_an_earlier_one():
+    """What a residual raised in a step that was given up is none of a later solve's."""
+    body = nts.RigidBody.from_inertia(1.0, (1.0, 1.0, 1.0), velocity=(1.0, 0.0, 0.0))
+    newton = nts.Newton(linear_solver="direct", max_retries=0)
+    stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum(), newton=newton)
+    stepper.start(1e-2)
+    evaluate, solver = stepper.problem.evaluate, stepper.solver
+
+    def raising(x):
+        raise nts.StepFailedError("an early failure")
+
+    stepper.problem.begin(stepper.state, 1e-2)
+    solver.prepare()
+    stepper.problem.evaluate = raising
+    solver.iterates.forget_last()
+    with pytest.raises(nts.StepFailedError, match="an early failure"):
+        solver._function(None, stepper.problem.x, None)
+    stepper.problem.evaluate, prepare = evaluate, solver.prepare
+
+    def breaking():
+        prepare()
+        solver.snes = Breaks(solver.snes)
+
+    solver.prepare = breaking
+    with pytest.raises(nts.StepFailedError, match="PETSc stopped with error 76"):
+        stepper.advance(1e-2)
     stepper.close()

@@ -139,10 +139,15 @@ def at_nodes(space: Any, what: str, value: Any) -> FloatArray:
         value: The Function.
 
     Raises:
-        ValueError: It is on another mesh, or not finite.
+        ValueError: It is on another mesh, of another kind of space, or not finite.
     """
     if value.function_space.mesh.ufl_domain() != space.mesh.ufl_domain():
         raise ValueError(f"{what}: is on another mesh; make it on that of the body")
+    if compat.lagrange_degree(value.function_space) is None:
+        raise ValueError(
+            f"{what}: may have several values at a node; interpolate it into a continuous space, "
+            "one of Lagrange elements for 3-vectors"
+        )
     here = fem.Function(space)
     here.interpolate(value)
     found: FloatArray = here.x.array.reshape(-1, 3)

@@ -76,8 +76,8 @@ class Continuum(UflBody):
         space: Their function space.
         law: W as a function of Green's strain in UFL, with Constants for numbers of the package's
             materials.
-        stressed: Stress of the undeformed body over its stiffness, and a sentence about it; None:
-            it has none, or no step was made yet.
+        stressed: Stress of the undeformed body over its stiffness; None: it has none, or no step
+            was made yet.
 
     Raises:
         TypeError: `material`, `extra_form`, `name` or a condition is not of the right kind, or what
@@ -136,7 +136,7 @@ class Continuum(UflBody):
         (self._load_form,) = self._set_forms(self._energy() * self._dx, load)
         self._assembled_loads = np.zeros(3 * len(self._loads))
         self._seen_at_rest = False
-        self.stressed: tuple[float, str] | None = None
+        self.stressed: float | None = None
 
     # ---- set-up
     def _boundary_measure(self, degree: int) -> Any:
@@ -192,6 +192,12 @@ class Continuum(UflBody):
         dx = ufl.Measure("dx", self.mesh, metadata={"quadrature_degree": self._of_mass})
         return self._rho * ufl.inner(v, w) * dx
 
+    def _check_parameters(self) -> None:
+        """Raise ValueError unless density and moduli are in their ranges."""
+        super()._check_parameters()
+        if isinstance(self.material, Isotropic):
+            self.material.check()
+
     def _virtual_work(self, rule: Integrator, w: Any) -> Any:
         """Virtual work of the rule's stress in UFL."""
         h0, h1 = ufl.grad(self._u0), ufl.grad(self._u1)
@@ -232,12 +238,7 @@ class Continuum(UflBody):
         squares = np.array([at_rest @ at_rest, change @ change])
         stress, stiffness = np.sqrt(self.comm.allreduce(squares)).tolist()
         if not stress <= _STRESS_FREE * stiffness:
-            size = stress / stiffness if stiffness else math.inf
-            self.stressed = size, (
-                f"body {self.name!r} is under a stress of about {size:.2g} of its stiffness while "
-                "undeformed, and moves by itself; unless that is meant, let W(C) have dW/dC = 0 at "
-                "C = 1"
-            )
+            self.stressed = stress / stiffness if stiffness else math.inf
 
     def _loads_at(self, time: float) -> list[tuple[VectorInTime, FloatArray]]:
         """Body force and tractions as they were given, and their values at a time."""

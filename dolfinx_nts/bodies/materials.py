@@ -87,6 +87,10 @@ class StVenantKirchhoff(Isotropic):
     poisson: Parameter
 
     def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError if a parameter is out of its range."""
         _check_elastic(self.young, self.poisson)
 
     @cached_property
@@ -123,6 +127,10 @@ class NeoHookean(Isotropic):
     poisson: Parameter
 
     def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError if a parameter is out of its range."""
         _check_elastic(self.young, self.poisson)
 
     @cached_property
@@ -168,6 +176,10 @@ class MooneyRivlin(Isotropic):
     c: Parameter
 
     def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError if a parameter is out of its range."""
         for name, value in (("a", self.a), ("b", self.b)):
             require_finite_parameter(name, value, "Pa")
         if is_number(self.a) and is_number(self.b) and not self.a + self.b > 0:

@@ -20,7 +20,13 @@ from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.massless import redistributed
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.mesh_check import places_of
-from dolfinx_nts.bodies.parameters import in_expressions, is_number, values_of
+from dolfinx_nts.bodies.parameters import (
+    Parameter,
+    in_expressions,
+    is_number,
+    require_positive_parameter,
+    values_of,
+)
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
@@ -81,6 +87,7 @@ class UflBody(Body):
         self.reference = space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
         self._compiled: dict[Integrator, tuple[Any, Any, Any]] = {}
         self._stiffness: FloatArray | None = None
+        self._given_density: Parameter | None = None
         self.allow_inversion = allow_inversion
         # Cells of a surface or a line have no inside.
         self._determinants: Determinants | None = None
@@ -96,6 +103,11 @@ class UflBody(Body):
     def _mass_form(self, v: Any, w: Any) -> Any:
         """Kinetic energy's second derivative in UFL, linear in v and w."""
         raise NotImplementedError
+
+    def _check_parameters(self) -> None:
+        """Raise ValueError unless parameters are in their ranges. Collective."""
+        if self._given_density is not None:
+            require_positive_parameter("density", self._given_density, "kg/m^d")
 
     def _virtual_work(self, rule: Integrator, w: Any) -> Any:
         """Internal virtual work between the Functions `_u0` and `_u1` by a rule, in UFL."""
@@ -280,6 +292,7 @@ class UflBody(Body):
         )
         self._mass_parameters = of_mass
         self._parameters = [*of_energy, *of_mass]
+        self._taken = self.parameters()
         if self._extra_form is not None:
             self._check_extra_form(self._extra_form, w)
         self._mass_compiled, *compiled, self._energy_form = compat.compile_forms(
@@ -305,9 +318,12 @@ class UflBody(Body):
     def _density(self, density: Any) -> Any:
         """A density as the forms take it: bodies of any number share compiled forms.
 
+        It is checked again where it changes.
+
         Raises:
             ValueError: It is on another mesh.
         """
+        self._given_density = density
         if is_number(density):
             return fem.Constant(self.mesh, float(density))
         problem = misfit([density], self.mesh.ufl_domain())
@@ -457,15 +473,19 @@ class UflBody(Body):
         if self._stiffness is None:
             rule: Any = Static()
             tangent = self._compile(rule)[1]
-            kept = [f.x.array.copy() for f in (self._u0, self._u1)]
+            kept, rate = [f.x.array.copy() for f in (self._u0, self._u1)], self._rate.value.copy()
             for u in (self._u0, self._u1):
                 self._fill(u, np.zeros(self.num_owned))
             self._factors.value, self._rate.value = (0.0, 1.0), 0.0
-            compat.assemble_matrix(self._matrix, tangent, (), 0.0)
-            diagonal = self._matrix.getDiagonal()
+            # The body's matrix may be kept from an earlier step.
+            matrix = compat.create_matrix(tangent)
+            compat.assemble_matrix(matrix, tangent, (), 0.0)
+            diagonal = matrix.getDiagonal()
             # The mean of a node's three entries does not depend on the directions of the axes.
             self._stiffness = np.repeat(diagonal.array_r.reshape(-1, 3).mean(axis=1), 3)
-            diagonal.destroy()
+            for petsc_object in (diagonal, matrix):
+                petsc_object.destroy()
+            self._rate.value = rate
             for u, values in zip((self._u0, self._u1), kept, strict=True):
                 u.x.array[:] = values
         return self._stiffness
@@ -512,12 +532,19 @@ class UflBody(Body):
         """Assemble the mass anew if what it is made of has changed. Collective.
 
         Raises:
-            UserFunctionError: There is no mass left, or it has been moved between nodes.
+            UserFunctionError: A value is out of range, there is no mass left, or it has been moved
+                between nodes.
         """
-        if not self._mass_parameters:
+        if not self._parameters:
             return
-        changed = not np.array_equal(values_of(self._mass_parameters), self._mass_values)
-        if not self.comm.allreduce(changed, op=MPI.LOR):
+        known = (self._parameters, self._taken), (self._mass_parameters, self._mass_values)
+        changed = np.array([not np.array_equal(values_of(p), last) for p, last in known])
+        self.comm.Allreduce(MPI.IN_PLACE, changed, op=MPI.LOR)
+        if not changed.any():
+            return
+        self._refuse_values()
+        self._taken, self._stiffness = self.parameters(), None
+        if not changed[1]:
             return
         if self.has_massless:
             raise UserFunctionError(
@@ -528,9 +555,18 @@ class UflBody(Body):
         total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
         if not total > 0.0:
             raise UserFunctionError(
-                f"density of {self.name!r}: its new values make a mass of {total:.3g} kg; it must "
-                "be positive"
+                f"mass of {self.name!r}: its parameters now make {total:.3g} kg; it must be "
+                "positive"
             )
+
+    def _refuse_values(self) -> None:
+        """Raise a UserFunctionError on every rank if a changed parameter is out of its range."""
+        problem, cause = None, None
+        try:
+            self._check_parameters()
+        except ValueError as error:
+            problem, cause = f"a parameter of {self.name!r} has changed: {error}", error
+        raise_together(self.comm, problem, UserFunctionError, cause)
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Write the accepted state into the dolfinx Functions u and v."""

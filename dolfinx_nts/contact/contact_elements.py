@@ -27,7 +27,9 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Changes of one node's state in a step that are no search any more.
-CYCLE = 8
+_CYCLE = 8
+#: What messages say of such a node; what follows says what to do.
+UNSETTLED = "settles in neither; "
 _EPS = float(np.finfo(float).eps)
 
 
@@ -214,7 +216,7 @@ class ContactElements(ContactLaws):
         return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
-        """Residual and tangent of the pairs; pure. Collective.
+        """Residual and tangent of the pairs. Collective, and reached by all if an obstacle raises.
 
         Args:
             x: Nodes of slave and master at t_{n+1} [m], shape (n, k, 3).
@@ -222,13 +224,18 @@ class ContactElements(ContactLaws):
                 h^2/2 lambda of the scaled constraints, and of lambda_T over the facet size, over
                 `scale` [m], shape (n, constraints).
         """
+        none = np.empty(0), None, np.empty((0, 1))
         if not self.num_elements:
-            self._together(np.empty(0), None, np.empty((0, 1)))
+            self._together(*none)
             return self._nothing()
         scale = self.scale[:, None]
         multiplier = scale * own["constraints"]
         x = self._control(x)
-        residual, tangent, gap, slip = self._element(x, own["augmented"], multiplier)
+        try:
+            residual, tangent, gap, slip = self._element(x, own["augmented"], multiplier)
+        except Exception:  # any of an obstacle of the user's; the other ranks wait
+            self._together(*none)
+            raise
         together = self._together(gap, slip, multiplier)
         part = self._laws(x, residual, tangent, gap, slip, multiplier, together)
         if slip is not None:
@@ -438,11 +445,11 @@ class ContactElements(ContactLaws):
         text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
         if slide:
             text += f" and {slide} between stick and slip"
-        if max(touch, slide) >= CYCLE:
+        if max(touch, slide) >= _CYCLE:
             states = "stick and slip" if slide > touch else "contact and none"
             remedy = "try another dt"
             if not self._free[i, 0].any():
                 # Several such nodes on one facet share the little that its nodes can give way.
                 remedy = "its motion is prescribed, so make its surface the master"
-            text += f": it flips between {states} and settles in neither; {remedy}"
+            text += f": it flips between {states} and {UNSETTLED}{remedy}"
         return float(weight[i]), text

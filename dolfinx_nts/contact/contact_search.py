@@ -255,7 +255,8 @@ class ContactSearch:
             hit = pair.missed(positions, motions, path, reach, held)
         except StepFailedError as failure:
             time, dt = self._step.state.time, self._step.dt
-            raise StepFailedError(f"step from t={time:.6g} with dt={dt:.3g}: {failure}") from None
+            text = f"step from t={time:.6g} with dt={dt:.3g}: {failure}"
+            raise StepFailedError(text, advises=failure.advises) from None
         if hit is None:
             return False
         new = hit >= 0

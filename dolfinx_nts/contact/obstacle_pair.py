@@ -110,6 +110,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
             node = int(self.slave.original[np.flatnonzero(passed)[0]])
             raise StepFailedError(
                 f"contact {self.name!r}: node {node} passes through the obstacle within the step; "
-                "use a smaller dt"
+                "use a smaller dt",
+                advises=True,
             )
         return None

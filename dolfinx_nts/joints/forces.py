@@ -323,7 +323,8 @@ class AboutAxis(Between):
         if turn >= np.pi:
             raise StepFailedError(
                 f"step from t={start:.6g}: prescribed rotations may change the angle of "
-                f"{self.name!r} by {turn:.3g} rad, half a turn or more; use a smaller dt"
+                f"{self.name!r} by {turn:.3g} rad, half a turn or more; use a smaller dt",
+                advises=True,
             )
 
     @classmethod

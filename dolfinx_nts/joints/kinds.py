@@ -157,7 +157,8 @@ class Revolute(_WithAxis):
                 # The products cannot tell such a turn from one the other way.
                 raise StepFailedError(
                     f"step from t={times[0]:.6g}: the angle of {self.name!r} changes by "
-                    f"{np.ptp(angles):.3g} rad, half a turn or more; use a smaller dt"
+                    f"{np.ptp(angles):.3g} rad, half a turn or more; use a smaller dt",
+                    advises=True,
                 )
             middle = angles.mean()
             b = np.cos(middle) * self.m2_b - np.sin(middle) * self.m1_b

@@ -18,6 +18,9 @@ from dolfinx_nts.kernels.precise import cofactor, determinant, invariants
 class Isotropic:
     """A material that is a function of the invariants I_1, I_2, I_3 of C - 1."""
 
+    def check(self) -> None:
+        """Raise ValueError if a parameter is out of its range; asked whenever one has changed."""
+
     def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
         """W [J/m^3]."""
         raise NotImplementedError(f"{type(self).__name__} needs a method of_invariants")

@@ -257,7 +257,8 @@ class _LoadStepper(Stepper):
                     # Bodies in search of each other move by load over stabilization, whatever dt.
                     if not 0.0 < problem.stabilization.share < _STIFFEST:
                         unheld = self._unheld(state, dt)
-                        raise StepFailedError(f"{unheld}{failure}") from failure
+                        advises = bool(unheld) or failure.advises
+                        raise StepFailedError(f"{unheld}{failure}", advises=advises) from failure
                     problem.stabilization.share /= _RELIEF
                     continue
                 iterations += step.iterations

@@ -100,8 +100,8 @@ def simulate(
             1e-8 and "fast" to about 1e-5 of the energy, with matrices kept over many steps.
         sleep: Leave a body out of a step while its velocity is exactly zero, its forces balance to
             rounding and no contact may reach it; it wakes in the first step in which that ends. The
-            solution is the same; a body that has moved hardly ever comes to rest exactly. What a
-            caller changes in a material during the run wakes nothing.
+            solution is the same; a body that has moved hardly ever comes to rest exactly. When a
+            caller changes a material during the run, the forces on all sleepers are looked at anew.
         adapt: Choose the steps by their error and by closing gaps.
         watch_overlap: Look whether bodies of a contact end up inside each other, with all of their
             boundaries, or an obstacle in the facets that it is the master of, and warn. It costs

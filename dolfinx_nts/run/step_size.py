@@ -154,10 +154,9 @@ class Pace:
 
         In free flight a node whose gap closes after a part theta of the step would be pushed back
         by 1 - theta of its way. The force for that follows from its mass, and force x gap is lost.
-        Nodes
-        that close within the shortest step count as touching. Contacts that carry at t_n are left
-        out: a consistent mass makes their nodes bounce in turn, and to meet each bounce costs many
-        steps and saves no energy (measured). Every rank must call it.
+        Nodes that close within the shortest step count as touching. Contacts that carry at t_n are
+        left out: a consistent mass makes their nodes bounce in turn, and to meet each bounce costs
+        many steps and saves no energy (measured). Every rank must call it.
         """
         comm, state, contacts = problem.system.comm, problem.state, problem.contacts
         carrying = np.array([bool((c.force > 0.0).any()) for c in state.contacts], dtype=bool)

@@ -70,10 +70,19 @@ def tell_stressed(solution: Solution, time: float) -> None:
         solution: The run.
         time: When [s].
     """
-    for body in solution.system.bodies:
-        stressed = getattr(body, "stressed", None)
-        if stressed is not None and "stress at rest" not in solution.warnings:
-            solution.warn("stress at rest", time, *stressed)
+    sizes = {body.name: getattr(body, "stressed", None) for body in solution.system.bodies}
+    found = {name: size for name, size in sizes.items() if size is not None}
+    if not found or "stress at rest" in solution.warnings:
+        return
+    worst, names = max(found.values()), ", ".join(map(repr, found))
+    one = len(found) == 1
+    solution.warn(
+        "stress at rest", time, worst,
+        f"{f'body {names} is' if one else f'bodies {names} are'} under a stress of about "
+        f"{worst:.2g} of {'its' if one else 'their'} stiffness while undeformed, and "
+        f"{'moves by itself' if one else 'move by themselves'}; unless that is meant, let W(C) "
+        "have dW/dC = 0 at C = 1",
+    )  # fmt: skip
 
 
 def tell_frictionless(solution: Solution, impulses: FloatArray, time: float) -> None:
@@ -101,7 +110,11 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
     steps = len(solution.rows) - 1
     often = steps % _SELDOM == 0 or (steps < _SELDOM and steps & (steps - 1) == 0)
     measured = often or "turns" in solution.warnings
-    awake = problem.awake if measured else ()
+    awake: set[int] = set()
+    if measured:
+        # What has no mass has no spin.
+        masses = system.comm.allreduce(np.array([b.nodal_mass.sum() for b in system.bodies]))
+        awake = set(problem.awake) & set(np.flatnonzero(masses > 0.0).tolist())
     turning = [k for k, body in enumerate(system.bodies) if body.oriented or k in awake]
     if not turning:
         return

@@ -506,7 +506,8 @@ class Stepper:
         raise StepFailedError(
             f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
             f"{far:.3g} m, and no search found all contacts on the way of their nodes; use a "
-            "smaller dt"
+            "smaller dt",
+            advises=True,
         )
 
     def _take(self, trial: Trial) -> None:

@@ -114,7 +114,8 @@ def _refuse_moved(problem: StepProblem, step: Evaluation) -> None:
         name = bodies[int(np.argmax(moves))].name
         raise StepFailedError(
             f"step from t={problem.state.time:.6g}: coordinates of body {name!r} move as "
-            "prescribed in an impact; use impact='published', or supports at rest"
+            "prescribed in an impact; use impact='published', or supports at rest",
+            advises=True,
         )
 
 

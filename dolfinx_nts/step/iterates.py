@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.contact.contact_elements import CYCLE
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.problem import StepProblem
 
@@ -64,12 +63,6 @@ class Iterates:
                 self._settled &= not changes.any()
         self.last = new
         return new
-
-    @property
-    def cycles(self) -> bool:
-        """Whether some element flips as often as messages call a cycle. Collective."""
-        local = max((int(flips.max(initial=0)) for flips in self.flips), default=0)
-        return bool(self._problem.system.comm.allreduce(local, op=MPI.MAX) >= CYCLE)
 
     @property
     def settled(self) -> bool:

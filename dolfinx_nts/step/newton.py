@@ -12,6 +12,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.assembly import StepMatrix
@@ -24,7 +25,7 @@ from dolfinx_nts.step.linear_solver import keep_bodies, set_schur, take_bodies
 from dolfinx_nts.step.presets import Presets
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.upright import Upright
-from dolfinx_nts.validation import StepFailedError, UserFunctionError
+from dolfinx_nts.validation import StepFailedError
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +71,7 @@ class StepSolver:
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
         self._version, self._solved = -1, False
-        self._raised: UserFunctionError | StepFailedError | None = None
+        self._raised: StepFailedError | None = None
         joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
         self._independent: bool | None = True if form_tree(joints) else None
         self.matrix: StepMatrix | None = None
@@ -112,6 +113,7 @@ class StepSolver:
                     self.destroy()
                     self.prepare()
             try:
+                self._raised = None
                 self._presets.options.check(self.snes, self.matrix.operator)
                 self.snes.solve(None, self.problem.x)
             except PETSc.Error as error:
@@ -245,7 +247,7 @@ class StepSolver:
     def _function(self, _snes: Any, x: Any, f: Any) -> None:
         try:
             f.array_w[:] = self.problem.residual(self.iterates.at(x))
-        except (UserFunctionError, StepFailedError) as error:
+        except StepFailedError as error:
             self._raised = error
             raise
 
@@ -315,12 +317,12 @@ class StepSolver:
                 f"{iterations} iterations: {self._upright.describe_inverted(e.x)}",
                 advises=True,
             )
-        why = self._presets.why_failed(self.snes, reason)
+        why, advises = self._presets.why_failed(self.snes, reason)
         message = diagnosis(problem, e, self.iterates.flips, why, iterations)
         flat = self._upright.describe_flat(e.x)
         if flat:
             return StepFailedError(f"{message}; {flat}", advises=True)
-        return StepFailedError(message, advises=self.iterates.cycles)
+        return StepFailedError(message, advises=advises or UNSETTLED in message)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

@@ -117,26 +117,27 @@ class Presets:
             limit = int(limit * math.log(rtol) / math.log(_COARSE))
         snes.getKSP().setTolerances(rtol=rtol, max_it=limit)
 
-    def why_failed(self, snes: Any, reason: int) -> str:
-        """PETSc's reason of a failure in words.
+    def why_failed(self, snes: Any, reason: int) -> tuple[str, bool]:
+        """PETSc's reason of a failure in words, and whether they say what to do.
 
         Args:
             snes: The SNES that failed.
             reason: Its own reason.
         """
         if reason != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
-            return f"SNES reason {reason}"
+            return f"SNES reason {reason}", False
         ksp = snes.getKSP()
         why = f"the linear solver {self.name!r} failed, KSP reason {ksp.getConvergedReason()}"
         why += self.with_options
-        if _mumps_lacks_memory(ksp.getPC()):
+        advises = _mumps_lacks_memory(ksp.getPC())
+        if advises:
             why += (
                 "; MUMPS did not get the memory for its factors: use more ranks or memory, "
                 "Newton(linear_solver='krylov'), or a coarser mesh"
             )
         if self._names == ("krylov",):
             why += "; linear_solver='auto' goes on with MUMPS where that happens"
-        return why
+        return why, advises
 
     @property
     def with_options(self) -> str:

@@ -97,7 +97,7 @@ class StepProblem:
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.centre, self._span = _box(system)
-        self.stabilization = Stabilization(system, self._span)
+        self.stabilization = Stabilization(system, self._span, self._largest_load)
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
@@ -112,7 +112,7 @@ class StepProblem:
                 continue
             rigid = all(body.rigid for body in joint.bodies)
             found.append((getattr(coupling, "hold_alone", None) if rigid else None, bodies))
-        moved = system.comm.allreduce(np.array([b.fixed.sum() for b in system.bodies]))
+        moved = system.comm.allreduce(np.array([b.fixed.size for b in system.bodies]))
         free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
         alone = hanging([bodies for _, bodies in found], free)
         for (hold_alone, _), hangs in zip(found, alone, strict=True):
@@ -345,7 +345,8 @@ class StepProblem:
 
         v_0 + v_1 = 2 (u_1 - u_0)/h makes the mean of the forces at both ends do the work in the
         methods that carry accelerations, not those where the step takes them. Loads that are
-        functions of time differ; of others, and of other methods, it is 0.
+        functions of time differ; of others, and of other methods, it is 0. What loads push at
+        prescribed coordinates goes into the supports: their reactions hold it.
 
         Args:
             e: Solution of the step.
@@ -361,8 +362,18 @@ class StepProblem:
                 mean += 0.5 * self.factor * body.external(terms.u1, self._gravity)
             body.begin_step(self.integrator, self._moments[k])
             here = self.factor * body.external(terms.u1, self._gravity)
-            works[k] = float((mean - here) @ terms.du)
+            works[k] = float(free(body, mean - here) @ terms.du)
         return works
+
+    def _largest_load(self) -> float:
+        """Largest load but gravity on a coordinate, all of its ramp [N]. Collective."""
+        largest, none = 0.0, np.zeros(3)
+        for body, moment in zip(self.system.bodies, self._moments, strict=True):
+            body.begin_step(self.integrator, moment._replace(ramp=1.0))
+            load = np.abs(body.external(np.zeros(body.num_owned), none))
+            largest = max(largest, float(load.max(initial=0.0)))
+            body.begin_step(self.integrator, moment)
+        return float(global_max(self.system.comm, np.array([largest]))[0])
 
     def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
         """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
@@ -422,7 +433,7 @@ class StepProblem:
 
     # ---- iterates
     def evaluate(self, x: Any) -> Evaluation:
-        """The step equations at an iterate; pure. Every rank must call it.
+        """The step equations at an iterate; no state changes. Every rank must call it.
 
         Args:
             x: PETSc vector of the unknowns.
@@ -491,7 +502,7 @@ class StepProblem:
         self.rounding.measure_springs()
 
     def _springs(self) -> FloatArray:
-        """Stiffness at t_n of elements without unknowns of their own, of each body. Collective."""
+        """Norm of the stiffness at t_n of elements without unknowns, of each body. Collective."""
         laid, elements, start = self.laid, self.elements, self.x.duplicate()
         local = np.zeros(len(self.system.bodies))
         start.set(0.0)
@@ -500,16 +511,21 @@ class StepProblem:
         positions = laid.positions(start, elements)
         own = laid.own_values(start.array_r, elements)
         start.destroy()
-        for batch, numbers, x, mine in zip(elements, self.bodies, positions, own, strict=True):
-            if any(batch.widths.values()):
-                continue
-            stiffness, first = batch.evaluate(x, mine).tangent, 0
-            for k, dofs in zip(numbers, batch.dofs(), strict=True):
+        chosen = [i for i, batch in enumerate(elements) if not any(batch.widths.values())]
+        parts = evaluate_together(
+            self.system.comm,
+            [elements[i] for i in chosen],
+            [positions[i] for i in chosen],
+            [own[i] for i in chosen],
+        )
+        for i, part in zip(chosen, parts, strict=True):
+            first = 0
+            for k, dofs in zip(self.bodies[i], elements[i].dofs(), strict=True):
                 stop = first + dofs.shape[1]
-                along = stiffness[:, first:stop, first:stop].diagonal(axis1=1, axis2=2)
-                local[k] += float(np.linalg.norm(along[dofs >= 0]))
+                along = part.tangent[:, first:stop, first:stop].diagonal(axis1=1, axis2=2)
+                local[k] += float(np.square(along[dofs >= 0]).sum())
                 first = stop
-        found: FloatArray = self.system.comm.allreduce(local)
+        found: FloatArray = np.sqrt(self.system.comm.allreduce(local))
         return found
 
     # ---- lengths and rounding

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -19,13 +20,15 @@ class Stabilization:
     Args:
         system: The scene.
         span: Size of the scene [m].
+        largest_load: Asks for the largest load on a coordinate, all of its ramp [N]. Collective.
 
     Attributes:
         share: That part [-], zero in dynamics.
     """
 
-    def __init__(self, system: System, span: float) -> None:
-        self._system, self._span = system, span
+    def __init__(self, system: System, span: float, largest_load: Callable[[], float]) -> None:
+        self._system, self._span, self._largest_load = system, span, largest_load
+        self._load = 0.0
         self.share = 0.0
 
     def of(self, body: Any) -> FloatArray:
@@ -66,10 +69,10 @@ class Stabilization:
         return float(np.mean(found)) if found else 0.0
 
     def _of_loads(self) -> float:
-        """Largest load in the step over the size of the scene [N/m]. Collective."""
-        bodies, none = self._system.bodies, np.zeros(3)
-        loads = [np.abs(b.external(np.zeros(b.num_owned), none)).max(initial=0.0) for b in bodies]
-        return self._over_span(max(self._system.comm.allgather(float(max(loads)))))
+        """Largest load over the size of the scene, the first that is any [N/m]. Collective."""
+        # One number for all load steps, or the last relaxations would differ from the first.
+        self._load = self._load or self._largest_load()
+        return self._over_span(self._load)
 
     def _over_span(self, force: float) -> float:
         return force / self._span if force and self._span else 0.0
