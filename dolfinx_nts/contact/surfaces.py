@@ -172,6 +172,9 @@ class Surface:
         fixed: Which coordinates of the points are prescribed, shape (p, 3).
     """
 
+    #: For surfaces of one's own that do not call `__init__`.
+    _redundant: Callable[[], bool] | None = None
+
     def __init__(
         self, body: Any, skin: Skin, smoothing: bool = False,
         redundant: Callable[[], bool] | None = None,
