@@ -175,7 +175,7 @@ def test_a_mass_that_vanishes_ends_the_run(change):
     run = nts.simulate(
         nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=3 * DT, before_step=lose
     )
-    words = f"a parameter of 'cube' has changed: density={density!s} with a value of {change}: must"
+    words = f"a parameter of 'cube' has changed: density with a value of {change}: must"
     assert words in run.status
     assert len(run.balance["time"]) == 2
 
@@ -198,8 +198,7 @@ def test_a_value_out_of_range_in_one_cell_ends_the_run(name, good, bad):
     run = nts.simulate(
         nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=3 * DT, before_step=spoil
     )
-    assert f"a parameter of 'cube' has changed: {name}=" in run.status
-    assert f"with a value of {bad}: must" in run.status
+    assert f"a parameter of 'cube' has changed: {name} with a value of {bad}: must" in run.status
     assert len(run.balance["time"]) == 2
 
 
@@ -215,13 +214,13 @@ def test_the_stiffness_of_nodes_is_that_of_changed_moduli():
 
 def test_what_is_no_parameter_is_refused():
     mesh, other = box(), box()
-    with pytest.raises(ValueError, match=r"young=.* with a value of -1.0: must be positive"):
+    with pytest.raises(ValueError, match=r"young with a value of -1.0: must be positive"):
         nts.NeoHookean(field(mesh, -1.0), 0.3)
-    with pytest.raises(ValueError, match=r"poisson=.* with a value of 0.5: must lie in"):
+    with pytest.raises(ValueError, match=r"poisson with a value of 0.5: must lie in"):
         nts.NeoHookean(1e5, fem.Constant(mesh, 0.5))
     with pytest.raises(ValueError, match=r"has shape \(3,\); pass a scalar"):
         nts.NeoHookean(fem.Constant(mesh, np.ones(3)), 0.3)
-    with pytest.raises(ValueError, match=r"density=.* with a value of nan"):
+    with pytest.raises(ValueError, match=r"density with a value of nan"):
         nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=fem.Constant(mesh, np.nan))
     with pytest.raises(ValueError, match="density=.*of another mesh; make it on the mesh"):
         nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=fem.Constant(other, 1.0))

@@ -43,7 +43,7 @@ def require_parameter(name: str, value: Any, fits: Callable[[Any], bool], wanted
         values = np.ravel(value.x.array if is_field else value.value)
         unfit = [v for v in (values.min(), values.max()) if not fits(v)] if len(values) else []
         if unfit:
-            problem = f"{name}={value!s} with a value of {float(unfit[0])!r}: {wanted}"
+            problem = f"{name} with a value of {float(unfit[0])!r}: {wanted}"
     if is_field:
         raise_together(value.function_space.mesh.comm, problem)
     elif problem is not None:
