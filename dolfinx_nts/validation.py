@@ -253,7 +253,8 @@ def at_time(
         if array.shape == (3,) and np.isfinite(array).all():
             value = array
         else:
-            problem = f"{label}: returned {given!r}; pass three finite components [{unit}]"
+            shown = given.item() if isinstance(given, np.generic) else given  # NumPy 2 adds a type
+            problem = f"{label}: returned {shown!r}; pass three finite components [{unit}]"
     agree(comm, label, value, problem, cause)
     return value
 
