@@ -26,6 +26,8 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Square of the singular values that count as zero, over that of the largest.
 _NONE = 1e-12
+#: Bodies up to which dense arrays are the faster ones.
+_FEW = 8
 #: Solves by least squares, each for what that threshold has left of the one before.
 _PASSES = 3
 
@@ -138,26 +140,35 @@ def _null_part(rows: _Rows) -> FloatArray:
     n = len(rows.body)
     known, place = np.unique(rows.body, return_inverse=True)
     place = place.reshape(n, 2)
-    columns = 6 * place[:, :, None] + np.arange(6)
-    shape = n, 6 * len(known)
-    at = np.repeat(np.arange(n), 12), columns.ravel()
-    g = scipy.sparse.csr_array((rows.push.ravel(), at), shape=shape)
+    columns = (6 * place[:, :, None] + np.arange(6)).reshape(n, 12)
+    pushes, few = rows.push.reshape(n, 12), len(known) <= _FEW
     # Turns in the length that makes their gaps as large as those of translations, if any do.
-    square = np.asarray(g.multiply(g).sum(axis=0)).reshape(-1, 2, 3).sum(axis=2)
+    square = np.bincount(columns.ravel(), pushes.ravel() ** 2, 6 * len(known))
+    square = square.reshape(-1, 2, 3).sum(axis=2)
     wanted = np.where(square[:, :1] > 0.0, square[:, :1], 1.0)
     unit = np.sqrt(np.divide(wanted, square, out=np.zeros_like(square), where=square > 0.0))
-    g = g @ scipy.sparse.diags(np.repeat(unit.ravel(), 3))
-    a, b = (g.T @ g).tocsc(), g.T @ rows.value
+    pushes = pushes * np.repeat(unit.ravel(), 3)[columns]
+    at = np.repeat(np.arange(n), 12), columns.ravel()
+    g: Any = scipy.sparse.csr_array((pushes.ravel(), at), shape=(n, 6 * len(known)))
+    if few:
+        g = g.toarray()
+    a, b = g.T @ g, g.T @ rows.value
     largest = a.diagonal().reshape(-1, 6).max(axis=1)
     held = np.repeat(_NONE * np.where(largest > 0.0, largest, 1.0), 6)
-    near = scipy.sparse.linalg.splu(a + scipy.sparse.diags(held, format="csc"))
+    if few:
+        inverse = np.linalg.inv(a + np.diag(held))
+        solve: Callable[[FloatArray], FloatArray] = inverse.__matmul__
+    else:
+        solve = scipy.sparse.linalg.splu((a + scipy.sparse.diags(held)).tocsc()).solve
     best = np.zeros_like(b)
     for _ in range(_PASSES):
-        best += near.solve(b - a @ best)
+        best += solve(b - a @ best)
     null: FloatArray = rows.value - g @ best
-    touch = scipy.sparse.csr_array((np.ones(n), place.T), shape=(len(known),) * 2)
-    count, group = connected_components(touch, directed=False)
-    stuck = np.zeros(count, dtype=bool)
-    np.logical_or.at(stuck, group[place[:, 0]], np.abs(null[:, 0]) > rows.limit)
-    null[stuck[group[place[:, 0]]]] = 0.0
+    stuck = np.abs(null[:, 0]) > rows.limit
+    if stuck.any():
+        touch = scipy.sparse.csr_array((np.ones(n), place.T), shape=(len(known),) * 2)
+        count, group = connected_components(touch, directed=False)
+        of_group = np.zeros(count, dtype=bool)
+        np.logical_or.at(of_group, group[place[:, 0]], stuck)
+        null[of_group[group[place[:, 0]]]] = 0.0
     return null
