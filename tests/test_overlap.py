@@ -6,6 +6,7 @@ import logging
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from mpi4py import MPI
@@ -295,6 +296,28 @@ def test_edges_that_cross_are_told_with_place_and_depth():
     along = 1 if body.name == "upper" else 0
     assert np.allclose(ends[:, along], [-1 / 6, 1 / 6]) and len(found.nodes) == 2
     assert all(text in found.text for text in ("'upper'", "'lower'", "finer mesh of the slave"))
+
+
+@pytest.mark.mpi
+def test_a_look_tells_of_each_pair():
+    """Blocks that reach 0.3 m and 0.25 m into the two sides of a larger one."""
+
+    def block(name, low, high, n):
+        mesh = create_box(COMM, [low, high], n, CellType.hexahedron)
+        return nts.Continuum(mesh, lambda c: 1e6 * ufl.tr(c), density=1e3, name=name)
+
+    left = block("left", [-2, 0, 0], [-1, 1, 1], (1, 1, 1))
+    right = block("right", [2, 0, 0], [3, 1, 1], (1, 1, 1))
+    middle = block("middle", [0, -0.5, -0.5], [1, 1.5, 1.5], (4, 8, 8))
+    pairs = [nts.ContactPair(slave=b.boundary(), master=middle.boundary()) for b in (left, right)]
+    system = nts.System([left, middle, right], contacts=pairs)
+    there = moved(system, (1.3, 0, 0), (0, 0, 0), (-1.25, 0, 0))
+    found = overlap.OverlapWatch(system).look(there)
+    depths = {f.about: f.depth for f in found if f.kind == "node inside a body"}
+    assert depths == {
+        ("left", "middle"): pytest.approx(0.3, rel=1e-12),
+        ("middle", "right"): pytest.approx(0.25, rel=1e-12),
+    }
 
 
 def fly(t_end=0.06, scene=None, integrator=MID_STEP["energy-momentum"], **options):

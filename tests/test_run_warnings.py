@@ -1,5 +1,6 @@
 """What a run says against its own result: counted by kind, in the status, the summary, the CSV."""
 
+import json
 import logging
 
 import numpy as np
@@ -9,7 +10,9 @@ from point_mass import mass_on_wall
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
+from dolfinx_nts.run.record import Record, unpacked
 from dolfinx_nts.run.run_warnings import RunWarnings
+from dolfinx_nts.run.table import Table
 
 
 def test_a_kind_is_counted_and_its_worst_case_kept(caplog):
@@ -28,6 +31,20 @@ def test_one_grave_case_makes_the_kind_grave(caplog):
     warnings.add("drift", 1.0, 1.0, "off", grave=False)
     warnings.add("drift", 2.0, 2.0, "far off", grave=True)
     assert [w.text for w in warnings.grave] == ["far off"]
+
+
+def test_each_pair_has_a_warning_of_its_own(caplog):
+    """A lesser one after a worse one of another pair; both are read again from a file."""
+    found, pairs = RunWarnings(), (("ball", "floor"), ("cup", "ball"))
+    for size, pair in zip((2.0, 1.0), pairs, strict=True):
+        found.add("inside", size, size, f"{pair[0]} is in {pair[1]}", grave=True, about=pair)
+    said = [r.getMessage() for r in caplog.records]
+    assert said == ["t=2: ball is in floor", "t=1: cup is in ball"]
+    assert list(found) == ["inside"] and len(found) == 1 and found["inside"].worst == 2.0
+    assert [w.about for w in found.grave] == [w.about for w in found.every] == list(pairs)
+    tables, notes = Record(warnings=found, rows=Table([{"time": 0.0}])).packed()
+    again = unpacked(tables, json.loads(json.dumps(notes)))
+    assert again["warnings"].every == found.every
 
 
 @pytest.mark.mpi

@@ -28,10 +28,12 @@ EPS = np.finfo(float).eps
 NAMED = re.compile(r"\w+(\[\d+\])?=|'[\w >-]+'|\b(bodies|contacts|joints|slave|surface|marker)\b")
 REMEDY = re.compile(
     r"\b(must|[Pp]ass|[Cc]heck|[Cc]hoose|[Uu]se|[Ll]eave|[Dd]rop|[Mm]ake|[Ll]et|[Gg]ive|[Mm]ove|"
-    r"[Dd]eclare|[Jj]oin|[Tt]ry|may prevent it)\b"
+    r"[Dd]eclare|[Jj]oin|[Tt]ie|[Tt]ry|may prevent it)\b"
 )
 #: Tetrahedra at the corners of a hexahedron: a corner and its neighbours.
 CORNER_TETS = np.array([[c, c ^ 1, c ^ 2, c ^ 4] for c in range(8)])
+#: Edges of a tetrahedron.
+PAIRS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 #: Kinds of warnings that tell of bodies inside each other, and of bodies and obstacles.
 OVERLAPS = {"edge through a body", "node inside a body", "node beside a surface"}
 IN_OBSTACLES = {
@@ -130,8 +132,8 @@ class Watch:
         self._hear()
 
     def _hear(self):
-        """Keep what is told: of a kind the run keeps the worst alone."""
-        self._told |= {(kind, w.text) for kind, w in self.run.warnings.items()}
+        """Keep what is told: of a kind and a pair the run keeps the worst alone."""
+        self._told |= {(w.kind, w.text) for w in self.run.warnings.every}
 
     def _is_told(self, kinds, *names):
         """Whether a warning of such a kind names these bodies."""
@@ -355,13 +357,20 @@ def law_of(body, unit=1.0):
 
 
 def thickness(solid):
-    """Shortest of a body's lengths along its principal axes, or a ring's wall [m]."""
+    """Shortest of a body's lengths along its principal axes [m], or a ring's wall.
+
+    A wall is twice as thick as what lies deepest in it, which is looked for at places along the
+    edges and diagonals of the cells.
+    """
     middle = solid.x - solid.x.mean(axis=0)
     along = middle @ np.linalg.eigh(middle.T @ middle)[1]
     wall = solid.x[solid.tets].mean(axis=1) - solid.x.mean(axis=0)
-    hollow = np.linalg.norm(wall, axis=1).min() > 0.5 * np.linalg.norm(middle, axis=1).max()
-    size = np.ptp(along, axis=0).min()
-    return float(min(size, np.ptp(solid.x[solid.cells], axis=1).min()) if hollow else size)
+    if np.linalg.norm(wall, axis=1).min() <= 0.5 * np.linalg.norm(middle, axis=1).max():
+        return float(np.ptp(along, axis=0).min())
+    ends = solid.x[np.unique(np.sort(solid.tets[:, PAIRS].reshape(-1, 2), axis=1), axis=0)]
+    parts = np.linspace(0.0, 1.0, 41)[1:-1, None, None]
+    places = (ends[:, 0] + parts * (ends[:, 1] - ends[:, 0])).reshape(-1, 3)
+    return 2.0 * float(solid.depth(solid.x, places).max())
 
 
 def judge_restart(scene, comm, path):

@@ -48,6 +48,11 @@ class Finding(NamedTuple):
     text: str
     grave: bool = True
 
+    @property
+    def about(self) -> tuple[str, ...]:
+        """The two names, whichever is inside the other."""
+        return tuple(sorted(self.bodies))
+
 
 class Pause(NamedTuple):
     """How far two bodies may move relative to each other until the next look.

@@ -82,7 +82,7 @@ class OverlapWatch:
     def look(
         self, u: Sequence[FloatArray], time: float = 0.0, *, last: bool = False
     ) -> list[Finding]:
-        """The worst finding of each kind, if a look is due. Collective, the same on all ranks.
+        """The worst finding of each kind and pair, if a look is due. Collective, same on all ranks.
 
         Args:
             u: Owned displacements of all bodies [m]; kept until the next look, not to be changed.
@@ -99,10 +99,11 @@ class OverlapWatch:
             found, pause = self._pairs[k].look(now[k], both)
             findings += found
             self._looked[k] = _Looked(now[k], pause, both)
-        worst: dict[str, Finding] = {}
+        worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
-            if f.kind not in worst or f.size > worst[f.kind].size:
-                worst[f.kind] = f
+            key = f.kind, f.about
+            if key not in worst or f.size > worst[key].size:
+                worst[key] = f
         return list(worst.values())
 
     def enclosed(self, u: Sequence[FloatArray], time: float) -> list[Finding]:

@@ -165,7 +165,7 @@ class Record:
             "settings": self.settings,
             "columns": list(self.rows.columns),
             "counts": [getattr(self, name) for name in _COUNTS],
-            "warnings": [asdict(w) for w in self.warnings.values()],
+            "warnings": [asdict(w) for w in self.warnings.every],
             "switches": [switches.number, switches.defect, switches.size, switches.worst],
             "contacts": names,
         }
@@ -188,7 +188,9 @@ def unpacked(tables: Mapping[str, npt.NDArray[Any]], notes: Mapping[str, Any]) -
         "status": notes["status"],
         "rows": Table.of(columns),
         "switches": switches,
-        "warnings": RunWarnings(RunWarning(**w) for w in notes["warnings"]),
+        "warnings": RunWarnings(
+            RunWarning(**w | {"about": tuple(w["about"])}) for w in notes["warnings"]
+        ),
         "settings": notes["settings"],
         **dict(zip(_COUNTS, notes["counts"], strict=True)),
     }

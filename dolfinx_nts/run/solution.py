@@ -67,10 +67,19 @@ class Solution(Record):
         nodal = contact_fields.at_nodes(self.system, state, self.contact_loads, body)
         return contact_fields.functions(body, nodal)
 
-    def warn(self, kind: str, time: float, size: float, text: str, *, grave: bool = False) -> None:
+    def warn(
+        self,
+        kind: str,
+        time: float,
+        size: float,
+        text: str,
+        *,
+        grave: bool = False,
+        about: tuple[str, ...] = (),
+    ) -> None:
         """Add a warning; every rank must make the same call, see `RunWarnings.add`."""
         root = self.system.comm.rank == 0
-        self.warnings.add(kind, time, size, text, grave=grave, speak=root)
+        self.warnings.add(kind, time, size, text, grave=grave, about=about, speak=root)
 
     def finish(self) -> None:
         """Say in the status that the run is complete, and what may be wrong in it."""
@@ -136,6 +145,6 @@ class Restart(Solution):
             rejected=self.rejected,
             exceeded=self.exceeded,
             switches=copy.deepcopy(self.switches),
-            warnings=RunWarnings(self.warnings.values()),
+            warnings=RunWarnings(self.warnings.every),
             state=self.state,
         )

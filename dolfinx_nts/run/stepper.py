@@ -413,8 +413,9 @@ class Stepper:
         if self._overlap is not None:
             for found in self._overlap.look(self.state.u, self.state.time, last=last):
                 self.solution.warn(
-                    found.kind, self.state.time, found.depth, found.text, grave=found.grave
-                )
+                    found.kind, self.state.time, found.depth, found.text, grave=found.grave,
+                    about=found.about,
+                )  # fmt: skip
 
     def _first_row(self) -> dict[str, Any]:
         forces = resultants.at_start(self.system) | carried_forces(self.system, self._start)
