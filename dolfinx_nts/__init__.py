@@ -29,6 +29,7 @@ from dolfinx_nts.elements import (
     JointCoupling,
     Slopes,
     Step,
+    StepWarning,
 )
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import (
@@ -136,6 +137,7 @@ __all__ = [
     "State",
     "Step",
     "StepFailedError",
+    "StepWarning",
     "Stepper",
     "Surface",
     "System",
