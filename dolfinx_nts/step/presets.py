@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from petsc4py import PETSc
@@ -79,6 +79,18 @@ class Presets:
     def has_next(self) -> bool:
         """Whether another preset may take over now."""
         return self._chosen < len(self._names) - 1
+
+    @property
+    def memory(self) -> tuple[str, int]:
+        """The preset in use and for how many more steps it is, for a run that goes on."""
+        return self.name, self._patience
+
+    def resume(self, memory: Sequence[Any]) -> None:
+        """Go on from another run's memory, unless this run has no such preset."""
+        name, patience = memory
+        if name in self._names:
+            self._patience = patience
+            self.use(self._names.index(name))
 
     def first_is_due(self) -> bool:
         """Count a step; tells whether another than the first preset was in use for long enough."""
