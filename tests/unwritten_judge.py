@@ -262,16 +262,19 @@ class Watch:
         told = set(self.run.warnings)
         closes = RULES[self._scene.rule].closes_ledger
         missing = np.abs(residual).max()
-        # Forces that stop all in a step do work over the rounding of positions.
+        # Forces that stop all in a step, and those that hold it, do work over the rounding of
+        # positions.
         size = max(np.abs(y).max() for row in self.rows for y, _ in row)
-        stops = self._mass * self._speed / np.diff(table["time"]).min(initial=np.inf)
-        allowed = 2.0 * self._promise * largest + 100.0 * EPS * stops * size
+        stops = self._speed / np.diff(table["time"]).min(initial=np.inf)
+        holds = self._scene.unit * self._scene.gravity
+        rounding = 100.0 * EPS * self._mass * (stops + holds) * size
+        allowed = 2.0 * self._promise * largest + rounding
         if closes and missing > allowed and "ledger" not in told:
             yield f"the ledger misses {missing / largest:.3g} of the largest energy"
         if (np.diff(table["friction_dissipation"]) < -1e-9 * largest).any():
             yield "friction gives energy back"
         gain = (table["energy"] - table["energy"][0] - table["external_work"]).max()
-        if gain > GAIN * largest and not told & {"ledger", "energy from behind facets",
+        if gain > GAIN * largest + rounding and not told & {"ledger", "energy from behind facets",
                                                  "energy from massless nodes"}:  # fmt: skip
             yield f"energy grows by {gain / largest:.3g} of the largest without a word"
 
