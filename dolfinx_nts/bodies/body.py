@@ -71,6 +71,7 @@ class Body:
     has_massless: bool = False
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None
+    _shown: tuple[FloatArray, ...] = ()
 
     # ---- what each body has of its own
     def _missing(self, name: str) -> NotImplementedError:
