@@ -300,9 +300,10 @@ def last_change(sets):
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.fast(
-    "hex-midpoint-False", "hex-mean-value stress-False", "hex-energy-momentum-True",
-    "smooth-gonzalez contact-True", "smooth-condensed-True", "curved-condensed-False",
+    "hex-midpoint-False", "hex-energy-momentum-True", "smooth-gonzalez contact-True",
+    "smooth-condensed-True", "curved-condensed-False",
 )  # fmt: skip
+@pytest.mark.fast_on_ranks("smooth-gonzalez contact-True")
 def test_newton_converges_quadratically(cell, rule, turned):
     """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""
     system = two_blocks(cell, gap=0.02, speed=6.0)
@@ -347,6 +348,7 @@ def test_newton_converges_quadratically_with_friction(cell, rule, friction, chan
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.fast_on_ranks("curved")
+@pytest.mark.fast("hex", "curved")
 def test_condensing_changes_no_solution(cell):
     results = []
     for rule in ("energy-momentum", "condensed"):

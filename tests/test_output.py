@@ -186,6 +186,7 @@ def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
         ({"interval": 1.0}, [0, 7]),
     ],
 )
+@pytest.mark.fast_on_ranks("cadence0-written0", "cadence4-written4")
 def test_cadence(cadence, written, mpi_tmp_path):
     writer = output.Fields(mpi_tmp_path, **cadence)
     nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=7e-3, output=[writer])
@@ -360,6 +361,7 @@ def coloured(pixels):
 @pytest.mark.parametrize("colour", ["speed", "stress"])
 @pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 @pytest.mark.fast("hexahedron-speed", "tetrahedron-stress")
+@pytest.mark.fast_on_ranks("tetrahedron-stress")
 def test_picture(colour, cell, mpi_tmp_path):
     system = meeting_blocks(cell=cell)
     for body in system.bodies:

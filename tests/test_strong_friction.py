@@ -32,7 +32,7 @@ def box(low, high, parts, name, velocity=(0, 0, 0), bcs=()):
 @pytest.mark.fast(
     "False-50.0-balanced", "False-inf-exact", "True-1000000.0-exact", "True-inf-balanced",
 )  # fmt: skip
-@pytest.mark.fast_on_ranks("False-inf-exact", "True-inf-balanced")
+@pytest.mark.fast_on_ranks("True-inf-balanced")
 def test_a_cube_flush_with_a_wall_falls_freely(meshed, friction, accuracy):
     """No force presses it to the wall, so none of friction's acts: v = -g t."""
     system = flush(meshed, friction)
@@ -85,8 +85,8 @@ def test_the_way_along_a_wall_is_that_of_free_fall(integrator, friction, meshed,
     ("young", "cells", "friction"),
     [(2e11, 2, 50.0), (2e11, 4, 50.0), (2e11, 6, np.inf), (1e6, 6, np.inf)],
 )
-@pytest.mark.fast_on_ranks("200000000000.0-4-50.0")
 @pytest.mark.fast("200000000000.0-2-50.0", "200000000000.0-4-50.0", "1000000.0-6-inf")
+@pytest.mark.fast_on_ranks()
 def test_a_stiff_or_fine_cube_flush_with_a_wall_falls_freely(young, cells, friction):
     """Rounding of its own forces, a million times that of its weight, presses it to the wall.
 
