@@ -31,6 +31,23 @@ def over(value: float, limit: float) -> float:
     return float(value / limit) if limit > 0 else np.inf
 
 
+class StepWarning(NamedTuple):
+    """What an accepted step did that its user may not have meant; see `RunWarning`.
+
+    Attributes:
+        kind: What it is, e.g. "slip".
+        size: How bad, in the unit that `text` names.
+        text: Sentence with a remedy.
+        about: Names of the contact, joint or bodies that it is about; a run keeps the worst of each
+            kind for each of them. Empty for the whole scene.
+    """
+
+    kind: str
+    size: float
+    text: str
+    about: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """What a step tells those who make its elements.
@@ -378,14 +395,14 @@ class Coupling(Protocol):
             Whether there is such a thing that had none yet, the same on all ranks.
         """
 
-    def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
+    def warnings(self, parts: Sequence[Any]) -> list[StepWarning]:
         """Return what an accepted step did that its user may not have meant. Collective.
 
         Args:
             parts: Solution, of each of `elements`.
 
         Returns:
-            Kinds, sizes and sentences as of `RunWarning`, the same on all ranks.
+            Warnings, the same on all ranks.
         """
 
     def smallest(self, parts: Sequence[Any]) -> dict[str, float]:

@@ -80,6 +80,27 @@ def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
     krylov.close()
 
 
+@pytest.mark.mpi
+def test_mumps_gets_more_workspace_where_it_runs_out_of_it(caplog, capfd):
+    """A twentieth of what it guesses is too little: it gets more once, and nobody is told."""
+    caplog.set_level("INFO", logger="dolfinx_nts")
+    tables, workspaces = [], []
+    for options in ({"mat_mumps_icntl_14": -95}, {}):
+        newton, scheme = nts.Newton(linear_solver="direct", condense=False), nts.EnergyMomentum()
+        scene = pressed_block(0.3, n=3)
+        stepper = nts.Stepper(scene, scheme, newton=newton, petsc_options=options)
+        for _ in range(5):
+            stepper.advance(5e-3)
+        tables.append(stepper.solution.balance)
+        factors = stepper.solver.snes.getKSP().getPC().getFactorMatrix()
+        workspaces.append((factors.getMumpsIcntl(14), factors.getMumpsInfog(1)))
+        assert stepper.solution.retries == 0
+        stepper.close()
+    assert workspaces == [(400, 0), (80, 0)]
+    assert tables[1]["active"].max() > 0 and difference(*tables) < 1e-12
+    assert not caplog.records and capfd.readouterr() == ("", "")
+
+
 def touching(comm, petsc_options=None, **options):
     """Stepper of a block in the first step with all its nodes on the floor."""
     newton = nts.Newton(linear_solver="krylov", **options)

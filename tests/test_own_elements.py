@@ -630,7 +630,8 @@ class Telling(nts.EveryStep):
     def warnings(self, parts):
         x = self.step.state.u
         way = COMM.allreduce(max(float(np.abs(u).max(initial=0.0)) for u in x), op=MPI.MAX)
-        return [("way", way, f"a body has moved by {way:.3g} m")] if way > 0.0125 else []
+        told = nts.StepWarning("way", way, f"a body has moved by {way:.3g} m", ("a",))
+        return [told] if way > 0.0125 else []
 
     def give_way(self):
         was, self.firm = self.firm, False
@@ -650,7 +651,7 @@ def test_a_coupling_of_ones_own_warns_and_gives_way():
         stepper.advance(5e-3)
     # The steps start 0, 5, 10, 15 and 20 mm from the start.
     (found,) = stepper.solution.warnings.values()
-    assert (found.kind, found.count) == ("way", 2)
+    assert (found.kind, found.count, found.about) == ("way", 2, ("a",))
     assert found.worst == pytest.approx(0.02, abs=1e-9)
     problem = stepper.problem
     assert [problem.give_way(), problem.give_way()] == [True, False]

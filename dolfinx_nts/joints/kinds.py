@@ -19,7 +19,6 @@ from dolfinx_nts.joints.between import (
     Product,
     Times,
     direction,
-    number_at,
     triad,
 )
 from dolfinx_nts.validation import (
@@ -28,6 +27,7 @@ from dolfinx_nts.validation import (
     at_time,
     floats,
     known_options,
+    number_at,
     require_positive,
 )
 

@@ -59,8 +59,8 @@ def tell_couplings(
 ) -> None:
     """Warn of what contacts and joints tell. Collective; arguments as of `tell_step`."""
     for coupling, parts in problem.each(step):
-        for kind, size, text in coupling.warnings(parts):
-            solution.warn(kind, state.time, size, text)
+        for found in coupling.warnings(parts):
+            solution.warn(found.kind, state.time, found.size, found.text, about=found.about)
 
 
 def tell_stressed(solution: Solution, time: float) -> None:
