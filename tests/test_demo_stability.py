@@ -4,10 +4,8 @@ import pytest
 import stability as demo
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "scene", ["bouncing", pytest.param("rubbing", marks=pytest.mark.mpi)]  # the shorter one
-)
+@pytest.mark.slow  # in serial: a body of one cell is of one rank
+@pytest.mark.parametrize("scene", list(demo.STEPS))
 def test_newmark_doubles_the_energy_that_energy_momentum_keeps(scene):
     steps = {scene: demo.STEPS[scene]}
     r = demo.main(steps=steps, integrators=("energy-momentum", "midpoint", "newmark"))[scene]
