@@ -51,6 +51,7 @@ def resident():
 
 
 @pytest.mark.parametrize("left", ["", "kept = scene(COMM)"])
+@pytest.mark.fast("")
 def test_a_destroyed_system_leaves_no_petsc_object(left):
     """PETSc's own list of what was never freed, which names those of a system that is left."""
     code = f"""

@@ -183,7 +183,7 @@ def test_sliding_in_a_bowl_keeps_the_energy(bowl, integrator):
 
 
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
-@pytest.mark.fast("energy-momentum")
+@pytest.mark.slow
 def test_without_gravity_a_mass_in_a_sphere_follows_a_great_circle(integrator):
     """A radial force has no moment: the plane of motion and the angular momentum stay."""
     start, velocity = TURN @ [0.0, 0.0, -1.0], TURN @ [0.6, 0.8, 0.0]

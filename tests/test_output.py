@@ -109,6 +109,7 @@ def test_contact_fields(mpi_tmp_path):
 
 
 @mpi
+@pytest.mark.fast_on_ranks()
 def test_mean_force_of_two_steps():
     """A bar that hits a wall: rho c v of its section, about which single steps alternate."""
     young, density, speed, n = 1e6, 1e3, 0.01, 30
@@ -158,6 +159,7 @@ def test_cells_of_the_file_fill_the_body(cell, mpi_tmp_path):
 
 @mpi
 @pytest.mark.parametrize("cells, degree", [([1, 1, 1], 1), ([2, 1, 1], 2)])
+@pytest.mark.fast_on_ranks("cells0-1")
 def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
     mesh = box([0.0, 0, 0], [1.0, 1, 1], cells)
     body = nts.Continuum(
@@ -378,6 +380,7 @@ def test_picture(colour, cell, mpi_tmp_path):
 
 
 @mpi
+@pytest.mark.fast_on_ranks()
 def test_picture_has_true_proportions_and_hides_what_is_behind(mpi_tmp_path):
     """Seen along -x, a small fast block in front of a large resting one."""
     back = nts.Continuum(box([0.0, 0, 0], [1.0, 4, 2], [1, 2, 2]), RUBBER, density=1.0, name="b")

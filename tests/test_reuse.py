@@ -48,6 +48,7 @@ def test_reuse_changes_no_solution(integrator, solver):
 @pytest.mark.mpi
 @pytest.mark.parametrize("reuse", [False, True])
 @pytest.mark.fast("True")
+@pytest.mark.fast_on_ranks("True")
 def test_two_runs_of_one_system_in_turns_are_those_one_after_the_other(reuse):
     """Each finds the bodies' matrix changed by the other one, and makes it anew."""
 

@@ -131,7 +131,7 @@ def block(**options):
     ],
     ids=["moving support", "traction", "body force"],
 )
-@pytest.mark.fast_on_ranks("moving support")
+@pytest.mark.fast_on_ranks("traction", "body force")
 def test_the_work_of_loads_and_supports_closes_the_ledger(options):
     system = nts.System([block(**options)], gravity=(0, 0, -9.81))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.1)

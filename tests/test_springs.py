@@ -247,7 +247,7 @@ def test_torsion_pendulum_over_several_turns(rule):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_two_wheels_on_one_axis():
     """They turn against each other by more than half a turn; their angular momentum stays."""
     k, axis, spins = 2.0, np.array([2.0, 1.0, 2.0]) / 3.0, (9.0, -2.0)

@@ -70,6 +70,7 @@ def test_a_sliding_box_brakes_as_coulomb_says(rule):
 
 @pytest.mark.mpi
 @by_rule
+@pytest.mark.fast_on_ranks("generalized-alpha")
 def test_two_boxes_that_meet_keep_their_momentum(rule):
     """Whatever the scheme makes of the energy: the forces are equal and opposite."""
     left = box((-1.02, 0, 0), velocity=(1.0, 0, 0), name="left")
