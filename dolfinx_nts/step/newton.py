@@ -1,9 +1,9 @@
-"""PETSc SNES for a step: nested Jacobian, convergence per block."""
+"""PETSc SNES for a step: Jacobian, convergence per block."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -57,7 +57,7 @@ class StepSolver:
 
     Attributes:
         iterates: Iterates of the step.
-        matrix: Nested Jacobian and the form of it that SNES sees, after `assemble`.
+        matrix: Jacobian as SNES sees it, after `assemble`.
         snes: The PETSc SNES, after `prepare`.
     """
 
@@ -76,6 +76,19 @@ class StepSolver:
         self._independent: bool | None = True if form_tree(joints) else None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
+
+    @property
+    def memory(self) -> tuple[Any, ...]:
+        """What the next step takes from those before it, for a run that goes on.
+
+        Of `Presets`, and whether constraints of joints repeat each other, as the first step found.
+        """
+        return *self._presets.memory, self._independent
+
+    def resume(self, memory: Sequence[Any]) -> None:
+        """Go on from another run's memory, before the first step."""
+        *of_presets, self._independent = memory
+        self._presets.resume(of_presets)
 
     def solve(self) -> Evaluation:
         """Solve the step that `problem.begin` fixed.
@@ -198,7 +211,7 @@ class StepSolver:
             self._version = self.problem.version
 
     def assemble(self, e: Evaluation) -> StepMatrix:
-        """Nested Jacobian at an iterate, and what SNES sees of it. Every rank must call it.
+        """Jacobian at an iterate, as SNES sees it. Every rank must call it.
 
         The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
         """
