@@ -244,6 +244,11 @@ def test_contact_changes_beside_matrices_that_are_kept(rule, solver):
     "curved-mixed-energy-momentum",
     "curved-mixed-condensed",
 )
+@pytest.mark.enough_on_ranks(
+    "hex-none-condensed", "tet-none-mean-value stress", "tet-mixed-static",
+    "tet-mixed-gonzalez contact", "smooth-mixed-gonzalez contact", "smooth-none-static",
+    "curved-none-midpoint", "curved-mixed-static",
+)  # fmt: skip
 def test_jacobian_along_directions(cell, friction, rule):
     """As above on any number of ranks: matrix times direction."""
     system = two_blocks(cell, friction=FRICTION[friction])
@@ -303,8 +308,13 @@ def last_change(sets):
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.fast(
-    "hex-midpoint-False", "hex-mean-value stress-False", "hex-energy-momentum-True",
-    "smooth-gonzalez contact-True", "smooth-condensed-True", "curved-condensed-False",
+    "hex-midpoint-False", "hex-energy-momentum-True", "smooth-gonzalez contact-True",
+    "smooth-condensed-True", "curved-condensed-False",
+)  # fmt: skip
+@pytest.mark.fast_on_ranks("smooth-gonzalez contact-True")
+@pytest.mark.enough_on_ranks(
+    "hex-condensed-True", "tet-mean-value stress-True", "smooth-energy-momentum-True",
+    "curved-gonzalez contact-True",
 )  # fmt: skip
 def test_newton_converges_quadratically(cell, rule, turned):
     """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""
@@ -349,7 +359,8 @@ def test_newton_converges_quadratically_with_friction(cell, rule, friction, chan
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.fast_on_ranks("curved")
+@pytest.mark.fast("hex", "curved")
+@pytest.mark.fast_on_ranks()
 def test_condensing_changes_no_solution(cell):
     results = []
     for rule in ("energy-momentum", "condensed"):

@@ -77,6 +77,7 @@ class Body:
     stressed: float | None = None
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None
+    _shown: tuple[FloatArray, ...] = ()
 
     # ---- what each body has of its own
     def _missing(self, name: str) -> NotImplementedError:

@@ -339,10 +339,20 @@ class StepSolver:
             )
         why, advises = self._presets.why_failed(self.snes, reason)
         message = diagnosis(problem, e, self.iterates.flips, why, iterations)
+        return self.with_flat(message, e, advises=advises or UNSETTLED in message)
+
+    def with_flat(self, message: str, e: Evaluation, *, advises: bool = False) -> StepFailedError:
+        """A failure that also names the cell that is nearly inside out, if one is. Collective.
+
+        Args:
+            message: What failed.
+            e: Where.
+            advises: Whether that tells what to do.
+        """
         flat = self._upright.describe_flat(e.x)
         if flat:
             return StepFailedError(f"{message}; {flat}", advises=True)
-        return StepFailedError(message, advises=advises or UNSETTLED in message)
+        return StepFailedError(message, advises=advises)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
