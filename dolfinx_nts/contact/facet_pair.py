@@ -53,7 +53,9 @@ class FacetPair(ContactPair, master=Surface):
             )
         self.extent = max(self.extent, master.material.extent(self.origin))
         self._free_edges = master.boundary_edges
-        self._joined = patches.neighbours(master.facets, master.reference[master.facets])
+        corners = master.reference[master.facets]
+        self._joined = patches.neighbours(master.facets, corners)
+        self._beside = patches.neighbours(master.facets, corners, sharp=-np.inf)
 
     @property
     def bodies(self) -> tuple[Any, ...]:
@@ -173,6 +175,7 @@ class FacetPair(ContactPair, master=Surface):
             motion: Expected in the step.
         """
         slave_path, master_path = self._gather_paths(motion.paths)
+        found = self._round_edges(found, x, master, slave_path, master_path)
         change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
         corners, node = master[self.master.facets], found.node[change]
         if len(node):
@@ -191,6 +194,55 @@ class FacetPair(ContactPair, master=Surface):
             other, _ = self._measure(x, master, node, aimed[node], start, None)
             found = _replace(found, other)
         return found
+
+    def _round_edges(
+        self,
+        found: Candidates,
+        x: FloatArray,
+        master: FloatArray,
+        slave_path: FloatArray,
+        master_path: FloatArray,
+    ) -> Candidates:
+        """Candidates closest to an edge of two facets, with the one that they will be outside of.
+
+        Both facets of a convex edge are as near, but a node is outside the body where it is outside
+        one of them: the plane of the other one would hold what passes beside the body.
+
+        Args:
+            found: Candidates of the closest facets.
+            x: This rank's slaves at t_n [m], shape (share, 3).
+            master: Points of the master at t_n [m].
+            slave_path: Expected motion of these slaves in the step [m], shape (share, 3).
+            master_path: That of the points of the master [m].
+        """
+        nc = self.master.facets.shape[1]
+        excess = facets.edge_excess(found.xi, nc)
+        beyond = np.flatnonzero(excess.max(axis=1) > search.PREFERENCE)
+        if not beyond.size:
+            return found
+        near, excess, moved = found.part(beyond), excess[beyond], master + master_path
+        end = (x + slave_path)[near.node]
+        far, best = self._gap_at(near.facet, near.xi, end, moved), near.facet.copy()
+        for edge in range(nc):
+            other = self._beside[near.facet, edge] // nc
+            some = np.flatnonzero((excess[:, edge] > search.PREFERENCE) & (other >= 0))
+            start, _ = compiled.closest_point(end[some], moved[self.master.facets[other[some]]])
+            gap = self._gap_at(other[some], start, end[some], moved)
+            outer = gap > far[some] + search.PREFERENCE * near.length[some]
+            best[some[outer]], far[some[outer]] = other[some[outer]], gap[outer]
+        change = np.flatnonzero(best != near.facet)
+        node, facet = near.node[change], best[change]
+        start, _ = compiled.closest_point(x[node], master[self.master.facets[facet]])
+        other, _ = self._measure(x, master, node, facet, start, None)
+        return _replace(found, other)
+
+    def _gap_at(
+        self, facet: IntArray, xi: FloatArray, points: FloatArray, master: FloatArray
+    ) -> FloatArray:
+        """Distance of points (n, 3) from their facets' tangent planes at `xi` (n, 2) [m], (n,)."""
+        foot, _, normal = facets.frame(master[self.master.facets[facet]], xi)
+        gap: FloatArray = np.einsum("ni,ni->n", normal, points - foot)
+        return gap
 
     def _gather_paths(self, paths: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Displacements of this rank's slaves and of all points of the master [m]. Collective."""

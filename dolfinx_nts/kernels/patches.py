@@ -102,12 +102,14 @@ def along(xi: FloatArray, step: FloatArray) -> FloatArray:
     return out
 
 
-def neighbours(facets: IntArray, corners: FloatArray) -> IntArray:
-    """Number nc f + k of the edge that facet f's edge k (corner k to k + 1) is smoothly joined to.
+def neighbours(facets: IntArray, corners: FloatArray, sharp: float = SHARP) -> IntArray:
+    """Number nc f + k of the edge that facet f's edge k (corner k to k + 1) is joined to.
 
     Args:
         facets: Points of each facet, cyclic, same orientation for all, shape (m, nc).
         corners: Their positions in the reference configuration [m], shape (m, nc, 3).
+        sharp: Edges are sharp where facets' normals have a cosine below this, and join nothing;
+            -inf: no edge is.
 
     Returns:
         Shape (m, nc); -1 at the end of the surface, at sharp edges and where it branches.
@@ -122,7 +124,7 @@ def neighbours(facets: IntArray, corners: FloatArray) -> IntArray:
     first = np.flatnonzero(np.r_[True, (key[1:] != key[:-1]).any(axis=1)])
     count = np.diff(first, append=len(key))
     one, two = order[first[count == 2]], order[first[count == 2] + 1]
-    smooth = np.einsum("ni,ni->n", normal[one // nc], normal[two // nc]) >= SHARP
+    smooth = np.einsum("ni,ni->n", normal[one // nc], normal[two // nc]) >= sharp
     smooth &= start[one] == end[two]
     across = np.full(len(start), -1)
     across[one[smooth]], across[two[smooth]] = two[smooth], one[smooth]
