@@ -151,6 +151,13 @@ class Elements(Protocol):
         """Whether its constraints hold always and in both directions, as those of joints."""
 
     @property
+    def alike(self) -> tuple[Any, ...] | None:
+        """What batches of its class have in common that its `evaluate_alike` takes at once.
+
+        None: each batch is evaluated by itself.
+        """
+
+    @property
     def extent(self) -> float:
         """Length beside the displacements whose rounding is in its rows, on this rank [m]."""
 
@@ -237,8 +244,8 @@ def evaluate_together(
 ) -> tuple[Any, ...]:
     """What elements contribute at an iterate; what fails on one rank fails on all. Collective.
 
-    Batches of one class with equal `alike`, if they have that, are evaluated by one call of its
-    `evaluate_alike`: arrays of single elements cost as much as those of hundreds.
+    Arrays of single elements cost as much as those of hundreds, so batches that are `alike` are
+    evaluated by one call.
 
     Args:
         comm: MPI communicator.
@@ -253,7 +260,7 @@ def evaluate_together(
     parts: list[Any] = [None] * len(elements)
     groups: dict[Any, list[int]] = {}
     for k, batch in enumerate(elements):
-        alike = getattr(batch, "alike", None)
+        alike = batch.alike
         groups.setdefault(k if alike is None else (type(batch), *alike), []).append(k)
     cause, problem = None, None
     for group in groups.values():

@@ -65,6 +65,11 @@ class PointElements:
         return True
 
     @property
+    def alike(self) -> tuple[Any, ...] | None:
+        """Each batch is evaluated by itself."""
+        return None
+
+    @property
     def force_scale(self) -> float:
         """Unknowns are forces."""
         return 1.0

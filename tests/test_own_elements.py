@@ -422,7 +422,7 @@ def test_a_step_is_cut_where_elements_refuse_it_on_one_rank():
 )  # fmt: skip
 def test_what_elements_raise_keeps_its_kind_and_its_advice(error, kind, text, advises):
     class Bad:
-        name = "bad"
+        name, alike = "bad", None
 
         def evaluate(self, x, own):
             if COMM.rank == COMM.size - 1:

@@ -118,6 +118,11 @@ class ContactElements(ContactLaws):
         return False
 
     @property
+    def alike(self) -> None:
+        """Each batch is evaluated by itself."""
+        return None
+
+    @property
     def force_scale(self) -> float:
         """Unknowns are forces."""
         return 1.0
