@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -201,7 +202,7 @@ class Elements(Protocol):
     def resultant(self, part: Any, k: int, u: FloatArray) -> FloatArray:
         """Resultant of its forces on one of its bodies, this rank's part. Collective.
 
-        Elements may leave it out; the `reactions` of a joint that has such are NaN.
+        Of elements that do not know it, NaN, and so are the `reactions` of their joint.
 
         Args:
             part: Solution of the step.
@@ -236,6 +237,9 @@ def evaluate_together(
 ) -> tuple[Any, ...]:
     """What elements contribute at an iterate; what fails on one rank fails on all. Collective.
 
+    Batches of one class with equal `alike`, if they have that, are evaluated by one call of its
+    `evaluate_alike`: arrays of single elements cost as much as those of hundreds.
+
     Args:
         comm: MPI communicator.
         elements: Batches of elements.
@@ -246,18 +250,36 @@ def evaluate_together(
         UserFunctionError: One raised on some rank.
         StepFailedError: It raised this.
     """
-    parts: list[Any] = []
+    parts: list[Any] = [None] * len(elements)
+    groups: dict[Any, list[int]] = {}
+    for k, batch in enumerate(elements):
+        alike = getattr(batch, "alike", None)
+        groups.setdefault(k if alike is None else (type(batch), *alike), []).append(k)
     cause, problem = None, None
-    for batch, x, unknowns in zip(elements, places, own, strict=True):
+    for group in groups.values():
         try:
-            parts.append(batch.evaluate(x, unknowns))
+            batches = [elements[k] for k in group]
+            found = _of_group(batches, [places[k] for k in group], [own[k] for k in group])
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
             if cause is None:
-                cause, problem = error, _problem(batch, error)
+                cause, problem = error, _problem(elements[group[0]], error)
+            continue
+        for k, part in zip(group, found, strict=True):
+            parts[k] = part
     if global_max(comm, np.array([float(cause is not None)]))[0]:
         kind, text, advises = next(filter(None, comm.allgather(problem)))
         raise kind(text, advises=advises) from cause
     return tuple(parts)
+
+
+def _of_group(
+    batches: Sequence[Any], places: Sequence[FloatArray], own: Sequence[Mapping[str, FloatArray]]
+) -> Sequence[Any]:
+    """What batches that are alike, or a single one, contribute."""
+    if len(batches) == 1:
+        return [batches[0].evaluate(places[0], own[0])]
+    alike: Sequence[Any] = batches[0].evaluate_alike(batches, places, own)
+    return alike
 
 
 def _problem(batch: Any, error: Exception) -> tuple[type[StepFailedError], str, bool]:
@@ -286,35 +308,42 @@ class Slopes(NamedTuple):
     about: bool = False
 
 
-class Joint(Protocol):
+class Joint:
     """What a System accepts beside contacts: joints, springs, ties; part of the scene.
 
-    All ranks call all its functions, also those without elements. What one raises must be raised on
-    all ranks, or the others wait for ever; `Elements.evaluate` alone may raise on some.
+    A joint of one's own inherits from it, sets `name` and `bodies`, and has `coupling`; all else
+    has a default here. All ranks call all its functions, also those without elements. What one
+    raises must be raised on all ranks, or the others wait for ever; `Elements.evaluate` alone may
+    raise on some.
 
     Attributes:
         name: For messages.
         bodies: Bodies of the system that it couples.
         losses: Columns of the balance table for energy that leaves through it, of its own names;
             its elements' `ledger` says how much.
-        numbers: One number per element on this rank, the same on any number of ranks. A joint that
-            remembers nothing may leave it out.
-        settings: Numbers and texts by name, for JSON and the same on all ranks, that it was made
-            with; a checkpoint goes on only with equal ones. It may be missing: then name and kind
-            alone are compared.
-        slopes: Function of the arguments of `potential` that returns `Slopes`, for a force along
-            one coordinate; a run warns of one that is too fast for its steps. Collective. It may
-            be missing.
+        numbers: One number per element on this rank, the same on any number of ranks; None: it
+            remembers nothing that a checkpoint keeps.
         driven: Whether it moves bodies as prescribed by a function of time, which impacts that give
-            their energy back refuse. It may be missing where it does not.
+            their energy back refuse.
     """
 
     name: str
     bodies: tuple[Any, ...]
-    losses: tuple[str, ...]
+    losses: tuple[str, ...] = ()
+    numbers: IntArray | None = None
+    driven: bool = False
+
+    @cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """Numbers and texts by name that it was made with, for JSON and the same on all ranks.
+
+        A checkpoint goes on only with equal ones. Without any, name and kind alone are compared.
+        """
+        return {}
 
     def start(self) -> Any:
         """Return what it remembers at the start."""
+        return None
 
     def potential(self, u: Sequence[FloatArray], history: Any) -> float:
         """Stored energy on this rank [J]. Collective.
@@ -323,6 +352,15 @@ class Joint(Protocol):
             u: Owned displacements of each of its bodies [m].
             history: What it remembers there, such as the turns of an angle.
         """
+        return 0.0
+
+    def slopes(self, u: Sequence[FloatArray], history: Any) -> Slopes | None:
+        """What its force does, if it is one along a coordinate and holds nothing. Collective.
+
+        A run warns of one that is too fast for its steps. Arguments are those of `potential`; None,
+        for all of them, of a joint that holds.
+        """
+        return None
 
     def coupling(self, bodies: tuple[int, ...]) -> JointCoupling:
         """Return what makes its elements in a run.
@@ -330,6 +368,16 @@ class Joint(Protocol):
         Args:
             bodies: Numbers of its bodies in the system.
         """
+        raise NotImplementedError(f"{type(self).__name__} has no coupling(); see nts.Joint")
+
+
+#: What an object has that is used as a joint without being a `Joint`.
+_PROTOCOL = tuple(name for name in (*Joint.__annotations__, *vars(Joint)) if name[0] != "_")
+
+
+def is_joint(given: Any) -> bool:
+    """Return whether an object is a `Joint` or has all that one has."""
+    return isinstance(given, Joint) or all(hasattr(given, name) for name in _PROTOCOL)
 
 
 class Coupling(Protocol):
@@ -417,11 +465,13 @@ class Coupling(Protocol):
 
 
 class JointCoupling(Coupling, Protocol):
-    """What a `Joint` makes: a `Coupling` that also says what its forces do.
+    """What a `Joint` makes: a `Coupling` that also says what its forces do."""
 
-    It may have `hold_alone()`, which a run calls at its start where its constraints repeat no
-    others, so that its equations need no compliance.
-    """
+    def hold_alone(self) -> None:
+        """Take note that its constraints repeat no others: its equations need no compliance.
+
+        A run calls it at its start.
+        """
 
     def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
         """External work in a load step of `equilibrium` on this rank [J]. Collective.

@@ -184,6 +184,9 @@ class EveryStep:
         self.step, self._history = step, history
         self.elements = [self.make(step, history)]
 
+    def hold_alone(self) -> None:
+        """Nothing is lent."""
+
     def touched(self) -> set[int]:
         """All bodies."""
         return set(self.bodies[0])

@@ -94,8 +94,7 @@ def describe(system: System) -> dict[str, Any]:
 
 def _settings(item: Any) -> dict[str, Any]:
     """`settings` of a joint or an obstacle, as they come back from JSON; functions are None."""
-    given = getattr(item, "settings", {})
-    text = json.dumps(given, default=lambda a: a.tolist() if hasattr(a, "tolist") else None)
+    text = json.dumps(item.settings, default=lambda a: a.tolist() if hasattr(a, "tolist") else None)
     found: dict[str, Any] = json.loads(text)
     return found
 
@@ -297,7 +296,7 @@ class Numbering:
 
 
 def _misfit(joint: Any, value: Any) -> str | None:
-    if value is None or (isinstance(value, np.ndarray) and hasattr(joint, "numbers")):
+    if value is None or (isinstance(value, np.ndarray) and joint.numbers is not None):
         return None
     return (
         f"joint {joint.name!r} remembers a {type(value).__name__}; a checkpoint takes an array "

@@ -70,7 +70,7 @@ def tell_stressed(solution: Solution, time: float) -> None:
         solution: The run.
         time: When [s].
     """
-    sizes = {body.name: getattr(body, "stressed", None) for body in solution.system.bodies}
+    sizes = {body.name: body.stressed for body in solution.system.bodies}
     found = {name: size for name, size in sizes.items() if size is not None}
     if not found or "stress at rest" in solution.warnings:
         return
