@@ -26,6 +26,7 @@ NAME.previous: whenever a process or a machine stops, one of the two is whole.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import itertools
 import json
@@ -326,7 +327,10 @@ def prepare(path: Path) -> None:
 
     Raises:
         OSError: It cannot.
+        ImportError: There is no h5py.
     """
+    # Before the first step, as it takes longer than ten small checkpoints, and may be missing.
+    importlib.import_module("h5py")
     if path.is_dir():
         raise IsADirectoryError("it is a folder; name a file in it")
     path.parent.mkdir(parents=True, exist_ok=True)
