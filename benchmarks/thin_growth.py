@@ -1,0 +1,70 @@
+"""CPU time a step of beams and shells that swing freely, beside continua of as many coordinates.
+
+    python benchmarks/thin_growth.py --beam 250 1000 4000 --shell 25 50 --continuum 15 27
+
+A beam has as many elements as is said, a shell and a continuum as many along a side.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from dolfinx.mesh import CellType, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+from dolfinx_nts.dolfinx_compat import create_mesh
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "demos"))
+from flying_plate import plate_mesh
+
+STEPS, DT, RUBBER = 3, 1e-3, {"young": 1e6, "poisson": 0.3, "density": 1e3}
+
+
+def swinging(x):
+    """Velocities across [m/s]."""
+    return np.stack([0 * x[0], 0 * x[0], np.cos(np.pi * x[0])])
+
+
+def body(kind, n):
+    """A body one metre long."""
+    if kind == "beam":
+        x = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], n + 1)
+        pieces = np.column_stack([np.arange(n), np.arange(1, n + 1)])
+        mesh = create_mesh(MPI.COMM_SELF, pieces, x, "interval")
+        return nts.Beam(mesh, nts.Circle(0.01).section(**RUBBER), velocity=swinging)
+    if kind == "shell":
+        mesh = plate_mesh(MPI.COMM_SELF, n, n, 1.0, 1.0)
+        return nts.Shell(mesh, thickness=0.02, velocity=swinging, **RUBBER)
+    mesh = create_box(MPI.COMM_SELF, [[0, 0, 0], [1, 1, 1]], [n] * 3, CellType.hexahedron)
+    material = nts.NeoHookean(young=RUBBER["young"], poisson=RUBBER["poisson"])
+    return nts.Continuum(mesh, material, density=RUBBER["density"], velocity=swinging)
+
+
+def main(sizes):
+    """Print a row for each kind and size."""
+    for kind, numbers in sizes.items():
+        for n in numbers:
+            scene = nts.System([body(kind, n)])
+            stepper = nts.Stepper(scene, nts.EnergyMomentum())
+            stepper.advance(DT)
+            start = time.process_time()
+            for _ in range(STEPS):
+                stepper.advance(DT)
+            each, many = (time.process_time() - start) / STEPS, scene.bodies[0].num_owned
+            print(
+                f"{kind} {n}: {many} coordinates, {1e3 * each:.0f} ms a step, "
+                f"{1e6 * each / many:.1f} us each",
+                flush=True,
+            )
+            stepper.close()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--beam", type=int, nargs="*", default=[250, 1000])
+    parser.add_argument("--shell", type=int, nargs="*", default=[25, 50])
+    parser.add_argument("--continuum", type=int, nargs="*", default=[15])
+    main(vars(parser.parse_args()))
