@@ -92,6 +92,7 @@ class StepMatrix:
     Attributes:
         nest: Blocks of the fields, as of the last fresh assembly, that are converted to one matrix:
             of all fields, or if split of the bodies; None if these are stored in blocks of nodes.
+            A body's own is without elements where these find room in it.
         operator: What the solvers see, after `assemble`.
     """
 
@@ -126,11 +127,10 @@ class StepMatrix:
             i: self._bodies[i].duplicate(copy=False) for i, j in self._sources
             if i == j and i < len(bodies)
         }
-        self._same: dict[int, bool] = {}
-        self.nest: Any = None
-        if found is None:
-            grid = [[self._block(i, j) for j in joined] for i in joined]
-            self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
+        # Bodies whose own matrix has room for them: a copy would be for nothing.
+        self._roomy: list[int] = []
+        self._joined = joined
+        self.nest: Any = None if found is not None else self._new_nest()
         halves = [fields[: len(bodies)], fields[len(bodies) :]] if self._split else [fields]
         local = layout.counts[layout.comm.rank]
         layouts = [Layout(layout.comm, local[half].tolist()) for half in halves]
@@ -156,6 +156,10 @@ class StepMatrix:
             self._corner.createBAIJ((own, own), 3, nnz=self._by_nodes.room, comm=layout.comm)
         self._schur: SchurApproximation | None = None
         self.operator: Any = None
+
+    def _new_nest(self) -> Any:
+        grid = [[self._block(i, j) for j in self._joined] for i in self._joined]
+        return PETSc.Mat().createNest(grid, comm=self._layout.comm)
 
     def _block(self, i: int, j: int) -> Any:
         if i == j and i < len(self._bodies):
@@ -216,11 +220,17 @@ class StepMatrix:
         for key, sources in self._sources.items():
             if key in self._blocks:
                 self._blocks[key].set(tangents)
-            else:
+            elif key[0] in self._copies:
                 self._fill_copy(key[0], sources, tangents)
         self.nest.assemble()
         # Without `out` the nest itself is converted.
         self.nest.convert("aij", out=self._corner)
+        if self._roomy:
+            for k in self._roomy:
+                self._add_within(k, tangents)
+            self._corner.assemble()
+        elif self.operator is None:
+            self._drop_copies()
 
     def _add(self, tangents: Sequence[FloatArray]) -> None:
         """Add elements' tangents to the operator's corner."""
@@ -279,20 +289,38 @@ class StepMatrix:
         self, k: int, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]
     ) -> None:
         """Bring the copy of a body's matrix up to it and to elements within it. Collective."""
-        body, a = self._bodies[k], self._copies[k]
-        kinds = PETSc.Mat.Structure
-        same = self._same.get(k, True)
-        structure = kinds.SAME_NONZERO_PATTERN if same else kinds.DIFFERENT_NONZERO_PATTERN
-        body.copy(a, structure=structure)
+        a, kinds = self._copies[k], PETSc.Mat.Structure
+        new = self.operator is None
+        structure = kinds.SAME_NONZERO_PATTERN if new else kinds.DIFFERENT_NONZERO_PATTERN
+        self._bodies[k].copy(a, structure=structure)
         a.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         for e, i, j in sources:
             element = self._elements[e]
             values = tangents[e][:, element.columns[i], element.columns[j]]
             _add_block(a, element.numbers[i], element.numbers[j], values)
         a.assemble()
-        if k not in self._same:
-            total = PETSc.Mat.InfoType.GLOBAL_SUM
-            self._same[k] = a.getInfo(total)["nz_used"] == body.getInfo(total)["nz_used"]
+
+    def _drop_copies(self) -> None:
+        """Do without the copies that elements have filled no new entries of. Collective."""
+        total = PETSc.Mat.InfoType.GLOBAL_SUM
+        for k, a in list(self._copies.items()):
+            if a.getInfo(total)["nz_used"] == self._bodies[k].getInfo(total)["nz_used"]:
+                self._roomy.append(k)
+                self._copies.pop(k).destroy()
+        if self._roomy:
+            self.nest.destroy()
+            self.nest = self._new_nest()
+
+    def _add_within(self, k: int, tangents: Sequence[FloatArray]) -> None:
+        """Add elements' tangents within a body without a copy to the operator's corner."""
+        for e, i, j in self._sources[k, k]:
+            element = self._elements[e]
+            rows, cols = (
+                np.where(n < 0, -1, self._body_layout.to_system(k, n))
+                for n in (element.numbers[i], element.numbers[j])
+            )
+            values = tangents[e][:, element.columns[i], element.columns[j]]
+            _add_block(self._corner, rows, cols, values)
 
     def whole_bodies(self) -> list[IntArray] | None:
         """Numbers of the bodies dealt to this rank in their part of the operator, body by body.
