@@ -12,6 +12,7 @@ from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
+from dolfinx_nts.bodies.pressure import Pressure
 from dolfinx_nts.bodies.rigid import RigidBody
 from dolfinx_nts.bodies.section import Circle, Rectangle, Section
 from dolfinx_nts.bodies.shell import Shell
@@ -118,6 +119,7 @@ __all__ = [
     "PointMoment",
     "PointPart",
     "Points",
+    "Pressure",
     "Prismatic",
     "Revolute",
     "Rectangle",

@@ -15,15 +15,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations, Upright, rank_of
 from dolfinx_nts.elements import Joint
 from dolfinx_nts.kernels import quadratic
-from dolfinx_nts.validation import (
-    agree,
-    call_together,
-    floats,
-    is_finite,
-    require_name,
-    require_same,
-    vector,
-)
+from dolfinx_nts.validation import require_name, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]
 Times = tuple[float, ...]
@@ -349,19 +341,3 @@ class Motion:
     def since_start(self, time: float) -> Any:
         """Its change since t = 0. Collective."""
         return self.at(time) - self.first
-
-
-def number_at(comm: Any, name: str, function: Callable[[float], Any], t: float, unit: str) -> float:
-    """The user's number at a time; what fails on one rank raises on all.
-
-    Raises:
-        UserFunctionError: It raised, or returned anything but the same finite number on all ranks.
-    """
-    name = f"{name} at t={float(t)!r}"
-    value = floats(given := call_together(comm, name, function, t))
-    fits = value.size == 1 and is_finite(value.item())
-    problem = None if fits else f"{name}: returned {given!r}; return a finite number [{unit}]"
-    number = float(value.item()) if fits else 0.0
-    agree(comm, name, np.array([number]), problem)
-    return number
-

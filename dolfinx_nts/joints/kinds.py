@@ -20,7 +20,6 @@ from dolfinx_nts.joints.between import (
     Product,
     Times,
     direction,
-    number_at,
     triad,
 )
 from dolfinx_nts.validation import (
@@ -29,6 +28,7 @@ from dolfinx_nts.validation import (
     at_time,
     floats,
     known_options,
+    number_at,
     require_positive,
 )
 

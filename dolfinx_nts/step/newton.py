@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -76,6 +76,19 @@ class StepSolver:
         self._independent: bool | None = True if form_tree(joints) else None
         self.matrix: StepMatrix | None = None
         self.snes: Any = None
+
+    @property
+    def memory(self) -> tuple[Any, ...]:
+        """What the next step takes from those before it, for a run that goes on.
+
+        Of `Presets`, and whether constraints of joints repeat each other, as the first step found.
+        """
+        return *self._presets.memory, self._independent
+
+    def resume(self, memory: Sequence[Any]) -> None:
+        """Go on from another run's memory, before the first step."""
+        *of_presets, self._independent = memory
+        self._presets.resume(of_presets)
 
     def solve(self) -> Evaluation:
         """Solve the step that `problem.begin` fixed.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from petsc4py import PETSc
@@ -80,6 +80,18 @@ class Presets:
     def name(self) -> str:
         """The preset in use."""
         return self._names[self._chosen]
+
+    @property
+    def memory(self) -> tuple[str, int, dict[str, int]]:
+        """For a run that goes on: the preset in use, for how many more steps, and workspaces."""
+        return self.name, self._patience, self._workspace
+
+    def resume(self, memory: Sequence[Any]) -> None:
+        """Go on from another run's memory, unless this run has no such preset."""
+        name, patience, workspace = memory
+        if name in self._names:
+            self._patience, self._workspace = patience, dict(workspace)
+            self.use(self._names.index(name))
 
     def first_is_due(self) -> bool:
         """Count a step; tells whether another than the first preset was in use for long enough."""
