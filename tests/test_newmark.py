@@ -213,6 +213,20 @@ def test_work_of_loads_in_time(rule, kind):
         assert abs(run.balance["ledger_residual"][-1]) < 1e-2 * work
 
 
+def test_a_body_is_told_of_a_step_once_unless_its_loads_change():
+    """Else at both ends of the step, too, and again where it takes its forces."""
+    steps, counts = 4, []
+    for force in ((0.0, 0.0, 1.0), lambda t: (0.0, 0.0, 1.0)):
+        body = nts.RigidBody.from_inertia(1.0, (1.0, 1.0, 1.0), force=force)
+        told, begin = [], body.begin_step
+        body.begin_step = lambda *given, told=told, begin=begin: (told.append(given), begin(*given))
+        run = nts.simulate(nts.System([body]), nts.Newmark(), dt=0.1, t_end=0.1 * steps)
+        counts.append(len(told))
+        # z = t^2/2 at t = 0.4.
+        assert run.balance["external_work"][-1] == pytest.approx(0.08, rel=1e-9)
+    assert counts[1] - counts[0] == 3 * steps
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.Newmark(), nts.GeneralizedAlpha(rho_inf=0.8)], ids=repr)
 @pytest.mark.parametrize("kind", ["rigid", "continuum"])

@@ -137,24 +137,17 @@ class Beam(DirectorBody):
         every = np.ones(len(hull.facets), dtype=bool)
         return self._surface(self._marked(marker, every, x), smoothing)
 
-    def resultants(self) -> dict[str, Any]:
-        """Force and moment in the sections of the cells, at the last accepted state. Collective.
+    def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Force [N] and moment [N m] in the sections of the cells, vectors in space, (n, 3) each.
 
-        Returns:
-            DOLFINx Functions of degree 0, vectors in space as the sections are turned: "force" [N]
-            and "moment" [N m] on what lies before a section from what lies behind it.
+        They act on what lies before a section from what lies behind it.
         """
-        y = self._vectors(self.last_accepted()[0])
         stress = kernel.strains(self._elements, y) * self.section.stiffness
         axes = 0.5 * (y[:, 1:4] + y[:, 5:]) / self.length
         force, moment = (
             np.einsum("ni,nij->nj", stress[:, part], axes) for part in (slice(3), slice(3, 6))
         )
-        stem = self.u.name[:-2]
-        return {
-            "force": self._cell_function(f"{stem}_force", force),
-            "moment": self._cell_function(f"{stem}_moment", moment),
-        }
+        return force, moment
 
     def directions_at(self, direction: FloatArray, x: Any) -> Points:
         """A direction that turns with a node, for joints. Collective.

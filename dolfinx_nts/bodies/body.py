@@ -41,6 +41,7 @@ class Body:
         degree: Its polynomial degree; None without a mesh.
         joints: Constraints among its own coordinates, see `Joint`.
         driven: Whether prescribed coordinates follow functions of time.
+        loads_in_time: Whether loads on it may change by themselves in time.
         rigid: Whether no motion changes distances in it, so that `directions` turn with it.
         oriented: Whether it has directors, and with them `length`, `directions_at` and `turn`.
         length: What its directors are multiples of [m].
@@ -66,6 +67,7 @@ class Body:
     degree: int | None = None
     joints: tuple[Any, ...] = ()
     driven: bool = False
+    loads_in_time: bool = True
     rigid: bool = False
     oriented: bool = False
     length: float

@@ -128,7 +128,8 @@ class Continuum(UflBody):
         self._of_mass = max(quadrature_degree, 2 * degree)
         self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
         self._ds = self._boundary_measure(quadrature_degree)
-        self._loads_at(0.0)
+        changing = any(callable(value) for value, _ in self._loads_at(0.0))
+        self.loads_in_time = changing or extra_form is not None
         self._stand(bcs, velocity, displacement)
         self._rho = self._density(density)
         self.law = strain_energy(with_constants(material, self.mesh))

@@ -111,6 +111,7 @@ class DirectorBody(Body):
             self.comm, skeleton, self._here, bcs, forces, self.kind, self.name
         )
         self.fixed, self.driven = self._conditions.fixed, self._conditions.driven
+        self.loads_in_time = self._conditions.loads_in_time
         self._pressures = Pressures(
             self.comm, skeleton, self._cells, self._conditions.pressures, self.name
         )
@@ -215,6 +216,27 @@ class DirectorBody(Body):
         moved = gather_rows(self.comm, u)
         order = self._skeleton.order
         return self._skeleton.x[order], self._skeleton.x[order] + moved[order]
+
+    def resultants(self) -> dict[str, Any]:
+        """Force and moment in the middles of the cells, at the last accepted state. Collective.
+
+        Returns:
+            DOLFINx Functions of degree 0, "force" and "moment", as `force_and_moment` has them.
+        """
+        both = self.force_and_moment(self._vectors(self.last_accepted()[0]))
+        stem = self.u.name[:-2]
+        return {
+            what: self._cell_function(f"{stem}_{what}", values)
+            for what, values in zip(("force", "moment"), both, strict=True)
+        }
+
+    def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Stress resultants in this rank's cells.
+
+        Args:
+            y: Nodal vectors of the cells [m], shape (n, vectors, 3).
+        """
+        raise NotImplementedError
 
     def _cell_function(self, name: str, values: FloatArray) -> Any:
         """DOLFINx Function of degree 0 from values (n, 3) or (n, 3, 3) in this rank's cells."""

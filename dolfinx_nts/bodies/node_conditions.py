@@ -35,6 +35,7 @@ class NodeConditions:
         fixed: Positions of the prescribed coordinates among this rank's, ascending.
         still: Those whose conditions do not depend on time.
         driven: Whether one's value is a function of time.
+        loads_in_time: Whether a load's is.
         free_directors: This rank's nodes whose directors are not all prescribed.
         turned: This rank's nodes on which moments act.
         pressures: Loads on cells by their position among all.
@@ -64,6 +65,7 @@ class NodeConditions:
             self._load(k, load) for k, load in enumerate(forces) if isinstance(load, Load)
         ]
         self.pressures = {k: load for k, load in enumerate(forces) if isinstance(load, Pressure)}
+        self.loads_in_time = any(callable(load.value) for load in forces)
         turning = [weights != 0.0 for load, weights, _ in self._loads if load.turns]
         self.turned: IntArray = np.flatnonzero(np.any(turning, axis=0) if turning else [])
         x = skeleton.x[here]

@@ -220,6 +220,7 @@ class RigidBody(Body):
         self._force, self._motion, self._turn = force, motion, rotation
         self.driven = callable(motion) or callable(rotation)
         self._given = [("force", force, "N"), ("torque", torque, "N m")]
+        self.loads_in_time = callable(force) or callable(torque)
         for what, value, unit in self._given:
             self._vector(what, value, 0.0, unit)
         # Rounding of a disc's or a rod's moments is no mass.

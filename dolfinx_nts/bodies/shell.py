@@ -160,15 +160,12 @@ class Shell(DirectorBody):
         self._sides.add(side)
         return self._surface(chosen, smoothing)
 
-    def resultants(self) -> dict[str, Any]:
-        """Stress resultants in the middles of the cells, at the last accepted state. Collective.
+    def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Forces [N/m] and moments [N] of a length, in axes of the reference, (n, 3, 3) each.
 
-        Returns:
-            DOLFINx Functions of degree 0, 3 x 3 tensors in axes of the reference: "force" [N/m],
-            membrane forces and, in the rows and columns of the normal, transverse shear; "moment"
-            [N], bending and twisting moments.
+        Forces are those of the membrane and, in the rows and columns of the normal, transverse
+        shear; moments bend and twist.
         """
-        y = self._vectors(self.last_accepted()[0])
         middle = np.zeros((1, 2))
         e = kernel.strains(y, self._rest, self.length, middle)[:, 0]
         axes = kernel.axes(self._rest[:, ::2], middle)[0][:, 0]
@@ -178,11 +175,7 @@ class Shell(DirectorBody):
             local[k, :, [0, 1, 0, 1], [0, 1, 1, 0]] = stress[:, [0, 1, 2, 2]].T
         local[0, :, :2, 2] = local[0, :, 2, :2] = c.shear * e[:, 6:]
         force, moment = np.einsum("npi,knpq,nqj->knij", axes, local, axes)
-        stem = self.u.name[:-2]
-        return {
-            "force": self._cell_function(f"{stem}_force", force),
-            "moment": self._cell_function(f"{stem}_moment", moment),
-        }
+        return force, moment
 
     def directions_at(self, direction: FloatArray, x: Any) -> Points:
         """The director of a node, for joints. Collective.

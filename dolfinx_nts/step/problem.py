@@ -357,6 +357,9 @@ class StepProblem:
             return works
         ends = self.state.time, self.state.time + self.dt
         for k, (body, terms) in enumerate(zip(self.system.bodies, e.bodies, strict=True)):
+            # Loads that do not change have the same mean, and users' functions are not asked.
+            if not body.loads_in_time:
+                continue
             mean = np.zeros_like(terms.du)
             for time in ends:
                 body.begin_step(self.integrator, self._moments[k]._replace(time=time))
