@@ -85,13 +85,15 @@ class StepMatrix:
         elements: Unknowns of each batch of elements.
         split: Whether solvers see a nest of two fields, "bodies" and "constraints", from which a
             field split takes its blocks without a copy; else one matrix.
-        blocked: Whether the bodies' part may be stored in the 3 x 3 blocks of nodes (BAIJ), with
-            which a product takes a third of the time; few of PETSc's preconditioners take it. With
+        blocked: Whether the bodies' part may be filled in the 3 x 3 blocks of nodes. With
             constraints it needs `split`.
+        kind: PETSc's type of it if so: "baij", with which a product takes a third of the time, or
+            "aij", as few of PETSc's preconditioners take the first.
 
     Attributes:
         nest: Blocks of the fields, as of the last fresh assembly, that are converted to one matrix:
-            of all fields, or if split of the bodies; None if these are stored in blocks of nodes.
+            of all fields, or if split of the bodies; None if these are filled in blocks of nodes.
+        corner: The bodies' part of the operator.
         operator: What the solvers see, after `assemble`.
     """
 
@@ -103,6 +105,7 @@ class StepMatrix:
         *,
         split: bool = False,
         blocked: bool = False,
+        kind: str = "baij",
     ) -> None:
         self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
         self._in_operator: list[FloatArray] = []
@@ -146,14 +149,18 @@ class StepMatrix:
             parts = [self._entries(e, numbers[i][e], numbers[j][e]) for e in range(len(elements))]
             self._constraints.append(Triplets(layout.comm, size, parts))
         self._by_nodes: node_blocks.NodeBlocks | None = None
-        self._corner = PETSc.Mat()
+        self.corner = PETSc.Mat()
         if found is not None:
             of_elements = [number for _, number in self._corner_numbers]
             self._by_nodes = node_blocks.NodeBlocks(
                 bodies, found, layouts[0].to_system, of_elements
             )
-            own = (self._by_nodes.size, None)
-            self._corner.createBAIJ((own, own), 3, nnz=self._by_nodes.room, comm=layout.comm)
+            own, room = (self._by_nodes.size, None), self._by_nodes.room
+            if kind == "baij":
+                self.corner.createBAIJ((own, own), 3, nnz=room, comm=layout.comm)
+            else:
+                room = [np.repeat(3 * blocks, 3) for blocks in room]
+                self.corner.createAIJ((own, own), 3, nnz=room, comm=layout.comm)
         self._schur: SchurApproximation | None = None
         self.operator: Any = None
 
@@ -189,19 +196,19 @@ class StepMatrix:
         if self.operator is None or fresh:
             self._renew(tangents)
             if self._schur is not None:
-                self._schur.renew_bodies(self._corner)
+                self._schur.renew_bodies(self.corner)
         else:
             # On several ranks converting is slow. Outside an element's pattern its tangent is zero.
-            self._corner.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
+            self.corner.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
             self._add([a - b for a, b in zip(tangents, self._in_operator, strict=True)])
         self._in_operator = list(tangents)
         for part in self._constraints:
             part.set(tangents)
         if self.operator is None:
-            self.operator = self._corner
+            self.operator = self.corner
             if self._split:
                 b, c, d = (part.matrix for part in self._constraints)
-                grid = [[self._corner, b], [c, d]]
+                grid = [[self.corner, b], [c, d]]
                 self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
             self.operator.assemble()
         # To assemble a nest is to assemble its blocks, each with a message from all to all.
@@ -210,7 +217,7 @@ class StepMatrix:
     def _renew(self, tangents: Sequence[FloatArray]) -> None:
         """Bring nest and operator's corner up to the bodies' matrices, with elements."""
         if self._by_nodes:
-            self._by_nodes.fill(self._corner)
+            self._by_nodes.fill(self.corner)
             self._add(tangents)
             return
         for key, sources in self._sources.items():
@@ -220,17 +227,17 @@ class StepMatrix:
                 self._fill_copy(key[0], sources, tangents)
         self.nest.assemble()
         # Without `out` the nest itself is converted.
-        self.nest.convert("aij", out=self._corner)
+        self.nest.convert("aij", out=self.corner)
 
     def _add(self, tangents: Sequence[FloatArray]) -> None:
         """Add elements' tangents to the operator's corner."""
         for (columns, numbers), tangent in zip(self._corner_numbers, tangents, strict=True):
             values = tangent[:, columns][:, :, columns]
             if self._by_nodes:
-                node_blocks.add(self._corner, numbers, values)
+                node_blocks.add(self.corner, numbers, values)
             else:
-                _add_block(self._corner, numbers, numbers, values)
-        self._corner.assemble()
+                _add_block(self.corner, numbers, numbers, values)
+        self.corner.assemble()
 
     def schur(self) -> SchurApproximation:
         """Approximate Schur complements of the constraints, as the operator is. Collective.
@@ -239,13 +246,13 @@ class StepMatrix:
         """
         if self._schur is None:
             self._schur = SchurApproximation(*self._touched())
-            self._schur.renew_bodies(self._corner)
+            self._schur.renew_bodies(self.corner)
         self._schur.renew(*(part.matrix for part in self._constraints))
         return self._schur
 
     def _touched(self) -> tuple[Any, Any]:
         """Index sets of this rank's coordinates that elements touch, and of its constraints."""
-        comm, mark = self._layout.comm, self._corner.createVecLeft()
+        comm, mark = self._layout.comm, self.corner.createVecLeft()
         for _, numbers in self._corner_numbers:
             index = numbers[numbers >= 0].astype(PETSc.IntType)
             mark.setValues(index, np.ones(len(index)), addv=PETSc.InsertMode.ADD_VALUES)
@@ -328,7 +335,7 @@ class StepMatrix:
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
-        made = [self._corner, *self._constraints, *self._blocks.values(), *self._copies.values()]
+        made = [self.corner, *self._constraints, *self._blocks.values(), *self._copies.values()]
         made += [self.operator] if self._split and self.operator else []
         made += [a for a in (self.nest, self._schur) if a]
         for a in made:
