@@ -12,6 +12,7 @@ from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
+from dolfinx_nts.bodies.pressure import Pressure
 from dolfinx_nts.bodies.rigid import RigidBody
 from dolfinx_nts.bodies.section import Circle, Rectangle, Section
 from dolfinx_nts.bodies.shell import Shell
@@ -28,6 +29,7 @@ from dolfinx_nts.elements import (
     JointCoupling,
     Slopes,
     Step,
+    StepWarning,
 )
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import (
@@ -117,6 +119,7 @@ __all__ = [
     "PointMoment",
     "PointPart",
     "Points",
+    "Pressure",
     "Prismatic",
     "Revolute",
     "Rectangle",
@@ -134,6 +137,7 @@ __all__ = [
     "State",
     "Step",
     "StepFailedError",
+    "StepWarning",
     "Stepper",
     "Surface",
     "System",

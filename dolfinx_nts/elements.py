@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -29,6 +30,23 @@ def over(value: float, limit: float) -> float:
     if value == 0.0:
         return 0.0
     return float(value / limit) if limit > 0 else np.inf
+
+
+class StepWarning(NamedTuple):
+    """What an accepted step did that its user may not have meant; see `RunWarning`.
+
+    Attributes:
+        kind: What it is, e.g. "slip".
+        size: How bad, in the unit that `text` names.
+        text: Sentence with a remedy.
+        about: Names of the contact, joint or bodies that it is about; a run keeps the worst of each
+            kind for each of them. Empty for the whole scene.
+    """
+
+    kind: str
+    size: float
+    text: str
+    about: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +202,7 @@ class Elements(Protocol):
     def resultant(self, part: Any, k: int, u: FloatArray) -> FloatArray:
         """Resultant of its forces on one of its bodies, this rank's part. Collective.
 
-        Elements may leave it out; the `reactions` of a joint that has such are NaN.
+        Of elements that do not know it, NaN, and so are the `reactions` of their joint.
 
         Args:
             part: Solution of the step.
@@ -269,35 +287,42 @@ class Slopes(NamedTuple):
     about: bool = False
 
 
-class Joint(Protocol):
+class Joint:
     """What a System accepts beside contacts: joints, springs, ties; part of the scene.
 
-    All ranks call all its functions, also those without elements. What one raises must be raised on
-    all ranks, or the others wait for ever; `Elements.evaluate` alone may raise on some.
+    A joint of one's own inherits from it, sets `name` and `bodies`, and has `coupling`; all else
+    has a default here. All ranks call all its functions, also those without elements. What one
+    raises must be raised on all ranks, or the others wait for ever; `Elements.evaluate` alone may
+    raise on some.
 
     Attributes:
         name: For messages.
         bodies: Bodies of the system that it couples.
         losses: Columns of the balance table for energy that leaves through it, of its own names;
             its elements' `ledger` says how much.
-        numbers: One number per element on this rank, the same on any number of ranks. A joint that
-            remembers nothing may leave it out.
-        settings: Numbers and texts by name, for JSON and the same on all ranks, that it was made
-            with; a checkpoint goes on only with equal ones. It may be missing: then name and kind
-            alone are compared.
-        slopes: Function of the arguments of `potential` that returns `Slopes`, for a force along
-            one coordinate; a run warns of one that is too fast for its steps. Collective. It may
-            be missing.
+        numbers: One number per element on this rank, the same on any number of ranks; None: it
+            remembers nothing that a checkpoint keeps.
         driven: Whether it moves bodies as prescribed by a function of time, which impacts that give
-            their energy back refuse. It may be missing where it does not.
+            their energy back refuse.
     """
 
     name: str
     bodies: tuple[Any, ...]
-    losses: tuple[str, ...]
+    losses: tuple[str, ...] = ()
+    numbers: IntArray | None = None
+    driven: bool = False
+
+    @cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """Numbers and texts by name that it was made with, for JSON and the same on all ranks.
+
+        A checkpoint goes on only with equal ones. Without any, name and kind alone are compared.
+        """
+        return {}
 
     def start(self) -> Any:
         """Return what it remembers at the start."""
+        return None
 
     def potential(self, u: Sequence[FloatArray], history: Any) -> float:
         """Stored energy on this rank [J]. Collective.
@@ -306,6 +331,15 @@ class Joint(Protocol):
             u: Owned displacements of each of its bodies [m].
             history: What it remembers there, such as the turns of an angle.
         """
+        return 0.0
+
+    def slopes(self, u: Sequence[FloatArray], history: Any) -> Slopes | None:
+        """What its force does, if it is one along a coordinate and holds nothing. Collective.
+
+        A run warns of one that is too fast for its steps. Arguments are those of `potential`; None,
+        for all of them, of a joint that holds.
+        """
+        return None
 
     def coupling(self, bodies: tuple[int, ...]) -> JointCoupling:
         """Return what makes its elements in a run.
@@ -313,6 +347,16 @@ class Joint(Protocol):
         Args:
             bodies: Numbers of its bodies in the system.
         """
+        raise NotImplementedError(f"{type(self).__name__} has no coupling(); see nts.Joint")
+
+
+#: What an object has that is used as a joint without being a `Joint`.
+_PROTOCOL = tuple(name for name in (*Joint.__annotations__, *vars(Joint)) if name[0] != "_")
+
+
+def is_joint(given: Any) -> bool:
+    """Return whether an object is a `Joint` or has all that one has."""
+    return isinstance(given, Joint) or all(hasattr(given, name) for name in _PROTOCOL)
 
 
 class Coupling(Protocol):
@@ -378,14 +422,14 @@ class Coupling(Protocol):
             Whether there is such a thing that had none yet, the same on all ranks.
         """
 
-    def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
+    def warnings(self, parts: Sequence[Any]) -> list[StepWarning]:
         """Return what an accepted step did that its user may not have meant. Collective.
 
         Args:
             parts: Solution, of each of `elements`.
 
         Returns:
-            Kinds, sizes and sentences as of `RunWarning`, the same on all ranks.
+            Warnings, the same on all ranks.
         """
 
     def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
@@ -400,11 +444,13 @@ class Coupling(Protocol):
 
 
 class JointCoupling(Coupling, Protocol):
-    """What a `Joint` makes: a `Coupling` that also says what its forces do.
+    """What a `Joint` makes: a `Coupling` that also says what its forces do."""
 
-    It may have `hold_alone()`, which a run calls at its start where its constraints repeat no
-    others, so that its equations need no compliance.
-    """
+    def hold_alone(self) -> None:
+        """Take note that its constraints repeat no others: its equations need no compliance.
+
+        A run calls it at its start.
+        """
 
     def load_step_work(self, before: Any, after: Any, start: float, end: float) -> float | None:
         """External work in a load step of `equilibrium` on this rank [J]. Collective.

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.elements import Step, over
+from dolfinx_nts.elements import Step, StepWarning, over
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.kinematics import Kinematics, differenced, has_constraints, unknown
@@ -184,6 +184,9 @@ class EveryStep:
         self.step, self._history = step, history
         self.elements = [self.make(step, history)]
 
+    def hold_alone(self) -> None:
+        """Nothing is lent."""
+
     def touched(self) -> set[int]:
         """All bodies."""
         return set(self.bodies[0])
@@ -208,7 +211,7 @@ class EveryStep:
         """Nothing yields."""
         return False
 
-    def warnings(self, parts: Sequence[Any]) -> list[tuple[str, float, str]]:
+    def warnings(self, parts: Sequence[Any]) -> list[StepWarning]:
         """Nothing to warn of."""
         return []
 

@@ -13,7 +13,7 @@ from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
-from dolfinx_nts.elements import Joint
+from dolfinx_nts.elements import Joint, is_joint
 from dolfinx_nts.parallel import raise_together, same_kernels
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.validation import items, known_options, require_same, vector
@@ -76,7 +76,8 @@ class System:
         self.contacts = items(
             "contacts", contacts, lambda c: isinstance(c, ContactPair), "ContactPair"
         )
-        self.joints = items("joints", joints, lambda j: hasattr(j, "coupling"), "joints")
+        wanted = "joints; the class of a joint of your own inherits from nts.Joint"
+        self.joints = items("joints", joints, is_joint, wanted)
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
         self.comm = self.bodies[0].comm

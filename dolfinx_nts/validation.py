@@ -294,6 +294,21 @@ def vector_in_time(comm: Any, name: str, value: Any, time: float, unit: str) -> 
     return at_time(comm, name, value, time, unit) if is_function else vector(name, value, unit)
 
 
+def number_at(comm: Any, name: str, function: Callable[[float], Any], t: float, unit: str) -> float:
+    """The user's number at a time; what fails on one rank raises on all.
+
+    Raises:
+        UserFunctionError: It raised, or returned anything but the same finite number on all ranks.
+    """
+    name = f"{name} at t={float(t)!r}"
+    value = floats(given := call_together(comm, name, function, t))
+    fits = value.size == 1 and is_finite(value.item())
+    problem = None if fits else f"{name}: returned {given!r}; return a finite number [{unit}]"
+    number = float(value.item()) if fits else 0.0
+    agree(comm, name, np.array([number]), problem)
+    return number
+
+
 def at_points(
     comm: Any,
     name: str,

@@ -28,3 +28,19 @@ def plate_nodes(n, m, a, b):
 
 def plate(n, m, a, b, comm=MPI.COMM_WORLD):
     return surface_mesh(plate_nodes(n, m, a, b), grid(n, m), comm)
+
+
+def ball(n):
+    """Nodes and cells of a unit sphere: a cube of n x n cells a side, blown up; tops outside."""
+    turns = np.tan(np.linspace(-np.pi / 4, np.pi / 4, n + 1))
+    a, b = (t.ravel() for t in np.meshgrid(turns, turns, indexing="ij"))
+    sides = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            x = np.empty((len(a), 3))
+            x[:, axis], x[:, (axis + 1) % 3], x[:, (axis + 2) % 3] = sign, a, sign * b
+            sides.append(x / np.linalg.norm(x, axis=1, keepdims=True))
+    every = np.concatenate(sides)
+    _, first, number = np.unique(every.round(9), axis=0, return_index=True, return_inverse=True)
+    cells = np.concatenate([grid(n, n) + k * len(a) for k in range(6)])
+    return every[first], number.ravel()[cells]

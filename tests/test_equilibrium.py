@@ -741,7 +741,7 @@ def test_a_light_body_rests_between_springs_that_pull_at_it(mass):
     )
 
 
-class Ratchet:
+class Ratchet(nts.Joint):
     """A joint of one's own whose elements' ledger names work and a loss: 3 J and 1 J a unit."""
 
     losses = ("ratchet_loss",)
@@ -751,12 +751,6 @@ class Ratchet:
         side = body.points((0.5, 0.5, 1.0))
         self.bodies = (body,)
         self.side = side if COMM.rank == 0 else side.part(slice(0))
-
-    def start(self):
-        return None
-
-    def potential(self, u, history):
-        return 0.0
 
     def coupling(self, bodies):
         def make(step, history):

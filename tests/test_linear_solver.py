@@ -39,8 +39,8 @@ def stepper_of(system, **options):
         (100, False, True, {}, "krylov"),
         (99, False, True, {}, "direct"),
         (50_000, True, True, {"snes_linesearch_type": "bt"}, "krylov"),
-        (5_000, True, False, {}, "multigrid"),
-        (4_999, False, False, {}, "direct"),
+        (10_000, True, False, {}, "multigrid"),
+        (9_999, False, False, {}, "direct"),
         (50_000, True, False, {"mat_mumps_icntl_7": 4}, "direct"),
         (50_000, True, True, {"mat_mumps_icntl_7": 4}, "direct"),
         (50_000, True, True, {"snes_linesearch_type": "bt", "ksp_type": "cg"}, "direct"),
@@ -82,6 +82,27 @@ def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
     with pytest.raises(nts.StepFailedError):
         krylov.advance(long)
     krylov.close()
+
+
+@pytest.mark.mpi
+def test_mumps_gets_more_workspace_where_it_runs_out_of_it(caplog, capfd):
+    """A twentieth of what it guesses is too little: it gets more once, and nobody is told."""
+    caplog.set_level("INFO", logger="dolfinx_nts")
+    tables, workspaces = [], []
+    for options in ({"mat_mumps_icntl_14": -95}, {}):
+        newton, scheme = nts.Newton(linear_solver="direct", condense=False), nts.EnergyMomentum()
+        scene = pressed_block(0.3, n=3)
+        stepper = nts.Stepper(scene, scheme, newton=newton, petsc_options=options)
+        for _ in range(5):
+            stepper.advance(5e-3)
+        tables.append(stepper.solution.balance)
+        factors = stepper.solver.snes.getKSP().getPC().getFactorMatrix()
+        workspaces.append((factors.getMumpsIcntl(14), factors.getMumpsInfog(1)))
+        assert stepper.solution.retries == 0
+        stepper.close()
+    assert workspaces == [(400, 0), (80, 0)]
+    assert tables[1]["active"].max() > 0 and difference(*tables) < 1e-12
+    assert not caplog.records and capfd.readouterr() == ("", "")
 
 
 def touching(comm, petsc_options=None, **options):

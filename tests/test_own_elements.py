@@ -49,7 +49,7 @@ class SpringElements(nts.PointElements):
         return np.linalg.norm(np.einsum("na,nai->ni", weight, x), axis=1)
 
 
-class Spring:
+class Spring(nts.Joint):
     """A spring with a damper between points of two bodies."""
 
     losses = ("damping_dissipation",)
@@ -68,9 +68,6 @@ class Spring:
             name=self.name, sides=self._sides, stiffness=self.stiffness, damping=self.damping,
             length=getattr(self, "length", 1.0), step=step, x0=x0,
         )  # fmt: skip
-
-    def start(self):
-        return None
 
     def potential(self, u, history):
         batch = self._elements(None)
@@ -226,15 +223,16 @@ def test_a_weak_spring_of_ones_own_holds_no_body(tells):
 
 
 class Silent:
-    """A joint that leaves out what may be left out."""
+    """A spring that does not say its slopes; no `Joint`, but it has all that one has."""
 
     def __init__(self, joint):
         self._joint = joint
 
     def __getattr__(self, name):
-        if name == "slopes":
-            raise AttributeError(name)
         return getattr(self._joint, name)
+
+    def slopes(self, u, history):
+        return None
 
 
 @pytest.mark.mpi
@@ -297,10 +295,9 @@ class DriveElements(nts.PointElements):
 MASS = 1e3
 
 
-class Drive:
+class Drive(nts.Joint):
     """A joint with the ground whose constraint depends on time: a way at an acceleration."""
 
-    losses = ()
     driven = True
 
     def __init__(self, body, x, speed, acceleration=0.0, name="drive"):
@@ -308,12 +305,6 @@ class Drive:
         self.rates = (speed, acceleration)
         side = body.points(x)
         self.side = side if COMM.rank == 0 else side.part(slice(0))
-
-    def start(self):
-        return None
-
-    def potential(self, u, history):
-        return 0.0
 
     def coupling(self, bodies):
         def make(step, history):
@@ -630,7 +621,8 @@ class Telling(nts.EveryStep):
     def warnings(self, parts):
         x = self.step.state.u
         way = COMM.allreduce(max(float(np.abs(u).max(initial=0.0)) for u in x), op=MPI.MAX)
-        return [("way", way, f"a body has moved by {way:.3g} m")] if way > 0.0125 else []
+        told = nts.StepWarning("way", way, f"a body has moved by {way:.3g} m", ("a",))
+        return [told] if way > 0.0125 else []
 
     def give_way(self):
         was, self.firm = self.firm, False
@@ -650,7 +642,7 @@ def test_a_coupling_of_ones_own_warns_and_gives_way():
         stepper.advance(5e-3)
     # The steps start 0, 5, 10, 15 and 20 mm from the start.
     (found,) = stepper.solution.warnings.values()
-    assert (found.kind, found.count) == ("way", 2)
+    assert (found.kind, found.count, found.about) == ("way", 2, ("a",))
     assert found.worst == pytest.approx(0.02, abs=1e-9)
     problem = stepper.problem
     assert [problem.give_way(), problem.give_way()] == [True, False]
@@ -673,15 +665,18 @@ class PushElements(nts.PointElements):
 
 
 class Unspoken:
-    """Elements that are no PointElements and do not say their resultant."""
+    """Elements that are no PointElements and do not know their resultant."""
 
     def __init__(self, batch):
         self._batch = batch
 
     def __getattr__(self, name):
-        if name in ("resultant", "sides"):
+        if name == "sides":
             raise AttributeError(name)
         return getattr(self._batch, name)
+
+    def resultant(self, part, k, u):
+        return np.full((4, 3), np.nan)
 
 
 class TwoBatches(nts.EveryStep):
@@ -690,21 +685,13 @@ class TwoBatches(nts.EveryStep):
         self.bodies = [self.bodies[0]] * len(self.elements)
 
 
-class Pushes:
+class Pushes(nts.Joint):
     """A joint whose coupling has two batches of elements, each of two points."""
-
-    losses = ()
 
     def __init__(self, body, x, push, name="pushes", wrap=lambda batch: batch):
         self.name, self.bodies, self.push, self._wrap = name, (body,), push, wrap
         self._here = slice(None) if COMM.rank == 0 else slice(0)
         self._sides = [body.points(both).part(self._here) for both in x]
-
-    def start(self):
-        return None
-
-    def potential(self, u, history):
-        return 0.0
 
     def coupling(self, bodies):
         def make(step, history):

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from processes import in_fresh_python
 
 SCRIPT = """
 import ufl
@@ -81,3 +82,25 @@ def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
     done = run("w[2] * ufl.dx", tmp_path)
     assert done.returncode != 0
     assert "no space left" in done.stderr and "Error" in done.stderr
+
+
+#: A body at rest, whose step asks no linear solver, in a run that nobody closes.
+LEFT_OPEN = """
+import os
+os.environ["PETSC_OPTIONS"] = "-options_left"
+from dolfinx.mesh import CellType, create_box
+from mpi4py import MPI
+import dolfinx_nts as nts
+
+mesh = create_box(MPI.COMM_SELF, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)
+body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3)
+stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum())
+stepper.advance(1e-3)
+assert stepper.solution.rows[-1]["newton_iterations"] == 0
+"""
+
+
+@pytest.mark.slow
+def test_petsc_does_not_complain_of_options_that_a_run_left():
+    told = in_fresh_python(LEFT_OPEN)
+    assert "no unused options" in told and "nts_" not in told

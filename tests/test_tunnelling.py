@@ -255,6 +255,25 @@ def test_a_mass_that_came_from_beside_is_not_moved_through_the_plate(integrator)
 
 
 @pytest.mark.mpi
+def test_each_contact_tells_of_its_own_nodes_beside_the_plate():
+    """The plate moves over two masses at different depths: the less deep one is told of, too."""
+    body, top = plate(lambda t: (0.6 * np.sin(np.pi * t), 0.0, 0.0), thickness=1.0, cells=4)
+    masses, contacts = [], []
+    for name, y, sinks in (("slow", 0.1, 0.2), ("fast", -0.7, 0.4)):
+        start = (2.3, y, 0.02)
+        masses.append(PointMass(COMM, MASS, start, (0.0, 0.0, -sinks), name=name))
+        contacts.append(nts.ContactPair(slave=PointSurface(masses[-1], start), master=top))
+    system = nts.System([*masses, body], contacts=contacts)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.02, t_end=0.5)
+    # The facets are 1 m wide, and the last step looks at where it starts, at t = 0.48.
+    found = {w.about: w for w in run.warnings.every if w.kind == "node beside a surface"}
+    assert list(found) == [("slow-plate",), ("fast-plate",)]
+    for sinks, (about, warning) in zip((0.2, 0.4), found.items(), strict=True):
+        assert warning.worst == pytest.approx(0.48 * sinks - 0.02, rel=1e-9)
+        assert repr(about[0]) in warning.text
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize(
     ("integrator", "accuracy", "dt", "n"),
     [

@@ -157,6 +157,7 @@ PLATE = Body(cells=(1, 3, 3), size=(1.5, 1.5, 0.3), law="", density=1e2, speed=-
              drift=(0.0, 5.0), spin=(10.0, -20.0, 5.0))  # fmt: skip
 BALL = Body(shape="ball", cells=(3, 3, 3), cell="tetrahedron", law="", density=1e4, gap=-0.1,
             speed=30.0, drift=(0.0, 5.0))  # fmt: skip
+SLAB = Body(cells=(1, 2, 1), cell="tetrahedron", size=(1.5, 1.5, 0.3), speed=3.0)
 FOUND = {
     # The fourth step's look, at the nodes and edges of one of both bodies, counted as the last one.
     "last look at both": Scene(bodies=(RING, CUBE), contacts=(Contact(swapped=True),), steps=4),
@@ -172,12 +173,25 @@ FOUND = {
         bodies=(Body(law="", held="moving"),), joints=(("Planar", 0, False),), steps=3,
         options=(("project_start", True),),
     ),
+    # The judge measured the wall of a ring that comes with its axis ahead into a plate.
+    "ring on a plate": Scene(
+        row=(0.0, 0.0, 1.0), bodies=(SLAB, Body(shape="ring", cells=(8, 1, 2), cell="tetrahedron",
+                                                gap=0.0, speed=-0.5)),
+        contacts=(Contact(facing=(-1.0, -1.0), friction=0.3),), gravity=9.81, rule="newmark",
+        dt=5e-3, steps=8,
+    ),
+    # The judge took the work of a weight over the rounding of its place for energy.
+    "weight on a joint": Scene(
+        row=(0.0, 0.0, 1.0), bodies=(Body(law="", turn=1.1, speed=0.0, spin=(0.0, 0.0, 5.0)),),
+        joints=(("Prismatic", 0, True),), gravity=9.81, dt=5e-3,
+        options=(("project_start", True),), newton=(("rtol", 1e-6), ("reuse", True)),
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", FOUND)
-@pytest.mark.fast("last look at both", "remedy where no start fits")
+@pytest.mark.fast("last look at both", "remedy where no start fits", "weight on a joint")
 @pytest.mark.fast_on_ranks()
 def test_what_was_found_is_mended(name):
     verdict = judge(FOUND[name], COMM)

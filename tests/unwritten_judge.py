@@ -262,16 +262,19 @@ class Watch:
         told = set(self.run.warnings)
         closes = RULES[self._scene.rule].closes_ledger
         missing = np.abs(residual).max()
-        # Forces that stop all in a step do work over the rounding of positions.
+        # Forces that stop all in a step, and those that hold it, do work over the rounding of
+        # positions.
         size = max(np.abs(y).max() for row in self.rows for y, _ in row)
-        stops = self._mass * self._speed / np.diff(table["time"]).min(initial=np.inf)
-        allowed = 2.0 * self._promise * largest + 100.0 * EPS * stops * size
+        stops = self._speed / np.diff(table["time"]).min(initial=np.inf)
+        holds = self._scene.unit * self._scene.gravity
+        rounding = 100.0 * EPS * self._mass * (stops + holds) * size
+        allowed = 2.0 * self._promise * largest + rounding
         if closes and missing > allowed and "ledger" not in told:
             yield f"the ledger misses {missing / largest:.3g} of the largest energy"
         if (np.diff(table["friction_dissipation"]) < -1e-9 * largest).any():
             yield "friction gives energy back"
         gain = (table["energy"] - table["energy"][0] - table["external_work"]).max()
-        if gain > GAIN * largest and not told & {"ledger", "energy from behind facets",
+        if gain > GAIN * largest + rounding and not told & {"ledger", "energy from behind facets",
                                                  "energy from massless nodes"}:  # fmt: skip
             yield f"energy grows by {gain / largest:.3g} of the largest without a word"
 
@@ -300,10 +303,11 @@ class Watch:
             if self._is_told(OVERLAPS, *(f"body {k}" for k in pair)):
                 continue
             for a, b in (pair, pair[::-1]):
-                thick = min(thickness(solids[a]), thickness(solids[b]))
-                allowed = DEEP * min(max(solids[a].edge, solids[b].edge), thick)
-                depth, at = self._deepest(a, b)
-                if depth > allowed:
+                allowed = DEEP * min(max(solids[a].edge, solids[b].edge), thickness(solids[b]))
+                depth, at, length = self._deepest(a, b)
+                # A ring that comes with its axis ahead is as thick as it is long.
+                thick = max(thickness(solids[a]), min(shortest(solids[a]), length))
+                if depth > min(allowed, DEEP * thick):
                     yield f"body {a} is {depth:.3g} m inside body {b} (row {at:.2f})"
 
     def _depth_in_floor(self, k):
@@ -326,8 +330,11 @@ class Watch:
         return np.max(-gap(k), where=gap(0) >= -1e-9 * self._scene.unit, initial=0.0)
 
     def _deepest(self, a, b):
-        """How deep samples of body a come into body b on straight ways between the rows [m]."""
-        deepest, where = 0.0, 0
+        """How deep samples of body a come into body b on straight ways between the rows [m].
+
+        Also in which row, and how long body a is along the shortest way out of b there [m].
+        """
+        deepest, where, length = 0.0, 0, 0.0
         sa, sb = self.made.solids[a], self.made.solids[b]
         for k, (before, after) in enumerate(zip(self.rows, self.rows[1:], strict=False)):
             ways = [after[j][0] - before[j][0] for j in (a, b)]
@@ -335,10 +342,12 @@ class Watch:
             parts = min(8, 1 + int(4.0 * way / thickness(sb)))
             for part in np.arange(1, parts + 1) / parts:
                 y, z = (before[j][0] + part * w for j, w in zip((a, b), ways, strict=True))
-                found = sb.depth(z, sa.samples(y)).max()
-                if found > deepest:
-                    deepest, where = found, k + part
-        return deepest, where
+                samples = sa.samples(y)
+                depths = sb.depth(z, samples)
+                if depths.max() > deepest:
+                    deepest, where = depths.max(), k + part
+                    length = reach(sa, y, samples[depths.argmax()], sb, z)
+        return deepest, where, length
 
 
 def law_of(body, unit=1.0):
@@ -356,6 +365,33 @@ def law_of(body, unit=1.0):
     return energy
 
 
+def shortest(solid):
+    """Shortest of a body's lengths along its principal axes [m]."""
+    middle = solid.x - solid.x.mean(axis=0)
+    return float(np.ptp(middle @ np.linalg.eigh(middle.T @ middle)[1], axis=0).min())
+
+
+def reach(solid, y, point, other, z):
+    """How long a body is from a point of its boundary on along the shortest way out of another [m].
+
+    Args:
+        solid: The body.
+        y: Where its nodes are [m].
+        point: On its boundary, inside the other [m].
+        other: The other body.
+        z: Where its nodes are [m].
+    """
+    aside = 1e-4 * other.edge * np.concatenate([np.eye(3), -np.eye(3)])
+    depth = other.depth(z, point + aside)
+    way = depth[3:] - depth[:3]
+    way /= max(np.linalg.norm(way), np.finfo(float).tiny)
+    middles = y[solid.tets].mean(axis=1)
+    inner = middles[np.linalg.norm(middles - point, axis=1).argmin()]
+    steps = np.linspace(0.0, np.linalg.norm(np.ptp(y, axis=0)), 400)
+    on = solid.inside(y, point + 0.01 * (inner - point) + steps[:, None] * way)
+    return float(steps[on.argmin()])
+
+
 def thickness(solid):
     """Shortest of a body's lengths along its principal axes [m], or a ring's wall.
 
@@ -363,10 +399,9 @@ def thickness(solid):
     edges and diagonals of the cells.
     """
     middle = solid.x - solid.x.mean(axis=0)
-    along = middle @ np.linalg.eigh(middle.T @ middle)[1]
     wall = solid.x[solid.tets].mean(axis=1) - solid.x.mean(axis=0)
     if np.linalg.norm(wall, axis=1).min() <= 0.5 * np.linalg.norm(middle, axis=1).max():
-        return float(np.ptp(along, axis=0).min())
+        return shortest(solid)
     ends = solid.x[np.unique(np.sort(solid.tets[:, PAIRS].reshape(-1, 2), axis=1), axis=0)]
     parts = np.linspace(0.0, 1.0, 41)[1:-1, None, None]
     places = (ends[:, 0] + parts * (ends[:, 1] - ends[:, 0])).reshape(-1, 3)

@@ -48,6 +48,9 @@ class Body:
             all ranks; None: the size of the positions.
         allow_inversion: Whether steps are accepted that end with `smallest_det` <= 0.
         has_massless: Whether coordinates on any rank have no mass.
+        law: W as a function of Green's strain in UFL; None: it has no material.
+        made_on: Places of its mesh's nodes when it was made, see `places_of`; None without a mesh.
+        stressed: Stress of the undeformed body over its stiffness, once it is known and too large.
         destroyed: Whether `destroy` was called.
     """
 
@@ -69,6 +72,9 @@ class Body:
     rounded: float | None = None
     allow_inversion: bool = False
     has_massless: bool = False
+    law: Any = None
+    made_on: Any = None
+    stressed: float | None = None
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None
 
@@ -140,8 +146,7 @@ class Body:
 
     def last_accepted(self) -> tuple[FloatArray, FloatArray]:
         """Owned u [m] and v [m/s] of the last accepted state, or of the start."""
-        known = getattr(self, "_accepted", None)
-        return known or (self.initial_displacement, self.initial_velocity)
+        return self._accepted or (self.initial_displacement, self.initial_velocity)
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of the sum of the places' momenta [kg m/s], shape (3,)."""

@@ -136,7 +136,7 @@ class Continuum(UflBody):
         (self._load_form,) = self._set_forms(self._energy() * self._dx, load)
         self._assembled_loads = np.zeros(3 * len(self._loads))
         self._seen_at_rest = False
-        self.stressed: float | None = None
+        self.stressed = None
 
     # ---- set-up
     def _boundary_measure(self, degree: int) -> Any:

@@ -21,6 +21,7 @@ from dolfinx_nts.bodies.hull import Hull
 from dolfinx_nts.bodies.mesh_check import places_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.node_conditions import NodeConditions
+from dolfinx_nts.bodies.pressure import Pressure, Pressures
 from dolfinx_nts.bodies.skeleton import Skeleton
 from dolfinx_nts.contact.surfaces import Skin, Surface, in_order
 from dolfinx_nts.evaluation import Moment
@@ -87,7 +88,7 @@ class DirectorBody(Body):
         length: float,
         masses: FloatArray,
         bcs: Sequence[Clamp | Dirichlet],
-        forces: Sequence[Load],
+        forces: Sequence[Load | Pressure],
         velocity: Any,
         spin: FloatArray,
     ) -> None:
@@ -110,6 +111,9 @@ class DirectorBody(Body):
             self.comm, skeleton, self._here, bcs, forces, self.kind, self.name
         )
         self.fixed, self.driven = self._conditions.fixed, self._conditions.driven
+        self._pressures = Pressures(
+            self.comm, skeleton, self._cells, self._conditions.pressures, self.name
+        )
         self._set_up_velocity(velocity, spin)
         held = self._first + self._conditions.free_directors
         along = np.empty_like(skeleton.order)
@@ -338,6 +342,7 @@ class DirectorBody(Body):
         self._u0, self._y0 = moment.u0, self._vectors(moment.u0)
         self._theta, self._held_at = rule.taken_at, rule.theta
         self._load, self._couple = self._conditions.loads(moment.time, moment.ramp)
+        self._pressures.begin(moment.time, moment.ramp)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -369,6 +374,11 @@ class DirectorBody(Body):
             y = self.reference + self._u0 + self._held_at * (u1 - self._u0)
             pushed = np.matmul(self._of_turned(y), -self._turning)
             f[turned, 3:] += pushed.reshape(len(turned), self._width - 3)
+        if self._pressures:
+            on_cells = np.zeros((len(self._nodes), self._corners, 3))
+            x0, x1 = self._y0[:, ::2], self._vectors(u1)[:, ::2]
+            on_cells[:, ::2] = self._pressures.forces(x0, x1, self._theta)
+            f += self._gather(on_cells).reshape(f.shape)
         return f.ravel()
 
     def _of_turned(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -398,6 +408,10 @@ class DirectorBody(Body):
         if stiffness:
             y1 = self._vectors(u1)
             values += stiffness * kernel.tangent(self._elements, self._y0, y1, self._theta)
+            if self._pressures:
+                pushed = self._pressures.tangent(self._y0[:, ::2], y1[:, ::2], self._theta)
+                of_places = values.reshape(n, self._corners, 3, self._corners, 3)
+                of_places[:, ::2, :, ::2] -= stiffness * pushed
         if mass:
             inertia = mass * np.einsum("nab,k->nakb", self._shares, self._masses)
             k = self._width // 3

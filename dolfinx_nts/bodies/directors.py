@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.constraints import Constraints, Equations
+from dolfinx_nts.elements import Joint
 
 if TYPE_CHECKING:
     from dolfinx_nts.points import Points
@@ -20,7 +20,7 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 _PAIRS = {3: ((1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (3, 1)), 1: ((1, 1),)}
 
 
-class Directors:
+class Directors(Joint):
     """Keep three directors, or one, of each node orthonormal.
 
     (D_i . D_j - l^2 delta_ij)/(2 l) = 0.
@@ -31,8 +31,6 @@ class Directors:
         length: l [m].
         numbers: Of each node in the body, whatever the ranks, shape (n,).
     """
-
-    losses: tuple[str, ...] = ()
 
     def __init__(self, body: Any, nodes: Points, length: float, numbers: IntArray) -> None:
         self.name, self.bodies, self._side = f"{body.name} directors", (body,), nodes
@@ -46,14 +44,6 @@ class Directors:
             weights[:, k, 1, j] = 1.0
             target[:, k] = 0.5 * length * (i == j)
         self._equations = Equations(weights, np.zeros((n, m, 2, 3)), target)
-
-    def start(self) -> None:
-        """Nothing to remember."""
-        return None
-
-    def potential(self, u: Sequence[FloatArray], history: Any) -> float:
-        """None [J]."""
-        return 0.0
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run; a triad may be solved by its mirror image, one vector not."""

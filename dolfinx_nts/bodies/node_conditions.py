@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.conditions import Dirichlet, Meetings, takes_place
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
+from dolfinx_nts.bodies.pressure import Pressure
 from dolfinx_nts.bodies.skeleton import Skeleton
 from dolfinx_nts.validation import at_points, items, vector_in_time
 
@@ -36,6 +37,7 @@ class NodeConditions:
         driven: Whether one's value is a function of time.
         free_directors: This rank's nodes whose directors are not all prescribed.
         turned: This rank's nodes on which moments act.
+        pressures: Loads on cells by their position among all.
     """
 
     def __init__(
@@ -44,19 +46,24 @@ class NodeConditions:
         skeleton: Skeleton,
         here: slice,
         bcs: Sequence[Clamp | Dirichlet],
-        forces: Sequence[Load],
+        forces: Sequence[Load | Pressure],
         kind: str,
         name: str,
     ) -> None:
         self._comm, self._skeleton, self._here, self._name = comm, skeleton, here, name
         self._width = 3 * (1 + skeleton.directors.shape[1])
         bcs = items("bcs", bcs, lambda b: isinstance(b, Clamp | Dirichlet), "Clamp or Dirichlet")
+        shell = kind == "shell"
         forces = items(
-            "forces", forces, lambda f: isinstance(f, Load),
-            "PointForce, PointMoment, LineForce or LineMoment",
+            "forces", forces, lambda f: isinstance(f, Load | Pressure if shell else Load),
+            f"{'Pressure, ' * shell}PointForce, PointMoment, LineForce or LineMoment",
         )  # fmt: skip
+        self._values_of_loads = [load.value for load in forces]
         self._hold(bcs, kind)
-        self._loads = [self._load(k, load) for k, load in enumerate(forces)]
+        self._loads = [
+            self._load(k, load) for k, load in enumerate(forces) if isinstance(load, Load)
+        ]
+        self.pressures = {k: load for k, load in enumerate(forces) if isinstance(load, Pressure)}
         turning = [weights != 0.0 for load, weights, _ in self._loads if load.turns]
         self.turned: IntArray = np.flatnonzero(np.any(turning, axis=0) if turning else [])
         x = skeleton.x[here]
@@ -67,7 +74,7 @@ class NodeConditions:
     @property
     def settings(self) -> dict[str, Any]:
         """What ranks must have in common, see `Body`."""
-        return {"bcs": self._values, "forces": [load.value for load, _, _ in self._loads]}
+        return {"bcs": self._values, "forces": self._values_of_loads}
 
     def _hold(self, bcs: Sequence[Clamp | Dirichlet], kind: str) -> None:
         owner = np.full((self._here.stop - self._here.start, self._width), -1)

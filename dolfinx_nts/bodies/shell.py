@@ -13,6 +13,7 @@ from dolfinx_nts.bodies.director_body import DirectorBody
 from dolfinx_nts.bodies.hull import SIDES, Hull, of_shell
 from dolfinx_nts.bodies.midsurface import check_midsurface, midsurface_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
+from dolfinx_nts.bodies.pressure import Pressure
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.kernels import shell as kernel
@@ -59,7 +60,7 @@ class Shell(DirectorBody):
         velocity: At the start [m/s], a vector, or a function x (3, n) -> (3, n).
         angular_velocity: At the start, about the centre of mass [rad/s].
         bcs: `Clamp` and `Dirichlet` conditions, whose functions `where` select nodes.
-        forces: `PointForce`, `PointMoment`, `LineForce` and `LineMoment` loads.
+        forces: `Pressure`, `PointForce`, `PointMoment`, `LineForce` and `LineMoment` loads.
         name: Name in messages and files.
 
     Attributes:
@@ -86,7 +87,7 @@ class Shell(DirectorBody):
         velocity: Any = (0.0, 0.0, 0.0),
         angular_velocity: Vector = (0.0, 0.0, 0.0),
         bcs: Sequence[Clamp | Dirichlet] = (),
-        forces: Sequence[Load] = (),
+        forces: Sequence[Load | Pressure] = (),
         name: str = "shell",
     ) -> None:
         require_name("name", name)

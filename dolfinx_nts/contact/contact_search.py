@@ -15,7 +15,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
-from dolfinx_nts.elements import Step
+from dolfinx_nts.elements import Step, StepWarning
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import ContactHistory
@@ -281,46 +281,48 @@ class ContactSearch:
         gaps = [part.gap for part in parts] + self.idle_gaps
         return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
 
-    def warnings(self, parts: Sequence[Contribution]) -> list[tuple[str, float, str]]:
+    def warnings(self, parts: Sequence[Contribution]) -> list[StepWarning]:
         """Nodes that an accepted step leaves beside a surface, or lets slip all the same."""
         return [*self._beside(), *self._slips(parts)]
 
-    def _beside(self) -> Iterator[tuple[str, float, str]]:
+    def _beside(self) -> Iterator[StepWarning]:
         """Nodes that have passed by a surface's edge and lie behind it. Collective."""
         if not self._step.integrator.inertia:
             return  # what a load step passes by is looked for
-        deepest = np.array([depth for depth, _ in self.beside])
-        self._comm.Allreduce(MPI.IN_PLACE, deepest, op=MPI.MAX)
+        deepest = global_max(self._comm, np.array([depth for depth, _ in self.beside]))
         if deepest.max(initial=0.0) <= _BESIDE:
             return
-        k = int(deepest.argmax())
-        depth, node = max(self._comm.allgather(self.beside[k]))
-        yield (
-            "node beside a surface", depth,
-            f"node {node} of contact {self._pairs[k].name!r} has passed the master's edge "
-            f"and lies {depth:.3g} of a facet behind its surface, where nothing holds it; let the "
-            "master's surface reach farther",
-        )  # fmt: skip
+        found = self._comm.allgather(self.beside)
+        for k in np.flatnonzero(deepest > _BESIDE):
+            depth, node = max(of_rank[k] for of_rank in found)
+            name = self._pairs[k].name
+            text = (
+                f"node {node} of contact {name!r} has passed the master's edge and lies {depth:.3g}"
+                " of a facet behind its surface, where nothing holds it; let the master's surface "
+                "reach farther"
+            )
+            yield StepWarning("node beside a surface", float(depth), text, (name,))
 
-    def _slips(self, parts: Sequence[Contribution]) -> Iterator[tuple[str, float, str]]:
+    def _slips(self, parts: Sequence[Contribution]) -> Iterator[StepWarning]:
         """Nodes that slip in spite of infinite friction. Collective.
 
         They may slip in the next step, too, if any does.
         """
         both = zip(self.elements, parts, strict=True)
-        endless = [part for c, part in both if np.isinf(c.pair.friction)]
+        endless = [(c.pair.name, part) for c, part in both if np.isinf(c.pair.friction)]
         if not (endless and self.bounded):
             return
-        slips = [part.distance[part.active & ~part.stick].max(initial=0.0) for part in endless]
-        farthest = float(self._comm.allreduce(max(slips), op=MPI.MAX))
-        self.bounded = farthest > 0.0
-        if self.bounded:
-            yield (
-                "slip", farthest,
-                "nodes would pull if they stuck and would enter the master if they left: in spite "
-                f"of infinite friction they slip, by up to {farthest:.3g} m in a step; a finite "
-                "coefficient may be meant",
-            )  # fmt: skip
+        slips = [part.distance[part.active & ~part.stick].max(initial=0.0) for _, part in endless]
+        farthest = global_max(self._comm, np.array(slips))
+        self.bounded = bool(farthest.max() > 0.0)
+        for (name, _), slip in zip(endless, farthest, strict=True):
+            if slip > 0.0:
+                text = (
+                    f"nodes of contact {name!r} would pull if they stuck and would enter the "
+                    "master if they left: in spite of infinite friction they slip, by up to "
+                    f"{slip:.3g} m in a step; a finite coefficient may be meant"
+                )
+                yield StepWarning("slip", float(slip), text, (name,))
 
     # ---- first guesses, and what else solves a step
     def guess(self, k: int, x: FloatArray) -> FloatArray:

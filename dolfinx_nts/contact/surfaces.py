@@ -8,8 +8,9 @@ positions are gathered when a search needs them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -174,6 +175,8 @@ class Surface:
 
     #: For surfaces of one's own that do not call `__init__`.
     _redundant: Callable[[], bool] | None = None
+    #: What a restart compares beside the facets.
+    settings: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
         self, body: Any, skin: Skin, smoothing: bool = False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,16 +13,9 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations, Upright, rank_of
+from dolfinx_nts.elements import Joint
 from dolfinx_nts.kernels import quadratic
-from dolfinx_nts.validation import (
-    agree,
-    call_together,
-    floats,
-    is_finite,
-    require_name,
-    require_same,
-    vector,
-)
+from dolfinx_nts.validation import require_name, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]
 Times = tuple[float, ...]
@@ -78,7 +72,7 @@ def assemble(products: Sequence[Product], times: int) -> tuple[Equations, FloatA
     return Equations(weights, constants, prescribed[0]), prescribed
 
 
-class Between(ABC):
+class Between(Joint, ABC):
     """A joint between two bodies, or a body and the ground; one element on one rank.
 
     Args:
@@ -96,7 +90,6 @@ class Between(ABC):
         motion: What is prescribed, see `drive`.
     """
 
-    losses: tuple[str, ...] = ()
     motion: Motion | None = None
 
     def __init__(
@@ -116,6 +109,8 @@ class Between(ABC):
             )
         self.bodies = tuple(body for body in (a, b) if body is not None)
         self.comm = self.bodies[0].comm
+        self._here = int(self.comm.rank == rank_of(self.name, self.comm))
+        self.numbers = np.arange(self._here)
         argument, *given = points
         require_same(self.comm, **{argument: given, "name": name})
         places = [vector(argument, x, "m") for x in given]
@@ -173,6 +168,7 @@ class Between(ABC):
             unit: Of its values.
             read: `number_at`, or `at_time` for vectors.
         """
+        self.driven = True
         self.motion = Motion(self.comm, f"{argument} of {self.name!r}", function, unit, read)
 
     @abstractmethod
@@ -220,22 +216,7 @@ class Between(ABC):
 
         return upright
 
-    @property
-    def _here(self) -> int:
-        """Its elements on this rank."""
-        return int(self.comm.rank == rank_of(self.name, self.comm))
-
-    @property
-    def numbers(self) -> npt.NDArray[np.int64]:
-        """Of its elements on this rank."""
-        return np.arange(self._here)
-
-    @property
-    def driven(self) -> bool:
-        """Whether a function of time prescribes its motion."""
-        return self.motion is not None
-
-    @property
+    @cached_property
     def settings(self) -> dict[str, Any]:
         """What a restart compares; of a motion only whether there is one."""
         return {
@@ -360,19 +341,3 @@ class Motion:
     def since_start(self, time: float) -> Any:
         """Its change since t = 0. Collective."""
         return self.at(time) - self.first
-
-
-def number_at(comm: Any, name: str, function: Callable[[float], Any], t: float, unit: str) -> float:
-    """The user's number at a time; what fails on one rank raises on all.
-
-    Raises:
-        UserFunctionError: It raised, or returned anything but the same finite number on all ranks.
-    """
-    name = f"{name} at t={float(t)!r}"
-    value = floats(given := call_together(comm, name, function, t))
-    fits = value.size == 1 and is_finite(value.item())
-    problem = None if fits else f"{name}: returned {given!r}; return a finite number [{unit}]"
-    number = float(value.item()) if fits else 0.0
-    agree(comm, name, np.array([number]), problem)
-    return number
-

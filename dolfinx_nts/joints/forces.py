@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.constraints import rank_of
-from dolfinx_nts.elements import Slopes, Step
+from dolfinx_nts.elements import Joint, Slopes, Step
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
 from dolfinx_nts.point_elements import EveryStep, PointElements
@@ -180,7 +181,7 @@ class SpringElements(PointElements):
         return {self.loses: float(part.work.sum())} if self.loses else {}
 
 
-class Between:
+class Between(Joint):
     """What springs and dampers have in common, see `Joint`.
 
     Args:
@@ -188,7 +189,6 @@ class Between:
         name: In messages and files; None: made of its kind and the bodies' names.
     """
 
-    losses: tuple[str, ...] = ()
     _way: Way
     _force: Force
 
@@ -214,7 +214,7 @@ class Between:
         weights, constants = (np.array(part) for part in zip(*rows, strict=True))
         self._way = Way(coordinate, here, weights, constants)
 
-    @property
+    @cached_property
     def settings(self) -> dict[str, Any]:
         """What a restart compares; of a user's own energy nothing."""
         return self._given | self._force.settings
@@ -225,10 +225,6 @@ class Between:
 
     def _check(self, step: Step) -> None:
         """Raise where its coordinate cannot be followed through a step. Collective."""
-
-    def potential(self, u: Sequence[FloatArray], history: FloatArray) -> float:
-        """None [J]."""
-        return 0.0
 
     def _at(self, u: Sequence[FloatArray], history: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Nodal vectors [m] and the coordinate. Collective."""

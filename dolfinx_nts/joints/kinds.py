@@ -8,6 +8,7 @@ angle only the change since t = 0 counts. Its work is external work.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from dolfinx_nts.joints.between import (
     Product,
     Times,
     direction,
-    number_at,
     triad,
 )
 from dolfinx_nts.validation import (
@@ -28,6 +28,7 @@ from dolfinx_nts.validation import (
     at_time,
     floats,
     known_options,
+    number_at,
     require_positive,
 )
 
@@ -91,7 +92,7 @@ class _WithAxis(Between):
         axes = triad(self.axis)
         (self.m1_a, self.m2_a, self.n_a), (self.m1_b, self.m2_b, self.n_b) = self.directions(axes)
 
-    @property
+    @cached_property
     def settings(self) -> dict[str, Any]:
         """Its axis, too."""
         return super().settings | {"axis": self.axis.tolist()}
@@ -267,7 +268,7 @@ class Universal(Between):
         (self.n_a, _), (_, self.n_b) = self.directions(arms)
         self.arms = arms
 
-    @property
+    @cached_property
     def settings(self) -> dict[str, Any]:
         """Its arms, too."""
         return super().settings | {"axes": self.arms.tolist()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,14 @@ import numpy as np
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.joints.between import FloatArray, named
+from dolfinx_nts.elements import Joint
+from dolfinx_nts.joints.between import named
 from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options
 
 
 @known_options
-class Tie:
+class Tie(Joint):
     """Nodes of a flexible body that move with a rigid one: x_k - (phi + theta_ki d_i) = 0.
 
     Args:
@@ -30,8 +30,6 @@ class Tie:
         TypeError: An argument is of another kind.
         ValueError: The surface is one of a rigid body.
     """
-
-    losses: tuple[str, ...] = ()
 
     def __init__(self, rigid: Any, surface: Any, *, name: str | None = None) -> None:
         if not (isinstance(rigid, Body) and rigid.rigid):
@@ -56,14 +54,6 @@ class Tie:
             "which nodes": zlib.crc32(nodes.tobytes()),
         }
         self._sides: tuple[Points, ...] = (rigid.at_nodes(mine, at), surface.material.part(mine))
-
-    def start(self) -> None:
-        """Nothing to remember."""
-        return None
-
-    def potential(self, u: Sequence[FloatArray], history: Any) -> float:
-        """None [J]."""
-        return 0.0
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run: one element a node, with the three components."""

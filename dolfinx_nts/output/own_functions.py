@@ -53,7 +53,7 @@ def of_body(functions: Sequence[Own], body: Any) -> list[OwnField]:
     for k, given in enumerate(functions):
         function: Any = given
         if not isinstance(given, fem.Function):
-            if not hasattr(body, "law"):
+            if body.law is None:
                 continue
             function = given(body)
         if function.function_space.mesh.ufl_domain() == domain:

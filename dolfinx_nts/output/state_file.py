@@ -1,8 +1,8 @@
 """Files of states, checkpoints and saved runs: HDF5, in numberings that do not depend on the ranks.
 
-Version 4, with h5py's names of types:
+Version 5, with h5py's names of types:
 
-- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (4) and
+- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (5) and
   `package` (the version that wrote it);
 - `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
   to the run, see `dolfinx_nts.run.checkpoint`;
@@ -13,7 +13,7 @@ Version 4, with h5py's names of types:
   ascending, and the fields of `ContactHistory`; further ones of the run;
 - `joints/K/number` and `joints/K/value`, of joint K of `System.joints` that remembers something,
   one row an element;
-- `balance/NAME`, shape (rows, ...): the columns of the balance table;
+- `balance/table`, shape (rows, numbers of a row): the columns of the balance table side by side;
 - `switches/NAME`: the newest changes of facet, see `dolfinx_nts.run.checkpoint`.
 
 Behind the HDF5 part stand "crc32" and the CRC-32 of that part in four bytes, the lowest first. HDF5
@@ -32,6 +32,7 @@ import json
 import os
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,7 @@ _OTHER = {
     CHECKPOINT: "it is no checkpoint; pass the path that Checkpoint had",
     SOLUTION: "it holds no saved run; pass the path that Solution.save had",
 }
-_VERSION = 4
+_VERSION = 5
 #: What stands between the HDF5 part and its checksum.
 _MARK = b"crc32"
 #: Part of masses and of a body's size by which the same scene may differ on other ranks.
@@ -92,8 +93,7 @@ def describe(system: System) -> dict[str, Any]:
 
 def _settings(item: Any) -> dict[str, Any]:
     """`settings` of a joint or an obstacle, as they come back from JSON; functions are None."""
-    given = getattr(item, "settings", {})
-    text = json.dumps(given, default=lambda a: a.tolist() if hasattr(a, "tolist") else None)
+    text = json.dumps(item.settings, default=lambda a: a.tolist() if hasattr(a, "tolist") else None)
     found: dict[str, Any] = json.loads(text)
     return found
 
@@ -295,7 +295,7 @@ class Numbering:
 
 
 def _misfit(joint: Any, value: Any) -> str | None:
-    if value is None or (isinstance(value, np.ndarray) and hasattr(joint, "numbers")):
+    if value is None or (isinstance(value, np.ndarray) and joint.numbers is not None):
         return None
     return (
         f"joint {joint.name!r} remembers a {type(value).__name__}; a checkpoint takes an array "
@@ -339,16 +339,22 @@ def image(kind: str, tables: Tables, notes: Mapping[str, Any]) -> bytes:
     """Content of a file."""
     import h5py
 
-    found = io.BytesIO()
-    with h5py.File(found, "w") as file:
-        package = version("dolfinx_nts")
-        file.attrs.update(format=f"dolfinx_nts {kind}", version=_VERSION, package=package)
+    # In memory, whatever its name.
+    with h5py.File(kind, "w", driver="core", backing_store=False) as file:
+        file.attrs.update(format=f"dolfinx_nts {kind}", version=_VERSION, package=_package())
         # Numbers may be NumPy's.
         file["notes"] = json.dumps(notes, default=lambda number: number.item())
         for place, values in tables.items():
             file[place] = values
-    data = found.getvalue()
+        file.flush()
+        data: bytes = file.id.get_file_image()
     return data + _MARK + zlib.crc32(data).to_bytes(4, "little")
+
+
+@cache
+def _package() -> str:
+    """Version of this package, which takes a look at the disk."""
+    return version("dolfinx_nts")
 
 
 def write(path: Path, tables: Tables, notes: Mapping[str, Any]) -> None:

@@ -2,7 +2,8 @@
 
 The file is described in `dolfinx_nts.output.state_file`; of its `notes` the run has
 
-- `status` and `settings`, see `Record`; `columns`, the names of `balance` in their order;
+- `status` and `settings`, see `Record`; `columns`, the names of those of the balance table in their
+  order, and the shape of each in a row;
 - `counts`: retries, rejected, exceeded, see `Record`;
 - `warnings`: the fields of each `RunWarning`;
 - `switches`: number, defect, size and worst of `Switches`; the newest are in `switches/time`,
@@ -14,7 +15,10 @@ The file is described in `dolfinx_nts.output.state_file`; of its `notes` the run
 - `measured`: of each body, diagonals of its matrix and factors, from which rounding is judged;
 - `pace`: what `Adapt` remembers, see `PaceMemory`, but its accelerations, which are
   `bodies/K/acceleration`; or null;
-- `recent`: lengths of the last two steps [s].
+- `recent`: lengths of the last two steps [s];
+- `solver`: the preset of the linear solver in use, the steps for which it still is, MUMPS's
+  workspace by preset where it is not the first, and whether constraints of joints repeat each other
+  (null: not known yet), see `StepSolver.memory`.
 
 Further arrays of contact K are `unknowns`, whether a node had unknowns in the last step, and
 `force_before` p_N [N] of the step before, if there was one.
@@ -41,7 +45,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 #: Notes that are the stepper's.
-_MEMORY = ("last", "promised", "bounded", "measured", "recent")
+_MEMORY = ("last", "promised", "bounded", "measured", "recent", "solver")
 #: Differences that the refusal of a checkpoint names.
 _NAMED = 5
 

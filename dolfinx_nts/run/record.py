@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -154,7 +155,10 @@ class Record:
         """Arrays and notes of a file from which `unpacked` makes the fields of a record."""
         newest, switches = list(self.switches), self.switches
         names = list(dict.fromkeys(s.contact for s in newest))
-        found: Tables = {f"balance/{name}": column for name, column in self.rows.columns.items()}
+        columns = self.rows.columns
+        # One array: making a place in a file takes longer than writing a short column.
+        flat = [column.reshape(len(column), -1) for column in columns.values()]
+        found: Tables = {"balance/table": np.hstack(flat)}
         found["switches/time"] = np.array([s.time for s in newest])
         found["switches/contact"] = np.array([names.index(s.contact) for s in newest], dtype=int)
         found["switches/node"] = np.array([s.node for s in newest], dtype=int)
@@ -163,7 +167,7 @@ class Record:
         return found, {
             "status": self.status,
             "settings": self.settings,
-            "columns": list(self.rows.columns),
+            "columns": {name: column.shape[1:] for name, column in columns.items()},
             "counts": [getattr(self, name) for name in _COUNTS],
             "warnings": [asdict(w) for w in self.warnings.every],
             "switches": [switches.number, switches.defect, switches.size, switches.worst],
@@ -173,7 +177,13 @@ class Record:
 
 def unpacked(tables: Mapping[str, npt.NDArray[Any]], notes: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a record from what `Record.packed` has made, by name."""
-    columns = {name: tables[f"balance/{name}"] for name in notes["columns"]}
+    table, shapes = tables["balance/table"], notes["columns"]
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
+    flat = np.split(table, ends[:-1], axis=1)
+    columns = {
+        name: values.reshape(len(table), *shape)
+        for (name, shape), values in zip(shapes.items(), flat, strict=True)
+    }
     parts = (tables[f"switches/{name}"].tolist() for name in _OF_SWITCHES)
     switches = Switches()
     switches.extend(

@@ -29,9 +29,9 @@ def _scene(system: System) -> dict[str, Any]:
         found[f"friction of contacts[{number}]"] = pair.friction
         surfaces: Mapping[str, Any] = {"slave": pair.slave, "master": pair.master}
         for role, surface in surfaces.items():
-            for name, value in getattr(surface, "settings", {}).items():
+            for name, value in surface.settings.items():
                 found[f"{name} of the {role} of contacts[{number}]"] = value
     for item in (*system.bodies, *system.joints):
-        for name, value in getattr(item, "settings", {}).items():
+        for name, value in item.settings.items():
             found[f"{name} of {item.name!r}"] = value
     return found

@@ -83,7 +83,7 @@ def refuse_moved_meshes(system: System) -> None:
         system: Its bodies.
     """
     for body in system.bodies:
-        made = getattr(body, "made_on", None)
+        made = body.made_on
         moved = made is not None and made != places_of(body.mesh)
         text = (
             f"mesh of {body.name!r}: its nodes were moved after the body was made; move them "
@@ -121,7 +121,7 @@ def refuse_moved(system: System) -> None:
                 "or let a heavy rigid body take its place"
             )
     for joint in system.joints:
-        if getattr(joint, "driven", False):
+        if joint.driven:
             raise ValueError(
                 f"impact='restored': joint {joint.name!r} is driven; use impact='published'"
             )

@@ -59,8 +59,8 @@ def tell_couplings(
 ) -> None:
     """Warn of what contacts and joints tell. Collective; arguments as of `tell_step`."""
     for coupling, parts in problem.each(step):
-        for kind, size, text in coupling.warnings(parts):
-            solution.warn(kind, state.time, size, text)
+        for found in coupling.warnings(parts):
+            solution.warn(found.kind, state.time, found.size, found.text, about=found.about)
 
 
 def tell_stressed(solution: Solution, time: float) -> None:
@@ -70,7 +70,7 @@ def tell_stressed(solution: Solution, time: float) -> None:
         solution: The run.
         time: When [s].
     """
-    sizes = {body.name: getattr(body, "stressed", None) for body in solution.system.bodies}
+    sizes = {body.name: body.stressed for body in solution.system.bodies}
     found = {name: size for name, size in sizes.items() if size is not None}
     if not found or "stress at rest" in solution.warnings:
         return

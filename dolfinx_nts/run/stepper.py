@@ -189,7 +189,7 @@ class Stepper:
 
         last: start and length of the last step [s], or None; promised: see `Promises.memory`;
         bounded: whether nodes that infinite friction holds may slip; measured: see `Rounding`;
-        recent: lengths of the last two steps [s].
+        recent: lengths of the last two steps [s]; solver: see `StepSolver.memory`.
         """
         return {
             "last": self._last_steps.last,
@@ -197,6 +197,7 @@ class Stepper:
             "bounded": self.problem.contacts.bounded,
             "measured": self.problem.rounding.measured,
             "recent": self._last_steps.lengths,
+            "solver": self.solver.memory,
         }
 
     @property
@@ -217,6 +218,7 @@ class Stepper:
         self.problem.contacts.resume(nodal["unknowns"], memory["bounded"])
         self._promises.resume(memory["promised"])
         self.problem.rounding.measured = memory["measured"]
+        self.solver.resume(memory["solver"])
         if self._last_steps.last is not None:
             begin, length = self._last_steps.last
             self._call_before(length, begin)

@@ -28,7 +28,7 @@ class Newton:
             fifth. Incomplete factors weaken as dt grows beyond the time a wave needs through an
             element, multigrid near incompressibility.
             "auto" starts with "krylov", except below 600 coordinates (100 where no contact is
-            declared), in statics with "multigrid", except below 5,000 (20,000 beside rigid bodies,
+            declared), in statics with "multigrid", except below 10,000 (20,000 beside rigid bodies,
             beams or shells), and with MUMPS where `petsc_options` has others than those of SNES;
             after a solve that needed more iterations than MUMPS is worth it takes MUMPS for some
             steps. Where MUMPS fails, it leaves out equations that repeat others for some steps.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,16 +24,17 @@ _SECOND = "dolfinx_nts_second"
 SOLVERS = ("auto", "direct", "krylov", "multigrid")
 #: Those that MUMPS may take over from.
 ITERATIVE = ("krylov", "multigrid")
+#: MUMPS's option for workspace beyond what it guesses [%].
+WORKSPACE = "mat_mumps_icntl_14"
 #: Presets; a user's `petsc_options` override them one by one.
 PRESETS: dict[str, dict[str, Any]] = {
-    # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses, most on
-    # thin bodies, whose nodes have about as many constraints as coordinates where they touch.
+    # LU of the converted AIJ; indefinite pivoting needs more workspace than MUMPS guesses.
     "direct": {
         "snes_linesearch_type": "basic",
         "ksp_type": "preonly",
         "pc_type": "lu",
         "pc_factor_mat_solver_type": "mumps",
-        "mat_mumps_icntl_14": 300,
+        WORKSPACE: 80,
     },
     # In dynamics mass dominates the bodies' M + h^2/2 K: incomplete factors are good. "selfp" is
     # replaced by `SchurApproximation`, but for a user who asks for it, and where options are
@@ -115,8 +117,9 @@ PRESETS |= {
 #: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
 #: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.
 _FEW = (100, 600)
-#: The same of "multigrid" without inertia, for continua alone and beside other bodies.
-_FEW_STATIC = (5_000, 20_000)
+#: The same of "multigrid" without inertia, for continua alone and beside other bodies; of thin ones
+#: MUMPS has less work than of the cubes that break even at 4,000.
+_FEW_STATIC = (10_000, 20_000)
 #: Iterations of each for 1e3 coordinates that take as long as MUMPS, and how they grow.
 _WORTH = {"krylov": (60, 0.4), "multigrid": (10, 0.5)}
 
@@ -171,6 +174,7 @@ class SolverOptions:
         condense: Whether the augmented unknowns are condensed.
         given: The user's options without prefix; they override the preset.
         limit: Krylov iterations of a solve that are one too many, the preset's if None.
+        workspace: MUMPS's beyond its guess [%], in place of the preset's and of the user's.
     """
 
     def __init__(
@@ -180,6 +184,7 @@ class SolverOptions:
         condense: bool,
         given: Mapping[str, Any],
         limit: int | None = None,
+        workspace: int | None = None,
     ) -> None:
         self._comm, self._given = comm, dict(given)
         known = dict(PRESETS[preset])
@@ -187,14 +192,20 @@ class SolverOptions:
             known |= _PARTS
         if limit is not None:
             known["ksp_max_it"] = limit
+        if workspace is not None:
+            known[WORKSPACE] = workspace
+            self._given.pop(WORKSPACE, None)
         if condense and preset in _CONDENSED:
             known = {k: v for k, v in known.items() if not k.startswith(_CONSTRAINTS + _FACTORS)}
             known |= _CONDENSED[preset]
         self._preset = known
-        self._all = {**known, **given}
+        self._all = {**known, **self._given}
         self.augmented = preset == "multigrid" and self.split
-        self._unchecked = set(given)
+        self._unchecked = set(self._given)
         self._entered: dict[str, str] = {}
+        # Of a run that nobody closed they are removed, too: PETSc would complain when it ends of
+        # those that a linear solver would have asked for that had nothing to solve.
+        weakref.finalize(self, _remove, self._entered)
 
     @property
     def schur(self) -> bool:
@@ -337,10 +348,14 @@ class SolverOptions:
 
     def remove(self) -> None:
         """Take the options out of PETSc's global database."""
-        database = PETSc.Options()
-        for key in self._entered:
-            database.delValue(key)
-        self._entered.clear()
+        _remove(self._entered)
+
+
+def _remove(entered: dict[str, str]) -> None:
+    database = PETSc.Options()
+    for key in entered:
+        database.delValue(key)
+    entered.clear()
 
 
 def _split(snes: Any, *parts: tuple[str, Any]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -79,6 +79,19 @@ class StepSolver:
         self._augmented: AugmentedMatrix | None = None
         self.snes: Any = None
 
+    @property
+    def memory(self) -> tuple[Any, ...]:
+        """What the next step takes from those before it, for a run that goes on.
+
+        Of `Presets`, and whether constraints of joints repeat each other, as the first step found.
+        """
+        return *self._presets.memory, self._independent
+
+    def resume(self, memory: Sequence[Any]) -> None:
+        """Go on from another run's memory, before the first step."""
+        *of_presets, self._independent = memory
+        self._presets.resume(of_presets)
+
     def solve(self) -> Evaluation:
         """Solve the step that `problem.begin` fixed.
 
@@ -126,8 +139,8 @@ class StepSolver:
                 if self._raised is not None:
                     # Newer versions of petsc4py put an error of their own in its place.
                     raise self._raised from error
-                if self._presets.has_next:
-                    return self._attempt_otherwise(iterations)
+                if (preset := self._presets.alternative()) is not None:
+                    return self._attempt_otherwise(preset, iterations)
                 state = self.problem.state
                 raise StepFailedError(
                     f"step from t={state.time:.6g} with dt={self.problem.dt:.3g}: PETSc stopped "
@@ -145,8 +158,8 @@ class StepSolver:
                     return replace(last, iterations=iterations, min_det=float(dets.min()))
                 reason = PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN
             unsolved = reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
-            if unsolved and self._presets.has_next:
-                return self._attempt_otherwise(iterations)
+            if unsolved and (preset := self._presets.alternative(self.snes)) is not None:
+                return self._attempt_otherwise(preset, iterations)
         self._tangents.due = True
         failure = self._failure(last, reason, iterations)
         if unsolved:
@@ -170,13 +183,20 @@ class StepSolver:
         # An element of the user's own may have a compliance.
         return replace(e, min_det=solved.min_det) if self._worst(e) <= 1.0 else solved
 
-    def _attempt_otherwise(self, iterations: int) -> Evaluation:
-        """Solve the step with the next preset, after the linear solver failed or took too long."""
+    def _attempt_otherwise(self, preset: int, iterations: int) -> Evaluation:
+        """Solve the step anew, after the linear solver failed or took too long.
+
+        Args:
+            preset: Number of what is to solve it, see `Presets.alternative`.
+            iterations: Iterations that were in vain.
+        """
         self._tangents.due = True
         self.destroy()
-        self._presets.use_next()
-        name, time = self._presets.name, self.problem.state.time
-        logger.info("t=%.6g: linear solver %r for the next steps", time, name)
+        before = self._presets.name
+        self._presets.use(preset)
+        if self._presets.name != before:
+            name, time = self._presets.name, self.problem.state.time
+            logger.info("t=%.6g: linear solver %r for the next steps", time, name)
         self.problem.guess(flight=True)
         last = self._attempt()
         return replace(last, iterations=iterations + last.iterations)

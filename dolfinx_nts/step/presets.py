@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from petsc4py import PETSc
@@ -23,14 +23,19 @@ _KEPT = 1e-3
 _LAST = 1e5
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
-#: What MUMPS says in INFOG(1) where it or the machine has not the memory that it needs.
-_NO_MEMORY = (-5, -7, -8, -9, -11, -13, -14, -19, -20)
+#: What MUMPS says in INFOG(1) where more pivots were put off than it has workspace for ...
+_NO_WORKSPACE = (-8, -9, -17, -20)
+#: ... and where it or the machine has not the memory that it needs.
+_NO_MEMORY = (*_NO_WORKSPACE, -5, -7, -11, -13, -14, -19)
+#: Workspace beyond MUMPS's guess [%] that it gets then, where another preset is left to try and
+#: where none is. Thin bodies need it, whose nodes have about as many constraints as coordinates.
+_WORKSPACE = {True: 400, False: 2000}
 
 
-def _mumps_lacks_memory(pc: Any) -> bool:
-    """Whether a factorisation by MUMPS failed for want of memory, the same on all ranks."""
+def _mumps_factors(pc: Any) -> Any:
+    """Matrix of MUMPS's factors, whose INFOG(1) is the same on all ranks; None of others."""
     factors = pc.getType() in ("lu", "cholesky") and pc.getFactorSolverType() == "mumps"
-    return factors and pc.getFactorMatrix().getMumpsInfog(1) in _NO_MEMORY
+    return pc.getFactorMatrix() if factors else None
 
 
 class Presets:
@@ -59,6 +64,7 @@ class Presets:
     ) -> None:
         self._system, self._newton, self._given = system, newton, given
         self._condense, self._patience = condense, 0
+        self._workspace: dict[str, int] = {}
         mumps: tuple[str, ...] = ("direct", "null-pivots")
         if any(pair.redundant for pair in system.contacts):
             mumps = ("redundant", "null-pivots")
@@ -76,9 +82,16 @@ class Presets:
         return self._names[self._chosen]
 
     @property
-    def has_next(self) -> bool:
-        """Whether another preset may take over now."""
-        return self._chosen < len(self._names) - 1
+    def memory(self) -> tuple[str, int, dict[str, int]]:
+        """For a run that goes on: the preset in use, for how many more steps, and workspaces."""
+        return self.name, self._patience, self._workspace
+
+    def resume(self, memory: Sequence[Any]) -> None:
+        """Go on from another run's memory, unless this run has no such preset."""
+        name, patience, workspace = memory
+        if name in self._names:
+            self._patience, self._workspace = patience, dict(workspace)
+            self.use(self._names.index(name))
 
     def first_is_due(self) -> bool:
         """Count a step; tells whether another than the first preset was in use for long enough."""
@@ -90,14 +103,30 @@ class Presets:
         self._chosen = chosen
         weighed = self.name in ITERATIVE and self._newton.linear_solver == "auto"
         limit = most_iterations(self.name, self._system.size) if weighed else None
+        workspace = self._workspace.get(self.name)
         self.options = SolverOptions(
-            self._system.comm, self.name, self._condense, self._given, limit
+            self._system.comm, self.name, self._condense, self._given, limit, workspace
         )
 
-    def use_next(self) -> None:
-        """Change to the preset that takes over."""
+    def alternative(self, snes: Any = None) -> int | None:
+        """Number of the preset that takes over where a linear solve failed, None if none does.
+
+        It is the one in use where MUMPS may try again with more workspace, which it then gets.
+
+        Args:
+            snes: The SNES that failed, None if it is of no use any more.
+        """
+        follows = self._chosen < len(self._names) - 1
+        factors = None if snes is None else _mumps_factors(snes.getKSP().getPC())
+        if factors is not None and factors.getMumpsInfog(1) in _NO_WORKSPACE:
+            had = factors.getMumpsIcntl(14)
+            if had < _WORKSPACE[follows]:
+                self._workspace[self.name] = min(max(5 * had, 400), _WORKSPACE[follows])
+                return self._chosen
+        if not follows:
+            return None
         self._patience = _PATIENCE
-        self.use(self._chosen + 1)
+        return self._chosen + 1
 
     def aim(self, snes: Any, worst: float, adds_up: Callable[[], bool]) -> None:
         """Let the Krylov solver of "krylov" and "multigrid" go as far as is worth it at an iterate.
@@ -129,7 +158,8 @@ class Presets:
         ksp = snes.getKSP()
         why = f"the linear solver {self.name!r} failed, KSP reason {ksp.getConvergedReason()}"
         why += self.with_options
-        advises = _mumps_lacks_memory(ksp.getPC())
+        factors = _mumps_factors(ksp.getPC())
+        advises = factors is not None and factors.getMumpsInfog(1) in _NO_MEMORY
         if advises:
             why += (
                 "; MUMPS did not get the memory for its factors: use more ranks or memory, "

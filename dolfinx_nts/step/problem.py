@@ -105,19 +105,20 @@ class StepProblem:
     def _lend_less(self) -> None:
         """Lend no compliance to joints of rigid bodies that form no loop. Collective."""
         system = self.system
-        found: list[tuple[Any, tuple[int, ...]]] = []
+        found: list[tuple[JointCoupling | None, tuple[int, ...]]] = []
         of = zip(system.declared_joints, self.joints, system.joint_bodies, strict=False)
         for joint, coupling, bodies in of:
-            if hasattr(joint, "slopes"):  # a spring holds nothing
+            still = [np.zeros(body.num_owned) for body in joint.bodies]
+            if joint.slopes(still, joint.start()) is not None:  # a spring holds nothing
                 continue
             rigid = all(body.rigid for body in joint.bodies)
-            found.append((getattr(coupling, "hold_alone", None) if rigid else None, bodies))
+            found.append((coupling if rigid else None, bodies))
         moved = system.comm.allreduce(np.array([b.fixed.size for b in system.bodies]))
         free = {k for k, b in enumerate(system.bodies) if b.rigid and not moved[k]}
         alone = hanging([bodies for _, bodies in found], free)
-        for (hold_alone, _), hangs in zip(found, alone, strict=True):
-            if hold_alone is not None and hangs:
-                hold_alone()
+        for (rigid_ones, _), hangs in zip(found, alone, strict=True):
+            if rigid_ones is not None and hangs:
+                rigid_ones.hold_alone()
 
     # ---- set-up of a step
     def begin(

@@ -87,13 +87,11 @@ def _of_joint(
     """Of a joint on its first body, whose number is given, on this rank. Collective.
 
     Returns:
-        As of `Elements.resultant`, shape (4, 3); NaN if its elements have none.
+        As of `Elements.resultant`, shape (4, 3).
     """
     out = np.zeros((4, 3))
     u = problem.state.u[first] + problem.integrator.theta * step.bodies[first].du
     for batch, of, part in zip(coupling.elements, coupling.bodies, parts, strict=True):
-        if not hasattr(batch, "resultant"):
-            return np.full((4, 3), np.nan)
         if first in of:
             out += batch.resultant(part, of.index(first), u)
     return out

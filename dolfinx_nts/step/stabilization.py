@@ -60,11 +60,11 @@ class Stabilization:
         """Of all springs in the mean, as they are in the reference [N/m]. Collective."""
         found, comm = [], self._system.comm
         for joint in self._system.joints:
-            if hasattr(joint, "slopes"):
-                still = [np.zeros(body.num_owned) for body in joint.bodies]
-                gradients, stiffness, *_ = joint.slopes(still, joint.start())
-                slope = comm.allgather(max(np.abs(g).max(initial=0.0) for g in gradients))
-                found.append(abs(stiffness) * max(slope) ** 2)
+            still = [np.zeros(body.num_owned) for body in joint.bodies]
+            slopes = joint.slopes(still, joint.start())
+            if slopes is not None:
+                own = max(np.abs(g).max(initial=0.0) for g in slopes.gradients)
+                found.append(abs(slopes.stiffness) * max(comm.allgather(own)) ** 2)
         found = [stiffness for stiffness in found if stiffness]
         return float(np.mean(found)) if found else 0.0
 

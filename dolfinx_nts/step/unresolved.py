@@ -54,12 +54,14 @@ def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[floa
     Returns:
         How many times it is too fast, and a sentence with a remedy.
     """
-    if not any(hasattr(joint, "slopes") for joint in problem.system.joints):
+    each = zip(problem.system.joints, problem.system.joint_bodies, state.joints, strict=True)
+    slopes = [joint.slopes([state.u[k] for k in of], history) for joint, of, history in each]
+    if not any(slopes):
         return None
     still = tuple(np.zeros_like(v) for v in state.v)
     problem.begin(replace(state, a=state.a or still), dt)
     worst, text = 1.0, ""
-    for fast in sorted(_suspects(problem, state, dt), key=lambda f: f.limit, reverse=True):
+    for fast in sorted(_suspects(problem, slopes, dt), key=lambda f: f.limit, reverse=True):
         # Joints hold bodies, so that the mass is at least that of the limit.
         if fast.limit <= worst:
             break
@@ -70,17 +72,17 @@ def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[floa
     return (worst, text) if text else None
 
 
-def _suspects(problem: StepProblem, state: State, dt: float) -> list[_Fast]:
+def _suspects(
+    problem: StepProblem, of_joints: Iterable[Slopes | None], dt: float
+) -> list[_Fast]:
     """Springs and dampers that would be too fast if no constraint held the bodies. Collective."""
     found, system = [], problem.system
-    joints = zip(system.joints, system.joint_bodies, state.joints, strict=True)
-    for joint, bodies, history in joints:
-        if not hasattr(joint, "slopes"):
+    for joint, bodies, slopes in zip(
+        system.joints, system.joint_bodies, of_joints, strict=True
+    ):
+        if slopes is None or not all(system.bodies[k].rigid for k in _joined(problem, bodies)):
             continue
-        if not all(system.bodies[k].rigid for k in _joined(problem, bodies)):
-            continue
-        slopes = joint.slopes([state.u[k] for k in bodies], history)
-        gradient = [np.zeros_like(u) for u in state.u]
+        gradient = [np.zeros(body.num_owned) for body in system.bodies]
         mobility = 0.0
         for k, g in zip(bodies, slopes.gradients, strict=True):
             gradient[k] = g
