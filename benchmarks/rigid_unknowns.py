@@ -8,10 +8,10 @@ Printed are how far both solutions differ, and CPU times over that of a whole st
 solves (MUMPS, analysis kept), of the projection, which the reduced form needs in addition, of the
 matrices' assembly, and of the directors' elements, which it could leave out.
 
-Measured for 100 bodies (three runs, beside other jobs): same motion to 2e-16; of a step the linear
-solves take 6 to 10 %, 3 to 5 % reduced; the projection 3 to 4 %; the directors' elements 8 to 15 %,
-and a part of the assembly's 15 to 30 % is theirs. So six unknowns would save less than a fifth of a
-step: most of it is Python around elements of one body each, which rotations would need alike. They
+Measured for 100 bodies (three runs, beside other jobs): same motion to 2e-16; of a step of 70 ms the
+linear solves take 15 %, 6 to 7 % reduced; the projection 5 to 6 %; the directors' elements 4 %, and
+a part of the assembly's 2 % is theirs. So six unknowns would save less than a tenth of a step: most
+of it is Python around bodies and elements one by one, which rotations would need alike. They
 would cost a second kind of body, whose points are not linear in its unknowns. They are not built.
 
     python benchmarks/rigid_unknowns.py [--bodies 10 100 400]
@@ -31,6 +31,7 @@ from scipy.sparse import bmat, bsr_matrix, csr_matrix
 from scipy.sparse.linalg import spsolve
 
 import dolfinx_nts as nts
+from dolfinx_nts.elements import evaluate_together
 
 STEP = 5e-3
 
@@ -132,16 +133,15 @@ def measure(bodies: int) -> None:
     differ = np.abs(found - known[:n]).max() / np.abs(known[:n]).max()
 
     elements = [c for c in problem.elements if "directors" in c.name]
-    evaluated = [
-        (c, c.reference(), {"constraints": np.zeros((c.num_elements, 6))}) for c in elements
-    ]
+    places = [c.reference() for c in elements]
+    unknowns = [{"constraints": np.zeros((c.num_elements, 6))} for c in elements]
     parts = {
         "linear solves": iterations * cost(lambda: full.solve(right)),
         "reduced": iterations * cost(lambda: less.solve(right_small)),
         "projection": iterations * cost(project),
         "assembly of all matrices": iterations * cost(lambda: solver.assemble(e)),
         "directors' elements": (iterations + 1)
-        * cost(lambda: [c.evaluate(*at) for c, *at in evaluated]),
+        * cost(lambda: evaluate_together(problem.system.comm, elements, places, unknowns)),
     }
     print(
         f"{bodies} bodies: {a.shape[0]} unknowns and {a.nnz} entries, {small.shape[0]} and "

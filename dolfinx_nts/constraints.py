@@ -161,41 +161,43 @@ class ConstraintElements(PointElements):
         return kernel.factors(weights, constants, self.y0)
 
     @cached_property
-    def _is_curved(self) -> bool:
-        """Whether any constraint is quadratic."""
-        return bool(self.curvature.any())
-
-    @cached_property
     def _bent(self) -> FloatArray:
         """Largest curvature of each constraint [1/m], shape (n, m)."""
-        bent: FloatArray = np.abs(self.curvature).max(axis=(2, 3), initial=0.0)
-        return bent
+        return _bent(self.curvature)
+
+    @property
+    def alike(self) -> tuple[Any, ...]:
+        """What batches have in common that are evaluated as one, see `evaluate_together`."""
+        return (self.theta, *self.equations.weights.shape[1:])
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> ConstraintPart:
         """Residual and tangent; the multipliers' unknowns are lengths, factor lambda / scale."""
-        weights, constants, _ = self.equations
-        n, m, _, k = weights.shape
-        scale, last = self.scale, 3 * k
-        multiplier = scale * own["constraints"]
-        end = kernel.factors(weights, constants, x)
-        middle = self._start + self.theta * (end - self._start)
-        force = kernel.gradient(weights, middle).reshape(n, m, last)
-        gap = kernel.value(end) - self.prescribed[1]
-        residual = np.empty((n, last + m))
-        residual[:, :last] = np.matmul(multiplier[:, None], force)[:, 0]
-        residual[:, last:] = scale * gap
-        tangent = np.zeros((n, last + m, last + m))
-        if self._is_curved:
-            bend = np.matmul(self.theta * multiplier[:, None], self.curvature.reshape(n, m, k * k))
-            stiffness = bend.reshape(n, k, k)
-            for i in range(3):
-                tangent[:, i:last:3, i:last:3] = stiffness
-        tangent[:, :last, last:] = (scale * force).transpose(0, 2, 1)
-        tangent[:, last:, :last] = scale * kernel.gradient(weights, end).reshape(n, m, last)
-        if self.lent:
-            rows = np.arange(last, last + m)
-            tangent[:, rows, rows] = -scale * (self.lent + np.abs(gap) * self._bent)
-        return ConstraintPart(residual, tangent, multiplier, gap, x)
+        (part,) = self.evaluate_alike([self], [x], [own])
+        return part
+
+    @staticmethod
+    def evaluate_alike(
+        batches: Sequence[ConstraintElements],
+        places: Sequence[FloatArray],
+        own: Sequence[Mapping[str, FloatArray]],
+    ) -> list[ConstraintPart]:
+        """`evaluate` of batches that are `alike`, at once: most have a single element."""
+        first, counts = batches[0], [batch.num_elements for batch in batches]
+        each = [
+            (*b.equations[:2], b.curvature, b.prescribed[1], b.y0, x, y["constraints"])
+            for b, x, y in zip(batches, places, own, strict=True)
+        ]
+        known = (first._start, first._bent) if len(each) == 1 else (None, None)
+        joined = map(np.concatenate, zip(*each, strict=True)) if len(each) > 1 else each[0]
+        scale, lent = (
+            np.repeat([getattr(b, name) for b in batches], counts) for name in ("scale", "lent")
+        )
+        whole = _evaluate(first.theta, scale, lent, *joined, *known)
+        stops = np.cumsum(counts)
+        return [
+            ConstraintPart(*(array[stop - n : stop] for array in whole))
+            for n, stop in zip(counts, stops, strict=True)
+        ]
 
     def largest(self, part: ConstraintPart) -> list[float]:
         """The largest row of its constraints [m], and its extent."""
@@ -211,6 +213,55 @@ class ConstraintElements(PointElements):
         size = np.nan_to_num(np.abs(part.gap), nan=np.inf)
         worst = float(size.max())
         return worst * self.scale, f"{self.name!r}: off by {worst:.3g} m"
+
+
+def _bent(curvature: FloatArray) -> FloatArray:
+    """Largest entry of each constraint's curvature [1/m], shape (n, m)."""
+    bent: FloatArray = np.abs(curvature).max(axis=(2, 3), initial=0.0)
+    return bent
+
+
+def _evaluate(
+    theta: float,
+    scale: FloatArray,
+    lent: FloatArray,
+    weights: FloatArray,
+    constants: FloatArray,
+    curvature: FloatArray,
+    prescribed: FloatArray,
+    y0: FloatArray,
+    x: FloatArray,
+    unknowns: FloatArray,
+    start: FloatArray | None,
+    bent: FloatArray | None,
+) -> ConstraintPart:
+    """Residual and tangent of constraints; names as of `ConstraintElements`, axis 0 = element."""
+    n, m, _, k = weights.shape
+    start = kernel.factors(weights, constants, y0) if start is None else start
+    bent = _bent(curvature) if bent is None else bent
+    last, scale = 3 * k, scale[:, None]
+    multiplier = scale * unknowns
+    end = kernel.factors(weights, constants, x)
+    middle = start + theta * (end - start)
+    force = kernel.gradient(weights, middle).reshape(n, m, last)
+    gap = kernel.value(end) - prescribed
+    residual = np.empty((n, last + m))
+    residual[:, :last] = np.matmul(multiplier[:, None], force)[:, 0]
+    residual[:, last:] = scale * gap
+    tangent = np.zeros((n, last + m, last + m))
+    if bent.any():
+        bend = np.matmul(theta * multiplier[:, None], curvature.reshape(n, m, k * k))
+        stiffness = bend.reshape(n, k, k)
+        for i in range(3):
+            tangent[:, i:last:3, i:last:3] = stiffness
+    tangent[:, :last, last:] = (scale[:, :, None] * force).transpose(0, 2, 1)
+    gradient = kernel.gradient(weights, end).reshape(n, m, last)
+    tangent[:, last:, :last] = scale[:, :, None] * gradient
+    rows, lends = np.arange(last, last + m), lent > 0.0
+    tangent[:, rows, rows] = -scale * np.where(
+        lends[:, None], lent[:, None] + np.abs(gap) * bent, 0.0
+    )
+    return ConstraintPart(residual, tangent, multiplier, gap, x)
 
 
 class Constraints(EveryStep):

@@ -410,7 +410,7 @@ def csr_parts(a: Any) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
     """This rank's rows of an assembled AIJ matrix; unlike `getValuesCSR` nothing is copied.
 
     Args:
-        a: The matrix; the arrays are its own and are valid while it lives unchanged.
+        a: The matrix; the arrays are its own and are valid while it lives with this pattern.
 
     Returns:
         Of the part in the rank's own columns and, if there are several ranks, of that in the

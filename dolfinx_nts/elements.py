@@ -237,6 +237,9 @@ def evaluate_together(
 ) -> tuple[Any, ...]:
     """What elements contribute at an iterate; what fails on one rank fails on all. Collective.
 
+    Batches of one class with equal `alike`, if they have that, are evaluated by one call of its
+    `evaluate_alike`: arrays of single elements cost as much as those of hundreds.
+
     Args:
         comm: MPI communicator.
         elements: Batches of elements.
@@ -247,18 +250,36 @@ def evaluate_together(
         UserFunctionError: One raised on some rank.
         StepFailedError: It raised this.
     """
-    parts: list[Any] = []
+    parts: list[Any] = [None] * len(elements)
+    groups: dict[Any, list[int]] = {}
+    for k, batch in enumerate(elements):
+        alike = getattr(batch, "alike", None)
+        groups.setdefault(k if alike is None else (type(batch), *alike), []).append(k)
     cause, problem = None, None
-    for batch, x, unknowns in zip(elements, places, own, strict=True):
+    for group in groups.values():
         try:
-            parts.append(batch.evaluate(x, unknowns))
+            batches = [elements[k] for k in group]
+            found = _of_group(batches, [places[k] for k in group], [own[k] for k in group])
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
             if cause is None:
-                cause, problem = error, _problem(batch, error)
+                cause, problem = error, _problem(elements[group[0]], error)
+            continue
+        for k, part in zip(group, found, strict=True):
+            parts[k] = part
     if global_max(comm, np.array([float(cause is not None)]))[0]:
         kind, text, advises = next(filter(None, comm.allgather(problem)))
         raise kind(text, advises=advises) from cause
     return tuple(parts)
+
+
+def _of_group(
+    batches: Sequence[Any], places: Sequence[FloatArray], own: Sequence[Mapping[str, FloatArray]]
+) -> Sequence[Any]:
+    """What batches that are alike, or a single one, contribute."""
+    if len(batches) == 1:
+        return [batches[0].evaluate(places[0], own[0])]
+    alike: Sequence[Any] = batches[0].evaluate_alike(batches, places, own)
+    return alike
 
 
 def _problem(batch: Any, error: Exception) -> tuple[type[StepFailedError], str, bool]:

@@ -48,15 +48,20 @@ class Points:
     def __len__(self) -> int:
         return len(self.nodes)
 
-    @property
+    @cached_property
     def dofs(self) -> IntArray:
         """Global coordinates of the nodes, shape (n, k, 3)."""
         return of_nodes(self.nodes)
 
     def flat(self, prescribed: int | None = None) -> IntArray:
         """`dofs` as (n, 3 k), with `prescribed` in place of coordinates that are."""
-        numbers = self.dofs if prescribed is None else np.where(self.fixed, prescribed, self.dofs)
-        return numbers.reshape(len(self), 3 * self.nodes.shape[1])
+        if prescribed is None:
+            return self._flat
+        return np.where(self.fixed, prescribed, self.dofs).reshape(self._flat.shape)
+
+    @cached_property
+    def _flat(self) -> IntArray:
+        return self.dofs.reshape(len(self), 3 * self.nodes.shape[1])
 
     def part(self, chosen: Any) -> Points:
         """Return some of the points, chosen by numbers, a slice or a mask; ranks may differ."""

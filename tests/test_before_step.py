@@ -9,6 +9,7 @@ from mpi4py import MPI
 from scenes import box, everywhere
 
 import dolfinx_nts as nts
+from dolfinx_nts.validation import UserFunctionError
 
 COMM = MPI.COMM_WORLD
 DT = 1e-3
@@ -214,3 +215,82 @@ def test_it_must_be_callable():
         nts.simulate(
             nts.System([pulled()[0]]), nts.Midpoint(), dt=DT, t_end=DT, before_step=3
         )
+
+
+class Writes:
+    """A hook and a writer that writes into the array of u or v on the last rank, once."""
+
+    def __init__(self, body, which, time, by):
+        self.body, self.which, self.time, self.by = body, which, time, by
+
+    def __call__(self, time, dt):
+        if self.by == "before_step" and abs(time - self.time) < 0.5 * dt:
+            self.change()
+
+    def start(self, stepper):
+        if self.by == "start":
+            self.change()
+
+    def write(self, stepper, *, last=False):
+        if self.by == "writer" and abs(stepper.state.time - self.time) < 0.5 * DT:
+            self.change()
+
+    def close(self, stepper):
+        pass
+
+    def change(self):
+        if COMM.rank == COMM.size - 1:
+            getattr(self.body, self.which).x.array[1] += 0.5
+
+
+@pytest.mark.parametrize(
+    ("which", "time", "by", "steps"),
+    [
+        ("v", 0.0, "before_step", 0), ("u", 2 * DT, "before_step", 2), ("u", 2 * DT, "writer", 2),
+        ("v", 4 * DT, "writer", 4), ("u", 0.0, "start", 0),
+    ],
+)  # fmt: skip
+def test_what_is_written_into_u_or_v_ends_the_run(which, time, by, steps):
+    """Until then it is the run that nothing has disturbed, and the body is again in its state."""
+    body, load = pulled()
+    load.value = 1.0
+    writes = Writes(body, which, time, by)
+    run = nts.simulate(
+        nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=4 * DT, before_step=writes,
+        output=[writes],
+    )  # fmt: skip
+    assert f"body 'body': its {which} was written during the run, at t=" in run.status
+    assert "undone now: move nodes by Dirichlet" in run.status
+    assert len(run.rows) == steps + 1
+    # A cube that a load per volume pulls falls freely.
+    momentum = run.balance["linear_momentum"][-1]
+    assert np.allclose(momentum, [0, 0, steps * DT], rtol=1e-10, atol=1e-15)
+    for function, values in ((body.u, run.state.u[0]), (body.v, run.state.v[0])):
+        assert np.array_equal(function.x.array[: body.num_owned], values)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_what_is_written_between_steps_is_refused_once(rigid):
+    """Also where the Functions are made of the coordinates; load steps have no other."""
+    body, _ = pulled()
+    if rigid:
+        body = nts.RigidBody(box(), density=DENSITY, velocity=(1.0, 0, 0))
+    stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum())
+    stepper.advance(DT)
+    body.u.x.array[:] += 1e-3
+    with pytest.raises(UserFunctionError, match="its u was written during the run, at t=0.001"):
+        stepper.advance(DT)
+    stepper.advance(DT)
+    assert stepper.state.time == pytest.approx(2 * DT)
+    assert np.array_equal(stepper.solution.balance["linear_momentum"][0],
+                          stepper.solution.balance["linear_momentum"][1])  # fmt: skip
+    stepper.close()
+
+
+def test_what_is_written_between_load_steps_is_told():
+    body, load = pulled([nts.Dirichlet(lambda x: x[2] < 1e-9)])
+    load.value = 1.0
+    run = nts.equilibrium(
+        nts.System([body]), load_steps=2, output=[Writes(body, "u", 0.5, "writer")]
+    )
+    assert "its u was written during the run, at t=0.5 by" in run.status and len(run.rows) == 2

@@ -204,13 +204,15 @@ def distance(one, other):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", RULES)
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.fast(
-    "blocks-energy-momentum",
-    "mechanism-generalized-alpha",
-    "adapted-energy-momentum",
-    "restored-energy-momentum",
-)
 @pytest.mark.fast_on_ranks("mechanism-generalized-alpha")
+@pytest.mark.fast(
+    "mechanism-generalized-alpha", "adapted-energy-momentum", "restored-energy-momentum",
+)  # fmt: skip
+@pytest.mark.enough_on_ranks(
+    "blocks-energy-momentum", "tetrahedra-generalized-alpha", "mechanism-midpoint",
+    "floor-midpoint", "loaded-generalized-alpha", "sleepers-energy-momentum", "adapted-midpoint",
+    "endless-energy-momentum", "restored-midpoint",
+)  # fmt: skip
 def test_a_restarted_run_is_the_uninterrupted_one(scene, integrator, mpi_tmp_path):
     if scene == "adapted" and COMM.size > 1:
         pytest.skip("two uninterrupted runs differ there by 1e-9: their steps depend on rounding")
@@ -358,6 +360,7 @@ def series(folder, name="box"):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("cadence", [{"every": 4}, {"interval": 3.5 * DT}], ids=str)
+@pytest.mark.fast_on_ranks("{'every': 4}")
 def test_fields_go_on_where_the_state_is(cadence, mpi_tmp_path):
     """Those of a run whose last six steps were lost, and of one that ended too early, too."""
     path, whole, folder = mpi_tmp_path / "run.h5", mpi_tmp_path / "whole", mpi_tmp_path / "fields"

@@ -31,6 +31,7 @@ def stretched(material):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(("first", "other"), MATERIALS)
+@pytest.mark.fast_on_ranks("first0-other0")
 def test_other_moduli_compile_nothing(first, other, monkeypatch):
     stretched(first)
 

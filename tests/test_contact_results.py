@@ -60,12 +60,7 @@ def owned(function):
     ],
     ids=lambda v: v if isinstance(v, str) else type(v).__name__,
 )
-@pytest.mark.fast_on_ranks(
-    "smooth-EnergyMomentum",
-    "rigid slave-EnergyMomentum",
-    "rigid master-EnergyMomentum",
-    "plane-EnergyMomentum",
-)
+@pytest.mark.fast_on_ranks("smooth-EnergyMomentum", "rigid master-EnergyMomentum")
 def test_nodal_forces_add_up_on_both_sides(kind, integrator):
     system = pushed(kind)
     run = nts.Stepper(system, integrator, newton=nts.Newton(rtol=1e-12))

@@ -18,6 +18,7 @@ def test_the_way_of_the_die():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_first_touch_is_where_the_gap_says():
     """The arc is 0.2 mm above the block: contact at time 0.2, and no force before."""
     result = demo.main(**COARSE, steps=(10, 50), end=0.4)

@@ -19,6 +19,7 @@ def test_references_conserve():
 @pytest.mark.mpi
 @pytest.mark.parametrize("theta", [0.0, 0.25, 0.5])
 @pytest.mark.fast_on_ranks("0.25")
+@pytest.mark.fast("0.25")
 def test_rigid_balls_that_touch_move_as_one(theta):
     r = demo.main(kinds=("rigid, touching",), parts=(theta,), cells=2, duration=3e-3)
     (r,) = r["rigid, touching"].values()
@@ -41,7 +42,7 @@ def test_rigid_balls_apart_hand_it_on_if_gaps_close_between_steps():
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_flexible_row_hands_it_on():
     """Three coarse balls: most of it to the last one, as of a chain of linear springs."""
     r = demo.main(kinds=("flexible, touching",), parts=(0.25,), duration=0.02, **THREE)

@@ -13,6 +13,7 @@ SMALL = {
     "flying_plate": {"steps": (0.1,), "t_end": 0.3, "integrators": ("energy-momentum",)},
     "flying_l_block": {"t_end": 2.0},
     "heavy_top": {"steps": (4e-3,), "t_end": 0.02, "size": 0.05},
+    "leaf_spring": {"cells": 8, "steps": 5, "t_end": 1e-3},
     "newtons_cradle": {
         "kinds": ("rigid, touching",), "parts": (0.5,), "cells": 2, "duration": 2e-3,
     },
@@ -23,6 +24,7 @@ SMALL = {
     "rolling": {"facets": 16, "duration": 0.016},
     "rotating_cross": {"steps": (0.05,), "t_end": 0.2},
     "slider_crank": {"rods": ("rigid", "flexible"), "t_end": 0.002, "cells": 4},
+    "snap_fit": {"cells": 4, "steps": 2, "t_end": 5e-4},
     "sliding_block": {"floors": ("plane",), "dt": 8e-3, "cells": (2, 2, 1)},
     "slope": {"floors": ("plane",), "parts": ("verge",), "cells": (2, 2, 1)},
     "stability": {"steps": {"rubbing": 5}},

@@ -4,8 +4,7 @@ import pytest
 import stability as demo
 
 
-@pytest.mark.mpi
-@pytest.mark.slow
+@pytest.mark.slow  # in serial: a body of one cell is of one rank
 @pytest.mark.parametrize("scene", list(demo.STEPS))
 def test_newmark_doubles_the_energy_that_energy_momentum_keeps(scene):
     steps = {scene: demo.STEPS[scene]}

@@ -1,9 +1,11 @@
-"""Demos of beams and shells: the flying ones keep what the midpoint rule does not; a blow rings."""
+"""Demos of beams and shells, beside theory and what their ledgers say."""
 
 import drum_stick
 import flying_beam
 import flying_plate
+import leaf_spring
 import pytest
+import snap_fit
 from mpi4py import MPI
 
 
@@ -46,3 +48,37 @@ def test_the_plate_rings_at_its_first_frequency():
     assert found["status"] == "completed" and found["ledger"] < 1e-11
     assert found["last_contact"] < 2e-3
     assert found["peak_frequency"] == pytest.approx(found["first_frequency"], rel=0.05)
+
+
+def test_leaves_that_slide_on_each_other():
+    """Theory's loop; the clamping pressure stiffens the leaves by 1 %."""
+    found = leaf_spring.main(cells=8, steps=5, t_end=0.0)
+    assert found["status"] == "completed" and found["off theory"] < 0.05
+    for name in ("stiffness stuck", "stiffness sliding", "largest deflection", "deflection left",
+                 "friction"):  # fmt: skip
+        here, theory = found[name]
+        assert here == pytest.approx(theory, rel=0.025), name
+
+
+@pytest.mark.slow
+def test_leaves_that_are_let_go():
+    """Each half swing loses a little more to friction than of a mass on a spring."""
+    found = leaf_spring.main(comm=MPI.COMM_SELF, cells=8, t_end=0.025)
+    assert found["swing status"] == "completed" and found["ledger"] < 1e-11
+    assert found["swing back"] == pytest.approx(-1.75, abs=0.1)
+    assert found["energy left"] < 0.03
+
+
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_a_hook_that_snaps_behind_its_catch():
+    found = snap_fit.main(cells=8, steps=4, dt=1e-4, t_end=7e-3)
+    assert found["status"] == found["snap status"] == "completed"
+    for name in ("peak force", "on the flat face"):
+        here, theory = found[name]
+        assert here == pytest.approx(theory, rel=0.02)
+    assert found["ledger"] < 1e-11 and found["pull"] < -0.3 * found["peak force"][0]
+    # Over the nose, after the lead-in face and the flat one, and free until the end.
+    way = snap_fit.CLIMB + snap_fit.FLAT
+    assert found["snaps at"] == pytest.approx(way / snap_fit.SPEED, rel=0.05)
+    assert found["free since"] < 6.8e-3 and 0.1 < found["energy left"] < 0.5

@@ -58,6 +58,7 @@ def arrays(part):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_scene_has_the_mass_and_momentum_of_the_problem(demo):
     system = demo["scene"](COMM)
     for body, velocity in zip(system.bodies, [(0, 0, 0), (30, 0, 23)], strict=True):

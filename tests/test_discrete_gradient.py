@@ -303,6 +303,7 @@ def test_gonzalez_is_symmetric_in_its_ends(name):
 
 
 @pytest.mark.parametrize("points", [1, 2, 3, 7])
+@pytest.mark.fast("2")
 def test_mean_value_is_exact_for_st_venant_kirchhoff(points):
     rng = np.random.default_rng(5)
     for size in (0.5, 1e-3, 1e-8, 1e-14):

@@ -363,6 +363,7 @@ def test_a_body_that_falls_for_ever_is_reported():
 
 # ---- load stepping
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_cut_back_ends_where_small_steps_do():
     """A press too fast for Newton is halved, and a hyperelastic result knows no path."""
     press = nts.Dirichlet(at(2, 1.0), value=lambda t: (0, 0, -0.6 * t))
@@ -404,6 +405,7 @@ def test_failure_keeps_history(tmp_path, mpi_tmp_path):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_passing_by_a_facet_is_noticed():
     """A block is pushed through more than a facet in one step: no contact may be missed."""
     soft = nts.Continuum(
@@ -634,6 +636,7 @@ def wound():
 @pytest.mark.mpi
 @pytest.mark.parametrize("stabilization", [None, 0.1])
 @pytest.mark.parametrize("make", [pulled, hauled, wound])
+@pytest.mark.fast("pulled-None", "hauled-0.1", "wound-0.1")
 @pytest.mark.fast_on_ranks("hauled-0.1")
 def test_what_a_joint_prescribes_does_work(make, stabilization):
     """As loads do: what the ledger misses falls as the square of the load steps."""

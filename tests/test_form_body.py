@@ -67,6 +67,7 @@ def interval(n):
 @pytest.mark.parametrize(
     "integrator", MID_STEP.values(), ids=MID_STEP
 )
+@pytest.mark.fast("energy-momentum")
 def test_a_string_vibrates_as_its_elements_do(integrator, tmp_path):
     """The sine is a mode of linear elements, and the steps turn its phase by 2 atan(w h/2)."""
     n, tension, rho, dt, size = 8, 50.0, 0.02, 1e-3, 1e-2
@@ -151,6 +152,7 @@ def test_without_a_strain_the_angular_momentum_drifts():
     assert drift(balance, "angular_momentum") > 1e-6
 
 
+@pytest.mark.slow
 def test_energy_is_kept_as_far_as_the_points_are_exact():
     """n points integrate dPi/ds of degree 2 n - 1: an energy of degree 2 n."""
     one, two = (

@@ -16,8 +16,8 @@ DT = 2e-3
 
 @pytest.mark.parametrize(("first_steps", "steps"), [(12, 20), (13, 23)], ids=["12", "13"])
 @pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.fast("energy-momentum-13", "generalized-alpha-12")
 @pytest.mark.fast_on_ranks()
+@pytest.mark.fast("energy-momentum-13")
 def test_two_parts_are_the_whole(integrator, first_steps, steps):
     """With friction, in contact where the first one ends; on several ranks MUMPS rounds anew."""
     newton = nts.Newton(linear_solver="direct", condense=True)

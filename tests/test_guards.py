@@ -25,6 +25,7 @@ STEEP = ["b=1000", "b=300"]
 @pytest.mark.parametrize("accuracy", ["balanced", "exact"])
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast("midpoint-exact-b=1000")
+@pytest.mark.fast_on_ranks()
 def test_momentum_is_not_reversed_by_a_very_steep_material(integrator, accuracy, steepness, speed):
     """A diverged iterate of stiffness 1e55 excused du = 0 by its rounding, so that v_1 = -v_0."""
     system = two_blocks.scene(COMM, cells=(3, 2), material=fung(steepness), speed=speed)

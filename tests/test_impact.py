@@ -44,6 +44,10 @@ def cubes(friction=None, gap=0.05, **speeds):
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("height", [0.0137, 0.0151])
 @pytest.mark.fast_on_ranks("0.0137-0.5-energy-momentum", "0.0151-1.0-midpoint")
+@pytest.mark.fast(
+    "0.0137-0.0-midpoint", "0.0137-1.0-energy-momentum", "0.0151-0.5-energy-momentum",
+    "0.0151-1.0-midpoint",
+)  # fmt: skip
 def test_a_rigid_block_rebounds_by_its_restitution(integrator, restitution, height):
     """It leaves with e times its speed, wherever in a step its gap closes (by h v = 2 mm)."""
     block = nts.RigidBody(
@@ -162,6 +166,7 @@ def test_what_moves_as_prescribed_is_refused():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_pendulum_swings_back_from_a_wall():
     """A joint holds it: its energy stays, and it turns as fast as before."""
     bob = nts.RigidBody(

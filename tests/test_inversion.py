@@ -186,10 +186,10 @@ SCENES = {
 
 
 @pytest.mark.mpi
-@pytest.mark.fast("squeeze-balanced", "spin-exact", "1e6 g-balanced")
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.fast_on_ranks("squeeze-balanced")
+@pytest.mark.fast("squeeze-balanced", "1e6 g-balanced")
 def test_no_step_ends_inside_out(name, accuracy, evaluations):
     """The run stops with a sentence, soon, and what it has accepted is not inside out."""
     system, integrator, dt, t_end = SCENES[name]()
@@ -227,6 +227,7 @@ HARD = {
 @pytest.mark.parametrize(
     ("name", "accuracy"), [(name, accuracy) for name in HARD for accuracy in HARD[name][-1]]
 )
+@pytest.mark.enough_on_ranks("200 m/s-balanced", "100 m/s, midpoint-exact", "1e4 g-balanced")
 def test_a_hard_impact_is_whole_or_named(name, accuracy):
     """Either it completes, or the cell and the remedies stand in the status; never inside out."""
     make, integrator, dt, t_end, adapt, _ = HARD[name]
@@ -292,6 +293,31 @@ def test_statics(allowed):
     else:
         assert SENTENCE in run.status
         assert run.balance["min_det"].min() > 0.0
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("held", [True, False], ids=["held", "on a plane"])
+def test_a_load_step_that_ends_nearly_inside_out_says_so(held, monkeypatch):
+    """Newton's method ends there, or the relaxations; under 1 g, nothing is near it."""
+    monkeypatch.setattr("dolfinx_nts.run.equilibrium._RELAXATIONS", 10)
+
+    def load(times_g):
+        if not held:
+            return nts.equilibrium(
+                dropped(times_g), stabilization=0.1, newton=nts.Newton(max_retries=0)
+            )
+        body = cube(2, bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9)])
+        system = nts.System([body], gravity=(0, 0, -9.81 * times_g))
+        return nts.equilibrium(system, newton=nts.Newton(max_retries=0))
+
+    run = load(1e3 if held else 1e4)
+    assert ("is not at rest" in run.status) != held and SENTENCE in run.status
+    assert "a cell of body 'cube' is nearly inside out" in run.status
+    assert 0.0 < float(run.status.split(SENTENCE)[1].split()[0]) <= 0.1
+    assert "smaller loads or speeds may prevent it" in run.status
+    assert "Try more load steps" not in run.status
+    mild = load(1.0)
+    assert mild.status == "completed" and mild.balance["min_det"][-1] > 0.9
 
 
 # ---- bodies of a user's own forms

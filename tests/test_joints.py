@@ -283,6 +283,7 @@ def test_a_double_pendulum_in_a_plane():
     check_order(errors)
 
 
+@pytest.mark.slow
 def test_a_double_pendulum_in_space():
     """Spherical joints of rods, against the rods' unit vectors with their accelerations solved."""
     a11, a12, a22 = (M_A / 3 + M_B) * L_A**2, M_B * L_A * L_B / 2, M_B * L_B**2 / 3
@@ -823,6 +824,7 @@ def test_load_steps_of_half_a_turn_are_cut():
 @pytest.mark.mpi
 @pytest.mark.parametrize("turn", [1.6, 2.2])
 @pytest.mark.fast("2.2")
+@pytest.mark.fast_on_ranks()
 def test_the_angle_of_a_hinge_is_no_mirror_image(turn):
     """Its sine about the middle of the step has two angles; Newmark's steps found the other one."""
     body, system = motor(lambda t: turn / 0.05 * t, turn / 0.05)
@@ -840,6 +842,7 @@ def test_the_angle_of_a_hinge_is_no_mirror_image(turn):
         (nts.GeneralizedAlpha(), 10, [(-19, 4, -48), (7, 7, 47)]),
     ],
 )
+@pytest.mark.fast_on_ranks("rule0-9-spins0")
 def test_no_step_turns_directions_over(rule, steps, spins):
     """Bodies became mirror images, and axes of a hinge opposite: both solve the equations."""
     a = nts.RigidBody.from_inertia(1.0, (1, 2, 2.5), angular_velocity=spins[0], name="a")
@@ -876,6 +879,7 @@ def test_a_run_goes_on_from_within_its_first_step():
 @pytest.mark.mpi
 @pytest.mark.parametrize("heavy", [1e5, 1e8])
 @pytest.mark.fast("100000000.0")
+@pytest.mark.fast_on_ranks()
 def test_light_links_hold_a_heavy_body(heavy):
     """Joints without loops are lent no compliance, which would be one of the light links."""
     masses = [1.0, 1.0, 1.0, heavy]

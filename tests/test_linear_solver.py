@@ -131,7 +131,7 @@ def test_schur_complement_is_the_same_on_all_ranks_and_when_made_again():
 
 @pytest.mark.parametrize("condense", [True, False])
 @pytest.mark.parametrize("blocked", [True, False])
-@pytest.mark.fast("False-False", "True-True")
+@pytest.mark.fast("True-True")
 def test_schur_complements_are_those_of_the_operator(blocked, condense):
     """Against dense matrices; the bodies' part is that of the last fresh assembly."""
     options = {} if blocked else {"fieldsplit_bodies_pc_type": "gamg"}

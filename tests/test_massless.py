@@ -208,8 +208,7 @@ def check_kept(table, integrator):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.fast("0.3")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_small_blocks_lose_little(friction):
     """On any number of ranks; with consistent mass contact takes 5 %, at any step."""
     integrator, cells = nts.EnergyMomentum(), (4, 2)

@@ -346,6 +346,7 @@ def check_bar(part, soft, hard):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron"])
+@pytest.mark.fast("tetrahedron")
 def test_tags_in_one_body(kind):
     parts = nts.bodies_from_tags(*tagged_bar(kind), names={"bar": (7, 9)}, surfaces={"end": 5})
     (part,) = parts.values()

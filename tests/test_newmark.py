@@ -84,6 +84,7 @@ def test_an_oscillator_moves_as_the_scheme_says(scheme):
     stepper.close()
 
 
+@pytest.mark.slow
 def test_alpha_without_damping_is_the_midpoint_rule():
     """(a_0 + a_1)/2 is its mean acceleration."""
     ends = []
@@ -184,6 +185,9 @@ def test_parameters_out_of_range_are_named():
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.Newmark(), nts.GeneralizedAlpha(rho_inf=0.8)], ids=repr)
 @pytest.mark.parametrize("kind", ["traction", "body_force", "torque"])
+@pytest.mark.fast_on_ranks(
+    "traction-GeneralizedAlpha(rho_inf=0.8)", "torque-Newmark(beta=0.25, gamma=0.5)",
+)  # fmt: skip
 def test_work_of_loads_in_time(rule, kind):
     """A cube of 1 t that 1e4 t [N] lift from rest has 0.05 m/s after 0.1 s: 1.25 J, all of it work.
 

@@ -329,6 +329,10 @@ def test_gap_does_not_depend_on_the_numbering_of_the_corners(nc):
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("nc", KINDS)
 @pytest.mark.parametrize("motion", [1.0, 0.2, 1e-3])
+@pytest.mark.fast(
+    "1.0-3-gonzalez", "1.0-4-mean-value", "0.2-16-mean-value", "0.2-15-gonzalez",
+    "0.001-16-gonzalez", "0.001-15-mean-value",
+)  # fmt: skip
 def test_directionality(nc, rule, motion):
     z0, z1, multiplier = random_step(np.random.default_rng(11), 100, nc, motion)
     # gradbar g . D pi(z_m) . (z_1 - z_0) = gradbar g . (pi_1 - pi_0) = g(pi_1) - g(pi_0)
@@ -445,7 +449,7 @@ def test_over_triangles_both_rules_are_the_midpoint_gradient():
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("nc", KINDS)
-@pytest.mark.fast("3-gonzalez", "4-mean-value")
+@pytest.mark.fast("3-gonzalez")
 def test_at_rest(nc, rule):
     z, _, multiplier = random_step(np.random.default_rng(17), 10 if nc < 15 else 2, nc)
     with np.errstate(all="raise"):

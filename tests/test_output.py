@@ -109,6 +109,7 @@ def test_contact_fields(mpi_tmp_path):
 
 
 @mpi
+@pytest.mark.fast_on_ranks()
 def test_mean_force_of_two_steps():
     """A bar that hits a wall: rho c v of its section, about which single steps alternate."""
     young, density, speed, n = 1e6, 1e3, 0.01, 30
@@ -158,6 +159,7 @@ def test_cells_of_the_file_fill_the_body(cell, mpi_tmp_path):
 
 @mpi
 @pytest.mark.parametrize("cells, degree", [([1, 1, 1], 1), ([2, 1, 1], 2)])
+@pytest.mark.fast_on_ranks("cells0-1")
 def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
     mesh = box([0.0, 0, 0], [1.0, 1, 1], cells)
     body = nts.Continuum(
@@ -186,6 +188,7 @@ def test_fields_on_an_empty_rank_and_of_degree_2(cells, degree, mpi_tmp_path):
         ({"interval": 1.0}, [0, 7]),
     ],
 )
+@pytest.mark.fast_on_ranks("cadence0-written0", "cadence4-written4")
 def test_cadence(cadence, written, mpi_tmp_path):
     writer = output.Fields(mpi_tmp_path, **cadence)
     nts.simulate(thrown_block(), nts.Midpoint(), dt=1e-3, t_end=7e-3, output=[writer])
@@ -360,6 +363,7 @@ def coloured(pixels):
 @pytest.mark.parametrize("colour", ["speed", "stress"])
 @pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 @pytest.mark.fast("hexahedron-speed", "tetrahedron-stress")
+@pytest.mark.fast_on_ranks("tetrahedron-stress")
 def test_picture(colour, cell, mpi_tmp_path):
     system = meeting_blocks(cell=cell)
     for body in system.bodies:
@@ -376,6 +380,7 @@ def test_picture(colour, cell, mpi_tmp_path):
 
 
 @mpi
+@pytest.mark.fast_on_ranks()
 def test_picture_has_true_proportions_and_hides_what_is_behind(mpi_tmp_path):
     """Seen along -x, a small fast block in front of a large resting one."""
     back = nts.Continuum(box([0.0, 0, 0], [1.0, 4, 2], [1, 2, 2]), RUBBER, density=1.0, name="b")

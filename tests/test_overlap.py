@@ -117,6 +117,7 @@ def test_points_in_the_plane_of_a_facet_beside_it_are_outside():
 
 @pytest.mark.parametrize("nc", [3, 4])
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.fast("0-3", "1-4")
 def test_nodes_and_edges_inside_are_those_of_brute_force(seed, nc):
     """Edges are sampled densely; those within a hundredth of the least depth may be told or not."""
     heap = heaps(seed, nc)
@@ -458,6 +459,7 @@ def shot(thick):
 @pytest.mark.parametrize("thick", [0.01, 0.04, 0.1, 0.3])
 @pytest.mark.parametrize("step", [0.003, 0.03, 0.3, 3.0])
 @pytest.mark.fast("0.003-0.04", "0.03-0.3", "0.3-0.01", "3.0-0.1")
+@pytest.mark.enough_on_ranks("0.003-0.3", "3.0-0.04")
 def test_a_block_that_passes_a_thin_plate_between_its_nodes_is_told(thick, step):
     """However long the steps are: also of all of the way in one."""
     system, found = shot(thick), []
@@ -633,6 +635,7 @@ def obstacles(rng):
 
 @pytest.mark.parametrize("nc", [3, 4])
 @pytest.mark.parametrize("metre", [1.0, 1e-6])
+@pytest.mark.fast("1.0-4", "1e-06-3")
 def test_facets_in_obstacles_are_as_deep_as_their_distance_tells(nc, metre):
     """Warped facets of any shape; a twisted one may be seen edge on."""
     rng, found_any = np.random.default_rng(nc), 0
@@ -741,6 +744,7 @@ def test_an_obstacle_between_the_nodes_is_told_with_place_and_depth(master, up, 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.parametrize("moving", ["plate", "ball"])
+@pytest.mark.fast_on_ranks("plate-energy-momentum", "ball-midpoint")
 def test_a_run_in_which_a_ball_comes_through_a_facet_says_so(moving, integrator, caplog):
     """A ball of radius 0.4 between four nodes of a facet of 1: nothing holds them apart."""
     caplog.set_level(logging.CRITICAL)
@@ -785,8 +789,7 @@ def test_what_lies_on_an_obstacle_is_not_warned_of():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("shape", ["sphere", "cylinder"])
-@pytest.mark.fast("sphere")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_what_passes_between_two_looks_is_told(shape):
     """A thin obstacle that goes through a large facet in few steps, which no node of it meets."""
     ends = [np.zeros(3), np.ones(3)]
@@ -902,6 +905,8 @@ def everywhere(x):
 @pytest.mark.mpi
 @pytest.mark.parametrize("shape", ["sphere", "roller"])
 @pytest.mark.parametrize("moving", ["rigid", "flexible", "obstacle"])
+@pytest.mark.fast("rigid-sphere", "flexible-roller", "obstacle-sphere")
+@pytest.mark.fast_on_ranks("flexible-roller")
 def test_an_obstacle_that_comes_in_where_no_contact_is_says_so(shape, moving, caplog):
     """Through the side x = 1 of a cube of one cell, whose bottom is the slave, in many steps."""
     caplog.set_level(logging.CRITICAL)
@@ -925,6 +930,8 @@ def test_an_obstacle_that_comes_in_where_no_contact_is_says_so(shape, moving, ca
 @pytest.mark.mpi
 @pytest.mark.parametrize("metre", [1.0, 1e-6])
 @pytest.mark.parametrize("step", [0.03, 0.3, 1.5, 3.0])
+@pytest.mark.fast("0.03-1.0", "0.3-1e-06", "3.0-1.0")
+@pytest.mark.fast_on_ranks("0.03-1.0", "3.0-1.0")
 def test_an_obstacle_that_gets_inside_a_body_is_told(step, metre):
     """On a way of 3 m over a ball, which is inside the cube for 0.6 m, in steps of any length."""
     r, told = 0.2 * metre, []
@@ -1016,6 +1023,7 @@ def with_a_hole(through):
     ],
 )
 @pytest.mark.parametrize("where", [everywhere, lambda x: x[2] < 1e-9], ids=["all", "bottom"])
+@pytest.mark.fast_on_ranks("all-True-obstacle0", "bottom-False-obstacle5")
 def test_what_is_in_a_hole_or_around_or_below_is_not_inside(through, obstacle, where):
     body = with_a_hole(through)
     pair = nts.ContactPair(slave=body.surface(where), master=obstacle)
@@ -1029,6 +1037,7 @@ def test_what_is_in_a_hole_or_around_or_below_is_not_inside(through, obstacle, w
 @pytest.mark.parametrize("where", [everywhere, lambda x: x[2] < 1e-9], ids=["all", "bottom"])
 @pytest.mark.parametrize("through", [True, False])
 @pytest.mark.parametrize("place", [(0.5, 1.5, 0.5), (2.6, 2.4, 0.5), (0.5, 0.5, 0.1)])
+@pytest.mark.fast_on_ranks("place0-True-bottom", "place2-False-all")
 def test_a_start_around_an_obstacle_is_refused(place, through, where):
     body, r = with_a_hole(through), 0.09
     for ball in (nts.Sphere(place, r), Ball(place, r, width=r)):

@@ -104,6 +104,7 @@ def test_another_reader_sees_them(tmp_path):
 
 # ---- what a run shows
 @mpi
+@pytest.mark.fast_on_ranks()
 def test_a_plot_is_a_figure(mpi_tmp_path):
     figure = pytest.importorskip("matplotlib.figure").Figure
     _, system = moving()

@@ -65,6 +65,7 @@ class Mixed(nts.Midpoint):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("rule", [nts.Midpoint(), Mixed()])
+@pytest.mark.fast_on_ranks("rule0")
 def test_the_rule_of_forces_in_arrays_is_not_that_of_contact(rule):
     """A spring of V = (l - 1)^4 N/m^3 between two masses; contact stands beside it."""
     bodies = [
@@ -109,6 +110,7 @@ class Oscillator(PointMass):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_it_is_of_first_order():
     """After n steps x is the real part of (1 - i h)^-n, which tends to cos t as h does to 0."""
     ends = []

@@ -184,6 +184,7 @@ def test_a_mass_that_vanishes_ends_the_run(change):
     ("name", "good", "bad"),
     [("density", DENSITY, -1.0), ("young", YOUNG, np.nan)],
 )
+@pytest.mark.fast("young-100000.0-nan")
 def test_a_value_out_of_range_in_one_cell_ends_the_run(name, good, bad):
     """Though the mass in all would be positive."""
     mesh = box(cells=(1, 1, 2))

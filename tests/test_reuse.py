@@ -47,6 +47,8 @@ def test_reuse_changes_no_solution(integrator, solver):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("reuse", [False, True])
+@pytest.mark.fast("True")
+@pytest.mark.fast_on_ranks("True")
 def test_two_runs_of_one_system_in_turns_are_those_one_after_the_other(reuse):
     """Each finds the bodies' matrix changed by the other one, and makes it anew."""
 
@@ -80,7 +82,7 @@ def test_without_condensing_too():
 
 
 @pytest.mark.parametrize("metre", [1e3, 1e6])
-@pytest.mark.fast("1000.0")
+@pytest.mark.slow
 def test_units_change_no_decision(metre):
     table, some = run("energy-momentum", reuse=True, rtol=1e-9)
     again, same = run(
@@ -120,6 +122,7 @@ def test_a_step_without_its_last_contact_takes_the_matrices_on(solver):
     assert active.max() == 4 and active[-1] == 0 and np.isinf(gap[-1])
 
 
+@pytest.mark.slow
 def test_reuse_with_a_split_of_another_kind():
     """A user's own field split need not be a Schur complement."""
     options = {
@@ -161,8 +164,7 @@ def test_steps_that_differ_by_rounding_share_their_matrices():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("condense", [False, True])
-@pytest.mark.fast("True")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_a_body_without_contact_beside_two_with(condense):
     """The blocks of a split have a place for it."""
 
@@ -276,7 +278,8 @@ def arch():
     [(lambda: thrown(0.0), 60, False), (lambda: thrown(2.0), 130, False), (arch, 16, True)],
     ids=["falling", "turning", "arch"],
 )
-@pytest.mark.fast_on_ranks("falling")
+@pytest.mark.fast("falling", "arch")
+@pytest.mark.fast_on_ranks("arch")
 def test_what_iterations_leave_does_not_add_up(system, steps, contact):
     """A hundredth of the 1e-8 that "balanced" may leave, where 100 such steps left all of it."""
     stepper = nts.Stepper(system(), nts.EnergyMomentum(), newton=ACCURACY["balanced"])
@@ -302,6 +305,7 @@ def test_the_step_is_the_same_number_in_all_steps():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_runs_of_one_system_in_turn_use_no_matrix_of_each_other():
     """A body has one matrix; a run that took it of another step size would hardly converge."""
     system = rubbing_blocks(0.3)

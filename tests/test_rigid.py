@@ -48,7 +48,7 @@ MOMENTS, SPIN = np.array([1.0, 2.0, 3.0]), np.array([0.01, 1.0, 0.01])
     ("dt", "figure"), [(0.2, 3.796e-2), (0.1, 9.643e-3), (0.05, 2.420e-3), (0.025, 6.057e-4)]
 )
 @pytest.mark.fast("0.2-0.03796", "0.1-0.009643")
-@pytest.mark.fast_on_ranks("0.2-0.03796")
+@pytest.mark.fast_on_ranks()
 def test_a_free_body_errs_as_an_independent_program_does(dt, figure):
     """Theory section 12: largest entry of the rotation at t = 10 s against Euler's equations."""
     body = nts.RigidBody.from_inertia(1.0, MOMENTS, angular_velocity=SPIN)
@@ -62,6 +62,7 @@ def test_a_free_body_errs_as_an_independent_program_does(dt, figure):
 
 
 @pytest.mark.parametrize("rule", INTEGRATORS)
+@pytest.mark.fast("energy-momentum", "generalized-alpha")
 def test_all_rules_are_of_second_order(rule):
     """First accelerations know the forces of the directors' constraints."""
     exact, errors = euler(MOMENTS, SPIN, 4.0), []

@@ -87,6 +87,7 @@ def test_a_failed_run_keeps_what_it_has_and_says_where():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(("t_end", "steps"), [(7e-3, 4), (8e-3, 4), (8e-3 * (1 + 1e-12), 4)])
+@pytest.mark.fast_on_ranks("0.007-4")
 def test_equal_steps_reach_t_end(t_end, steps):
     run = nts.simulate(two_blocks.scene(COMM), nts.Midpoint(), dt=2e-3, t_end=t_end)
     assert run.status == "completed"
@@ -94,6 +95,7 @@ def test_equal_steps_reach_t_end(t_end, steps):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_single_precision_step_costs_no_precision():
     run = nts.simulate(
         two_blocks.scene(COMM), nts.EnergyMomentum(), dt=np.float32(2e-3), t_end=0.04
@@ -129,7 +131,7 @@ def block(**options):
     ],
     ids=["moving support", "traction", "body force"],
 )
-@pytest.mark.fast_on_ranks("moving support")
+@pytest.mark.fast_on_ranks("traction", "body force")
 def test_the_work_of_loads_and_supports_closes_the_ledger(options):
     system = nts.System([block(**options)], gravity=(0, 0, -9.81))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.1)
@@ -142,7 +144,7 @@ def test_the_work_of_loads_and_supports_closes_the_ledger(options):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.fast_on_ranks("midpoint")
+@pytest.mark.fast_on_ranks()
 def test_driven_nodes_have_the_velocity_of_their_support(integrator):
     """They start with it and do not alternate about it; exact for motion at constant speed."""
     speed = np.array([0.5, -0.2, 0.3])

@@ -32,6 +32,13 @@ def run(system, integrator, steps, **newton):
 )
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast_on_ranks("midpoint-0.75-True", "energy-momentum-0.75-False")
+@pytest.mark.fast(
+    "midpoint-0.0-True", "midpoint-0.49-False", "midpoint-0.51-True", "midpoint-0.5-False",
+    "midpoint-1.0-True", "energy-momentum-0.0-True", "energy-momentum-0.49-False",
+    "energy-momentum-0.51-True", "energy-momentum-0.5-False", "energy-momentum-1.0-True",
+    "gonzalez contact-0.0-True", "gonzalez contact-0.49-False", "gonzalez contact-0.51-True",
+    "gonzalez contact-0.5-False", "gonzalez contact-1.0-True",
+)  # fmt: skip
 def test_rebound(integrator, theta, turned):
     system, q = mass_on_wall(theta * STEP * SPEED, turned=turned)
     v, stepper = run(system, integrator, 4)

@@ -269,7 +269,7 @@ MOVERS = {
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", MOVERS)
 @pytest.mark.fast("later body force", "later traction", "later support", "extra form")
-@pytest.mark.fast_on_ranks("later support", "extra form")
+@pytest.mark.fast_on_ranks("later support")
 def test_loads_wake_in_the_step_in_which_they_act(name):
     a, b, awake = both(beside(**MOVERS[name]), STEPS)
     assert awake == (["a"] * 3 + ["ab"] * 3 if "later" in name else ["ab"] * STEPS)
@@ -288,6 +288,7 @@ def test_loads_wake_in_the_step_in_which_they_act(name):
     ids=["support", "held everywhere", "spring and damper", "force of zero"],
 )
 @pytest.mark.fast("support", "spring and damper")
+@pytest.mark.fast_on_ranks("support")
 def test_what_does_not_move_a_body_does_not_wake_it(options, expected):
     a, b, awake = both(beside(**options), 3, integrator="midpoint")
     assert awake == [expected] * 3
@@ -331,6 +332,7 @@ def pushed(gap, force):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP)
 @pytest.mark.fast("midpoint")
+@pytest.mark.fast_on_ranks()
 def test_a_motion_that_was_not_predicted_wakes_in_the_same_step(integrator):
     """The step is solved again with the sleeper, whose candidates were idle."""
     dt, gap = 0.02, 0.02

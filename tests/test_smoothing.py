@@ -131,7 +131,7 @@ def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
 
 @pytest.mark.parametrize("part", [0.2137, 0.1137])
 @pytest.mark.parametrize("shape", ["convex", "concave"])
-@pytest.mark.fast("convex-0.2137")
+@pytest.mark.slow
 def test_what_a_change_of_facet_costs_on_a_cylinder(shape, part):
     """At a slope of the angle between facets, the way beyond an edge is a height."""
     angle = 2 * END / FACETS / RADIUS

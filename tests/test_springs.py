@@ -191,6 +191,7 @@ def test_damped_tumbling_closes_the_ledger():
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_spring_of_no_length_passes_through_it():
     """It starts at length 0 and comes back there; V = k/2 l^2 is smooth."""
     k, v0 = 50.0, 0.7
@@ -246,7 +247,7 @@ def test_torsion_pendulum_over_several_turns(rule):
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_two_wheels_on_one_axis():
     """They turn against each other by more than half a turn; their angular momentum stays."""
     k, axis, spins = 2.0, np.array([2.0, 1.0, 2.0]) / 3.0, (9.0, -2.0)
@@ -322,6 +323,7 @@ def in_units(size):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("law", ["stiffness", "energy"])
+@pytest.mark.fast_on_ranks("energy")
 def test_a_mass_hangs_on_a_spring(law):
     """Its length is L + m g/k, whatever the body's shape; a damper does nothing."""
     g, k, rest = 9.81, 5e4, 1.0
@@ -369,6 +371,7 @@ def body_energy(run):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_a_spring_within_a_flexible_body():
     """Its ends are points of one body: an inner force that adds no momentum."""
     body = cube(velocity=(0.3, 0.0, 0.0))
@@ -647,6 +650,7 @@ def test_a_damper_that_steps_do_not_resolve_is_told(rule):
 @pytest.mark.parametrize(
     ("stiffness", "way"), [(1e6, 1e-6), (1e6, 1e-8), (1.0, 1e-6), (1e9, 1e-4)]
 )
+@pytest.mark.fast_on_ranks("1000000.0-1e-06")
 def test_statics_of_a_stiff_spring_needs_no_cut(stiffness, way):
     """Its force is as exact as a place 1 m from the origin is in 64 bits, and no more."""
     body = nts.RigidBody.from_inertia(

@@ -32,10 +32,12 @@ def on_the_floor(body, friction):
 @pytest.mark.mpi
 @by_rule
 @pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.fast("0.3-newmark", "0.0-generalized-alpha")
+@pytest.mark.fast_on_ranks("0.3-newmark")
 def test_a_box_at_rest_stays(rule, friction):
     body = box((0, 0, 0))
     system = nts.System([body], contacts=[on_the_floor(body, friction)], gravity=(0, 0, -G))
-    run = nts.simulate(system, rule, dt=1e-2, t_end=0.5)
+    run = nts.simulate(system, rule, dt=1e-2, t_end=0.2)
     weight = body.mass * G
     assert run.status == "completed" and run.retries == 0
     assert np.abs(run.contact_forces[1:, 0] - [0, 0, weight]).max() < 1e-9 * weight
@@ -68,6 +70,7 @@ def test_a_sliding_box_brakes_as_coulomb_says(rule):
 
 @pytest.mark.mpi
 @by_rule
+@pytest.mark.fast_on_ranks("generalized-alpha")
 def test_two_boxes_that_meet_keep_their_momentum(rule):
     """Whatever the scheme makes of the energy: the forces are equal and opposite."""
     left = box((-1.02, 0, 0), velocity=(1.0, 0, 0), name="left")

@@ -68,6 +68,7 @@ def vibrate(tolerance, t_end=5.0):
 
 # ---- the error
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_error_of_a_step_is_that_of_the_trapezoidal_rule():
     """h^3/12 times the third derivative of sin, over the tolerance and what the mass may cover."""
     adapt, h, span = nts.Adapt(tolerance=1e-2), 0.01, 2.0
@@ -159,6 +160,7 @@ def test_a_mass_rebounds_from_a_wall_without_loss(integrator, theta):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_the_first_impact_of_a_bar_is_one_event():
     """Its four nodes close together: one step ends there, and none of the impact is lost."""
     import bar_impact
@@ -251,7 +253,8 @@ def test_rejected_steps_leave_no_trace():
 @pytest.mark.mpi
 @pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
 def test_ranks_take_the_steps_of_a_serial_run():
-    parallel, serial = impact(), impact(MPI.COMM_SELF)
+    parallel, serial = impact(cells=(3, 2)), impact(MPI.COMM_SELF, cells=(3, 2))
+    assert parallel.balance["active"].max() > 3
     a, b = parallel.balance, serial.balance
     assert parallel.rejected == serial.rejected
     assert np.allclose(a["time"], b["time"], rtol=1e-9, atol=0)

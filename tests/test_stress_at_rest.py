@@ -68,6 +68,7 @@ def test_the_size_of_the_stress(part, integrator):
     assert np.abs(stepper.state.v[0]).max(initial=0.0) > 0.0
 
 
+@pytest.mark.slow
 def test_statics_and_dynamics_of_one_body_both_tell():
     system = nts.System([block(0.01, bcs=[nts.Dirichlet(lambda x: x[2] < 2 + 1e-9)])])
     for run in (

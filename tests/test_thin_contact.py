@@ -1,5 +1,7 @@
 """Contact of beams and shells with everything: skins that are linear in places and directors."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
@@ -317,3 +319,27 @@ def test_a_checkpoint_goes_on_on_other_ranks(mpi_tmp_path):
     for kind, k in (("centreline", 0), ("midsurface", 1)):
         (_, x), (_, y) = (getattr(s.bodies[k], kind)() for s in (alone, several))
         assert y == pytest.approx(x, abs=1e-12)
+
+
+def strike(file):
+    """A beam falls on a shell, with friction; the run is saved."""
+    stick, plate = beam(0.0505, velocity=FAST), shell()
+    contact = nts.ContactPair(stick.surface(), plate.surface(side="top"), friction=MU)
+    run = nts.simulate(nts.System([plate, stick], contacts=[contact]), EM, dt=1e-3, t_end=3e-3)
+    assert run.status == "completed" and run.balance["active"].max() > 0
+    run.save(file)
+
+
+@pytest.mark.parametrize("ranks", [3, 4])
+def test_an_impact_of_beam_and_shell_on_more_ranks(ranks, on_ranks, tmp_path):
+    """Places and velocities to 1e-9 of those of one rank."""
+    folder = str(Path(__file__).parent)
+    code = f"import sys; sys.path.insert(0, {folder!r}); import test_thin_contact as t; "
+    on_ranks(ranks, "-c", f"{code}t.strike({str(tmp_path / 'many.h5')!r})")
+    strike(tmp_path / "one.h5")
+    one, other = (nts.load(tmp_path / f"{name}.h5") for name in ("one", "many"))
+    for of in ("u", "v"):
+        mine, theirs = (
+            np.concatenate([body[of] for body in run.bodies.values()]) for run in (one, other)
+        )
+        assert np.abs(mine - theirs).max() < 1e-9 * np.abs(mine).max()

@@ -51,6 +51,7 @@ def held(axis):
         ({}, 0.1, None),
     ],
 )
+@pytest.mark.fast_on_ranks("options0-None-nothing resists body 'cube' ", "options5-0.1-None")
 def test_motions_that_nothing_resists(options, stabilization, words):
     run = nts.equilibrium(standing(**options), stabilization=stabilization)
     if words is None:

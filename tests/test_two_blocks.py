@@ -94,7 +94,7 @@ def test_mean_value_stress_closes_to_quadrature_error():
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_ledger_closes_when_the_step_changes():
     stepper = nts.Stepper(two_blocks.scene(COMM), ENERGY_MOMENTUM)
     for k in range(60):

@@ -93,6 +93,7 @@ METEOR = Scene(
         ({"gravity": (0, 0, -9.81)}, "linear momentum changes"),
     ],
 )
+@pytest.mark.fast_on_ranks("change2-linear momentum changes")
 def test_the_judge_sees_what_is_wrong(change, text, monkeypatch):
     """Where the package is given another scene than the judge."""
     system = nts.System
@@ -141,6 +142,7 @@ def test_what_is_raised_in_mid_run_is_no_refusal(monkeypatch):
 
 
 @pytest.mark.mpi
+@pytest.mark.fast_on_ranks()
 def test_the_judge_sees_a_wrong_energy(monkeypatch):
     """Bodies heavier than the judge believes."""
     monkeypatch.setitem(NONSENSE, "density", 1.01e3)

@@ -82,15 +82,9 @@ def same_on_all_ranks(value):
 @pytest.mark.parametrize("fails", FAILURES)
 @pytest.mark.parametrize("what", NAMES)
 @pytest.mark.fast(
-    "Dirichlet-raises-all", "Dirichlet-nan-last", "Traction-nan-all", "Traction-two_numbers-last",
-    "body_force-raises-last", "body_force-two_numbers-all", "motion-raises-last", "motion-nan-all",
+    "Dirichlet-nan-last", "Traction-two_numbers-last", "body_force-raises-last", "motion-nan-all",
 )  # fmt: skip
-@pytest.mark.fast_on_ranks(
-    "Dirichlet-nan-last",
-    "Traction-two_numbers-last",
-    "body_force-raises-last",
-    "motion-nan-all",
-)
+@pytest.mark.fast_on_ranks("Dirichlet-nan-last", "motion-nan-all")
 def test_a_run_keeps_what_it_has(what, fails, ranks):
     system = scene(what, until_late(fails, ranks))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=DT, t_end=5 * DT)

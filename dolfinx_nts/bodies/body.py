@@ -77,6 +77,7 @@ class Body:
     stressed: float | None = None
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None
+    _shown: tuple[FloatArray, ...] = ()
 
     # ---- what each body has of its own
     def _missing(self, name: str) -> NotImplementedError:
@@ -160,9 +161,7 @@ class Body:
 
     def weight(self, gravity: FloatArray) -> FloatArray:
         """Forces of gravity (3,) [m/s^2], which accelerates places and no directors [N]."""
-        acceleration = np.zeros((len(self.places), 3))
-        acceleration[self.places] = gravity
-        return self.nodal_mass * acceleration.ravel()
+        return self.nodal_mass * (self.places[:, None] * gravity).ravel()
 
     def destroy(self) -> None:
         """Free the PETSc objects, for those who make many bodies; it cannot be used afterwards.

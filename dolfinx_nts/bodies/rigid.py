@@ -249,6 +249,8 @@ class RigidBody(Body):
         self._directors_held = Directors(self, held, self.length, np.arange(len(held)))
         self.joints = () if rotation is not None else (self._directors_held,)
         self._matrix: Any = None
+        # Mass factor that it holds, and PETSc's count of changes since.
+        self._holds: tuple[float, int] | None = None
         self._reach = np.ones(4)
         if self.mesh is not None:
             x = self.space.tabulate_dof_coordinates()
@@ -499,6 +501,9 @@ class RigidBody(Body):
         self.check_alive()
         if self._matrix is None:
             self._matrix = compat.dense_matrix(self.comm, self.num_owned)
+        constant = not self._couple.any()
+        if constant and self._holds == (mass, self._matrix.stateGet()):
+            return self._matrix
         if self.num_owned:
             whole = np.diag(mass * (self.nodal_mass + self._lent))
             if self._couple.any():
@@ -510,6 +515,7 @@ class RigidBody(Body):
             numbers = np.arange(12, dtype=PETSc.IntType)
             self._matrix.setValues(numbers, numbers, whole.ravel())
         self._matrix.assemble()
+        self._holds = (mass, self._matrix.stateGet()) if constant else None
         return self._matrix
 
     def nodal_stiffness(self) -> FloatArray:
@@ -526,7 +532,7 @@ class RigidBody(Body):
         Shape (2, 3), (1, 3) if only one of them is prescribed, (0, 3) if none is.
         """
         rows = np.zeros((2, 3))
-        if self.num_owned:
+        if self.num_owned and self._fixed.any():
             forces = residual.reshape(4, 3)
             rows[0] = forces[0]
             rows[1] = cross(self._directors(u1), forces[1:]).sum(axis=0)

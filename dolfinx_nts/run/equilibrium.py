@@ -278,9 +278,10 @@ class _LoadStepper(Stepper):
                 search = left * self.newton.rtol > _NEARLY_AT_REST
         finally:
             problem.stabilization.share = 0.0
-        raise StepFailedError(
+        raise self.solver.with_flat(
             f"step from t={kept.time:.6g}: body {restless!r} is not at rest after {_RELAXATIONS} "
-            "relaxations; nothing holds it, or it hops from facet to facet"
+            "relaxations; nothing holds it, or it hops from facet to facet",
+            step,
         )
 
     def _unheld(self, state: State, dt: float) -> str:

@@ -276,6 +276,7 @@ def _run(
             saver = None if checkpoint is None else Saver(checkpoint, stepper)
             with progress_bar(None if adapt else len(steps), progress and root) as bar:
                 signal = _march(stepper, steps, output, started, adapt, bar, saver, interrupts)
+            stepper.refuse_written()
             stepper.look(last=True)
             if signal is None:
                 solution.finish()

@@ -10,13 +10,13 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.mesh_check import places_of
-from dolfinx_nts.parallel import global_max, raise_together
+from dolfinx_nts.parallel import first_problem, global_max, raise_together
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent, resultants
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import System
-from dolfinx_nts.validation import is_finite
+from dolfinx_nts.validation import UserFunctionError, is_finite
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -72,6 +72,44 @@ def refuse_overwritten(system: System) -> None:
             and f"body {body.name!r}: its {here} was written since it was made or run, which a run "
             f"would drop; it is undone now: pass {option}= to the body, or start= to the run",
         )
+
+
+def note_shown(body: Any) -> None:
+    """Keep what a run has just written into a body's u and v, for `refuse_written`."""
+    if body.mesh is not None:
+        body._shown = tuple(f.x.array.copy() for f in (body.u, body.v))
+
+
+def refuse_written(system: System, time: float) -> None:
+    """Raise on every rank if a caller has written into a body's u or v during a run. Collective.
+
+    A run goes on from its own state, so that what was written would be lost, but files and
+    pictures would show it. Other runs of the same bodies may have written, too.
+
+    Args:
+        system: Its bodies.
+        time: At the state of the run [s].
+
+    Raises:
+        UserFunctionError: Something was written; it is undone.
+    """
+    here = None
+    for body in system.bodies:
+        for k, known in enumerate(getattr(body, "_shown", ())):
+            values = (body.u, body.v)[k].x.array
+            if here or np.array_equal(values, known, equal_nan=True):
+                continue
+            here = (
+                f"body {body.name!r}: its {'uv'[k]} was written during the run, at t={time!r} by "
+                "before_step, a writer or between two steps; a run does not take it up, and it is "
+                "undone now: move nodes by Dirichlet with a function of time, push them by loads "
+                "that are functions of time, or start another run from displacement=, velocity="
+            )
+    found = first_problem(system.comm, here)
+    if found is not None:
+        for body in system.bodies:
+            body.accept(*Body.last_accepted(body))
+        raise UserFunctionError(found)
 
 
 def refuse_moved_meshes(system: System) -> None:

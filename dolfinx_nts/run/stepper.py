@@ -24,8 +24,10 @@ from dolfinx_nts.run.start import (
     check_restart,
     consistent_start,
     first_state,
+    note_shown,
     refuse_moved_meshes,
     refuse_overwritten,
+    refuse_written,
     with_prescribed_rates,
 )
 from dolfinx_nts.run.step_size import Pace
@@ -428,6 +430,7 @@ class Stepper:
             body.accept(u, v)
             # A body's own `accept` need not call the base's.
             Body.accept(body, u, v)
+            note_shown(body)
         self.state = self.solution.state = state
 
     def _step(self, dt: float, time: float) -> None:
@@ -449,6 +452,11 @@ class Stepper:
             time = self.state.time if time is None else time
             name = f"before_step at t={time!r} with dt={dt!r}"
             call_together(self.system.comm, name, self._before_step, time, dt)
+        self.refuse_written()
+
+    def refuse_written(self) -> None:
+        """Raise a UserFunctionError if something else has written into a body's u or v."""
+        refuse_written(self.system, self.state.time)
 
     def _note_materials(self) -> None:
         """Name in the ledger what changed parameters of materials do to the energy."""

@@ -1,8 +1,8 @@
-"""The PETSc matrices of the step problem: element blocks -> AIJ blocks -> nest -> solvers."""
+"""The PETSc matrices of the step problem: bodies and element blocks -> operator -> solvers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,61 +23,105 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 class Entries(NamedTuple):
-    """Entries of the tangents of a batch of elements, and where they stand in a matrix.
+    """Entries of the tangents of elements, and where they stand in a matrix, shape (n,) each.
 
     Attributes:
-        batch: Number of the batch.
-        rows: In an element's tangent, shape (k,).
-        cols: Likewise.
-        row_numbers: In the matrix, shape (n, k); negative ones are left out.
-        col_numbers: Likewise.
+        where: Where they stand among all entries of all tangents, one after the other.
+        rows: Their rows in the matrix.
+        cols: Their columns there.
     """
 
-    batch: int
+    where: IntArray
     rows: IntArray
     cols: IntArray
-    row_numbers: IntArray
-    col_numbers: IntArray
 
 
 class Triplets:
-    """An AIJ matrix made of certain entries of elements' tangents, whoever owns their rows.
+    """An AIJ matrix made of entries of elements' tangents, whoever owns their rows, and of bodies.
 
     Args:
         comm: MPI communicator.
         size: Its rows and columns on this rank.
-        parts: The entries.
+        parts: The entries of elements.
+        bodies: PETSc matrices whose entries are in it, too.
+        to_whole: (body, numbers in it) -> numbers in the new matrix.
 
     Attributes:
         matrix: The PETSc matrix.
     """
 
-    def __init__(self, comm: Any, size: tuple[int, int], parts: Sequence[Entries]) -> None:
-        self._entries = [(part.batch, part.rows, part.cols) for part in parts]
+    def __init__(
+        self,
+        comm: Any,
+        size: tuple[int, int],
+        parts: Sequence[Entries],
+        bodies: Sequence[Any] = (),
+        to_whole: Callable[[int, IntArray], IntArray] | None = None,
+    ) -> None:
+        none = np.empty(0, np.int64)
+        rows, cols = ([none, *(part[i] for part in parts)] for i in (1, 2))
+        self._index = np.concatenate([none, *(part.where for part in parts)])
+        self._bodies = [_OfBody(a) for a in bodies]
+        for k, body in enumerate(self._bodies):
+            assert to_whole is not None
+            for row, col in body.numbers():
+                rows.append(to_whole(k, row))
+                cols.append(to_whole(k, col))
         self.matrix = PETSc.Mat().create(comm)
         self.matrix.setSizes(((size[0], None), (size[1], None)))
         self.matrix.setType("aij")
-        none = np.empty(0, np.int64)
-        rows = np.concatenate([none, *(part.row_numbers.ravel() for part in parts)])
-        cols = np.concatenate([none, *(part.col_numbers.ravel() for part in parts)])
-        compat.set_preallocation_coo(self.matrix, rows, cols)
+        compat.set_preallocation_coo(self.matrix, np.concatenate(rows), np.concatenate(cols))
 
-    def set(self, tangents: Sequence[FloatArray]) -> None:
+    def set(self, tangents: FloatArray) -> None:
         """Replace all values. Collective.
 
         Args:
-            tangents: Of each batch of elements, shape (n, r, r).
+            tangents: All entries of all elements' tangents, one after the other.
         """
-        values = [tangents[e][:, rows, cols].ravel() for e, rows, cols in self._entries]
-        compat.set_values_coo(self.matrix, np.concatenate([np.empty(0), *values]))
+        of_bodies = [values for body in self._bodies for values in body.values()]
+        compat.set_values_coo(self.matrix, np.concatenate([tangents[self._index], *of_bodies]))
 
     def destroy(self) -> None:
-        """Free the PETSc object."""
-        self.matrix.destroy()
+        """Free the PETSc objects; the bodies' matrices stay theirs."""
+        for a in (self.matrix, *self._bodies):
+            a.destroy()
+
+
+class _OfBody:
+    """Entries of a body's matrix on this rank, whose pattern never changes.
+
+    Args:
+        matrix: Of the body; if it is no AIJ matrix, each look converts it.
+    """
+
+    def __init__(self, matrix: Any) -> None:
+        self._given = matrix
+        self._aij = matrix
+        if matrix.getType() not in {"seqaij", "mpiaij"}:
+            self._aij = matrix.convert("aij", out=PETSc.Mat())
+        self._parts = compat.csr_parts(self._aij)
+
+    def numbers(self) -> Iterator[tuple[IntArray, IntArray]]:
+        """Rows and columns of the entries of each part."""
+        start, stop = self._aij.getOwnershipRange()
+        for pointer, column, number, _ in self._parts:
+            yield np.repeat(np.arange(start, stop), np.diff(pointer)), number[column]
+
+    def values(self) -> list[FloatArray]:
+        """Their values as the body's matrix is now."""
+        if self._aij is not self._given:
+            self._given.convert("aij", out=self._aij)
+            self._parts = compat.csr_parts(self._aij)
+        return [part[3] for part in self._parts]
+
+    def destroy(self) -> None:
+        """Free what was converted."""
+        if self._aij is not self._given:
+            self._aij.destroy()
 
 
 class StepMatrix:
-    """Nested Jacobian of the step problem, and the form of it that the solvers see.
+    """Jacobian of the step problem in the form that the solvers see.
 
     Args:
         layout: Fields of the problem.
@@ -91,8 +135,6 @@ class StepMatrix:
             "aij", as few of PETSc's preconditioners take the first.
 
     Attributes:
-        nest: Blocks of the fields, as of the last fresh assembly, that are converted to one matrix:
-            of all fields, or if split of the bodies; None if these are filled in blocks of nodes.
         corner: The bodies' part of the operator.
         operator: What the solvers see, after `assemble`.
     """
@@ -107,33 +149,11 @@ class StepMatrix:
         blocked: bool = False,
         kind: str = "baij",
     ) -> None:
-        self._layout, self._bodies, self._elements = layout, list(bodies), list(elements)
+        self._layout, self._elements = layout, list(elements)
         self._in_operator: list[FloatArray] = []
-        fields = range(layout.counts.shape[1])
+        self._num_bodies, fields = len(bodies), range(layout.counts.shape[1])
         self._split = split and len(fields) > len(bodies)
         found = node_blocks.patterns(bodies) if blocked else None
-        joined = fields[: len(bodies)] if self._split else fields
-        self._sources: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
-        for e, element in enumerate(elements if found is None else ()):
-            for i, row in enumerate(element.fields):
-                for j, col in enumerate(element.fields):
-                    if row in joined and col in joined:
-                        self._sources.setdefault((row, col), []).append((e, i, j))
-        self._blocks = {
-            key: self._new_block(*key)
-            for key in self._sources
-            if key[0] != key[1] or key[0] >= len(bodies)
-        }
-        # Bodies' matrices with room for elements within the body, which may fill more entries.
-        self._copies = {
-            i: self._bodies[i].duplicate(copy=False) for i, j in self._sources
-            if i == j and i < len(bodies)
-        }
-        self._same: dict[int, bool] = {}
-        self.nest: Any = None
-        if found is None:
-            grid = [[self._block(i, j) for j in joined] for i in joined]
-            self.nest = PETSc.Mat().createNest(grid, comm=layout.comm)
         halves = [fields[: len(bodies)], fields[len(bodies) :]] if self._split else [fields]
         local = layout.counts[layout.comm.rank]
         layouts = [Layout(layout.comm, local[half].tolist()) for half in halves]
@@ -142,14 +162,16 @@ class StepMatrix:
         # The operator's upper left corner: the bodies, or all that there is if it is not split. Of
         # each batch the columns of its elements that are in it, and their numbers there.
         self._corner_numbers = numbers[0]
-        quarters = [(i, j) for i in range(len(halves)) for j in range(len(halves))][1:]
-        self._constraints = []
-        for i, j in quarters:
+        # That corner, unless it is in blocks, and the other three.
+        self._parts: list[Triplets] = []
+        for i, j in [(i, j) for i in range(len(halves)) for j in range(len(halves))]:
             size = (layouts[i].num_owned, layouts[j].num_owned)
-            parts = [self._entries(e, numbers[i][e], numbers[j][e]) for e in range(len(elements))]
-            self._constraints.append(Triplets(layout.comm, size, parts))
+            first = i == j == 0
+            if found is None or not first:
+                parts = self._entries(numbers[i], numbers[j])
+                of_bodies = (bodies, layouts[0].to_system) if first else ()
+                self._parts.append(Triplets(layout.comm, size, parts, *of_bodies))
         self._by_nodes: node_blocks.NodeBlocks | None = None
-        self.corner = PETSc.Mat()
         if found is not None:
             of_elements = [number for _, number in self._corner_numbers]
             self._by_nodes = node_blocks.NodeBlocks(
@@ -157,53 +179,47 @@ class StepMatrix:
             )
             own, room = (self._by_nodes.size, None), self._by_nodes.room
             if kind == "baij":
-                self.corner.createBAIJ((own, own), 3, nnz=room, comm=layout.comm)
+                self.corner = PETSc.Mat().createBAIJ((own, own), 3, nnz=room, comm=layout.comm)
             else:
                 room = [np.repeat(3 * blocks, 3) for blocks in room]
-                self.corner.createAIJ((own, own), 3, nnz=room, comm=layout.comm)
+                self.corner = PETSc.Mat().createAIJ((own, own), 3, nnz=room, comm=layout.comm)
+        else:
+            self.corner = self._parts[0].matrix
+        self._constraints = self._parts[-3:] if self._split else []
         self._schur: SchurApproximation | None = None
         self.operator: Any = None
 
-    def _block(self, i: int, j: int) -> Any:
-        if i == j and i < len(self._bodies):
-            return self._copies.get(i, self._bodies[i])
-        block = self._blocks.get((i, j))
-        return block.matrix if block else None
-
-    def _new_block(self, row: int, col: int) -> Triplets:
-        local, parts = self._layout.counts[self._layout.comm.rank], []
-        for e, i, j in self._sources[row, col]:
-            columns, numbers = self._elements[e].columns, self._elements[e].numbers
-            sides = [(np.arange(columns[k].start, columns[k].stop), numbers[k]) for k in (i, j)]
-            parts.append(self._entries(e, *sides))
-        return Triplets(self._layout.comm, (int(local[row]), int(local[col])), parts)
-
     def _entries(
-        self, e: int, rows: tuple[IntArray, IntArray], cols: tuple[IntArray, IntArray]
-    ) -> Entries:
-        """Of a batch what can be non-zero in some rows and columns (r,), numbered as (n, r)."""
-        i, j = np.nonzero(self._elements[e].pattern[np.ix_(rows[0], cols[0])])
-        return Entries(e, rows[0][i], cols[0][j], rows[1][:, i], cols[1][:, j])
+        self,
+        of_rows: Sequence[tuple[IntArray, IntArray]],
+        of_cols: Sequence[tuple[IntArray, IntArray]],
+    ) -> list[Entries]:
+        """Of each batch what can be non-zero in some rows and columns, as of `_numbers`."""
+        found, first = [], 0
+        for block, rows, cols in zip(self._elements, of_rows, of_cols, strict=True):
+            size = len(block.pattern)
+            i, j = np.nonzero(block.pattern[np.ix_(rows[0], cols[0])])
+            where = rows[0][i] * size + cols[0][j]
+            row, col = rows[1][:, i], cols[1][:, j]
+            kept, start = (row >= 0) & (col >= 0), first + size**2 * np.arange(len(row))
+            found.append(Entries((start[:, None] + where)[kept], row[kept], col[kept]))
+            first += size**2 * len(row)
+        return found
 
     def assemble(self, tangents: Sequence[FloatArray], *, fresh: bool = True) -> None:
-        """Add the elements' tangents (n, r, r); refresh nest and operator.
+        """Refresh the operator.
 
         Args:
-            tangents: Of each batch of elements.
-            fresh: The bodies' matrices are without elements, newly assembled; else they are as the
-                last call left them, and only the operator is changed.
+            tangents: Of each batch of elements, shape (n, r, r).
+            fresh: The bodies' matrices are newly assembled; else they are as in the last call.
         """
-        if self.operator is None or fresh:
-            self._renew(tangents)
-            if self._schur is not None:
-                self._schur.renew_bodies(self.corner)
-        else:
-            # On several ranks converting is slow. Outside an element's pattern its tangent is zero.
-            self.corner.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
-            self._add([a - b for a, b in zip(tangents, self._in_operator, strict=True)])
-        self._in_operator = list(tangents)
-        for part in self._constraints:
-            part.set(tangents)
+        if self._by_nodes:
+            self._assemble_nodes(self._by_nodes, tangents, fresh or self.operator is None)
+        values = _joined(tangents)
+        for part in self._parts:
+            part.set(values)
+        if fresh and self._schur is not None:
+            self._schur.renew_bodies(self.corner)
         if self.operator is None:
             self.operator = self.corner
             if self._split:
@@ -214,30 +230,19 @@ class StepMatrix:
         # To assemble a nest is to assemble its blocks, each with a message from all to all.
         self.operator.stateIncrease()
 
-    def _renew(self, tangents: Sequence[FloatArray]) -> None:
-        """Bring nest and operator's corner up to the bodies' matrices, with elements."""
-        if self._by_nodes:
-            self._by_nodes.fill(self.corner)
-            self._add(tangents)
-            return
-        for key, sources in self._sources.items():
-            if key in self._blocks:
-                self._blocks[key].set(tangents)
-            else:
-                self._fill_copy(key[0], sources, tangents)
-        self.nest.assemble()
-        # Without `out` the nest itself is converted.
-        self.nest.convert("aij", out=self.corner)
-
-    def _add(self, tangents: Sequence[FloatArray]) -> None:
-        """Add elements' tangents to the operator's corner."""
-        for (columns, numbers), tangent in zip(self._corner_numbers, tangents, strict=True):
-            values = tangent[:, columns][:, :, columns]
-            if self._by_nodes:
-                node_blocks.add(self.corner, numbers, values)
-            else:
-                _add_block(self.corner, numbers, numbers, values)
+    def _assemble_nodes(
+        self, blocks: node_blocks.NodeBlocks, tangents: Sequence[FloatArray], fresh: bool
+    ) -> None:
+        """Bring a corner in blocks up to the bodies' matrices and the elements. Collective."""
+        changes = tangents
+        if fresh:
+            blocks.fill(self.corner)
+        else:
+            changes = [a - b for a, b in zip(tangents, self._in_operator, strict=True)]
+        for (columns, numbers), change in zip(self._corner_numbers, changes, strict=True):
+            node_blocks.add(self.corner, numbers, change[:, columns][:, :, columns])
         self.corner.assemble()
+        self._in_operator = list(tangents)
 
     def schur(self) -> SchurApproximation:
         """Approximate Schur complements of the constraints, as the operator is. Collective.
@@ -282,25 +287,6 @@ class StepMatrix:
             result.append((np.concatenate(columns), np.concatenate(numbers, axis=1).astype(int)))
         return result
 
-    def _fill_copy(
-        self, k: int, sources: Sequence[tuple[int, int, int]], tangents: Sequence[FloatArray]
-    ) -> None:
-        """Bring the copy of a body's matrix up to it and to elements within it. Collective."""
-        body, a = self._bodies[k], self._copies[k]
-        kinds = PETSc.Mat.Structure
-        same = self._same.get(k, True)
-        structure = kinds.SAME_NONZERO_PATTERN if same else kinds.DIFFERENT_NONZERO_PATTERN
-        body.copy(a, structure=structure)
-        a.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
-        for e, i, j in sources:
-            element = self._elements[e]
-            values = tangents[e][:, element.columns[i], element.columns[j]]
-            _add_block(a, element.numbers[i], element.numbers[j], values)
-        a.assemble()
-        if k not in self._same:
-            total = PETSc.Mat.InfoType.GLOBAL_SUM
-            self._same[k] = a.getInfo(total)["nz_used"] == body.getInfo(total)["nz_used"]
-
     def whole_bodies(self) -> list[IntArray] | None:
         """Numbers of the bodies dealt to this rank in their part of the operator, body by body.
 
@@ -308,7 +294,7 @@ class StepMatrix:
             None unless the bodies divide among all ranks about evenly; the same on all ranks.
         """
         layout, comm = self._body_layout, self._layout.comm
-        sizes = layout.counts[:, : len(self._bodies)].sum(axis=0)
+        sizes = layout.counts[:, : self._num_bodies].sum(axis=0)
         load, mine = np.zeros(comm.size), []
         for k in np.argsort(-sizes, kind="stable"):
             rank = int(load.argmin())
@@ -335,20 +321,14 @@ class StepMatrix:
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
-        made = [self.corner, *self._constraints, *self._blocks.values(), *self._copies.values()]
+        made: list[Any] = [self._schur] if self._schur else []
+        made += [self.corner] if self._by_nodes else []
         made += [self.operator] if self._split and self.operator else []
-        made += [a for a in (self.nest, self._schur) if a]
-        for a in made:
+        for a in (*self._parts, *made):
             a.destroy()
 
 
-def _add_block(a: Any, rows: IntArray, cols: IntArray, values: FloatArray) -> None:
-    """Add blocks (n, r, c) at rows (n, r) and columns (n, c); negative numbers are left out."""
-    (n, num_rows), num_cols = rows.shape, cols.shape[1]
-    a.setValuesIJV(
-        np.arange(n * num_rows + 1, dtype=PETSc.IntType) * num_cols,
-        np.repeat(cols, num_rows, axis=0).ravel().astype(PETSc.IntType),
-        np.ascontiguousarray(values).ravel(),
-        addv=PETSc.InsertMode.ADD_VALUES,
-        rowmap=rows.ravel().astype(PETSc.IntType),
-    )
+def _joined(tangents: Sequence[FloatArray]) -> FloatArray:
+    """All entries of tangents, one after the other; a single batch is not copied."""
+    flat = [tangent.ravel() for tangent in tangents]
+    return flat[0] if len(flat) == 1 else np.concatenate([np.empty(0), *flat])

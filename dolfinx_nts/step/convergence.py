@@ -59,7 +59,7 @@ def _over_limits(
         t = e.bodies[k]
         parts = (forces[k], problem.flight[k], t.internal, t.external, t.coupling)
         squares[k, :5] = [float(p @ p) for p in parts]
-    squares[:, 5] = problem.laid.gross_forces(e.parts, len(e.bodies))
+    squares[:, 5] = problem.laid.gross_forces(problem.elements, e.parts, len(e.bodies))
     norms = np.sqrt(problem.system.comm.allreduce(squares))
     limits = problem.rtol * norms[:, 1:5].max(axis=1) + _CANCELLED * norms[:, 5] + rounding
     return [over(a, b) for a, b in zip(norms[:, 0], limits, strict=True)]

@@ -58,9 +58,10 @@ class Iterates:
             self.flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
         else:
             for k, (a, b) in enumerate(zip(last.parts, new.parts, strict=True)):
-                changes = a.status != b.status
-                self.flips[k] += changes
-                self._settled &= not changes.any()
+                if self.flips[k].size:
+                    changes = a.status != b.status
+                    self.flips[k] += changes
+                    self._settled &= not changes.any()
         self.last = new
         return new
 

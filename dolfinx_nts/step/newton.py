@@ -1,4 +1,4 @@
-"""PETSc SNES for a step: nested Jacobian, convergence per block."""
+"""PETSc SNES for a step: Jacobian, convergence per block."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class StepSolver:
 
     Attributes:
         iterates: Iterates of the step.
-        matrix: Nested Jacobian and the form of it that SNES sees, after `assemble`.
+        matrix: Jacobian as SNES sees it, after `assemble`.
         snes: The PETSc SNES, after `prepare`.
     """
 
@@ -213,7 +213,7 @@ class StepSolver:
             self._version = self.problem.version
 
     def assemble(self, e: Evaluation) -> StepMatrix:
-        """Nested Jacobian at an iterate, and what SNES sees of it. Every rank must call it.
+        """Jacobian at an iterate, as SNES sees it. Every rank must call it.
 
         The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
         """
@@ -360,10 +360,20 @@ class StepSolver:
             )
         why, advises = self._presets.why_failed(self.snes, reason)
         message = diagnosis(problem, e, self.iterates.flips, why, iterations)
+        return self.with_flat(message, e, advises=advises or UNSETTLED in message)
+
+    def with_flat(self, message: str, e: Evaluation, *, advises: bool = False) -> StepFailedError:
+        """A failure that also names the cell that is nearly inside out, if one is. Collective.
+
+        Args:
+            message: What failed.
+            e: Where.
+            advises: Whether that tells what to do.
+        """
         flat = self._upright.describe_flat(e.x)
         if flat:
             return StepFailedError(f"{message}; {flat}", advises=True)
-        return StepFailedError(message, advises=advises or UNSETTLED in message)
+        return StepFailedError(message, advises=advises)
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

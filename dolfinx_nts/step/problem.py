@@ -582,4 +582,4 @@ def _box(system: System) -> tuple[FloatArray, float]:
 def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:
     if b is None or len(a) != len(b):
         return False
-    return all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+    return all(x is y or np.array_equal(x, y) for x, y in zip(a, b, strict=True))

@@ -148,10 +148,14 @@ def _null_part(rows: _Rows) -> FloatArray:
     wanted = np.where(square[:, :1] > 0.0, square[:, :1], 1.0)
     unit = np.sqrt(np.divide(wanted, square, out=np.zeros_like(square), where=square > 0.0))
     pushes = pushes * np.repeat(unit.ravel(), 3)[columns]
-    at = np.repeat(np.arange(n), 12), columns.ravel()
-    g: Any = scipy.sparse.csr_array((pushes.ravel(), at), shape=(n, 6 * len(known)))
+    g: Any
     if few:
-        g = g.toarray()
+        g = np.zeros((n, 6 * len(known)))
+        for side in (slice(6), slice(6, None)):
+            g[np.arange(n)[:, None], columns[:, side]] += pushes[:, side]
+    else:
+        at = np.repeat(np.arange(n), 12), columns.ravel()
+        g = scipy.sparse.csr_array((pushes.ravel(), at), shape=(n, 6 * len(known)))
     a, b = g.T @ g, g.T @ rows.value
     largest = a.diagonal().reshape(-1, 6).max(axis=1)
     held = np.repeat(_NONE * np.where(largest > 0.0, largest, 1.0), 6)

@@ -52,12 +52,15 @@ class Unknowns:
                 counts.append(size)
         self.layout = Layout(comm, counts)
         self.blocks = self._blocks(elements, bodies) if there[-1] else []
-        index = [np.empty(0, np.int64)]
+        index, owners = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for c, numbers in zip(elements, bodies, strict=True):
             if c.num_elements:
-                both = zip(numbers, c.points(), strict=True)
+                both = list(zip(numbers, c.points(), strict=True))
                 parts = [self.layout.to_system(self._field[b], p) for b, p in both]
                 index.append(np.concatenate(parts, axis=1).ravel())
+                of = [np.full(p.shape, b) for b, p in both]
+                owners.append(np.concatenate(of, axis=1).ravel())
+        self._body_of_row = np.concatenate(owners)
         needed = np.concatenate(index).astype(PETSc.IntType)
         self.x = PETSc.Vec().createMPI((self.layout.num_owned, None), comm=comm)
         self._forces = self.x.duplicate()
@@ -121,38 +124,31 @@ class Unknowns:
         """Own unknowns of each batch by field, shape (n, width), from this rank's unknowns."""
         out: list[dict[str, FloatArray]] = [{} for _ in elements]
         for name in _OWN:
-            shapes = [(c.num_elements, c.widths[name]) for c in elements]
-            if name not in self.own:
-                parts = [np.zeros(shape) for shape in shapes]
-            else:
-                stops = np.cumsum([n * w for n, w in shapes])
-                parts = np.split(values[self.of_elements(name)], stops[:-1])
-            for own, part, shape in zip(out, parts, shapes, strict=True):
-                own[name] = part.reshape(shape)
+            of_field = values[self.of_elements(name)] if name in self.own else None
+            start = 0
+            for own, c in zip(out, elements, strict=True):
+                shape = c.num_elements, c.widths[name]
+                stop = start + shape[0] * shape[1]
+                own[name] = (
+                    np.zeros(shape) if of_field is None else of_field[start:stop].reshape(shape)
+                )
+                start = stop
         return out
 
-    def gross_forces(self, parts: Sequence[Any], bodies: int) -> FloatArray:
+    def gross_forces(
+        self, elements: Sequence[Any], parts: Sequence[Any], bodies: int
+    ) -> FloatArray:
         """Sum of the squares of all elements' forces on each body on this rank, shape (bodies,).
 
         Forces that cancel each other count in full.
         """
-        squares, numbers = np.zeros(bodies), list(self._field)
-        if not self.blocks:
-            return squares
-        for block, part in zip(self.blocks, parts, strict=True):
-            for field, columns in zip(block.fields, block.columns, strict=True):
-                if field < len(numbers):
-                    rows = part.residual[:, columns].ravel()
-                    squares[numbers[field]] += rows @ rows
-        return squares
+        squares: FloatArray = np.square(_coordinate_rows(elements, parts))
+        found: Any = np.bincount(self._body_of_row, squares, minlength=bodies)
+        return found
 
     def forces(self, elements: Sequence[Any], parts: Sequence[Any]) -> FloatArray:
         """Rows of coordinates of all elements, summed up at this rank's unknowns. Collective."""
-        rows = [
-            part.residual[:, : c.num_coordinates].ravel()
-            for c, part in zip(elements, parts, strict=True)
-        ]
-        self._local.array_w[:] = np.concatenate([np.empty(0), *rows])
+        self._local.array_w[:] = _coordinate_rows(elements, parts)
         self._forces.set(0.0)
         add, reverse = PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE
         self._scatter.scatter(self._local, self._forces, addv=add, mode=reverse)
@@ -163,3 +159,12 @@ class Unknowns:
         """Free the PETSc objects, which Python's collector does not."""
         for a in (self.x, self._forces, self._local, self._scatter):
             a.destroy()
+
+
+def _coordinate_rows(elements: Sequence[Any], parts: Sequence[Any]) -> FloatArray:
+    """Residuals of the coordinates of all elements, one after the other [kg m]."""
+    rows = [
+        part.residual[:, : c.num_coordinates].ravel()
+        for c, part in zip(elements, parts, strict=True)
+    ]
+    return np.concatenate([np.empty(0), *rows])
