@@ -10,8 +10,8 @@ matrices' assembly, and of the directors' elements, which it could leave out.
 
 Measured for 100 bodies (three runs, beside other jobs): same motion to 2e-16; of a step of 70 ms
 the linear solves take 15 %, 6 to 7 % reduced; the projection 5 to 6 %; the directors' elements 4 %,
-and a part of the assembly's 2 % is theirs. So six unknowns would save less than a tenth of a step: most
-of it is Python around bodies and elements one by one, which rotations would need alike. They
+and a part of the assembly's 2 % is theirs. So six unknowns would save less than a tenth of a step:
+most of it is Python around bodies and elements one by one, which rotations would need alike. They
 would cost a second kind of body, whose points are not linear in its unknowns. They are not built.
 
     python benchmarks/rigid_unknowns.py [--bodies 10 100 400]
