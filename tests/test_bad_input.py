@@ -657,7 +657,7 @@ def test_newton():
     pattern = r"^max_iterations=0: must be at least 1"
     raises(ValueError, pattern, lambda: nts.Newton(max_iterations=0))
     raises(ValueError, r"^max_retries=-1: must not be", lambda: nts.Newton(max_retries=-1))
-    pattern = r"^linear_solver='cg': choose one of 'auto', 'direct', 'krylov'"
+    pattern = r"^linear_solver='cg': choose one of 'auto', 'direct', 'krylov', 'multigrid'"
     raises(ValueError, pattern, lambda: nts.Newton(linear_solver="cg"))
     raises(TypeError, r"^reuse='no': pass True or False", lambda: nts.Newton(reuse="no"))
     raises(TypeError, r"^condense=1: pass True or False", lambda: nts.Newton(condense=1))

@@ -22,15 +22,17 @@ class Newton:
         max_retries: How often a dropped step may be cut (to less than half) before the run stops.
         condense: Eliminate (d, f) and their multipliers pair by pair, so that only the bodies,
             lambda_N and lambda_T reach the linear solver: the same solution in fewer iterations.
-        linear_solver: "direct" (MUMPS) or "krylov" (FGMRES with incomplete factors of the bodies
-            and a Schur complement for contact): at 50,000 coordinates an iteration costs a fifth.
-            Its incomplete factors weaken as dt grows beyond the time a wave needs through an
-            element.
+        linear_solver: "direct" (MUMPS), "krylov" (FGMRES with incomplete factors of the bodies
+            and a Schur complement for contact) or "multigrid" (FGMRES with an algebraic multigrid
+            of an augmented Lagrangian, for statics). At 50,000 coordinates an iteration costs a
+            fifth. Incomplete factors weaken as dt grows beyond the time a wave needs through an
+            element, multigrid near incompressibility.
             "auto" starts with "krylov", except below 600 coordinates (100 where no contact is
-            declared), in statics, and with `petsc_options` beyond those of SNES; after a solve that
-            needed more iterations than MUMPS is worth it takes MUMPS for some steps. Where MUMPS
-            fails, it leaves out equations that repeat others for some steps; "krylov" is left
-            alone.
+            declared), in statics with "multigrid", except below 10,000 (20,000 beside rigid bodies,
+            beams or shells), and with MUMPS where `petsc_options` has others than those of SNES;
+            after a solve that needed more iterations than MUMPS is worth it takes MUMPS for some
+            steps. Where MUMPS fails, it leaves out equations that repeat others for some steps.
+            Nothing takes over from "krylov" or "multigrid" where you ask for them.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew.
 
@@ -69,7 +71,8 @@ class Newton:
             return self.linear_solver
         flexible = [b for b in system.bodies if not b.joints]
         size = int(system.comm.allreduce(sum(b.num_owned for b in flexible)))
-        return choose(size, bool(system.contacts or system.joints), inertia, given)
+        couples, mixed = bool(system.contacts or system.joints), len(flexible) < len(system.bodies)
+        return choose(size, couples, inertia, given, mixed)
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.

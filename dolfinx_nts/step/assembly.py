@@ -129,11 +129,13 @@ class StepMatrix:
         elements: Unknowns of each batch of elements.
         split: Whether solvers see a nest of two fields, "bodies" and "constraints", from which a
             field split takes its blocks without a copy; else one matrix.
-        blocked: Whether the bodies' part may be stored in the 3 x 3 blocks of nodes (BAIJ), with
-            which a product takes a third of the time; few of PETSc's preconditioners take it. With
+        blocked: Whether the bodies' part may be filled in the 3 x 3 blocks of nodes. With
             constraints it needs `split`.
+        kind: PETSc's type of it if so: "baij", with which a product takes a third of the time, or
+            "aij", as few of PETSc's preconditioners take the first.
 
     Attributes:
+        corner: The bodies' part of the operator.
         operator: What the solvers see, after `assemble`.
     """
 
@@ -145,6 +147,7 @@ class StepMatrix:
         *,
         split: bool = False,
         blocked: bool = False,
+        kind: str = "baij",
     ) -> None:
         self._layout, self._elements = layout, list(elements)
         self._in_operator: list[FloatArray] = []
@@ -174,12 +177,14 @@ class StepMatrix:
             self._by_nodes = node_blocks.NodeBlocks(
                 bodies, found, layouts[0].to_system, of_elements
             )
-            own = (self._by_nodes.size, None)
-            self._corner = PETSc.Mat().createBAIJ(
-                (own, own), 3, nnz=self._by_nodes.room, comm=layout.comm
-            )
+            own, room = (self._by_nodes.size, None), self._by_nodes.room
+            if kind == "baij":
+                self.corner = PETSc.Mat().createBAIJ((own, own), 3, nnz=room, comm=layout.comm)
+            else:
+                room = [np.repeat(3 * blocks, 3) for blocks in room]
+                self.corner = PETSc.Mat().createAIJ((own, own), 3, nnz=room, comm=layout.comm)
         else:
-            self._corner = self._parts[0].matrix
+            self.corner = self._parts[0].matrix
         self._constraints = self._parts[-3:] if self._split else []
         self._schur: SchurApproximation | None = None
         self.operator: Any = None
@@ -214,12 +219,12 @@ class StepMatrix:
         for part in self._parts:
             part.set(values)
         if fresh and self._schur is not None:
-            self._schur.renew_bodies(self._corner)
+            self._schur.renew_bodies(self.corner)
         if self.operator is None:
-            self.operator = self._corner
+            self.operator = self.corner
             if self._split:
                 b, c, d = (part.matrix for part in self._constraints)
-                grid = [[self._corner, b], [c, d]]
+                grid = [[self.corner, b], [c, d]]
                 self.operator = PETSc.Mat().createNest(grid, comm=self._layout.comm)
             self.operator.assemble()
         # To assemble a nest is to assemble its blocks, each with a message from all to all.
@@ -231,12 +236,12 @@ class StepMatrix:
         """Bring a corner in blocks up to the bodies' matrices and the elements. Collective."""
         changes = tangents
         if fresh:
-            blocks.fill(self._corner)
+            blocks.fill(self.corner)
         else:
             changes = [a - b for a, b in zip(tangents, self._in_operator, strict=True)]
         for (columns, numbers), change in zip(self._corner_numbers, changes, strict=True):
-            node_blocks.add(self._corner, numbers, change[:, columns][:, :, columns])
-        self._corner.assemble()
+            node_blocks.add(self.corner, numbers, change[:, columns][:, :, columns])
+        self.corner.assemble()
         self._in_operator = list(tangents)
 
     def schur(self) -> SchurApproximation:
@@ -246,13 +251,13 @@ class StepMatrix:
         """
         if self._schur is None:
             self._schur = SchurApproximation(*self._touched())
-            self._schur.renew_bodies(self._corner)
+            self._schur.renew_bodies(self.corner)
         self._schur.renew(*(part.matrix for part in self._constraints))
         return self._schur
 
     def _touched(self) -> tuple[Any, Any]:
         """Index sets of this rank's coordinates that elements touch, and of its constraints."""
-        comm, mark = self._layout.comm, self._corner.createVecLeft()
+        comm, mark = self._layout.comm, self.corner.createVecLeft()
         for _, numbers in self._corner_numbers:
             index = numbers[numbers >= 0].astype(PETSc.IntType)
             mark.setValues(index, np.ones(len(index)), addv=PETSc.InsertMode.ADD_VALUES)
@@ -317,7 +322,7 @@ class StepMatrix:
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
         made: list[Any] = [self._schur] if self._schur else []
-        made += [self._corner] if self._by_nodes else []
+        made += [self.corner] if self._by_nodes else []
         made += [self.operator] if self._split and self.operator else []
         for a in (*self._parts, *made):
             a.destroy()

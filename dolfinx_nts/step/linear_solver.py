@@ -21,7 +21,9 @@ _FACTORS = "factors_"
 #: Name under which the first matrix stores the second approximation.
 _SECOND = "dolfinx_nts_second"
 #: What `Newton.linear_solver` may be.
-SOLVERS = ("auto", "direct", "krylov")
+SOLVERS = ("auto", "direct", "krylov", "multigrid")
+#: Those that MUMPS may take over from.
+ITERATIVE = ("krylov", "multigrid")
 #: MUMPS's option for workspace beyond what it guesses [%].
 WORKSPACE = "mat_mumps_icntl_14"
 #: Presets; a user's `petsc_options` override them one by one.
@@ -61,6 +63,30 @@ PRESETS: dict[str, dict[str, Any]] = {
         _CONSTRAINTS + "pc_factor_mat_solver_type": "mumps",
     },
 }
+# Without inertia: the field split takes the augmented matrix, see `step/augmented.py`, whose lower
+# right block is the Schur complement's approximation, element by element.
+_MULTIGRID = {
+    "ksp_type": "preonly",
+    "pc_type": "gamg",
+    # The graph of one matrix does for those of all iterates.
+    "pc_gamg_reuse_interpolation": True,
+}
+PRESETS["multigrid"] = PRESETS["krylov"] | {
+    "pc_fieldsplit_schur_precondition": "a11",
+    **{_BODIES + k: v for k, v in _MULTIGRID.items()},
+    _CONSTRAINTS + "pc_type": "bjacobi",
+    _CONSTRAINTS + "sub_pc_type": "lu",
+}
+#: Parts of the bodies where not all of them are for a multigrid.
+PARTS = ("continua", "others")
+_MIXED = {
+    _BODIES + "pc_type": "fieldsplit",
+    _BODIES + "pc_fieldsplit_type": "symmetric_multiplicative",
+    **{f"{_BODIES}fieldsplit_{PARTS[0]}_{k}": v for k, v in _MULTIGRID.items()},
+    f"{_BODIES}fieldsplit_{PARTS[1]}_ksp_type": "preonly",
+    f"{_BODIES}fieldsplit_{PARTS[1]}_pc_type": "lu",
+    f"{_BODIES}fieldsplit_{PARTS[1]}_pc_factor_mat_solver_type": "mumps",
+}
 #: On several ranks the preconditioner of bodies is additive Schwarz with an overlap of one node,
 #: which halves the iterations of smooth motion; without overlap it gains nothing.
 _PARTS = {_BODIES + "pc_type": "asm"}
@@ -91,30 +117,42 @@ PRESETS |= {
 #: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
 #: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.
 _FEW = (100, 600)
+#: The same of "multigrid" without inertia, for continua alone and beside other bodies; of thin ones
+#: MUMPS has less work than of the cubes that break even at 4,000.
+_FEW_STATIC = (10_000, 20_000)
+#: Iterations of each for 1e3 coordinates that take as long as MUMPS, and how they grow.
+_WORTH = {"krylov": (60, 0.4), "multigrid": (10, 0.5)}
 
 
-def choose(size: int, contact: bool, inertia: bool, given: Mapping[str, Any]) -> str:
-    """Preset to begin with: "krylov", but "direct" where that is as good or the user asks for it.
+def choose(
+    size: int, contact: bool, inertia: bool, given: Mapping[str, Any], mixed: bool = False
+) -> str:
+    """Preset to begin with, but "direct" where that is as good or the user asks for it.
 
-    Without inertia incomplete factors are poor.
+    Without inertia incomplete factors are poor, and "multigrid" takes their place.
 
     Args:
-        size: Coordinates of all bodies.
+        size: Coordinates of all bodies without constraints of their own.
         contact: Whether contacts are declared.
         inertia: Whether the step equations have inertia.
         given: The user's PETSc options; those of a linear solver are meant for "direct".
+        mixed: Whether there are other bodies beside these.
     """
     own = any(not name.startswith("snes_") for name in given)
-    return "direct" if own or not inertia or size < _FEW[contact] else "krylov"
+    if own or size < (_FEW[contact] if inertia else _FEW_STATIC[mixed]):
+        return "direct"
+    return "krylov" if inertia else "multigrid"
 
 
-def most_iterations(size: int) -> int:
+def most_iterations(preset: str, size: int) -> int:
     """Krylov iterations that take as long as MUMPS, measured on blocks of 1e3 to 5e4 coordinates.
 
     Args:
+        preset: One of `ITERATIVE`.
         size: Coordinates of all bodies.
     """
-    return int(60 * max(1.0, size / 1e3) ** 0.4)
+    number, power = _WORTH[preset]
+    return int(number * max(1.0, size / 1e3) ** power)
 
 
 #: In place of the preset's where the augmented unknowns are condensed: without zeros on its
@@ -162,6 +200,7 @@ class SolverOptions:
             known |= _CONDENSED[preset]
         self._preset = known
         self._all = {**known, **self._given}
+        self.augmented = preset == "multigrid" and self.split
         self._unchecked = set(self._given)
         self._entered: dict[str, str] = {}
         # Of a run that nobody closed they are removed, too: PETSc would complain when it ends of
@@ -172,7 +211,8 @@ class SolverOptions:
     def schur(self) -> bool:
         """Whether the preset's Schur complement is to be replaced by `SchurApproximation`."""
         name, kind = "pc_fieldsplit_schur_precondition", self._all.get("pc_fieldsplit_type")
-        return self.split and kind == "schur" and name in self._all and name not in self._given
+        ours = self._preset.get(name) == "selfp" and name not in self._given
+        return self.split and kind == "schur" and ours
 
     @property
     def most_iterations(self) -> int:
@@ -186,11 +226,26 @@ class SolverOptions:
 
     @property
     def blocked(self) -> bool:
-        """Whether the bodies' matrices may be in blocks: their preconditioner is the preset's."""
-        return self.split and not any(k.startswith(("pc_", _BODIES)) for k in self._given)
+        """Whether the bodies' matrices may be in blocks of nodes.
+
+        If so, their preconditioner is the preset's, or has a matrix of its own.
+        """
+        own = any(k.startswith(("pc_", _BODIES)) for k in self._given)
+        return self.split and (self.augmented or not own)
+
+    @property
+    def by_rank(self) -> bool:
+        """Whether each rank's preconditioner may take whole bodies, see `take_bodies`."""
+        return self.blocked and not self.augmented
 
     def configure(
-        self, snes: Any, matrix: StepMatrix | None, num_bodies: int, *, whole: bool = False
+        self,
+        snes: Any,
+        matrix: StepMatrix | None,
+        num_bodies: int,
+        *,
+        whole: bool = False,
+        mixed: bool = False,
     ) -> None:
         """Set a SNES up from the options.
 
@@ -201,11 +256,13 @@ class SolverOptions:
             matrix: Its matrix, if there are constraints to split off.
             num_bodies: Fields of the matrix that are bodies.
             whole: Whether each rank's preconditioner takes whole bodies, see `take_bodies`.
+            mixed: Whether some bodies are not for a multigrid, see `AugmentedMatrix.split_bodies`.
 
         Raises:
             ValueError: PETSc refuses a value.
         """
-        self._all = self._preset | (_WHOLE if whole else {}) | self._given
+        self._all = self._preset | (_WHOLE if whole else {}) | (_MIXED if mixed else {})
+        self._all |= self._given
         options = {k: k for k in self._all}
         if matrix is None and self.split:
             outer = {k: k for k in self._all if not k.startswith(("pc_", "fieldsplit_"))}
@@ -229,7 +286,7 @@ class SolverOptions:
         except PETSc.Error as error:
             raise self._refused(error) from error
 
-    def check(self, snes: Any, matrix: Any) -> None:
+    def check(self, snes: Any, matrix: Any, source: Any) -> None:
         """Raise on every rank if PETSc asks for one of the user's options nowhere in a solve.
 
         Nothing is solved yet: most options are asked for when the solver is set up. If some are
@@ -240,6 +297,7 @@ class SolverOptions:
         Args:
             snes: The configured SNES.
             matrix: Its assembled matrix.
+            source: What its preconditioner is made of.
 
         Raises:
             ValueError: PETSc does not know an option or its value.
@@ -248,7 +306,7 @@ class SolverOptions:
             return
         try:
             ksp = snes.getKSP()
-            ksp.setOperators(matrix, matrix)
+            ksp.setOperators(matrix, source)
             ksp.setUp()
             ksp.setUpOnBlocks()
             self._forget_used()

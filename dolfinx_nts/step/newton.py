@@ -16,6 +16,7 @@ from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.augmented import AugmentedMatrix
 from dolfinx_nts.step.convergence import ratios
 from dolfinx_nts.step.diagnosis import diagnosis
 from dolfinx_nts.step.iterates import Iterates
@@ -75,6 +76,7 @@ class StepSolver:
         joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
         self._independent: bool | None = True if form_tree(joints) else None
         self.matrix: StepMatrix | None = None
+        self._augmented: AugmentedMatrix | None = None
         self.snes: Any = None
 
     @property
@@ -127,7 +129,7 @@ class StepSolver:
                     self.prepare()
             try:
                 self._raised = None
-                self._presets.options.check(self.snes, self.matrix.operator)
+                self._presets.options.check(self.snes, self.matrix.operator, self._source.operator)
                 self.snes.solve(None, self.problem.x)
             except PETSc.Error as error:
                 # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
@@ -216,9 +218,8 @@ class StepSolver:
         The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
         """
         bodies, fresh = self._tangents.at(e)
-        new = self.matrix is None
+        new, options = self.matrix is None, self._presets.options
         if self.matrix is None:
-            options = self._presets.options
             self.matrix = StepMatrix(
                 self.problem.laid.layout,
                 bodies,
@@ -226,34 +227,48 @@ class StepSolver:
                 split=options.split,
                 blocked=options.blocked,
             )
-        elif self._solved and self.newton.reuse and self.problem.laid.own:
+            if options.augmented:
+                self._augmented = AugmentedMatrix(self.problem, bodies)
+        elif self._solved and self.newton.reuse and self.problem.laid.own and not options.augmented:
+            # Of an augmented matrix contacts that close change the bodies' part.
             keep_bodies(self.snes, not fresh)
         if fresh or new or self.problem.laid.blocks:
             tangents = [part.tangent for part in e.parts] if self.problem.laid.blocks else []
             self.matrix.assemble(tangents, fresh=fresh)
+            if self._augmented is not None:
+                self._augmented.assemble(tangents, fresh=fresh)
         self._tangents.remember()
         if self.snes is not None:
             self._refresh_schur()
         self._assembled = e
         return self.matrix
 
+    @property
+    def _source(self) -> StepMatrix:
+        """What the preconditioner is made of."""
+        assert self.matrix is not None
+        return self.matrix if self._augmented is None else self._augmented.matrix
+
     def _configure(self) -> None:
         assert self.matrix is not None
         self.snes = PETSc.SNES().create(self.problem.system.comm)
         self._f = self.problem.x.duplicate()
         self.snes.setFunction(self._function, self._f)
-        self.snes.setJacobian(self._jacobian, self.matrix.operator, self.matrix.operator)
+        self.snes.setJacobian(self._jacobian, self.matrix.operator, self._source.operator)
         self.snes.setConvergenceTest(self._converged)
-        self.snes.setLineSearchPreCheck(self._upright.shorten)
+        self.snes.setLineSearchPreCheck(self._check_update)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
         split = self.matrix if self.problem.laid.own else None
         self._solved = False
         options = self._presets.options
-        ours = options.blocked and self.problem.system.comm.size > 1
+        ours = options.by_rank and self.problem.system.comm.size > 1
         bodies = self.matrix.whole_bodies() if ours else None
         whole = bodies is not None
-        options.configure(self.snes, split, len(self.problem.awake), whole=whole)
+        mixed = self._augmented is not None and self._augmented.mixed
+        options.configure(self.snes, split, len(self.problem.awake), whole=whole, mixed=mixed)
         self._refresh_schur()
+        if self._augmented is not None and mixed:
+            self._augmented.split_bodies(self.snes, self.matrix.operator)
         if bodies is not None:
             take_bodies(self.snes, self.matrix.operator, bodies, split is not None)
 
@@ -275,6 +290,12 @@ class StepSolver:
         e = self.iterates.at(x)
         if e is not self._assembled:
             self.assemble(e)
+
+    def _check_update(self, x: Any, y: Any) -> bool:
+        """Hold prescribed coordinates, which a multigrid moves a little, and shorten updates."""
+        for k in self.problem.awake:
+            y.array_w[self.problem.of_body(k)][self.problem.system.bodies[k].fixed] = 0.0
+        return self._upright.shorten(x, y)
 
     def _worst(self, e: Evaluation) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -360,6 +381,9 @@ class StepSolver:
         if self.matrix is not None:
             self.matrix.destroy()
             self.matrix = None
+        if self._augmented is not None:
+            self._augmented.destroy()
+            self._augmented = None
         if self.snes is not None:
             self.snes.destroy()
             self._f.destroy()

@@ -9,7 +9,7 @@ from typing import Any
 from petsc4py import PETSc
 
 from dolfinx_nts.step.accuracy import Newton
-from dolfinx_nts.step.linear_solver import SolverOptions, most_iterations
+from dolfinx_nts.step.linear_solver import ITERATIVE, SolverOptions, most_iterations
 from dolfinx_nts.system import System
 
 #: Part of the tolerance that an iteration aims at if it may be the last: a step that only just
@@ -41,7 +41,7 @@ def _mumps_factors(pc: Any) -> Any:
 class Presets:
     """The presets of a run in the order in which they take over where a linear solve fails.
 
-    After "krylov" comes MUMPS, and then MUMPS without equations that repeat others.
+    After "krylov" and "multigrid" comes MUMPS, and then MUMPS without equations that repeat others.
 
     Args:
         system: The scene.
@@ -69,7 +69,7 @@ class Presets:
         if any(pair.redundant for pair in system.contacts):
             mumps = ("redundant", "null-pivots")
         own = given.keys() & {"ksp_type", "pc_type", "pc_factor_mat_solver_type"}
-        self._names: tuple[str, ...] = ("krylov",)
+        self._names: tuple[str, ...] = (first,)
         if first == "direct":
             self._names = mumps[:1] if own else mumps
         elif newton.linear_solver == "auto":
@@ -101,8 +101,8 @@ class Presets:
     def use(self, chosen: int) -> None:
         """Change to a preset by its number; the SNES and its options must be gone."""
         self._chosen = chosen
-        weighed = self.name == "krylov" and self._newton.linear_solver == "auto"
-        limit = most_iterations(self._system.size) if weighed else None
+        weighed = self.name in ITERATIVE and self._newton.linear_solver == "auto"
+        limit = most_iterations(self.name, self._system.size) if weighed else None
         workspace = self._workspace.get(self.name)
         self.options = SolverOptions(
             self._system.comm, self.name, self._condense, self._given, limit, workspace
@@ -129,14 +129,14 @@ class Presets:
         return self._chosen + 1
 
     def aim(self, snes: Any, worst: float, adds_up: Callable[[], bool]) -> None:
-        """Let the linear solver of "krylov" go as far as is worth it at an iterate.
+        """Let the Krylov solver of "krylov" and "multigrid" go as far as is worth it at an iterate.
 
         Args:
             snes: The SNES.
             worst: Residual of the iterate over its tolerance.
             adds_up: Tells whether what an iteration leaves adds up over steps; collective.
         """
-        if self.name != "krylov" or self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
+        if self.name not in ITERATIVE or self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
             return
         aim, limit = _AIM / worst, self.options.most_iterations
         if self._newton.reuse:
@@ -163,9 +163,9 @@ class Presets:
         if advises:
             why += (
                 "; MUMPS did not get the memory for its factors: use more ranks or memory, "
-                "Newton(linear_solver='krylov'), or a coarser mesh"
+                "Newton(linear_solver='krylov') (in statics 'multigrid'), or a coarser mesh"
             )
-        if self._names == ("krylov",):
+        if self._names[0] in ITERATIVE and len(self._names) == 1:
             why += "; linear_solver='auto' goes on with MUMPS where that happens"
         return why, advises
 

@@ -105,12 +105,17 @@ class Unknowns:
 
     def positions(self, x: Any, elements: Sequence[Any]) -> list[FloatArray]:
         """Positions that each batch depends on [m], see `Elements.evaluate`. Collective."""
+        both = zip([c.reference() for c in elements], self.at_elements(x, elements), strict=True)
+        return [reference + u.reshape(reference.shape) for reference, u in both]
+
+    def at_elements(self, x: Any, elements: Sequence[Any]) -> list[FloatArray]:
+        """A vector's values at the coordinates of each batch, shape (n, columns). Collective."""
         self._scatter.scatter(x, self._local, mode=PETSc.ScatterMode.FORWARD)
-        u, start, out = self._local.array_r, 0, []
+        values, start, out = self._local.array_r.copy(), 0, []
         for c in elements:
-            reference = c.reference()
-            out.append(reference + u[start : start + reference.size].reshape(reference.shape))
-            start += reference.size
+            stop = start + c.num_elements * c.num_coordinates
+            out.append(values[start:stop].reshape(c.num_elements, c.num_coordinates))
+            start = stop
         return out
 
     def own_values(
