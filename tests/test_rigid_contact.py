@@ -66,6 +66,22 @@ def test_a_box_at_rest_stays(nodes, friction):
 
 
 @pytest.mark.mpi
+def test_a_box_rests_in_a_groove():
+    """Between two planes at 45 degrees, each of which carries W / sqrt 2."""
+    turn = np.array([0.0, np.pi / 4, 0.0])
+    body = rigid((-0.5, -0.5, -0.5), (1, 1, 1), turn=turn)
+    lowest = np.array([0.0, 0.0, -np.sqrt(0.5)])
+    normals = np.array([(1.0, 0.0, 1.0), (-1.0, 0.0, 1.0)]) / np.sqrt(2.0)
+    pairs = [nts.ContactPair(body.surface(everywhere), nts.Plane(lowest, n)) for n in normals]
+    system = nts.System([body], contacts=pairs, gravity=(0, 0, -G))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.1)
+    forces, weight = run.contact_forces[1:], body.mass * G
+    assert run.status == "completed" and run.retries == 0
+    assert np.abs(forces - weight / np.sqrt(2.0) * normals).max() < 1e-10 * weight
+    assert np.abs(body.position).max() < 1e-13
+
+
+@pytest.mark.mpi
 def test_a_leaning_weight_divides_by_least_norm():
     """Two contacts hold one brick against inclined gravity: of all forces the least squares."""
     body, lean = rigid((0, 0, 0), (1, 1, 1), (5, 3, 1)), 0.1

@@ -96,8 +96,9 @@ class StepProblem:
         self.couplings: list[Coupling] = [self.contacts, *self.joints]
         self.unknowns: Unknowns | None = None
         self.version = 0
-        self.centre, self._span = _box(system)
-        self.stabilization = Stabilization(system, self._span, self._largest_load)
+        self.centre, span, directors = _box(system)
+        self._span = span + directors
+        self.stabilization = Stabilization(system, span, self._largest_load)
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self._springs
         )
@@ -572,14 +573,21 @@ class StepProblem:
         self.unknowns, self._numbers = None, None
 
 
-def _box(system: System) -> tuple[FloatArray, float]:
-    """Middle of the box around all bodies' reference and half its diagonal [m]. Collective."""
-    ends = np.full((2, 3), -np.inf)
+def _box(system: System) -> tuple[FloatArray, float, float]:
+    """Middle of the box around all bodies' places, half its diagonal, longest director [m].
+
+    All in the reference. Collective.
+    """
+    ends = np.full((3, 3), -np.inf)
+    ends[2] = 0.0
     for body in system.bodies:
-        x = body.reference.reshape(-1, 3)[body.places]
-        np.maximum(ends, [x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)], ends)
-    high, low = global_max(system.comm, ends) * [[1.0], [-1.0]]
-    return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+        x = body.reference.reshape(-1, 3)
+        directors, x = x[~body.places], x[body.places]
+        np.maximum(ends[0], x.max(axis=0, initial=-np.inf), ends[0])
+        np.maximum(ends[1], (-x).max(axis=0, initial=-np.inf), ends[1])
+        ends[2, 0] = max(ends[2, 0], np.linalg.norm(directors, axis=1).max(initial=0.0))
+    high, low, (directors, *_) = global_max(system.comm, ends) * [[1.0], [-1.0], [1.0]]
+    return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)), float(directors)
 
 
 def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:
