@@ -41,12 +41,14 @@ class StepWarning(NamedTuple):
         text: Sentence with a remedy.
         about: Names of the contact, joint or bodies that it is about; a run keeps the worst of each
             kind for each of them. Empty for the whole scene.
+        grave: Whether it may make the result wrong.
     """
 
     kind: str
     size: float
     text: str
     about: tuple[str, ...] = ()
+    grave: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -215,3 +215,33 @@ def test_restored_impulses_have_no_friction_and_say_so(friction):
     )  # fmt: skip
     assert run.status == "completed"
     assert ("impulses without friction" in run.warnings) is (friction > 0)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.fast_on_ranks("0.3")
+def test_a_weight_below_the_rounding_of_a_stiff_body_is_told(friction):
+    """Dust on steel: the weight of 5e-9 N is lost in the forces of the plate's nodes."""
+    steel, soft = (nts.NeoHookean(young, 0.3) for young in (2e11, 0.1))
+    plate = nts.Continuum(
+        box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.0), (2, 2, 1)), steel, density=7.8e3, name="plate",
+        bcs=[nts.Dirichlet(lambda x: x[2] < -0.499)],
+    )  # fmt: skip
+    dust = nts.Continuum(
+        box((-0.11, -0.12, 0.0), (0.1, 0.1, 0.1), (1, 1, 1)), soft, density=1e-7, name="dust",
+        velocity=(0.3, 0.0, 0.0),
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        dust.surface(lambda x: x[2] < 1e-9), plate.surface(lambda x: x[2] > -1e-9),
+        friction=friction,
+    )  # fmt: skip
+    system = nts.System([dust, plate], contacts=[pair], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.02)
+    depth = 0.05 - nts.motion_of(dust).centre[2]
+    if friction:
+        # It falls freely, but for what it bends; the plate's facets are squares of half a metre.
+        assert "nodes of contact 'dust-plate' lie up to" in run.status
+        assert "pass friction=0" in run.status
+        assert run.warnings["contact below rounding"].worst == pytest.approx(2 * depth, rel=1e-3)
+        assert depth == pytest.approx(9.81 * 0.02**2 / 2, rel=1e-3)
+    else:
+        assert run.status == "completed" and depth < 1e-7

@@ -35,6 +35,8 @@ _TOUCH = 4.0
 _ONE = 1e-6
 #: Depth in facet sizes from which on a node behind a surface that it passed by is told.
 _BESIDE = 1e-3
+#: Depth in facet sizes from which on a node is told that lies behind its facet without a force.
+_UNHELD = 1e-6
 #: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
 _SURELY = 1e-3
 
@@ -282,8 +284,8 @@ class ContactSearch:
         return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
 
     def warnings(self, parts: Sequence[Contribution]) -> list[StepWarning]:
-        """Nodes that an accepted step leaves beside a surface, or lets slip all the same."""
-        return [*self._beside(), *self._slips(parts)]
+        """Nodes that an accepted step leaves beside or behind a surface, or lets slip after all."""
+        return [*self._beside(), *self._unheld(parts), *self._slips(parts)]
 
     def _beside(self) -> Iterator[StepWarning]:
         """Nodes that have passed by a surface's edge and lie behind it. Collective."""
@@ -302,6 +304,22 @@ class ContactSearch:
                 "reach farther"
             )
             yield StepWarning("node beside a surface", float(depth), text, (name,))
+
+    def _unheld(self, parts: Sequence[Contribution]) -> Iterator[StepWarning]:
+        """Nodes behind their facets whose forces would be rounding of other forces. Collective."""
+        depths = [
+            (-part.gap / c.candidates.length)[~part.active].max(initial=0.0)
+            for c, part in zip(self.elements, parts, strict=True)
+        ]
+        for pair, depth in zip(self._pairs, global_max(self._comm, np.array(depths)), strict=True):
+            if depth > _UNHELD:
+                text = (
+                    f"nodes of contact {pair.name!r} lie up to {depth:.3g} of a facet behind their "
+                    f"master without contact: a force that holds them is below the rounding of the "
+                    "forces in the bodies, where friction has no direction; pass friction=0, or "
+                    "let the bodies differ less in stiffness and weight"
+                )
+                yield StepWarning("contact below rounding", float(depth), text, (pair.name,), True)
 
     def _slips(self, parts: Sequence[Contribution]) -> Iterator[StepWarning]:
         """Nodes that slip in spite of infinite friction. Collective.

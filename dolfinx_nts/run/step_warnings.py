@@ -60,7 +60,9 @@ def tell_couplings(
     """Warn of what contacts and joints tell. Collective; arguments as of `tell_step`."""
     for coupling, parts in problem.each(step):
         for found in coupling.warnings(parts):
-            solution.warn(found.kind, state.time, found.size, found.text, about=found.about)
+            solution.warn(
+                found.kind, state.time, found.size, found.text, about=found.about, grave=found.grave
+            )
 
 
 def tell_stressed(solution: Solution, time: float) -> None:
