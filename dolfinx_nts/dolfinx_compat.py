@@ -14,7 +14,7 @@ import dolfinx.fem.petsc as fem_petsc
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import cpp, fem, geometry, mesh
+from dolfinx import cpp, fem, geometry, jit, mesh
 from ffcx.codegeneration import jit as ffcx_jit
 from petsc4py import PETSc
 
@@ -263,6 +263,21 @@ def subspace_component_bc(space: Any, component: int, blocked_dofs: IntArray) ->
 #: No result changes: without errno and traps a branch that is not taken is not computed. Python's
 #: own flags ask for what only debuggers need, which takes a fifth of the compiler's time.
 C_FLAGS = ["-O2", "-g0", "-fno-math-errno", "-fno-trapping-math"]
+#: Time [s] that a rank waits for another one that compiles.
+_PATIENCE = 600
+
+
+def jit_options() -> dict[str, Any]:
+    """What differs from DOLFINx's defaults when forms are compiled, but for what a user chose.
+
+    A file `dolfinx_jit_options.json` (0.5.2: `dolfinx_jit_parameters.json`) in the working folder
+    or in `~/.config/dolfinx` is the user's choice.
+    """
+    named = "PARAMETERS" if _OLD else "OPTIONS"
+    defaults = getattr(jit, f"DOLFINX_DEFAULT_JIT_{named}")
+    chosen = getattr(jit, f"get_{named.lower()}")()
+    ours = {"cffi_extra_compile_args": C_FLAGS, "timeout": _PATIENCE}
+    return {name: value for name, value in ours.items() if chosen[name] == defaults[name][0]}
 
 
 def compile_forms(forms: Sequence[Any]) -> list[Any]:
@@ -274,7 +289,7 @@ def compile_forms(forms: Sequence[Any]) -> list[Any]:
             for domain in f.ufl_domains():
                 domain.ufl_coordinate_element()._sub_element._variant = "equispaced"
         f.signature()
-    options = {"cffi_extra_compile_args": C_FLAGS, "timeout": 600}
+    options = jit_options()
     given: dict[str, Any] = {"jit_options": options}
     if _OLD:
         given = {"jit_params": options, "form_compiler_params": {}}

@@ -7,6 +7,7 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
+from processes import in_fresh_python
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -51,6 +52,18 @@ def test_other_moduli_compile_nothing(first, other, monkeypatch):
         j = 1.1**3
         expected = 2e5 * (3 * square - 3) + 1.5e7 * (j - 1) ** 2 - 4e5 * np.log(j)
     np.testing.assert_allclose(energy, expected, rtol=1e-12)
+
+
+def test_a_users_flags_are_kept(tmp_path):
+    """From a file in the working folder, as of DOLFINx; what it does not name stays ours."""
+    ours = {"cffi_extra_compile_args": compat.C_FLAGS, "timeout": 600}
+    assert compat.jit_options() == ours
+    name = "parameters" if compat.VERSION < (0, 8) else "options"
+    file = tmp_path / f"dolfinx_jit_{name}.json"
+    file.write_text('{"cffi_extra_compile_args": ["-O3", "-march=native"]}')
+    code = "from dolfinx_nts import dolfinx_compat as c; print(c.jit_options())"
+    found = in_fresh_python(f"import os; os.chdir({str(tmp_path)!r}); {code}")
+    assert found.strip() == "{'timeout': 600}"
 
 
 def own_scene(mesh):
