@@ -100,30 +100,18 @@ def pytest_collection_modifyitems(config, items):
         size = {path: path.stat().st_size for path in {item.path for item in items}}
         items.sort(key=lambda i: ("demo" in i.path.name, size[i.path], i.path.name), reverse=True)
     unknown: dict[str, set[str]] = {}
-    dropped = []
     for item in items:
         if "on_ranks" in item.fixturenames:
             item.add_marker(pytest.mark.on_ranks)
             item.add_marker(pytest.mark.slow)
-        on_ranks = COMM.size > 1
-        for name, holds in (
-            ("fast", True), ("fast_on_ranks", on_ranks), ("enough_on_ranks", on_ranks),
-        ):  # fmt: skip
+        for name, holds in (("fast", True), ("fast_on_ranks", COMM.size > 1)):
             if (mark := item.get_closest_marker(name)) is None:
                 continue
             own = item.callspec.id if hasattr(item, "callspec") else ""
             test = item.nodeid.removesuffix(f"[{own}]")
             unknown.setdefault(f"{name} of {test}", set(mark.args)).discard(own)
-            if not holds or own in mark.args:
-                continue
-            if name == "enough_on_ranks" and item.get_closest_marker("slow"):
-                dropped.append(item)
-            elif name != "enough_on_ranks":
+            if holds and own not in mark.args:
                 item.add_marker(pytest.mark.slow)
-    if dropped:
-        config.hook.pytest_deselected(items=dropped)
-        left = set(items).difference(dropped)
-        items[:] = [item for item in items if item in left]
     # Of a test that is named with its parameters the others are not collected; an error in a
     # process of xdist reaches no one, and the tests on 2 ranks are collected without it.
     named = any("[" in argument for argument in config.args)

@@ -208,11 +208,6 @@ def distance(one, other):
 @pytest.mark.fast(
     "mechanism-generalized-alpha", "adapted-energy-momentum", "restored-energy-momentum",
 )  # fmt: skip
-@pytest.mark.enough_on_ranks(
-    "blocks-energy-momentum", "tetrahedra-generalized-alpha", "mechanism-midpoint",
-    "floor-midpoint", "loaded-generalized-alpha", "sleepers-energy-momentum", "adapted-midpoint",
-    "endless-energy-momentum", "restored-midpoint",
-)  # fmt: skip
 def test_a_restarted_run_is_the_uninterrupted_one(scene, integrator, mpi_tmp_path):
     if scene == "adapted" and COMM.size > 1:
         pytest.skip("two uninterrupted runs differ there by 1e-9: their steps depend on rounding")

@@ -132,10 +132,6 @@ def to_rounding(integrator):
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast("energy-momentum-0.3-hexahedron")
 @pytest.mark.fast_on_ranks()
-@pytest.mark.enough_on_ranks(
-    "midpoint-inf-tetrahedron", "energy-momentum-0.3-tetrahedron",
-    "gonzalez contact-0.1-hexahedron",
-)  # fmt: skip
 def test_friction_keeps_the_momenta_and_the_ledger(integrator, friction, cell):
     table = run(rubbing_blocks(friction, cell=cell), integrator).balance
     energy = table["energy"][0]
@@ -317,7 +313,6 @@ def plane_strain_slider(friction, integrator, speed=0.0):
 @pytest.mark.parametrize(("friction", "speed"), [(math.inf, 0.0), (0.5, 0.0), (0.2, 1.0)])
 @pytest.mark.fast("0.2-1.0-gonzalez contact", "inf-0.0-midpoint")
 @pytest.mark.fast_on_ranks()
-@pytest.mark.enough_on_ranks("inf-0.0-energy-momentum", "0.5-0.0-midpoint")
 def test_prescribed_tangential_direction_carries_no_force(friction, speed, integrator):
     stepper = plane_strain_slider(friction, integrator, speed)
     state = stepper.state

@@ -227,7 +227,6 @@ HARD = {
 @pytest.mark.parametrize(
     ("name", "accuracy"), [(name, accuracy) for name in HARD for accuracy in HARD[name][-1]]
 )
-@pytest.mark.enough_on_ranks("200 m/s-balanced", "100 m/s, midpoint-exact", "1e4 g-balanced")
 def test_a_hard_impact_is_whole_or_named(name, accuracy):
     """Either it completes, or the cell and the remedies stand in the status; never inside out."""
     make, integrator, dt, t_end, adapt, _ = HARD[name]

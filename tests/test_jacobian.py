@@ -244,11 +244,6 @@ def test_contact_changes_beside_matrices_that_are_kept(rule, solver):
     "curved-mixed-energy-momentum",
     "curved-mixed-condensed",
 )
-@pytest.mark.enough_on_ranks(
-    "hex-none-condensed", "tet-none-mean-value stress", "tet-mixed-static",
-    "tet-mixed-gonzalez contact", "smooth-mixed-gonzalez contact", "smooth-none-static",
-    "curved-none-midpoint", "curved-mixed-static",
-)  # fmt: skip
 def test_jacobian_along_directions(cell, friction, rule):
     """As above on any number of ranks: matrix times direction."""
     system = two_blocks(cell, friction=FRICTION[friction])
@@ -312,10 +307,6 @@ def last_change(sets):
     "smooth-condensed-True", "curved-condensed-False",
 )  # fmt: skip
 @pytest.mark.fast_on_ranks("smooth-gonzalez contact-True")
-@pytest.mark.enough_on_ranks(
-    "hex-condensed-True", "tet-mean-value stress-True", "smooth-energy-momentum-True",
-    "curved-gonzalez contact-True",
-)  # fmt: skip
 def test_newton_converges_quadratically(cell, rule, turned):
     """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""
     system = two_blocks(cell, gap=0.02, speed=6.0)

@@ -459,7 +459,6 @@ def shot(thick):
 @pytest.mark.parametrize("thick", [0.01, 0.04, 0.1, 0.3])
 @pytest.mark.parametrize("step", [0.003, 0.03, 0.3, 3.0])
 @pytest.mark.fast("0.003-0.04", "0.03-0.3", "0.3-0.01", "3.0-0.1")
-@pytest.mark.enough_on_ranks("0.003-0.3", "3.0-0.04")
 def test_a_block_that_passes_a_thin_plate_between_its_nodes_is_told(thick, step):
     """However long the steps are: also of all of the way in one."""
     system, found = shot(thick), []

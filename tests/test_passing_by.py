@@ -59,7 +59,6 @@ def test_a_block_falls_once_it_has_left_the_table():
 @pytest.mark.parametrize("number", range(24))
 @pytest.mark.fast("0", "1", "2", "3")
 @pytest.mark.fast_on_ranks("1")
-@pytest.mark.enough_on_ranks("2", "3")
 def test_boxes_that_pass_at_random(number):
     """One flies along a side of the other, 1 to 50 mm away, in steps of up to 0.15 m."""
     rng = np.random.default_rng(number)

@@ -33,7 +33,6 @@ def box(low, high, parts, name, velocity=(0, 0, 0), bcs=()):
     "False-50.0-balanced", "False-inf-exact", "True-1000000.0-exact", "True-inf-balanced",
 )  # fmt: skip
 @pytest.mark.fast_on_ranks("True-inf-balanced")
-@pytest.mark.enough_on_ranks("False-50.0-exact", "True-1000000.0-balanced")
 def test_a_cube_flush_with_a_wall_falls_freely(meshed, friction, accuracy):
     """No force presses it to the wall, so none of friction's acts: v = -g t."""
     system = flush(meshed, friction)
@@ -70,7 +69,6 @@ def flush(meshed, friction, gap=0.0):
         (nts.Midpoint(), 50.0, False, "balanced"), (nts.Midpoint(), np.inf, True, "exact"),
     ],
 )  # fmt: skip
-@pytest.mark.enough_on_ranks("integrator1-50.0-False-exact-0.0", "integrator5-inf-True-exact-1e-12")
 def test_the_way_along_a_wall_is_that_of_free_fall(integrator, friction, meshed, accuracy, gap):
     """Of each node g t^2 / 2 = 0.04905 m in 0.1 s, whether the wall is flush or 1e-12 m away."""
     system = flush(meshed, friction, gap)
@@ -203,7 +201,6 @@ def _disc(friction, integrator):
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.fast("energy-momentum-0.05-exact")
 @pytest.mark.fast_on_ranks()
-@pytest.mark.enough_on_ranks("midpoint-0.05-exact", "energy-momentum-0.05-balanced")
 def test_cubes_that_meet_at_the_end_of_a_step(integrator, gap, accuracy):
     """mu = 1e6 binds as no bound does; at 5 m/s a gap of 0.05 m closes after five steps."""
     energies = []
@@ -240,7 +237,6 @@ def large_on_small(place, friction, n):
 @pytest.mark.parametrize("place", [-4e-4, 0.0, 0.062])
 @pytest.mark.fast("-0.0004-inf", "0.0-0.3", "0.062-5.0")
 @pytest.mark.fast_on_ranks("0.062-5.0")
-@pytest.mark.enough_on_ranks("0.0-5.0", "0.062-inf")
 def test_one_large_element_stands_on_small_facets(place, friction):
     """Its nodes are 1e5 times heavier than the plate's: c belongs to what yields, the plate.
 
@@ -257,7 +253,6 @@ def test_one_large_element_stands_on_small_facets(place, friction):
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.3, np.inf])
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-@pytest.mark.enough_on_ranks("energy-momentum-0.3")
 def test_one_large_element_presses_a_plate_of_400_facets(integrator, friction):
     """20 steps, in which the facets under its node give way: it neither stops nor is told of."""
     system = large_on_small(0.0, friction, 20)

@@ -322,11 +322,15 @@ def test_a_checkpoint_goes_on_on_other_ranks(mpi_tmp_path):
 
 
 def strike(file):
-    """A beam falls on a shell, with friction; the run is saved."""
+    """A beam falls on a shell, slips and leaves; the run is saved.
+
+    No step is cut: whether one is, where many nodes stick, rounding may decide.
+    """
     stick, plate = beam(0.0505, velocity=FAST), shell()
-    contact = nts.ContactPair(stick.surface(), plate.surface(side="top"), friction=MU)
-    run = nts.simulate(nts.System([plate, stick], contacts=[contact]), EM, dt=1e-3, t_end=3e-3)
-    assert run.status == "completed" and run.balance["active"].max() > 0
+    contact = nts.ContactPair(stick.surface(), plate.surface(side="top"), friction=0.1)
+    run = nts.simulate(nts.System([plate, stick], contacts=[contact]), EM, dt=5e-4, t_end=2e-3)
+    assert run.status == "completed" and run.retries == 0 and run.balance["active"].max() > 0
+    assert run.balance["friction_dissipation"][-1] > 0.0
     run.save(file)
 
 

@@ -80,7 +80,6 @@ def run(system, integrator, dt=2e-3, steps=8):
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 @pytest.mark.fast_on_ranks("energy-momentum-corner")
-@pytest.mark.enough_on_ranks("energy-momentum-edge")
 def test_touching_at_rest_stays_at_rest(place, integrator):
     table = run(scene(place), integrator)
     assert np.abs(table["energy"]).max() <= 1e-20
@@ -90,7 +89,6 @@ def test_touching_at_rest_stays_at_rest(place, integrator):
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 @pytest.mark.fast_on_ranks("energy-momentum-across")
-@pytest.mark.enough_on_ranks("midpoint-corner")
 def test_touching_and_leaving_takes_no_force(place, integrator):
     table = run(scene(place, velocity=(0.0, 0.0, 1.0)), integrator)
     assert table["active"].sum() == 0
@@ -101,7 +99,6 @@ def test_touching_and_leaving_takes_no_force(place, integrator):
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 @pytest.mark.fast_on_ranks("midpoint-edge")
-@pytest.mark.enough_on_ranks("energy-momentum-edge")
 def test_touching_and_sliding_takes_no_force(place, integrator):
     """Frictionless sliding over edges of facets, at zero gap all the time."""
     table = run(scene(place, velocity=(-2.0, -1.0, 0.0)), integrator, dt=5e-3)
@@ -112,7 +109,6 @@ def test_touching_and_sliding_takes_no_force(place, integrator):
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.fast("midpoint-edge", "energy-momentum-corner", "energy-momentum-across")
 @pytest.mark.fast_on_ranks("energy-momentum-corner")
-@pytest.mark.enough_on_ranks("midpoint-across")
 def test_pressed_from_zero_gap(place, integrator):
     """A closed gap stays closed for a step, which throws the slaves back; nothing is lost by it."""
     table = run(scene(place, velocity=(0.0, 0.0, -1.0)), integrator)
@@ -129,7 +125,6 @@ def test_pressed_from_zero_gap(place, integrator):
     "energy-momentum-0.3-inside",
 )  # fmt: skip
 @pytest.mark.fast_on_ranks("energy-momentum-0.0-across")
-@pytest.mark.enough_on_ranks("midpoint-0.3-edge", "energy-momentum-0.3-corner")
 def test_falls_onto_edges_and_corners(place, integrator, friction):
     table = run(scene(place, gap=0.003, velocity=(0.0, 0.0, -1.0), friction=friction), integrator)
     assert table["active"].max() == 4
@@ -139,7 +134,6 @@ def test_falls_onto_edges_and_corners(place, integrator, friction):
 @rubbing
 @pytest.mark.fast_on_ranks()
 @pytest.mark.fast("energy-momentum-0.0")
-@pytest.mark.enough_on_ranks("energy-momentum-0.3")
 def test_slides_off_the_end_of_the_plate(integrator, friction):
     """Slaves leave over the free edge while in contact; no facet is there to hold them."""
     system = scene("corner", velocity=(2.0, 0.0, -0.2), friction=friction)
@@ -152,7 +146,6 @@ def test_slides_off_the_end_of_the_plate(integrator, friction):
 @rubbing
 @pytest.mark.fast("midpoint-0.3-driven", "energy-momentum-0.3-free")
 @pytest.mark.fast_on_ranks()
-@pytest.mark.enough_on_ranks("energy-momentum-0.3-driven")
 def test_slaves_that_cannot_move(master, integrator, friction):
     """A wholly prescribed cube: the plate that comes up must give way."""
     below = nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9, lambda t: (0.0, 0.0, 0.5 * t))
@@ -169,7 +162,6 @@ def test_slaves_that_cannot_move(master, integrator, friction):
     "midpoint-0.3-0.001",
 )  # fmt: skip
 @pytest.mark.fast_on_ranks("energy-momentum-0.3-0.0")
-@pytest.mark.enough_on_ranks("energy-momentum-0.3-0.001")
 def test_nothing_can_move(gap, integrator, friction):
     held = [nts.Dirichlet(everywhere)]
     table = run(scene(gap=gap, cube=held, plate=held, friction=friction), integrator)
@@ -190,7 +182,6 @@ def test_prescribed_slave_bottom_of_a_free_cube(integrator, friction):
 @rubbing
 @pytest.mark.fast("midpoint-0.3-components1", "energy-momentum-0.0-components0")
 @pytest.mark.fast_on_ranks()
-@pytest.mark.enough_on_ranks("midpoint-0.3-components0", "energy-momentum-0.3-components1")
 def test_slaves_held_in_some_components(components, integrator, friction):
     held = [nts.Dirichlet(lambda x: x[2] < 0.001 + 1e-9, components=components)]
     system = scene(gap=0.001, cube=held, plate_velocity=(0.1, 0.0, 1.0), friction=friction)
@@ -211,7 +202,6 @@ def test_held_slaves_driven_against_a_held_master_have_nothing_to_solve(integrat
 @rubbing
 @pytest.mark.fast("energy-momentum-0.3-corner")
 @pytest.mark.fast_on_ranks()
-@pytest.mark.enough_on_ranks("midpoint-0.3-corner")
 def test_contact_comes_and_goes(place, integrator, friction):
     """Two bounces under gravity on a plate that is held below."""
     held = [nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)]
@@ -284,7 +274,6 @@ def test_more_ranks_than_cells(on_ranks):
 @pytest.mark.parametrize("friction", [0.0, 0.3, np.inf])
 @pytest.mark.fast("energy-momentum-0.0")
 @pytest.mark.fast_on_ranks()
-@pytest.mark.enough_on_ranks("midpoint-inf", "energy-momentum-0.3")
 def test_the_same_gap_closed_twice_is_refused_or_as_closed_once(friction, integrator):
     """Twice the same pair is an error; two fixed plates in one plane are that plane."""
     whole = [nts.Dirichlet(lambda x: x[2] < 9)]
@@ -322,7 +311,6 @@ def test_the_same_gap_closed_twice_is_refused_or_as_closed_once(friction, integr
 
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["plane", "support"])
-@pytest.mark.enough_on_ranks("energy-momentum-plane", "midpoint-support")
 def test_nodes_between_two_that_do_not_yield_are_named(by, integrator):
     """Driven at 1 m/s at a plane that is 1 cm away they have nowhere to go from 0.01 s on."""
     mesh = create_box(COMM, [[0, 0, 0.01], [1, 1, 1.01]], [1, 1, 1], CellType.hexahedron)
@@ -349,9 +337,6 @@ def test_nodes_between_two_that_do_not_yield_are_named(by, integrator):
     ("friction", "row", "states"),
     [(0.0, 0, "contact and none"), (0.3, 0, "contact and none"), (0.3, 1, "stick and slip")],
 )
-@pytest.mark.enough_on_ranks(
-    "midpoint-0.3-1-stick and slip", "energy-momentum-0.0-0-contact and none",
-)  # fmt: skip
 def test_nodes_that_flip_are_named_with_their_states(friction, row, states, integrator):
     """Seven flips of a step are said to be some, eight to be a cycle, with what may end it."""
     stepper = nts.Stepper(scene(velocity=(0.0, 0.0, -1.0), friction=friction), integrator)

@@ -199,7 +199,6 @@ def test_a_mass_at_rest_that_falls_far_in_a_step(obstacle, integrator):
 @pytest.mark.parametrize("aim", [(0.0, 0.0), (150.0, 60.0), (-290.0, 10.0)])
 @pytest.mark.fast_on_ranks("aim0-energy-momentum", "aim1-midpoint", "aim2-gonzalez contact")
 @pytest.mark.fast("aim0-energy-momentum", "aim1-midpoint", "aim2-gonzalez contact")
-@pytest.mark.enough_on_ranks("aim0-midpoint", "aim2-energy-momentum")
 def test_a_shot_at_a_thin_plate(aim, integrator):
     """Through several facets a step, from beside the plate, too: it bounces as at a plane (B6)."""
     speed, dt = 300.0, 0.01
@@ -363,10 +362,6 @@ def over(meshed, young=1e6, velocity=(0.0, 0.0, 0.0), gravity=9.81, gap=0.2):
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
 @pytest.mark.parametrize(("young", "gravity", "dt"), [(1e6, 9.81, 0.5), (1e8, 9810.0, 0.01)])
 @pytest.mark.parametrize("meshed", [False, True])
-@pytest.mark.enough_on_ranks(
-    "False-1000000.0-9.81-0.5-energy-momentum-balanced",
-    "True-100000000.0-9810.0-0.01-midpoint-exact",
-)  # fmt: skip
 def test_a_block_at_rest_that_falls_far_in_a_step(meshed, young, gravity, dt, integrator, accuracy):
     """0.2 m above the floor, and by 1.2 or 0.5 m lower after a step of free fall."""
     system, seen, rule = over(meshed, young, gravity=gravity), Touches(), CONTACT_RULES[integrator]
@@ -386,7 +381,6 @@ def test_a_block_at_rest_that_falls_far_in_a_step(meshed, young, gravity, dt, in
 @pytest.mark.slow
 @pytest.mark.parametrize("meshed", [False, True])
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.enough_on_ranks("midpoint-True")
 def test_no_first_contact_wins_energy(integrator, meshed):
     """What contact brings is -p g_0: only a node behind its facet at t_n could bring energy.
 
@@ -423,7 +417,6 @@ def test_no_first_contact_wins_energy(integrator, meshed):
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
 @pytest.mark.parametrize("speed", [100.0, 300.0])
-@pytest.mark.enough_on_ranks("100.0-energy-momentum-balanced", "300.0-midpoint-exact")
 def test_a_shot_at_a_thin_flexible_plate(speed, integrator, accuracy):
     """In a step the block moves by 25 or 75 times the plate's thickness; the plate gives way."""
     half, thickness, gap, dt = 1.0, 0.02, 0.35, 5e-3
