@@ -6,7 +6,7 @@ import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 from point_mass import MASS, SPEED, STEP, mass_on_wall
-from scenes import CELLS, box
+from scenes import CELLS, box, everywhere
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -245,3 +245,30 @@ def test_a_weight_below_the_rounding_of_a_stiff_body_is_told(friction):
         assert depth == pytest.approx(9.81 * 0.02**2 / 2, rel=1e-3)
     else:
         assert run.status == "completed" and depth < 1e-7
+
+
+@pytest.mark.parametrize(("turn", "told"), [(0.3, False), (0.9, True)])
+@pytest.mark.fast_on_ranks("0.9-True")
+def test_an_arm_that_cuts_a_corner_is_told(turn, told):
+    """Points at radius 2 leave the chord of an arc of 0.9 rad by 2 (1 - cos 0.45) = 0.2 m."""
+    rate, pivot = turn / 0.01, 1.1
+
+    def centre(t):
+        return pivot * (np.cos(rate * t) - 1.0), pivot * np.sin(rate * t), 0.0
+
+    arm = nts.RigidBody(
+        box((0.2, -0.05, -0.2), (2.0, 0.05, 0.2), (4, 1, 1)), density=1e3, name="arm",
+        motion=centre, rotation=lambda t: (0.0, 0.0, rate * t),
+    )  # fmt: skip
+    away = box((1.93, 1.5, -0.04), (2.01, 1.58, 0.04), (1, 1, 1))
+    ball = nts.RigidBody(away, density=1e3, name="ball")
+    pair = nts.ContactPair(arm.surface(lambda x: x[1] > 0.049), ball.surface(everywhere))
+    system = nts.System([arm, ball], contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.01)
+    if not told:
+        assert run.status == "completed"
+        return
+    assert "contact 'arm-ball'" in run.status and "smaller dt" in run.status
+    # By the largest component of a motion, which is at least 1/sqrt(2) of it in the plane.
+    worst, exact = run.warnings["cut corners"].worst, 2.0 * (1.0 - np.cos(turn / 2))
+    assert 0.7 * exact < worst < 1.01 * exact

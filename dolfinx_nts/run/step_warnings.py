@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.inversion import describe, smallest_dets
 from dolfinx_nts.bodies.motion import motion_of
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.kernels import facets
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.state import State
@@ -23,6 +26,8 @@ _FAR = 1.0
 _STRETCHED = 0.95
 #: Its spin is measured after 1, 2, 4, 8, 16 steps and then every so many, as it costs 1 % of one.
 _SELDOM = 32
+#: Turn in a step [rad] below which points hardly leave their straight ways.
+_BENT = 0.1
 
 
 def tell_step(solution: Solution, problem: StepProblem, step: Evaluation, state: State) -> None:
@@ -144,3 +149,43 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
             f"{'as prescribed' if prescribed else 'kept'}; use a smaller dt",
             grave=bool(prescribed),
         )  # fmt: skip
+    by_body = dict(zip(turning, turns.tolist(), strict=True))
+    _tell_corners(solution, problem, new, by_body)
+
+
+def _tell_corners(
+    solution: Solution, problem: StepProblem, new: State, turns: Mapping[int, float]
+) -> None:
+    """Warn where points of a rigid body leave the straight ways on which contact is sought.
+
+    A point on an arc of angle phi with chord c leaves the chord by c/2 tan(phi/4). What it meets
+    there is missed if it is smaller than that. Collective.
+
+    Args:
+        solution: The run.
+        problem: Equations of the step.
+        new: State at its end.
+        turns: Turn in the step of some bodies [rad], the same on all ranks.
+    """
+    system, old = problem.system, problem.state
+    bodies = [k for k, turn in turns.items() if system.bodies[k].oriented and turn > _BENT]
+    if not bodies:
+        return
+    chords = [system.bodies[k].motion_of_points(new.u[k] - old.u[k]) for k in bodies]
+    for k, chord in zip(bodies, global_max(system.comm, np.array(chords)), strict=True):
+        way = 0.5 * float(chord) * float(np.tan(0.25 * min(turns[k], np.pi)))
+        for pair, both in zip(system.contacts, system.contact_bodies, strict=True):
+            if k not in both or len(both) < 2:
+                continue
+            other = pair.master if k == both[0] else pair.slave
+            size = float(facets.size(other.reference[other.facets]).min())
+            if way > size:
+                name = system.bodies[k].name
+                solution.warn(
+                    "cut corners", new.time, way,
+                    f"body {name!r} turns by {turns[k]:.2g} rad in a step: its points leave their "
+                    f"straight ways by up to {way:.2g} m, and contact {pair.name!r}, which is "
+                    f"sought on these, may miss facets of {other.body.name!r} that are "
+                    f"{size:.2g} m wide; use a smaller dt",
+                    grave=True, about=(pair.name,),
+                )  # fmt: skip
