@@ -312,10 +312,11 @@ class ContactSearch:
             for c, part in zip(self.elements, parts, strict=True)
         ]
         for pair, depth in zip(self._pairs, global_max(self._comm, np.array(depths)), strict=True):
-            if depth > _UNHELD:
+            # Without friction no force counts as rounding.
+            if pair.friction and depth > _UNHELD:
                 text = (
                     f"nodes of contact {pair.name!r} lie up to {depth:.3g} of a facet behind their "
-                    f"master without contact: a force that holds them is below the rounding of the "
+                    "master without contact: a force that holds them is below the rounding of the "
                     "forces in the bodies, where friction has no direction; pass friction=0, or "
                     "let the bodies differ less in stiffness and weight"
                 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -251,12 +250,7 @@ class FacetPair(ContactPair, master=Surface):
 
     def is_long(self, reach: float) -> bool:
         """Return whether a motion may carry a node through a facet that is not the closest."""
-        return reach > MARGIN * self._smallest
-
-    @cached_property
-    def _smallest(self) -> float:
-        """Size of the master's smallest facet in the reference [m]."""
-        return float(facets.size(self.master.reference[self.master.facets]).min())
+        return reach > MARGIN * self.master.smallest
 
     def missed(
         self,

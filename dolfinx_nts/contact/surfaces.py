@@ -241,6 +241,11 @@ class Surface:
         return result
 
     @cached_property
+    def smallest(self) -> float:
+        """Size of the smallest facet in the reference [m], inf without any; alike on all ranks."""
+        return float(facet_math.size(self.reference[self.facets]).min(initial=np.inf))
+
+    @cached_property
     def facet_nodes(self) -> Points:
         """Nodes of the body that each patch depends on; their weights are 0."""
         m = self.material

@@ -95,7 +95,7 @@ def refuse_written(system: System, time: float) -> None:
     """
     here = None
     for body in system.bodies:
-        for k, known in enumerate(getattr(body, "_shown", ())):
+        for k, known in enumerate(body._shown):
             values = (body.u, body.v)[k].x.array
             # The second test, for NaN, takes four times as long.
             same = np.array_equal(values, known) or np.array_equal(values, known, equal_nan=True)

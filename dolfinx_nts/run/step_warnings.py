@@ -10,7 +10,6 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.inversion import describe, smallest_dets
 from dolfinx_nts.bodies.motion import motion_of
 from dolfinx_nts.evaluation import Evaluation
-from dolfinx_nts.kernels import facets
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.state import State
@@ -178,7 +177,7 @@ def _tell_corners(
             if k not in both or len(both) < 2:
                 continue
             other = pair.master if k == both[0] else pair.slave
-            size = float(facets.size(other.reference[other.facets]).min())
+            size = other.smallest
             if way > size:
                 name = system.bodies[k].name
                 solution.warn(
