@@ -63,6 +63,9 @@ _CUT = 0.4
 _CUTS = 3
 #: Searches for contact, each along the motion that came of the one before.
 _SEARCHES = 4
+#: Part of the energies by which a restart may differ from its checkpoint, as sums of other ranks
+#: do.
+_SAME = 1e-10
 
 
 class Trial(NamedTuple):
@@ -225,6 +228,9 @@ class Stepper:
             begin, length = self._last_steps.last
             self._call_before(length, begin)
         self._materials.changed()
+        if self._keeps_ledger:
+            what = "what the restart was given in place of the checkpoint's materials"
+            self._restate(what, beyond=_SAME)
         if self.problem.integrator.accelerations and not self.state.a:
             # The run had another integrator.
             a = consistent.accelerations(self.problem, self.state, dt)
@@ -463,18 +469,37 @@ class Stepper:
         names = self._materials.changed()
         if names:
             self.problem.forget_forces()
-        if not names or not self._keeps_ledger:
-            return
+        if names and self._keeps_ledger:
+            what = f"a changed parameter of the material of {', '.join(map(repr, names))}"
+            self._restate(what, beyond=0.0)
+
+    def _restate(self, what: str, *, beyond: float) -> None:
+        """Name in the ledger what a change of bodies or joints does to energy and momenta.
+
+        Args:
+            what: Begin of the sentence on it.
+            beyond: Part of the energies that a difference must exceed.
+        """
+        before = self._restated or self.solution.rows[-1]
         self._measured.clear()
-        self._restated = balance.measure(self.system, self.state, self._measured)
-        now = self._restated["kinetic"] + self._restated["potential"]
-        change = now - self.solution.rows[-1]["energy"] - self._material_change
+        now = balance.measure(self.system, self.state, self._measured)
+        added = {name: now[name] - before[name] for name in now}
+        energies = "kinetic", "potential"
+        if sum(abs(added[e]) for e in energies) <= beyond * sum(abs(before[e]) for e in energies):
+            return
+        self._restated, change = now, added["kinetic"] + added["potential"]
         self._material_change += change
-        self.solution.warn(
-            "material changed", self.state.time, abs(change),
-            f"a changed parameter of the material of {', '.join(map(repr, names))} adds "
-            f"{change:.3g} J to its energy without work; see material_change in the balance",
-        )  # fmt: skip
+        text = (
+            f"{what} adds {change:.3g} J to the energy without work, see material_change in the "
+            "balance"
+        )
+        if added["kinetic"]:
+            momentum, spin = (np.linalg.norm(added[f"{s}_momentum"]) for s in ("linear", "angular"))
+            text += (
+                f"; {added['kinetic']:.3g} J of it are kinetic: velocities stay as they are, and "
+                f"{momentum:.3g} kg m/s and {spin:.3g} kg m^2/s of momentum come without a force"
+            )
+        self.solution.warn("material changed", self.state.time, abs(change), text)
 
     def _attempt(self, dt: float, time: float) -> Trial:
         """Solution of the step that `problem.begin` fixed, if it may be accepted.
