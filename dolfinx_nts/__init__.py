@@ -61,7 +61,7 @@ from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_terms import ContactTerms
 from dolfinx_nts.system import System
-from dolfinx_nts.validation import StepFailedError, UserFunctionError
+from dolfinx_nts.validation import OutputError, StepFailedError, UserFunctionError
 
 __version__ = version("dolfinx_nts")
 __all__ = [
@@ -105,6 +105,7 @@ __all__ = [
     "Newton",
     "Obstacle",
     "ObstaclePair",
+    "OutputError",
     "Planar",
     "Plane",
     "PointElements",

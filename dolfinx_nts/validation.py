@@ -47,6 +47,20 @@ class UserFunctionError(StepFailedError, ValueError):
     """
 
 
+class OutputError(RuntimeError):
+    """A writer raised, which ended the run: a full disk, say.
+
+    What it raised is `__cause__` on the rank where it did; the message is the same on all ranks.
+
+    Attributes:
+        solution: The `Solution` with everything computed until then; its status is the message.
+    """
+
+    def __init__(self, message: str, solution: Any) -> None:
+        super().__init__(message)
+        self.solution = solution
+
+
 def known_options(target: T) -> T:
     """Decorate a function or class: what is passed by an unknown name or without one raises.
 

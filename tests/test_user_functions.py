@@ -226,7 +226,10 @@ class Writer:
 @pytest.mark.fast_on_ranks("write-2-last")
 def test_a_writer_that_fails(failing, written, ranks, mpi_tmp_path):
     writers = [Writer(), Writer(failing, ranks), output.BalanceCSV(mpi_tmp_path / "b.csv")]
-    run = nts.simulate(scene(), nts.Midpoint(), dt=DT, t_end=3 * DT, output=writers)
+    with pytest.raises(nts.OutputError) as caught:
+        nts.simulate(scene(), nts.Midpoint(), dt=DT, t_end=3 * DT, output=writers)
+    run, mine = caught.value.solution, ranks == "all" or COMM.rank == COMM.size - 1
+    assert str(caught.value) == run.status and isinstance(caught.value.__cause__, KeyError) == mine
     assert re.search(
         rf"^output\[1\] \(Writer\): {failing} at t=0.00{written}\d* raised KeyError\('table'\); "
         "correct it, or leave this writer out$",
@@ -250,6 +253,8 @@ def test_a_writer_that_cannot_start_stops_before_any_step(ranks):
 
 def test_a_writer_of_equilibrium_that_fails():
     system = held("body_force", (0, 0, -1.0), nts.Dirichlet(bottom))
-    run = nts.equilibrium(system, load_steps=4, output=[Writer("write", "last")])
+    with pytest.raises(nts.OutputError) as caught:
+        nts.equilibrium(system, load_steps=4, output=[Writer("write", "last")])
+    run = caught.value.solution
     assert same_on_all_ranks(run.status).startswith("output[0] (Writer): write at t=0.5 raised")
     assert np.allclose(run.balance["time"], [0, 0.25, 0.5])

@@ -401,11 +401,12 @@ def equilibrium(
 
     Returns:
         The Equilibrium; the bodies' u hold it. A run that fails says so in `status` and keeps
-        everything computed until then, also where a function of time, `before_step` or a writer
-        raises, on any rank.
+        everything computed until then, also where a function of time or `before_step` raises, on
+        any rank.
 
     Raises:
         ValueError: An argument is out of range; before any work.
+        OutputError: A writer raised, on any rank; the Equilibrium until then is its `solution`.
     """
     same_run(system, load_steps=load_steps, stabilization=stabilization)
     times = _pseudo_times(load_steps)

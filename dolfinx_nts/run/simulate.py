@@ -20,6 +20,7 @@ from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.step.accuracy import ACCURACY, Newton
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import (
+    OutputError,
     StepFailedError,
     UserFunctionError,
     items,
@@ -149,13 +150,16 @@ def simulate(
         The Solution. SIGINT (Ctrl-C) and SIGTERM on any rank end the run after the step that is
         being made, with the status "interrupted: ..."; a second one ends the process as if nothing
         handled it. A run that fails says so in `status` and keeps everything computed until then,
-        also where a function of time, `before_step` or a writer raises, or returns what it must
-        not, on any rank: the run ends there, and all writers are closed. Only one that raises
-        between collective calls of its own on some ranks alone makes the others wait for ever.
+        also where a function of time or `before_step` raises, or returns what it must not, on any
+        rank: the run ends there, and all writers are closed. Only one that raises between
+        collective calls of its own on some ranks alone makes the others wait for ever.
 
     Raises:
         TypeError: An argument is of another type.
         ValueError: An argument is out of range; before any work.
+        OutputError: A writer raised, on any rank, as on a full disk: the run ends there and its
+            Solution is the error's `solution`. A script that does not handle it ends with an exit
+            status other than 0. All writers are closed; what they wrote before can be read.
         Exception: Before any step, what the `start` of a writer raises.
     """
     # Of a checkpoint not the path, which rank 0 writes.
@@ -270,7 +274,7 @@ def _run(
     """`run` while signals are noted."""
     solution, root = stepper.solution, stepper.system.comm.rank == 0
     started: list[Writer] = []
-    saver = None
+    saver, lost = None, (None, None)
     try:
         try:
             saver = None if checkpoint is None else Saver(checkpoint, stepper)
@@ -282,6 +286,9 @@ def _run(
                 solution.finish()
             else:
                 _stop(stepper, _interrupted(stepper, signal, checkpoint))
+        except OutputError as failure:
+            _last_look(stepper)
+            lost = str(failure), failure.__cause__
         except UserFunctionError as failure:
             _last_look(stepper)
             _stop(stepper, str(failure), failure.__cause__)
@@ -294,11 +301,13 @@ def _run(
             raise
         if saver is not None:
             saver.save()
-        problem, cause = _call_together(stepper, started, "close")
-        if problem is not None:
-            _stop(stepper, problem, cause)
+        unclosed = _call_together(stepper, started, "close")
     finally:
         stepper.close()
+    problem, cause = lost if lost[0] is not None else unclosed
+    if problem is not None:
+        _end(solution, problem)
+        raise OutputError(solution.status, solution) from cause
     return solution
 
 
@@ -343,7 +352,7 @@ def _march(
     for whole, last in _moves(stepper, steps, pace):
         problem, cause = _call_together(stepper, output, "write", last=last)
         if problem is not None:
-            raise UserFunctionError(problem) from cause
+            raise OutputError(problem, stepper.solution) from cause
         # A run that went on from a part of a step would not have the steps of the whole run.
         if not whole:
             continue
@@ -371,11 +380,15 @@ def _interrupted(stepper: Stepper, signal: str, checkpoint: Checkpoint | None) -
 
 def _stop(stepper: Stepper, reason: str, cause: BaseException | None = None) -> None:
     """Keep in the status why a run ended, and log it where it is known best."""
-    solution = stepper.solution
-    ended = not solution.status.startswith(("running", "completed"))
-    solution.status = f"{solution.status}; {reason}" if ended else reason
+    _end(stepper.solution, reason)
     if stepper.system.comm.rank == 0 or cause is not None:
         logger.warning("%s", reason, exc_info=cause)
+
+
+def _end(solution: Solution, reason: str) -> None:
+    """Keep in the status why a run ended, after what ended it before."""
+    ended = not solution.status.startswith(("running", "completed"))
+    solution.status = f"{solution.status}; {reason}" if ended else reason
 
 
 def _call(

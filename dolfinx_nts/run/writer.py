@@ -13,7 +13,8 @@ class Writer(Protocol):
 
     A writer need not derive from this class. What it finds in the stepper is the same as after the
     run: `stepper.state`, `stepper.solution.balance`, and `body.u` and `body.v` of
-    `stepper.system.bodies`. What it raises ends the run, on whatever rank.
+    `stepper.system.bodies`. What it raises, on whatever rank, ends the run with an
+    `OutputError`.
     """
 
     def start(self, stepper: Stepper) -> Any:
