@@ -274,7 +274,8 @@ def _run(
     """`run` while signals are noted."""
     solution, root = stepper.solution, stepper.system.comm.rank == 0
     started: list[Writer] = []
-    saver, lost = None, (None, None)
+    saver = None
+    lost: tuple[str | None, BaseException | None] = None, None
     try:
         try:
             saver = None if checkpoint is None else Saver(checkpoint, stepper)
