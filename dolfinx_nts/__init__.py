@@ -22,15 +22,8 @@ from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.elements import (
-    Coupling,
-    Elements,
-    Joint,
-    JointCoupling,
-    Slopes,
-    Step,
-    StepWarning,
-)
+from dolfinx_nts.coupling import Coupling, Joint, JointCoupling, Slopes, StepWarning
+from dolfinx_nts.elements import Elements, Step
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import (
     EnergyMomentum,

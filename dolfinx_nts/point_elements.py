@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.elements import Step, StepWarning, over
+from dolfinx_nts.coupling import StepWarning
+from dolfinx_nts.elements import Step, over
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.kinematics import Kinematics, differenced, has_constraints, unknown

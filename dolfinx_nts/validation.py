@@ -106,7 +106,7 @@ def known_options(target: T) -> T:
             object.__setattr__(self, "_made", True)
 
     def set_attribute(self: Any, name: str, value: Any) -> None:
-        if name in known and getattr(self, "_made", False):
+        if name in known and name != "name" and getattr(self, "_made", False):
             label = f" {self.name!r}" if hasattr(self, "name") else ""
             raise AttributeError(
                 f"{name}={value!r}: this {wrapped.__name__}{label} has been made with another "

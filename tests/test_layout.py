@@ -24,8 +24,8 @@ LEVELS = [
     {"parallel", "validation", "dolfinx_compat", "kernels"},
     {"integrators"},
     {
-        "bodies", "constraints", "contact", "elements", "evaluation", "joints", "kinematics",
-        "point_elements", "points", "state", "system",
+        "bodies", "constraints", "contact", "coupling", "elements", "evaluation", "joints",
+        "kinematics", "point_elements", "points", "state", "system",
     },
     {"step"},
     {"output"},

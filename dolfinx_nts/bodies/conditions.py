@@ -13,6 +13,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.nodal_values import at_nodes
 from dolfinx_nts.contact.surfaces import locate_facets
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import (
@@ -128,33 +129,6 @@ def facets_of(mesh: Any, where: Any, what: str) -> IntArray:
     if isinstance(where, tuple) and len(where) == 2:
         return locate_facets(mesh, *where, what)
     return locate_facets(mesh, where, None, what)
-
-
-def at_nodes(space: Any, what: str, value: Any) -> FloatArray:
-    """Values of a Function of vectors at all nodes of this rank, shape (nodes, 3). Collective.
-
-    Args:
-        space: Lagrange space of 3-vectors.
-        what: Argument and its value.
-        value: The Function.
-
-    Raises:
-        ValueError: It is on another mesh, of another kind of space, or not finite.
-    """
-    if value.function_space.mesh.ufl_domain() != space.mesh.ufl_domain():
-        raise ValueError(f"{what}: is on another mesh; make it on that of the body")
-    if compat.lagrange_degree(value.function_space) is None:
-        raise ValueError(
-            f"{what}: may have several values at a node; interpolate it into a continuous space, "
-            "one of Lagrange elements for 3-vectors"
-        )
-    here = fem.Function(space)
-    here.interpolate(value)
-    found: FloatArray = here.x.array.reshape(-1, 3)
-    bad = not np.isfinite(found).all()
-    text = f"{what}: is not finite; check it for NaN"
-    raise_together(space.mesh.comm, text if bad else None, UserFunctionError)
-    return found
 
 
 class Meetings:

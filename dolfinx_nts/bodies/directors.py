@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.constraints import Constraints, Equations
-from dolfinx_nts.elements import Joint
+from dolfinx_nts.coupling import Joint
 
 if TYPE_CHECKING:
     from dolfinx_nts.points import Points

@@ -13,6 +13,7 @@ from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.mesh_check import check_any_mesh
 from dolfinx_nts.bodies.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.ufl_body import UflBody
+from dolfinx_nts.bodies.user_forms import checked_form
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.parallel import raise_together
@@ -150,27 +151,29 @@ class FormBody(UflBody):
         """Pi of the displacement in UFL; what is wrong with it raises on every rank."""
         what, w = f"energy={energy!r}", ufl.TestFunction(self.space)
         remedy = "return a UFL form like 0.5 * k * ufl.inner(u, u) * ufl.dx"
-        form = self._form_of(
-            what, lambda: self._potential(self.u), set(), "has test or trial functions", remedy
-        )
-        self._form_of(
-            what, lambda: self._potential.virtual_work(self.u, w), {w},
+        form = checked_form(
+            self, what, lambda: self._potential(self.u), set(), "has test or trial functions",
+            remedy,
+        )  # fmt: skip
+        checked_form(
+            self, what, lambda: self._potential.virtual_work(self.u, w), {w},
             "does not depend on the displacement", remedy,
         )  # fmt: skip
         return form
 
     def _check_mass_form(self, mass: Any) -> None:
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
-        self._form_of(
-            f"mass={mass!r}", lambda: mass(v, w), {v, w}, "is not linear in each of v and w",
+        checked_form(
+            self, f"mass={mass!r}", lambda: mass(v, w), {v, w}, "is not linear in each of v and w",
             "return a UFL form like 2.0 * ufl.inner(v, w) * ufl.dx",
         )  # fmt: skip
 
     def _check_mass(self) -> None:
         """Raise on every rank unless the mass is one number between two nodes, > 0 in all."""
-        start, cols, values = self._mass.getValuesCSR()
+        mass = self._mass.matrix
+        start, cols, values = mass.getValuesCSR()
         rows = np.repeat(np.arange(len(start) - 1), np.diff(start))
-        size, problem = self._mass.norm(), None
+        size, problem = mass.norm(), None
         mixed = values[rows % 3 != cols % 3]
         masses = self.nodal_mass.reshape(-1, 3)
         differ = masses - masses[:, :1]
@@ -179,9 +182,9 @@ class FormBody(UflBody):
         total = self.comm.allreduce(float(self.nodal_mass.sum()))
         if not total > 0.0:
             problem = f"is {total / 3:.3g} kg in all; it must be positive"
-        elif not self._mass.isSymmetric(_ROUNDING * size):
+        elif not mass.isSymmetric(_ROUNDING * size):
             problem = "is not symmetric in v and w"
-        diagonal = self._mass.getDiagonal()
+        diagonal = mass.getDiagonal()
         if problem is None and not (diagonal.array_r > 0.0).all():
             k = int(diagonal.array_r.argmin())
             where = self.reference[3 * (k // 3) : 3 * (k // 3) + 3].tolist()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +21,60 @@ ROUNDED = 1e-9
 _EQUAL = 1e-9
 
 
-def measure(space: Any, density: Parameter) -> tuple[float, FloatArray, FloatArray]:
-    """Mass [kg], centre [m] and Euler tensor about it [kg m^2] of a mesh. Collective."""
+class Inertia(NamedTuple):
+    """Mass of a rigid body and where it is in the reference.
+
+    Attributes:
+        mass: [kg].
+        centre: Its centre [m], shape (3,).
+        euler: Principal moments E_i of int rho x x^T dV about it [kg m^2], shape (3,).
+        axes: Their directions d_i as columns, shape (3, 3).
+    """
+
+    mass: float
+    centre: FloatArray
+    euler: FloatArray
+    axes: FloatArray
+
+    @classmethod
+    def of_moments(
+        cls, mass: float, centre: FloatArray, moments: FloatArray, axes: FloatArray
+    ) -> Inertia:
+        """From principal moments of inertia [kg m^2], shape (3,)."""
+        return cls(mass, centre, _not_rounding(0.5 * moments.sum() - moments), axes)
+
+    @property
+    def moments(self) -> FloatArray:
+        """Principal moments of inertia [kg m^2], shape (3,)."""
+        found: FloatArray = self.euler.sum() - self.euler
+        return found
+
+    @property
+    def length(self) -> float:
+        """Radius of gyration l [m].
+
+        A point has none, and nothing depends on what its directors are given.
+        """
+        return float(np.sqrt(self.euler.sum() / self.mass)) or 1.0
+
+    @property
+    def nodes(self) -> FloatArray:
+        """The centre and l d_i [m], shape (4, 3)."""
+        return np.vstack([self.centre, self.length * self.axes.T])
+
+    @property
+    def nodal_mass(self) -> FloatArray:
+        """Of the centre m, of the directors E_i / l^2 [kg], shape (4,)."""
+        return np.array([self.mass, *(self.euler / self.length**2)])
+
+
+def _not_rounding(euler: FloatArray) -> FloatArray:
+    """Without the rounding of a disc's or a rod's moments, which is no mass."""
+    return np.where(euler > ROUNDED * euler.max(), euler, 0.0)
+
+
+def inertia_of(space: Any, density: Parameter) -> Inertia:
+    """That of a mesh with a function space of vectors on it. Collective."""
     mesh = space.mesh
     rho = fem.Constant(mesh, float(density)) if is_number(density) else density
     v, w = ufl.TrialFunction(space), ufl.TestFunction(space)
@@ -47,7 +99,8 @@ def measure(space: Any, density: Parameter) -> tuple[float, FloatArray, FloatArr
     euler = mesh.comm.allreduce(np.array([off.T @ weighted(off[:, k]) for k in range(3)]))
     for a in (matrix, right, left):
         a.destroy()
-    return mass, centre, 0.5 * (euler + euler.T)
+    moments, axes = axes_of(0.5 * (euler + euler.T))
+    return Inertia(mass, centre, _not_rounding(moments), axes)
 
 
 def principal(inertia: Any, axes: Any) -> tuple[FloatArray, FloatArray]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,12 +11,11 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.spatial.transform import Rotation
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
-from dolfinx_nts.bodies.inertia import ROUNDED, axes_of, measure, misfit_of_axes, principal
+from dolfinx_nts.bodies.inertia import Inertia, inertia_of, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh, places_of
 from dolfinx_nts.bodies.parameters import (
     Parameter,
@@ -25,6 +23,8 @@ from dolfinx_nts.bodies.parameters import (
     require_positive_parameter,
     values_of,
 )
+from dolfinx_nts.bodies.prescribed_motion import PrescribedMotion
+from dolfinx_nts.bodies.rigid_loads import RigidLoads, VectorInTime
 from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
@@ -34,31 +34,22 @@ from dolfinx_nts.parallel import gather_rows, raise_together
 from dolfinx_nts.points import Points
 from dolfinx_nts.validation import (
     UserFunctionError,
-    agree,
-    call_together,
-    floats,
     known_options,
     require_bool,
     require_name,
     require_positive,
     require_same,
     vector,
-    vector_in_time,
     vectors,
 )
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
-VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
 
 #: Part of the mass that the matrix lends to directors without mass where a rotation has no
 #: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
 _LENT = 1e-8
-#: Part of a torque along an axis without inertia that counts as none.
-_ALONG = 1e-6
-#: Parts of a step at which a prescribed rotation is asked for how far it turns.
-_ASKED = (0.0, 0.30, 0.57, 1.0)
 
 
 @known_options
@@ -119,11 +110,11 @@ class RigidBody(Body):
     ) -> None:
         require_name("name", name)
         check_mesh(mesh, name)
-        require_same(
-            mesh.comm, density=density if is_number(density) else None, velocity=velocity,
-            angular_velocity=angular_velocity, force=force, torque=torque, motion=motion,
-            rotation=rotation, name=name,
-        )  # fmt: skip
+        given = {
+            "name": name, "velocity": velocity, "angular_velocity": angular_velocity,
+            "force": force, "torque": torque, "motion": motion, "rotation": rotation,
+        }  # fmt: skip
+        require_same(mesh.comm, density=density if is_number(density) else None, **given)
         require_positive_parameter("density", density, "kg/m^3")
         self.mesh, self.density, self.degree = mesh, density, 1
         self.made_on = places_of(mesh)
@@ -132,12 +123,7 @@ class RigidBody(Body):
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
         self._densities = [] if is_number(density) else [density]
         self._measured = self.parameters()
-        mass, centre, euler = measure(self.space, density)
-        moments, axes = axes_of(euler)
-        self._set_up(
-            mesh.comm, name, mass, centre, moments, axes, velocity, angular_velocity, force,
-            torque, motion, rotation,
-        )  # fmt: skip
+        self._set_up(mesh.comm, inertia_of(self.space, density), **given)
 
     @classmethod
     @known_options
@@ -182,32 +168,26 @@ class RigidBody(Body):
         """
         if not isinstance(comm, MPI.Comm):
             raise TypeError(f"comm={comm!r}: pass an MPI communicator of mpi4py")
-        require_same(
-            comm, mass=mass, inertia=inertia, centre=centre, axes=axes, velocity=velocity,
-            angular_velocity=angular_velocity, force=force, torque=torque, motion=motion,
-            rotation=rotation, name=name,
-        )  # fmt: skip
+        given = {
+            "name": name, "velocity": velocity, "angular_velocity": angular_velocity,
+            "force": force, "torque": torque, "motion": motion, "rotation": rotation,
+        }  # fmt: skip
+        require_same(comm, mass=mass, inertia=inertia, centre=centre, axes=axes, **given)
         require_name("name", name)
         require_positive("mass", mass, "kg")
         where = vector("centre", centre, "m")
         moments, columns = principal(inertia, axes)
         body = cls.__new__(cls)
-        euler = 0.5 * moments.sum() - moments
-        body._set_up(
-            comm, name, float(mass), where, euler, columns, velocity, angular_velocity, force,
-            torque, motion, rotation,
-        )  # fmt: skip
+        body._set_up(comm, Inertia.of_moments(float(mass), where, moments, columns), **given)
         body._made = True
         return body
 
     def _set_up(
         self,
         comm: Any,
+        inertia: Inertia,
+        *,
         name: str,
-        mass: float,
-        centre: FloatArray,
-        euler: FloatArray,
-        axes: FloatArray,
         velocity: Any,
         angular_velocity: Any,
         force: VectorInTime,
@@ -215,51 +195,23 @@ class RigidBody(Body):
         motion: VectorInTime | None,
         rotation: Any,
     ) -> None:
-        """Set up what both constructors share; `euler`: principal moments of int rho x x^T dV."""
-        self.name, self.comm, self.mass = name, comm, mass
+        """Set up what both constructors share."""
+        self.name, self.comm, self._inertia = name, comm, inertia
+        self.mass, self.centre, self.moments = inertia.mass, inertia.centre, inertia.moments
+        self.length = inertia.length
         linear = vector("velocity", velocity, "m/s")
         turning = vector("angular_velocity", angular_velocity, "rad/s")
-        for what, speed, drive, prescribed in (
-            ("velocity", linear, "motion", motion),
-            ("angular_velocity", turning, "rotation", rotation),
-        ):
-            if speed.any() and prescribed is not None:
-                raise ValueError(
-                    f"{what} of {name!r}={speed.tolist()!r}: {drive}= prescribes it; leave {what} "
-                    f"out, or {drive}="
-                )
-        self._force, self._motion, self._turn = force, motion, rotation
-        self.driven = callable(motion) or callable(rotation)
-        self._given = [("force", force, "N"), ("torque", torque, "N m")]
-        self.loads_in_time = callable(force) or callable(torque)
-        for what, value, unit in self._given:
-            self._vector(what, value, 0.0, unit)
-        # Rounding of a disc's or a rod's moments is no mass.
-        euler = np.where(euler > ROUNDED * euler.max(), euler, 0.0)
-        self.moments = euler.sum() - euler
-        # A point has none, and nothing depends on what its directors are given.
-        self.length = float(np.sqrt(euler.sum() / mass)) or 1.0
-        self._axes, self.centre, self._euler = axes, centre, euler
-        self.owner = rank_of(name, comm)
-        here = comm.rank == self.owner
-        self.num_owned = 12 if here else 0
-        self.places = np.array([True, False, False, False])[: self.num_owned // 3]
-        y = np.vstack([centre, self.length * axes.T])
-        masses = np.array([mass, *(euler / self.length**2)])
-        self.reference: FloatArray = y.ravel()[: self.num_owned]
-        self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
-        self._lent = np.zeros(self.num_owned)
-        if np.count_nonzero(euler) < 2:
-            self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * mass
-        speeds = np.vstack([linear, np.cross(turning, y[1:])])
-        self.initial_velocity = speeds.ravel()[: self.num_owned]
-        fixed = np.repeat([motion is not None] + 3 * [rotation is not None], 3)
-        self.fixed = np.flatnonzero(fixed[: self.num_owned])
-        self._fixed = fixed
+        self._drive = PrescribedMotion(comm, name, motion, rotation)
+        self._drive.refuse_beside(linear, turning)
+        self.driven = self._drive.in_time
+        self._loads = RigidLoads(comm, name, force, torque, inertia.euler)
+        self.loads_in_time = self._loads.in_time
+        self._loads.begin(0.0, 1.0, inertia.axes)
+        self._set_up_nodes(linear, turning)
         self.prescribed(0.0)
-        held = self.points(centre).part(slice(0, int(here)))
+        held = self.points(self.centre).part(slice(0, int(comm.rank == self.owner)))
         self._directors_held = Directors(self, held, self.length, np.arange(len(held)))
-        self.joints = () if rotation is not None else (self._directors_held,)
+        self.joints = () if self._drive.turns else (self._directors_held,)
         self._matrix: Any = None
         # Mass factor that it holds, and PETSc's count of changes since.
         self._holds: tuple[float, int] | None = None
@@ -270,7 +222,22 @@ class RigidBody(Body):
             local = np.abs(self._mesh_weights).max(axis=0, initial=0.0)
             comm.Allreduce(local, self._reach, op=MPI.MAX)
         self.accept(np.zeros(self.num_owned), self.initial_velocity)
-        self._check_torque(self._vector("torque", torque, 0.0, "N m"))
+
+    def _set_up_nodes(self, linear: FloatArray, turning: FloatArray) -> None:
+        """Place, mass and velocity of the four nodes, all on one rank."""
+        self.owner = rank_of(self.name, self.comm)
+        self.num_owned = 12 if self.comm.rank == self.owner else 0
+        self.places = np.array([True, False, False, False])[: self.num_owned // 3]
+        y, masses = self._inertia.nodes, self._inertia.nodal_mass
+        self.reference: FloatArray = y.ravel()[: self.num_owned]
+        self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
+        self._lent = np.zeros(self.num_owned)
+        if np.count_nonzero(masses[1:]) < 2:
+            self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * self.mass
+        speeds = np.vstack([linear, np.cross(turning, y[1:])])
+        self.initial_velocity = speeds.ravel()[: self.num_owned]
+        self._fixed = np.repeat([self._drive.moves] + 3 * [self._drive.turns], 3)
+        self.fixed = np.flatnonzero(self._fixed[: self.num_owned])
 
     # ---- the last accepted state
     @property
@@ -298,12 +265,11 @@ class RigidBody(Body):
     # ---- points
     def _weights(self, x: FloatArray) -> FloatArray:
         """Weights of the four nodes in points x (n, 3) of the reference, shape (n, 4)."""
-        local = (x - self.centre) @ self._axes / self.length
+        local = (x - self.centre) @ self._inertia.axes / self.length
         return np.column_stack([np.ones(len(x)), local])
 
     def _points(self, weights: FloatArray) -> Points:
-        n = len(weights)
-        y = np.vstack([self.centre, self.length * self._axes.T])
+        n, y = len(weights), self._inertia.nodes
         nodes = np.tile(np.arange(4), (n, 1))
         fixed = np.tile(self._fixed.reshape(4, 3), (n, 1, 1))
         places = np.tile([True, False, False, False], (n, 1))
@@ -329,7 +295,7 @@ class RigidBody(Body):
         Raises:
             ValueError: x is no array of vectors.
         """
-        local = vectors("x", x, "vectors") @ self._axes / self.length
+        local = vectors("x", x, "vectors") @ self._inertia.axes / self.length
         return self._points(np.column_stack([np.zeros(len(local)), local]))
 
     def directions_at(self, direction: FloatArray, x: Any) -> Points:
@@ -403,63 +369,21 @@ class RigidBody(Body):
             return 0.0
         return float((self._reach @ np.abs(du).reshape(4, 3)).max())
 
-    # ---- loads and prescribed motion
-    def _vector(self, name: str, value: VectorInTime, time: float, unit: str) -> FloatArray:
-        return vector_in_time(self.comm, f"{name} of {self.name!r}", value, time, unit)
-
+    # ---- as of Body
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
         u = np.zeros((4, 3))
-        if self._motion is not None:
-            u[0] = self._vector("motion", self._motion, time, "m")
-        if self._turn is not None:
-            turn = self._rotation_at(time) - np.eye(3)
-            u[1:] = self.length * (turn @ self._axes).T
+        if self._drive.moves:
+            u[0] = self._drive.displacement(time)
+        if self._drive.turns:
+            turn = self._drive.rotation(time) - np.eye(3)
+            u[1:] = self.length * (turn @ self._inertia.axes).T
         return u.ravel()[self.fixed]
 
-    def _rotation_at(self, time: float) -> FloatArray:
-        """The prescribed rotation since the start, shape (3, 3). Collective."""
-        given, name, moves = self._turn, f"rotation of {self.name!r}", callable(self._turn)
-        if moves:
-            name = f"{name} at t={time!r}"
-            given = call_together(self.comm, name, given, time)
-        problem, turned = None, np.eye(3)
-        array = floats(given)
-        if array.shape not in ((3,), (3, 3)) or not np.isfinite(array).all():
-            problem = "pass a rotation vector (3,) [rad] or a rotation matrix (3, 3)"
-        elif array.shape == (3,):
-            turned = Rotation.from_rotvec(array).as_matrix()
-        else:
-            problem, turned = misfit_of_axes(array), array
-        if moves:
-            text = f"{name}: returned {given!r}; {problem}"
-            agree(self.comm, name, turned, text if problem else None)
-        else:
-            raise_together(self.comm, f"{name}={given!r}: {problem}" if problem else None)
-        return turned
-
-    def _check_torque(self, torque: FloatArray) -> None:
-        """Refuse a torque [N m] about the axis of a rod, or on a point: nothing resists it."""
-        if np.count_nonzero(self._euler) > 1:
-            return
-        axes = self.rotation[:, self._euler > 0.0].T if self._euler.any() else np.eye(3)
-        if np.abs(axes @ torque).max() > _ALONG * np.linalg.norm(torque):
-            raise UserFunctionError(
-                f"torque of {self.name!r}={torque.tolist()!r}: the body has no inertia about "
-                f"{'its axis' if len(axes) == 1 else 'any axis'}; give it some, or leave the "
-                "torque out"
-            )
-
-    # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n and the loads of the step."""
         self._u0, self._theta = moment.u0, rule.theta
-        now: list[FloatArray] = []
-        for what, value, unit in self._given:
-            part = 1.0 if callable(value) else moment.ramp
-            now.append(part * self._vector(what, value, moment.time, unit))
-        self._load, self._couple = now
-        self._check_torque(self._couple)
+        self._loads.begin(moment.time, moment.ramp, self.rotation)
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]."""
@@ -473,10 +397,9 @@ class RigidBody(Body):
         """Gravity, force, and the torque's forces on the directors [N]."""
         f = self.weight(gravity).reshape(-1, 3)
         if self.num_owned:
-            f[0] += self._load
-            if self._couple.any():
-                directors = self._directors(u1)
-                f[1:] = cross(np.tile(self._turning(directors), (3, 1)), directors)
+            f[0] += self._loads.force
+            if self._loads.turn:
+                f[1:] = self._loads.on_directors(self._directors(u1))
         return f.ravel()
 
     def _directors(self, u1: FloatArray) -> FloatArray:
@@ -484,42 +407,18 @@ class RigidBody(Body):
         u = self._u0 + self._theta * (u1 - self._u0)
         return (self.reference + u).reshape(4, 3)[1:]
 
-    def _turning(self, directors: FloatArray) -> FloatArray:
-        """The vector t [N/m] with sum D_i x (t x D_i) = torque, whose impulse is exact then.
-
-        On orthonormal directors it is torque / (2 l^2); in the middle of a step they are shorter.
-        """
-        squares = directors.T @ directors
-        whole = np.trace(squares) * np.eye(3) - squares
-        turning: FloatArray = np.linalg.solve(whole, self._couple)
-        return turning
-
-    def _torque_gradient(self, directors: FloatArray) -> FloatArray:
-        """Derivative of the torque's forces t x D_i by the directors, shape (9, 9)."""
-        squares = directors.T @ directors
-        t = self._turning(directors)
-        # (trace - squares) dt = - (change of both) t
-        change = np.concatenate(
-            [2.0 * np.outer(t, d) - (d @ t) * np.eye(3) - np.outer(d, t) for d in directors], axis=1
-        )
-        dt = -np.linalg.solve(np.trace(squares) * np.eye(3) - squares, change)
-        gradient = np.kron(np.eye(3), _spin(t))
-        for i, d in enumerate(directors):
-            gradient[3 * i : 3 * i + 3] -= _spin(d) @ dt
-        return gradient
-
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """Return mass M less stiffness times the derivative of the torque's forces."""
         self.check_alive()
         if self._matrix is None:
             self._matrix = compat.dense_matrix(self.comm, self.num_owned)
-        constant = not self._couple.any()
+        constant = not self._loads.turn
         if constant and self._holds == (mass, self._matrix.stateGet()):
             return self._matrix
         if self.num_owned:
             whole = np.diag(mass * (self.nodal_mass + self._lent))
-            if self._couple.any():
-                by_directors = self._torque_gradient(self._directors(u1))
+            if not constant:
+                by_directors = self._loads.gradient(self._directors(u1))
                 whole[3:, 3:] -= stiffness * self._theta * by_directors
             if self.fixed.size:
                 whole[self.fixed] = whole[:, self.fixed] = 0.0
@@ -567,29 +466,21 @@ class RigidBody(Body):
             forces = residual.reshape(4, 3)
             rows[0] = forces[0]
             rows[1] = cross(self._directors(u1), forces[1:]).sum(axis=0)
-        return rows[[self._motion is not None, self._turn is not None]]
+        return rows[[self._drive.moves, self._drive.turns]]
 
     @property
     def reaction_labels(self) -> list[tuple[str, str]]:
         """Name and unit of each row of `reactions`."""
-        motion = [("force", "N")] if self._motion is not None else []
-        return motion + ([("moment", "N m")] if self._turn is not None else [])
+        force = [("force", "N")] if self._drive.moves else []
+        return force + ([("moment", "N m")] if self._drive.turns else [])
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""
         return self._directors_held.largest_turn(self.reference + u0, self.reference + u1)
 
     def prescribed_turn(self, start: float, end: float) -> float:
-        """Turn that `rotation` prescribes between two times [rad], at least. Collective.
-
-        Its function is also asked at times between that share no period: rates below a hundred
-        turns in this time that look slow at all of them are slow.
-        """
-        if not callable(self._turn):
-            return 0.0
-        turned = [self._rotation_at(start + part * (end - start)) for part in _ASKED]
-        cosines = [0.5 * float((a * b).sum()) - 0.5 for a, b in pairwise(turned)]
-        return float(np.arccos(np.clip(cosines, -1.0, 1.0)).sum())
+        """Turn that `rotation` prescribes between two times [rad], at least. Collective."""
+        return self._drive.turn(start, end)
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""
@@ -607,9 +498,3 @@ class RigidBody(Body):
         super().destroy()
         if self._matrix is not None:
             self._matrix.destroy()
-
-
-def _spin(a: FloatArray) -> FloatArray:
-    """Matrix of a x."""
-    x, y, z = a
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

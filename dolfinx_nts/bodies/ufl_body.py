@@ -11,15 +11,15 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.conditions import Dirichlet, Supports, at_nodes
+from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.inversion import Determinants
-from dolfinx_nts.bodies.massless import redistributed
+from dolfinx_nts.bodies.mass_matrix import MassMatrix
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.mesh_check import places_of
+from dolfinx_nts.bodies.nodal_values import nodal_values
 from dolfinx_nts.bodies.parameters import (
     Parameter,
     in_expressions,
@@ -27,6 +27,7 @@ from dolfinx_nts.bodies.parameters import (
     require_positive_parameter,
     values_of,
 )
+from dolfinx_nts.bodies.user_forms import checked_form
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
@@ -36,10 +37,8 @@ from dolfinx_nts.parallel import gather_on_root, raise_together
 from dolfinx_nts.points import Points, in_mesh
 from dolfinx_nts.validation import (
     UserFunctionError,
-    at_points,
     require_bool,
     require_name,
-    vector,
     vectors,
 )
 
@@ -68,6 +67,8 @@ class UflBody(Body):
         has_massless: Whether there are such on any rank.
     """
 
+    _mass: MassMatrix
+
     def __init__(
         self, space: Any, degree: int, name: str, extra_form: ExtraForm | None,
         quadrature_degree: int, allow_inversion: bool,
@@ -94,10 +95,6 @@ class UflBody(Body):
         if self.mesh.topology.dim == 3:
             self._determinants = Determinants(space, degree, quadrature_degree)
         self._matrix: Any = None
-        self._mass: Any = None
-        self._consistent_mass: Any = None
-        self._mass_change: Any = None
-        self._sum: Any = None
 
     # ---- what a kind of body has of its own
     def _mass_form(self, v: Any, w: Any) -> Any:
@@ -191,22 +188,16 @@ class UflBody(Body):
             raise ValueError(f"{what}: the body has moved already; ask for it before the first run")
         massless = self.massless.copy()
         massless.reshape(-1, 3)[surface.rows] = True
-        old: Any = self._mass if self._consistent_mass is None else self._consistent_mass
-        x = self.reference.reshape(-1, 3)
-        new, problem = redistributed(old, massless[::3], x)
+        problem = self._mass.redistribute(
+            massless[::3], self.reference.reshape(-1, 3), self.fixed
+        )
         if problem:
             raise ValueError(
                 f"{what}: beside its nodes without mass the body {problem}; use a finer mesh, a "
                 "smaller surface, or mass='consistent'"
             )
-        self._consistent_mass, self._mass = old, new
         self.massless, self.has_massless = massless, True
-        self.nodal_mass = self.inertia(np.ones(self.num_owned))
-        change = new.copy()
-        change.axpy(-1.0, old, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        start, _ = change.getOwnershipRange()
-        change.zeroRowsColumns((start + self.fixed).astype(PETSc.IntType), diag=0.0)
-        self._mass_change = change
+        self.nodal_mass = self._mass.nodal
 
     def points(self, x: Any) -> Points:
         """Material points, for joints and springs. Collective.
@@ -242,16 +233,20 @@ class UflBody(Body):
         """Set conditions, and displacement and velocity at the start."""
         self._supports = Supports(self.comm, self.space, bcs, self.name)
         self.fixed, self.driven = self._supports.fixed, self._supports.driven
-        self._interpolate(self.v, "velocity", velocity, "m/s")
+        self.v.x.array[:] = self._given("velocity", velocity, "m/s")
         self.v.x.array[self._supports.still] = 0.0
         self.v.x.scatter_forward()
         self.initial_velocity = self.v.x.array[: self.num_owned].copy()
-        self._interpolate(self.u, "displacement", displacement, "m")
+        self.u.x.array[:] = self._given("displacement", displacement, "m")
         self._starts_moved = self.comm.allreduce(bool(self.u.x.array.any()), op=MPI.LOR)
         self.u.x.array[self.fixed] = self.prescribed(0.0)
         self.u.x.scatter_forward()
         self.initial_displacement = self.u.x.array[: self.num_owned].copy()
         self._refuse_inversion()
+
+    def _given(self, name: str, given: Any, unit: str) -> FloatArray:
+        """Values of an argument at all nodes of this rank, shape (coordinates,)."""
+        return nodal_values(self.space, name, self.name, given, unit).ravel()
 
     def _refuse_inversion(self) -> None:
         """Raise on every rank if the start turns a cell inside out."""
@@ -266,53 +261,28 @@ class UflBody(Body):
                 f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
             )
 
-    def _interpolate(self, function: Any, name: str, given: Any, unit: str) -> None:
-        """Fill a Function from another, a vector or a callable x (3, n) -> (3, n)."""
-        values = function.x.array
-        if isinstance(given, fem.Function) and given.ufl_shape == (3,):
-            what = f"{name}={given!s} of {self.name!r}"
-            values[:] = at_nodes(self.space, what, given).ravel()
-        elif callable(given) and not hasattr(given, "ufl_shape"):
-            # The nodes of Lagrange elements are their interpolation points.
-            x = self.space.tabulate_dof_coordinates().T
-            found = at_points(self.comm, f"{name} of {self.name!r}", given, x, (3,))
-            values[:] = found.T.ravel()
-        else:
-            else_ = "a callable x (3, n) -> (3, n), or a Function of vectors"
-            constant = vector(name, given, unit, or_else=else_)
-            values[:] = np.tile(constant, len(values) // 3)
-
     def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
         """Compile mass and energy in UFL and any loads, which are returned."""
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         mass = self._mass_form(v, w)
-        of_energy, of_mass = (
+        of_energy, self._mass_parameters = (
             in_expressions((part.integrand() for part in form.integrals()), [self.u])
             for form in (energy, mass)
         )
-        self._mass_parameters = of_mass
-        self._parameters = [*of_energy, *of_mass]
+        self._parameters = [*of_energy, *self._mass_parameters]
         self._taken = self.parameters()
         if self._extra_form is not None:
             self._check_extra_form(self._extra_form, w)
-        self._mass_compiled, *compiled, self._energy_form = compat.compile_forms(
-            [mass, *loads, energy]
-        )
+        of_mass, *compiled, self._energy_form = compat.compile_forms([mass, *loads, energy])
         self._load = np.zeros(self.num_owned)
-        self._in, self._out = compat.create_vector(self.space), compat.create_vector(self.space)
-        self._make_mass()
+        self._vector = compat.create_vector(self.space)
+        self._mass = MassMatrix(of_mass)
+        self._take_mass()
         return compiled
 
-    def _make_mass(self) -> None:
-        """Assemble the mass matrix. Collective."""
-        full = compat.create_matrix(self._mass_compiled)
-        compat.assemble_matrix(full, self._mass_compiled, (), 0.0)
-        if self._mass is not None:
-            self._mass.destroy()
-        # Directions do not mix: two of three entries of the blocks are zero.
-        self._mass = compat.without_zeros(full)
-        full.destroy()
-        self.nodal_mass = self.inertia(np.ones(self.num_owned))
+    def _take_mass(self) -> None:
+        """Take over the mass matrix as it was assembled."""
+        self.nodal_mass = self._mass.nodal
         self._mass_values = values_of(self._mass_parameters)
 
     def _density(self, density: Any) -> Any:
@@ -334,45 +304,11 @@ class UflBody(Body):
     def _check_extra_form(self, extra_form: ExtraForm, w: Any) -> None:
         # Sums, as those that it will be given.
         given = self.u + self.v, self.u - self.v, w, fem.Constant(self.mesh, 0.0)
-        self._form_of(
-            f"extra_form={extra_form!r}", lambda: extra_form(*given), {w},
+        checked_form(
+            self, f"extra_form={extra_form!r}", lambda: extra_form(*given), {w},
             "is not linear in the test function w alone",
             "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx",
         )  # fmt: skip
-
-    def _form_of(
-        self, what: str, make: Callable[[], Any], wanted: set[Any], else_: str, remedy: str
-    ) -> Any:
-        """A form of the user's; what is wrong with it raises on every rank.
-
-        Args:
-            what: Argument that it comes from, and its value.
-            make: Makes it.
-            wanted: Its test and trial functions.
-            else_: What to say if it has others.
-            remedy: What to do.
-
-        Raises:
-            TypeError: It is none, or cannot be compiled on this mesh.
-        """
-        problem, cause, form, domain = None, None, None, self.mesh.ufl_domain()
-        try:
-            form = make()
-            arguments = set(form.arguments()) if isinstance(form, ufl.Form) else set()
-        except Exception as error:  # any: a rank that raises alone would leave the others waiting
-            problem, cause = f"raised {error!r}; {remedy}", error
-        else:
-            if not isinstance(form, ufl.Form):
-                problem = f"returned an object of type {type(form).__name__}; {remedy}"
-            elif arguments != wanted:
-                problem = f"{else_}; {remedy}"
-            elif any(d != domain for d in form.ufl_domains()):
-                problem = "has a measure of another mesh; use ufl.dx, or one of the body's mesh"
-            else:
-                problem = misfit([part.integrand() for part in form.integrals()], domain)
-        text = f"{what} of {self.name!r}: {problem}"
-        raise_together(self.comm, text if problem else None, TypeError, cause)
-        return form
 
     def _compile(self, rule: Integrator) -> tuple[Any, Any, Any]:
         """Compiled internal virtual work, tangent and extra virtual work by a rule."""
@@ -417,9 +353,7 @@ class UflBody(Body):
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]."""
         self.check_alive()
-        self._in.array_w[:] = v
-        self._mass.mult(self._in, self._out)
-        return self._out.array_r.copy()
+        return self._mass.times(v)
 
     def internal(self, u1: FloatArray) -> FloatArray:
         """Internal forces of the step [N]."""
@@ -445,22 +379,7 @@ class UflBody(Body):
         self._fill(self._u1, u1)
         self._factors.value = mass, stiffness
         compat.assemble_matrix(self._matrix, self._forms[1], self._supports.masks, diagonal)
-        if self._mass_change is None:
-            return self._matrix
-        return self._with_change(mass)
-
-    def _with_change(self, mass: float) -> Any:
-        """The assembled matrix with mass where it is, which may be beyond the form's entries."""
-        if self._sum is None:
-            self._sum = self._matrix.copy()
-            other = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
-            self._sum.axpy(mass, self._mass_change, structure=other)
-            return self._sum
-        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-        self._sum.zeroEntries()
-        self._sum.axpy(1.0, self._matrix, structure=subset)
-        self._sum.axpy(mass, self._mass_change, structure=subset)
-        return self._sum
+        return self._mass.corrected(self._matrix, mass)
 
     def _mean(self, values: FloatArray) -> float:
         """Over all coordinates. Collective."""
@@ -513,9 +432,9 @@ class UflBody(Body):
         """
         if self._determinants is None:
             return np.inf, np.full(3, np.nan)
-        self._in.array_w[:] = u
-        self._in.ghostUpdate()
-        with self._in.localForm() as here:
+        self._vector.array_w[:] = u
+        self._vector.ghostUpdate()
+        with self._vector.localForm() as here:
             return self._determinants.smallest(here.array_r)
 
     @property
@@ -551,7 +470,8 @@ class UflBody(Body):
                 f"density of {self.name!r}: has changed after mass='redistributed' of a surface "
                 "took it from its nodes; keep it, or use mass='consistent'"
             )
-        self._make_mass()
+        self._mass.assemble()
+        self._take_mass()
         total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
         if not total > 0.0:
             raise UserFunctionError(
@@ -580,8 +500,7 @@ class UflBody(Body):
     def destroy(self) -> None:
         """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
         super().destroy()
-        of_mass = (self._mass, self._consistent_mass, self._mass_change, self._sum)
-        for a in (*of_mass, self._in, self._out, self._matrix):
+        for a in (self._mass, self._vector, self._matrix):
             if a is not None:
                 a.destroy()
 
@@ -591,5 +510,5 @@ class UflBody(Body):
 
     def _assemble(self, form: Any) -> FloatArray:
         self.check_alive()
-        compat.assemble_vector(self._out, form)
-        return self._out.array_r.copy()
+        compat.assemble_vector(self._vector, form)
+        return self._vector.array_r.copy()

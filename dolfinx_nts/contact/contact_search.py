@@ -15,7 +15,8 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
-from dolfinx_nts.elements import Step, StepWarning
+from dolfinx_nts.coupling import StepWarning
+from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import ContactHistory

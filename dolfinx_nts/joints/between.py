@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations, Upright, rank_of
-from dolfinx_nts.elements import Joint
+from dolfinx_nts.coupling import Joint
 from dolfinx_nts.kernels import quadratic
 from dolfinx_nts.validation import require_name, require_same, vector
 

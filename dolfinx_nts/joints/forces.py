@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.constraints import rank_of
-from dolfinx_nts.elements import Joint, Slopes, Step
+from dolfinx_nts.coupling import Joint, Slopes
+from dolfinx_nts.elements import Step
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import springs as kernel
 from dolfinx_nts.point_elements import EveryStep, PointElements

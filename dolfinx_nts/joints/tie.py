@@ -10,7 +10,7 @@ import numpy as np
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.elements import Joint
+from dolfinx_nts.coupling import Joint
 from dolfinx_nts.joints.between import named
 from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options

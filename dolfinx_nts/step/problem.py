@@ -21,7 +21,8 @@ from petsc4py import PETSc
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
-from dolfinx_nts.elements import Coupling, JointCoupling, Step, evaluate_together
+from dolfinx_nts.coupling import Coupling, JointCoupling
+from dolfinx_nts.elements import Step, evaluate_together
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, Moment, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import ContactHistory, State

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.elements import Slopes
+from dolfinx_nts.coupling import Slopes
 from dolfinx_nts.kinematics import has_constraints
 from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent

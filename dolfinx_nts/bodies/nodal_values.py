@@ -1,0 +1,62 @@
+"""Values that users give at all nodes of a body: vectors, functions of place, Functions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.validation import UserFunctionError, at_points, vector
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def nodal_values(space: Any, name: str, body: str, given: Any, unit: str) -> FloatArray:
+    """Values of a vector field at all nodes of this rank, shape (nodes, 3). Collective.
+
+    Args:
+        space: Lagrange space of 3-vectors.
+        name: Of the argument.
+        body: Name of the body.
+        given: A vector, a callable x (3, n) -> (3, n), or a Function of vectors.
+        unit: Its unit, for messages.
+    """
+    x = space.tabulate_dof_coordinates()
+    if isinstance(given, fem.Function) and given.ufl_shape == (3,):
+        return at_nodes(space, f"{name}={given!s} of {body!r}", given)
+    if callable(given) and not hasattr(given, "ufl_shape"):
+        # The nodes of Lagrange elements are their interpolation points.
+        return at_points(space.mesh.comm, f"{name} of {body!r}", given, x.T, (3,)).T
+    else_ = "a callable x (3, n) -> (3, n), or a Function of vectors"
+    return np.tile(vector(name, given, unit, or_else=else_), (len(x), 1))
+
+
+def at_nodes(space: Any, what: str, value: Any) -> FloatArray:
+    """Values of a Function of vectors at all nodes of this rank, shape (nodes, 3). Collective.
+
+    Args:
+        space: Lagrange space of 3-vectors.
+        what: Argument and its value.
+        value: The Function.
+
+    Raises:
+        ValueError: It is on another mesh, of another kind of space, or not finite.
+    """
+    if value.function_space.mesh.ufl_domain() != space.mesh.ufl_domain():
+        raise ValueError(f"{what}: is on another mesh; make it on that of the body")
+    if compat.lagrange_degree(value.function_space) is None:
+        raise ValueError(
+            f"{what}: may have several values at a node; interpolate it into a continuous space, "
+            "one of Lagrange elements for 3-vectors"
+        )
+    here = fem.Function(space)
+    here.interpolate(value)
+    found: FloatArray = here.x.array.reshape(-1, 3)
+    bad = not np.isfinite(found).all()
+    text = f"{what}: is not finite; check it for NaN"
+    raise_together(space.mesh.comm, text if bad else None, UserFunctionError)
+    return found
