@@ -151,7 +151,9 @@ SCENES = {f.__name__: f for f in (blocks, tetrahedra, mechanism, floor, loaded, 
 def run(scene, integrator="energy-momentum", **options):
     system, own = scene
     t_end = options.pop("t_end", STEPS * DT)
-    more = {"accuracy": "exact", "dt": DT, "t_end": t_end}
+    more = {"dt": DT, "t_end": t_end}
+    if "accuracy" not in options:
+        more["newton"] = nts.Newton(reuse=False)
     return nts.simulate(system, RULES[integrator], **{**more, **own, **options})
 
 
@@ -1013,7 +1015,7 @@ SCRIPT = textwrap.dedent(
         start = t.nts.restart(path, system)
     print("ready", flush=True)
     done = t.nts.simulate(
-        system, t.nts.EnergyMomentum(), dt=2e-4, t_end=1.0, accuracy="exact", start=start,
+        system, t.nts.EnergyMomentum(), dt=2e-4, t_end=1.0, newton=t.nts.Newton(reuse=False), start=start,
         watch_overlap=False, checkpoint=t.nts.Checkpoint(path, every=1),
     )
     """

@@ -148,7 +148,7 @@ class Stepper:
         self._keeps_ledger = ledger
         self._project_start = project_start
         self._before_step = before_step
-        self.newton = newton or Newton()
+        self.newton = (newton or Newton()).decided(system, integrator.inertia)
         self._materials, self._material_change = MaterialWatch(system), 0.0
         self._restated: dict[str, Any] | None = None
         preset = self.newton.preset(system, integrator.inertia, given)
