@@ -162,7 +162,10 @@ _CONDENSED: Mapping[str, Mapping[str, Any]] = {
 }
 #: PETSc's errors "no support", "unknown type", "missing factor": an option has a wrong value.
 _WRONG_VALUE = (56, 86, 92)
-_prefixes = itertools.count()
+#: Numbers of prefixes never used, and prefixes that are free again: PETSc keeps the name of each
+#: that it has seen until it ends, so that new ones for each run would never stop to take memory.
+_numbers = itertools.count()
+_free: list[str] = []
 
 
 class SolverOptions:
@@ -205,7 +208,8 @@ class SolverOptions:
         self._entered: dict[str, str] = {}
         # Of a run that nobody closed they are removed, too: PETSc would complain when it ends of
         # those that a linear solver would have asked for that had nothing to solve.
-        weakref.finalize(self, _remove, self._entered)
+        self._prefixes: list[str] = []
+        weakref.finalize(self, _remove, self._entered, self._prefixes)
 
     @property
     def schur(self) -> bool:
@@ -274,8 +278,9 @@ class SolverOptions:
             _split(snes, *matrix.field_sets(num_bodies))
 
     def _set(self, snes: Any, options: Mapping[str, str]) -> None:
-        """Give a SNES options (name -> the user's name) under a new prefix."""
-        prefix = f"nts_{next(_prefixes)}_"
+        """Give a SNES options (name -> the user's name) under a prefix that no other one has."""
+        prefix = _free.pop() if _free else f"nts_{next(_numbers)}_"
+        self._prefixes.append(prefix)
         snes.setOptionsPrefix(prefix)
         database = PETSc.Options()
         for name, source in options.items():
@@ -348,14 +353,16 @@ class SolverOptions:
 
     def remove(self) -> None:
         """Take the options out of PETSc's global database."""
-        _remove(self._entered)
+        _remove(self._entered, self._prefixes)
 
 
-def _remove(entered: dict[str, str]) -> None:
+def _remove(entered: dict[str, str], prefixes: list[str]) -> None:
     database = PETSc.Options()
     for key in entered:
         database.delValue(key)
+    _free.extend(prefixes)
     entered.clear()
+    prefixes.clear()
 
 
 def _split(snes: Any, *parts: tuple[str, Any]) -> None:
