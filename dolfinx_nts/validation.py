@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import inspect
@@ -64,7 +65,8 @@ class OutputError(RuntimeError):
 def known_options(target: T) -> T:
     """Decorate a function or class: what is passed by an unknown name or without one raises.
 
-    It says which names are known, or that of the first option that is passed by its name only.
+    It says which names are known, or that of the first option that is passed by its name only. To
+    set an option of an object that has been made raises, too, as most of them are read only once.
     """
     wrapped: Any = target
     is_class = isinstance(target, type)
@@ -92,11 +94,31 @@ def known_options(target: T) -> T:
                 )
         return function(*args, **options)
 
-    if is_class:
+    if not is_class:
+        decorated: Any = checked
+        return decorated
+
+    @functools.wraps(function)
+    def made(self: Any, *args: Any, **options: Any) -> None:
+        checked(self, *args, **options)
+        # A user's class that derives from this one goes on.
+        if type(self).__module__.partition(".")[0] == __name__.partition(".")[0]:
+            object.__setattr__(self, "_made", True)
+
+    def set_attribute(self: Any, name: str, value: Any) -> None:
+        if name in known and name != "name" and getattr(self, "_made", False):
+            label = f" {self.name!r}" if hasattr(self, "name") else ""
+            raise AttributeError(
+                f"{name}={value!r}: this {wrapped.__name__}{label} has been made with another "
+                f"{name}; make a new one"
+            )
+        object.__setattr__(self, name, value)
+
+    if dataclasses.is_dataclass(target):  # frozen, all of them
         wrapped.__init__ = checked
-        return target
-    decorated: Any = checked
-    return decorated
+    else:
+        wrapped.__init__, wrapped.__setattr__ = made, set_attribute
+    return target
 
 
 def is_finite(value: Any) -> TypeGuard[float]:

@@ -343,6 +343,26 @@ def test_tractions_overlap_on_one_rank():
     raises(ValueError, pattern, lambda: continuum(traction=loads))
 
 
+@pytest.mark.fast_on_ranks()
+def test_an_option_of_an_object_that_is_made_cannot_be_set():
+    """Whoever sets one in mid run would see no difference: most are read only once."""
+    cube = nts.Continuum(box(), nts.NeoHookean(1e6, 0.3), density=1e3, name="cube")
+    stone = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="stone")
+    spring = nts.Spring(stone, None, ((0, 0, 0), (0, 0, 1)), stiffness=1e3, name="coil")
+    floor = nts.Plane((0, 0, -1), (0, 0, 1))
+    pair = nts.ContactPair(cube.surface(lambda x: x[2] < 1e-9), floor, friction=0.3)
+    system = nts.System([cube, stone], contacts=[pair], joints=[spring], gravity=(0, 0, -9.81))
+    options = [
+        (spring, "stiffness", 2e3), (cube, "density", 2e3), (cube, "material", None),
+        (stone, "force", (0, 0, 1)), (pair, "friction", 0.5), (system, "gravity", (0, 0, 0)),
+    ]  # fmt: skip
+    for item, option, value in options:
+        with pytest.raises(AttributeError, match=f"^{option}=.*made with another.*make a new one"):
+            setattr(item, option, value)
+    with pytest.raises(AttributeError, match="Spring 'coil' has been"):
+        spring.stiffness = 2e3
+
+
 @pytest.mark.parametrize("components", [(3,), (), 0, ("x",)])
 def test_components_of_a_condition(components):
     pattern = rf"^components={re.escape(repr(components))}: pass a tuple of some of 0, 1, 2"

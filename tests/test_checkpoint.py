@@ -668,6 +668,30 @@ def test_another_spring_or_floor_is_refused(mpi_tmp_path):
     assert nts.restart(path, linked()).state.time == DT
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_another_material_is_told(factor, mpi_tmp_path):
+    """Of a stretched cube in flight; another density is refused, as another mass is."""
+
+    def cube(young=1e6, density=1e3):
+        body = nts.Continuum(
+            box(cells=2), nts.StVenantKirchhoff(young, 0.3), density=density,
+            displacement=lambda x: 0.01 * x, velocity=(2.0, 0.0, 0.0),
+        )  # fmt: skip
+        return nts.System([body])
+
+    path = mpi_tmp_path / "run.h5"
+    first = run((cube(), {}), t_end=DT, checkpoint=nts.Checkpoint(path, every=1))
+    with pytest.raises(ValueError, match=r"bodies\[0\].mass is"):
+        nts.restart(path, cube(density=2e3))
+    system = cube(factor * 1e6)
+    second = run((system, {}), t_end=3 * DT, start=nts.restart(path, system))
+    added = (factor - 1) * first.rows[-1]["potential"]
+    assert ("material changed" in second.warnings) == (factor != 1)
+    assert np.allclose(second.balance["material_change"], [0, 0, added, added], rtol=1e-9)
+    assert "ledger" not in second.warnings
+
+
 class Counter:
     """A joint of the user's own that counts in each of its elements, one on each rank."""
 
@@ -691,7 +715,7 @@ def test_elements_with_foreign_or_repeated_numbers_are_told():
     def numbering(**options):
         body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="body", comm=COMM)
         system = nts.System([body])
-        system.joints = (Counter(body, **options),)
+        vars(system)["joints"] = (Counter(body, **options),)
         return Numbering(system), system.initial_state()
 
     if COMM.size > 1:
@@ -779,7 +803,7 @@ def test_a_joint_that_remembers_something_else_is_told(mpi_tmp_path):
     body = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="body")
     tie = nts.System([body])
     order = Numbering(tie)
-    tie.joints = (Memory(body),)
+    vars(tie)["joints"] = (Memory(body),)
     state = tie.initial_state()
     with pytest.raises(TypeError, match="joint 'own' remembers a dict; a checkpoint takes an arr"):
         order.pack(state, {}, {})

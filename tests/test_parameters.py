@@ -33,6 +33,13 @@ KINDS = {
 }
 
 
+def set_value(parameter, value):
+    if isinstance(parameter, fem.Constant):
+        parameter.value = value
+    else:
+        parameter.x.array[:] = value
+
+
 def stretched(mesh, material, density=DENSITY):
     """A cube stretched by a tenth, and its stored energy [J]."""
     body = nts.Continuum(mesh, material, density=density, displacement=lambda x: 0.1 * x)
@@ -78,6 +85,41 @@ def test_a_rigid_body_of_two_densities():
     np.testing.assert_allclose(body.centre, [0.5, 0.5, (0.25 + 3.75) / 6], rtol=1e-13)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_rigid_body_whose_density_changes_ends_the_run(kind):
+    mesh = box(cells=(2, 2, 2))
+    density = KINDS[kind](mesh, 1e3)
+    body = nts.RigidBody(mesh, density=density, name="lid")
+
+    def change(time, dt):
+        if time > DT:
+            set_value(density, 2e3)
+
+    run = nts.simulate(
+        nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=4 * DT, before_step=change
+    )
+    assert run.status.startswith("density of 'lid': has changed") and len(run.rows) == 3
+
+
+def test_a_density_that_is_doubled_is_told_with_its_momentum():
+    """Velocities stay, so that energy and momenta of the flight are twice what they were."""
+    mesh = box(cells=(1, 1, 1))
+    density = fem.Constant(mesh, DENSITY)
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(YOUNG, POISSON), density=density, velocity=(3.0, 0.0, 4.0)
+    )
+
+    def change(time, dt):
+        density.value = DENSITY if time < DT else 2 * DENSITY
+
+    run = nts.simulate(
+        nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=3 * DT, before_step=change
+    )
+    text = run.warnings["material changed"].text
+    assert "adds 1.25e+04 J" in text and "5e+03 kg m/s and 2.55e+03 kg m^2/s" in text
+    assert np.allclose(run.balance["linear_momentum"][-1], [6e3, 0, 8e3], rtol=1e-12)
+
+
 @pytest.mark.fast("constant")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_modulus_changed_between_steps(kind):
@@ -89,10 +131,7 @@ def test_a_modulus_changed_between_steps(kind):
     def change(time, dt):
         if time > 0:
             return
-        if kind == "constant":
-            young.value = 2 * YOUNG
-        else:
-            young.x.array[:] = 2 * YOUNG
+        set_value(young, 2 * YOUNG)
 
     stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum())
     stepper.start(DT)

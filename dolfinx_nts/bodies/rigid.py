@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,12 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.inertia import Inertia, inertia_of, principal
 from dolfinx_nts.bodies.mesh_check import check_mesh, places_of
-from dolfinx_nts.bodies.parameters import Parameter, is_number, require_positive_parameter
+from dolfinx_nts.bodies.parameters import (
+    Parameter,
+    is_number,
+    require_positive_parameter,
+    values_of,
+)
 from dolfinx_nts.bodies.prescribed_motion import PrescribedMotion
 from dolfinx_nts.bodies.rigid_loads import RigidLoads, VectorInTime
 from dolfinx_nts.constraints import rank_of
@@ -24,9 +30,10 @@ from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.vectors import cross
-from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.parallel import gather_rows, raise_together
 from dolfinx_nts.points import Points
 from dolfinx_nts.validation import (
+    UserFunctionError,
     known_options,
     require_bool,
     require_name,
@@ -56,7 +63,8 @@ class RigidBody(Body):
 
     Args:
         mesh: 3D hexahedral or tetrahedral mesh.
-        density: [kg/m^3], > 0: a number, or a Constant or Function on the mesh as it is now.
+        density: [kg/m^3], > 0: a number, or a Constant or Function on the mesh, which must keep
+            its values.
         velocity: Of the centre of mass at the start [m/s]; not beside `motion`.
         angular_velocity: At the start [rad/s]; not beside `rotation`.
         force: Dead force on the centre of mass [N]: a vector, or a function of time.
@@ -84,6 +92,8 @@ class RigidBody(Body):
     """
 
     rigid = oriented = True
+    _densities: Sequence[Any] = ()
+    _made = False
 
     def __init__(
         self,
@@ -111,6 +121,8 @@ class RigidBody(Body):
         self.space = compat.vector_space(mesh, 1)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
+        self._densities = [] if is_number(density) else [density]
+        self._measured = self.parameters()
         self._set_up(mesh.comm, inertia_of(self.space, density), **given)
 
     @classmethod
@@ -167,6 +179,7 @@ class RigidBody(Body):
         moments, columns = principal(inertia, axes)
         body = cls.__new__(cls)
         body._set_up(comm, Inertia.of_moments(float(mass), where, moments, columns), **given)
+        body._made = True
         return body
 
     def _set_up(
@@ -419,6 +432,25 @@ class RigidBody(Body):
     def nodal_stiffness(self) -> FloatArray:
         """None [N/m]."""
         return np.zeros(self.num_owned)
+
+    def parameters(self) -> FloatArray:
+        """Values of a density that a caller may change, (n,)."""
+        return values_of(self._densities)
+
+    def take_parameters(self) -> None:
+        """Refuse a density that has changed since mass and inertia were measured. Collective.
+
+        Raises:
+            UserFunctionError: It has.
+        """
+        if self._densities:
+            same, problem = np.array_equal(self.parameters(), self._measured), None
+            if not same:
+                problem = (
+                    f"density of {self.name!r}: has changed, but the mass of a rigid body is "
+                    "measured when it is made; make a new body"
+                )
+            raise_together(self.comm, problem, UserFunctionError)
 
     def potential(self, u: FloatArray) -> float:
         """None [J]: loads do external work."""

@@ -170,6 +170,7 @@ def restart(path: StrPath, system: System) -> Restart:
     changes of facet go on, and so do equal steps and those of `Adapt`. A longer `t_end`, another
     `dt`, another integrator are legal: it goes on from the state then. Not in the file are
     materials, loads, prescribed motion and obstacles, as they are functions: they must be the same.
+    Materials that give the bodies another energy are told, "material changed", with what they add.
     `contact_fields` are zero until the first step.
 
     `BalanceCSV` and `ForcesCSV` write the whole table anew; `Fields` goes on with the files in its
@@ -186,7 +187,8 @@ def restart(path: StrPath, system: System) -> Restart:
     Raises:
         TypeError: An argument is of another type.
         OSError: There is no checkpoint, or none can be read.
-        ValueError: The file is none, or the system has other bodies, meshes, contacts or joints.
+        ValueError: The file is none, or the system has other bodies, meshes, masses, contacts or
+            joints.
     """
     from dolfinx_nts.output import state_file as files
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from dolfinx_nts.run.promises import Promises
 from dolfinx_nts.run.solution import Solution
@@ -42,25 +44,36 @@ class Ledger:
         forces = resultants.at_start(self._system) | carried_forces(self._system, start)
         self._solution.rows = Table([balance.first_row(self._system, state) | forces])
 
-    def restate(self, state: State, names: Sequence[str]) -> None:
-        """Name what changed parameters of materials do to the energy. Collective.
+    def restate(self, state: State, what: str, *, beyond: float) -> None:
+        """Name what a change of bodies or joints does to energy and momenta. Collective.
 
         Args:
             state: Last accepted state.
-            names: Of the bodies whose material has changed.
+            what: Begin of the sentence on it.
+            beyond: Part of the energies that a difference must exceed.
         """
-        if not names or not self._kept:
+        if not self._kept:
             return
+        before = self._restated or self._solution.rows[-1]
         self._known.clear()
-        self._restated = balance.measure(self._system, state, self._known)
-        now = self._restated["kinetic"] + self._restated["potential"]
-        change = now - self._solution.rows[-1]["energy"] - self._material_change
+        now = balance.measure(self._system, state, self._known)
+        added = {name: now[name] - before[name] for name in now}
+        energies = "kinetic", "potential"
+        if sum(abs(added[e]) for e in energies) <= beyond * sum(abs(before[e]) for e in energies):
+            return
+        self._restated, change = now, added["kinetic"] + added["potential"]
         self._material_change += change
-        self._solution.warn(
-            "material changed", state.time, abs(change),
-            f"a changed parameter of the material of {', '.join(map(repr, names))} adds "
-            f"{change:.3g} J to its energy without work; see material_change in the balance",
-        )  # fmt: skip
+        text = (
+            f"{what} adds {change:.3g} J to the energy without work, see material_change in the "
+            "balance"
+        )
+        if added["kinetic"]:
+            momentum, spin = (np.linalg.norm(added[f"{s}_momentum"]) for s in ("linear", "angular"))
+            text += (
+                f"; {added['kinetic']:.3g} J of it are kinetic: velocities stay as they are, and "
+                f"{momentum:.3g} kg m/s and {spin:.3g} kg m^2/s of momentum come without a force"
+            )
+        self._solution.warn("material changed", state.time, abs(change), text)
 
     def take_change(self) -> float:
         """What `restate` has found since the last row [J], which the next one is to have."""

@@ -61,6 +61,9 @@ FloatArray = npt.NDArray[np.float64]
 _CUT = 0.4
 #: Cuts of a step before nodes that infinite friction holds may slip.
 _CUTS = 3
+#: Part of the energies by which a restart may differ from its checkpoint, as sums of other ranks
+#: do.
+_SAME = 1e-10
 
 
 @known_options
@@ -206,6 +209,8 @@ class Stepper:
             begin, length = self._last_steps.last
             self._call_before(length, begin)
         self._materials.changed()
+        what = "what the restart was given in place of the checkpoint's materials"
+        self._ledger.restate(self.state, what, beyond=_SAME)
         if self.problem.integrator.accelerations and not self.state.a:
             # The run had another integrator.
             a = consistent.accelerations(self.problem, self.state, dt)
@@ -440,7 +445,8 @@ class Stepper:
         names = self._materials.changed()
         if names:
             self.problem.forget_forces()
-        self._ledger.restate(self.state, names)
+            what = f"a changed parameter of the material of {', '.join(map(repr, names))}"
+            self._ledger.restate(self.state, what, beyond=0.0)
 
     def _attempt(self, time: float) -> Trial:
         """Solution of the step that `_begin` fixed, if it may be accepted.
