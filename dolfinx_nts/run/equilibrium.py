@@ -17,7 +17,7 @@ from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
 from dolfinx_nts.run.stepper import Stepper
-from dolfinx_nts.run.table import Table
+from dolfinx_nts.run.trial import solved, state_after
 from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.state import State
 from dolfinx_nts.step import balance, resultants
@@ -98,6 +98,7 @@ class _Relaxed:
 class _LoadStepper(Stepper):
     """Stepper in pseudo time; a step is relaxed until nothing of the stabilization is left."""
 
+    makes = Equilibrium
     solution: Equilibrium
 
     def __init__(self, system: System, stabilization: float, **options: Any) -> None:
@@ -110,10 +111,7 @@ class _LoadStepper(Stepper):
         self._rates = [np.zeros_like(u) for u in self.state.u]
         self._forces = [np.zeros_like(u) for u in self.state.u]
         self._accept(replace(self.state, v=tuple(self._rates)))
-        self.solution = Equilibrium(
-            system, rows=Table([self._first_row()]), state=self.state,
-            settings=self.solution.settings,
-        )  # fmt: skip
+        self._ledger.open(self.state, self._start)
 
     def start(self, dt: float) -> None:
         """Nothing moves at the start, but the user may change a material; later calls do nothing.
@@ -125,7 +123,8 @@ class _LoadStepper(Stepper):
             return
         self._call_before(dt)
         self._materials.changed()
-        self.solution.rows, self._started = Table([self._first_row()]), True
+        self._ledger.open(self.state, self._start)
+        self._started = True
 
     def _step(self, dt: float, time: float) -> None:
         self._prepare(dt)
@@ -150,8 +149,7 @@ class _LoadStepper(Stepper):
             works.append(float(mean @ (end - start)))
         terms["external_work"] = sum(works)
         terms |= {"time": time, "newton_iterations": iterations}
-        terms |= {"contact_defect": 0.0, "material_change": self._material_change}
-        self._material_change = 0.0
+        terms |= {"contact_defect": 0.0, "material_change": self._ledger.take_change()}
         rows, measured = self.solution.rows, balance.measure(self.system, state)
         row = balance.next_row(rows[0], rows[-1], measured, terms)
         rows.append(row | forces_now)
@@ -239,7 +237,7 @@ class _LoadStepper(Stepper):
             for _ in range(_RELAXATIONS):
                 try:
                     step = self._solve(state, dt, search)
-                    reached = self._accepted(step, dt, time)
+                    reached = state_after(problem, step, time)
                     if search:  # else slip still counts from the last search
                         relaxed.lost["friction_dissipation"] += since
                         slipped = [contact.slip for contact in state.contacts]
@@ -302,8 +300,7 @@ class _LoadStepper(Stepper):
     def _solve(self, state: State, dt: float, search: bool) -> Evaluation:
         """Solution from a state; contact is sought as far as the bodies turn out to move."""
         self.problem.begin(state, dt, search=search)
-        step = self.solver.solve()
-        return self._covered(step) if search else step
+        return solved(self.problem, self.solver) if search else self.solver.solve()
 
     def _check_missed(self, state: State) -> None:
         """Raise if a slave went through a facet whose candidate it was not."""

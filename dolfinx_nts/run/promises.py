@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts.evaluation import Evaluation
@@ -14,9 +13,6 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.step import balance
 from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.system import System
-
-FloatArray = npt.NDArray[np.float64]
 
 #: What the ledger may miss of the energy, over the tolerance of Newton's method ...
 _PER_TOLERANCE = 10.0
@@ -145,35 +141,3 @@ class Promises:
                 )  # fmt: skip
             return
         self._solution.warn("energy from behind facets", row["time"], gain, text, grave=True)
-
-
-class MaterialWatch:
-    """Notices that a caller has changed parameters of materials between steps. Collective.
-
-    Args:
-        system: The scene; its bodies take over what has changed since they were made.
-    """
-
-    def __init__(self, system: System) -> None:
-        self._comm = system.comm
-        self._bodies = system.bodies
-        self._known = self._values()
-        for body in self._bodies:
-            body.take_parameters()
-
-    def _values(self) -> list[FloatArray]:
-        return [body.parameters() for body in self._bodies]
-
-    def changed(self) -> list[str]:
-        """Names of the bodies whose parameters differ from those of the last call.
-
-        Those bodies take them over. Collective.
-        """
-        last, self._known = self._known, self._values()
-        differ = [not np.array_equal(a, b) for a, b in zip(last, self._known, strict=True)]
-        flags = np.array(differ, dtype=bool)
-        self._comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.LOR)
-        bodies = [body for body, flag in zip(self._bodies, flags, strict=True) if flag]
-        for body in bodies:
-            body.take_parameters()
-        return [body.name for body in bodies]

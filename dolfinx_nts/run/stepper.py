@@ -6,21 +6,21 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.overlap import OverlapWatch
-from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme
 from dolfinx_nts.run.last_steps import LastSteps
-from dolfinx_nts.run.promises import MaterialWatch, Promises
+from dolfinx_nts.run.ledger import Ledger
+from dolfinx_nts.run.material_watch import MaterialWatch
+from dolfinx_nts.run.promises import Promises
 from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
-    carried_forces,
     check_restart,
     consistent_start,
     first_state,
@@ -32,13 +32,13 @@ from dolfinx_nts.run.start import (
 )
 from dolfinx_nts.run.step_size import Pace
 from dolfinx_nts.run.step_warnings import tell_frictionless, tell_step, tell_stressed
-from dolfinx_nts.run.table import Table
+from dolfinx_nts.run.trial import Trial, solved, state_after
 from dolfinx_nts.state import State
-from dolfinx_nts.step import balance, consistent, resultants
+from dolfinx_nts.step import consistent
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
 from dolfinx_nts.step.guards import check_momentum
-from dolfinx_nts.step.impact import Impact, restored
+from dolfinx_nts.step.impact import restored
 from dolfinx_nts.step.massless import off_balance
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
@@ -61,29 +61,9 @@ FloatArray = npt.NDArray[np.float64]
 _CUT = 0.4
 #: Cuts of a step before nodes that infinite friction holds may slip.
 _CUTS = 3
-#: Searches for contact, each along the motion that came of the one before.
-_SEARCHES = 4
 #: Part of the energies by which a restart may differ from its checkpoint, as sums of other ranks
 #: do.
 _SAME = 1e-10
-
-
-class Trial(NamedTuple):
-    """A solved step that may be accepted.
-
-    Attributes:
-        step: Solution of its equations.
-        state: State at its end.
-        measured: `balance.measure` of that state.
-        impulses: Of all forces in the step, see `check_momentum` [kg m/s].
-        impact: What restoring did to its velocities.
-    """
-
-    step: Evaluation
-    state: State
-    measured: dict[str, Any]
-    impulses: float
-    impact: Impact | None
 
 
 @known_options
@@ -113,6 +93,9 @@ class Stepper:
         solver: The SNES that solves them.
         restart: What it goes on from, if that is a `Restart`.
     """
+
+    #: What it computes.
+    makes: ClassVar[type[Solution]] = Solution
 
     def __init__(
         self,
@@ -145,28 +128,21 @@ class Stepper:
         check_impact(system, integrator, impact, restitution)
         given = petsc_options or {}
         self._restitution = float(restitution) if impact == "restored" else None
-        self._keeps_ledger = ledger
         self._project_start = project_start
         self._before_step = before_step
         self.newton = (newton or Newton()).decided(system, integrator.inertia)
-        self._materials, self._material_change = MaterialWatch(system), 0.0
-        self._restated: dict[str, Any] | None = None
+        self._materials = MaterialWatch(system)
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
-            system,
-            integrator,
-            rtol=self.newton.rtol,
-            condense=self.newton.condense,
-            sleep=sleep,
+            system, integrator, rtol=self.newton.rtol, condense=self.newton.condense, sleep=sleep
         )
         self.solver, self._given = StepSolver(self.problem, self.newton, preset, given), given
         self.system = system
         self._overlap = OverlapWatch(system) if watch_overlap else None
-        self._measured: dict[str, balance.Measured] = {}
         self._last_steps = LastSteps()
         self.restart = start if isinstance(start, Restart) else None
         check_restart(self.restart, system, start_time, ledger)
-        self.solution = self.restart.go_on() if self.restart else Solution(system)
+        self.solution = self.restart.go_on() if self.restart else self.makes(system)
         self.solution.settings = {
             "integrator": repr(integrator),
             "newton": repr(self.newton),
@@ -176,17 +152,22 @@ class Stepper:
             "restitution": float(restitution),
             "ranks": system.comm.size,
         }
-        refuse_moved_meshes(system)
-        refuse_overwritten(system)
-        state = first_state(system, start, start_time)
-        if not integrator.accelerations:
+        self._promises = Promises(self.solution, integrator, self.newton.rtol)
+        self._ledger = Ledger(self.solution, self._promises, kept=ledger)
+        self._set_out(start, start_time)
+
+    def _set_out(self, start: Solution | None, start_time: float | None) -> None:
+        """Accept the state that the run begins with; arguments are those of the class."""
+        refuse_moved_meshes(self.system)
+        refuse_overwritten(self.system)
+        state = first_state(self.system, start, start_time)
+        if not self.problem.integrator.accelerations:
             state = replace(state, a=())
         self._accept(state)
         self._start = start
         self._started, self._goes_on = False, start is not None and start.moving
         if self.restart is None:
-            self.solution.rows = Table([self._first_row()])
-        self._promises = Promises(self.solution, integrator, self.newton.rtol)
+            self._ledger.open(state, start)
 
     @property
     def memory(self) -> dict[str, Any]:
@@ -228,9 +209,8 @@ class Stepper:
             begin, length = self._last_steps.last
             self._call_before(length, begin)
         self._materials.changed()
-        if self._keeps_ledger:
-            what = "what the restart was given in place of the checkpoint's materials"
-            self._restate(what, beyond=_SAME)
+        what = "what the restart was given in place of the checkpoint's materials"
+        self._ledger.restate(self.state, what, beyond=_SAME)
         if self.problem.integrator.accelerations and not self.state.a:
             # The run had another integrator.
             a = consistent.accelerations(self.problem, self.state, dt)
@@ -322,7 +302,7 @@ class Stepper:
                 if part < 1.0:
                     dt *= part
                     self._begin(dt)
-                trial = self._attempt(dt, end if dt == left else now + dt)
+                trial = self._attempt(end if dt == left else now + dt)
             except UserFunctionError:
                 raise
             except StepFailedError as failure:
@@ -383,7 +363,7 @@ class Stepper:
         fast = tell_unresolved(self.problem, state, dt)
         if fast:
             self.solution.warn("unresolved", state.time, *fast)
-        self.solution.rows = Table([self._first_row()])
+        self._ledger.open(state, self._start)
         # Where bodies were before the first step, for one that carries them through each other.
         self.look()
 
@@ -427,10 +407,6 @@ class Stepper:
                     about=found.about,
                 )  # fmt: skip
 
-    def _first_row(self) -> dict[str, Any]:
-        forces = resultants.at_start(self.system) | carried_forces(self.system, self._start)
-        return balance.first_row(self.system, self.state) | forces
-
     def _accept(self, state: State) -> None:
         for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
             body.accept(u, v)
@@ -441,7 +417,7 @@ class Stepper:
 
     def _step(self, dt: float, time: float) -> None:
         self._begin(dt)
-        self._take(self._attempt(dt, time))
+        self._take(self._attempt(time))
 
     def _begin(self, dt: float) -> None:
         """Fix the equations of a step from the last accepted state."""
@@ -469,129 +445,41 @@ class Stepper:
         names = self._materials.changed()
         if names:
             self.problem.forget_forces()
-        if names and self._keeps_ledger:
             what = f"a changed parameter of the material of {', '.join(map(repr, names))}"
-            self._restate(what, beyond=0.0)
+            self._ledger.restate(self.state, what, beyond=0.0)
 
-    def _restate(self, what: str, *, beyond: float) -> None:
-        """Name in the ledger what a change of bodies or joints does to energy and momenta.
+    def _attempt(self, time: float) -> Trial:
+        """Solution of the step that `_begin` fixed, if it may be accepted.
 
         Args:
-            what: Begin of the sentence on it.
-            beyond: Part of the energies that a difference must exceed.
-        """
-        before = self._restated or self.solution.rows[-1]
-        self._measured.clear()
-        now = balance.measure(self.system, self.state, self._measured)
-        added = {name: now[name] - before[name] for name in now}
-        energies = "kinetic", "potential"
-        if sum(abs(added[e]) for e in energies) <= beyond * sum(abs(before[e]) for e in energies):
-            return
-        self._restated, change = now, added["kinetic"] + added["potential"]
-        self._material_change += change
-        text = (
-            f"{what} adds {change:.3g} J to the energy without work, see material_change in the "
-            "balance"
-        )
-        if added["kinetic"]:
-            momentum, spin = (np.linalg.norm(added[f"{s}_momentum"]) for s in ("linear", "angular"))
-            text += (
-                f"; {added['kinetic']:.3g} J of it are kinetic: velocities stay as they are, and "
-                f"{momentum:.3g} kg m/s and {spin:.3g} kg m^2/s of momentum come without a force"
-            )
-        self.solution.warn("material changed", self.state.time, abs(change), text)
-
-    def _attempt(self, dt: float, time: float) -> Trial:
-        """Solution of the step that `problem.begin` fixed, if it may be accepted.
+            time: At its end [s].
 
         Raises:
             StepFailedError: Not solved, or what came out cannot be.
         """
-        step = self._covered(self.solver.solve())
-        state = self._accepted(step, dt, time)
-        impact = None
-        if self._keeps_ledger:
-            before: Mapping[str, Any] = self._restated or self.solution.rows[-1]
-            measured: dict[str, Any] = balance.measure(self.system, state, self._measured)
-        else:
-            before, measured = (balance.momenta(self.system, s) for s in (self.state, state))
-        impulses = check_momentum(self.problem, step, state, before, measured)
+        problem, ledger, impact = self.problem, self._ledger, None
+        step = solved(problem, self.solver)
+        state = state_after(problem, step, time)
+        before, measured = ledger.before(self.state), ledger.measure(state)
+        impulses = check_momentum(problem, step, state, before, measured)
         if self._restitution is not None:
-            impact = restored(self.problem, step, state, self._restitution)
+            impact = restored(problem, step, state, self._restitution)
         if impact is not None:
             state = impact.state
-            if self._keeps_ledger:
-                measured = balance.measure(self.system, state, self._measured)
+            measured = ledger.measure(state)
         return Trial(step, state, measured, impulses, impact)
-
-    def _covered(self, step: Evaluation) -> Evaluation:
-        """The step itself, or solved again for as long as its motion may have passed by a contact.
-
-        Raises:
-            StepFailedError: No search found all contacts.
-        """
-        problem, iterations = self.problem, step.iterations
-        for k in range(_SEARCHES + 1):
-            if not problem.misses(step):
-                return replace(step, iterations=iterations)
-            if k < _SEARCHES:
-                problem.begin(problem.state, problem.dt, step)
-                step = self.solver.solve()
-                iterations += step.iterations
-        far = float(problem.motion(step).max())
-        raise StepFailedError(
-            f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
-            f"{far:.3g} m, and no search found all contacts on the way of their nodes; use a "
-            "smaller dt",
-            advises=True,
-        )
 
     def _take(self, trial: Trial) -> None:
         """Accept a step: a row of the ledger, and the new state."""
-        step, state, rows, impact = trial.step, trial.state, self.solution.rows, trial.impact
-        time = state.time
-        known = {"time": time, "newton_iterations": step.iterations}
-        if self._keeps_ledger:
-            terms = balance.step_terms(self.problem, step) | known
-            terms["impact_restored"] = 0.0 if impact is None else impact.energy
-            terms["material_change"], self._material_change = self._material_change, 0.0
-            self._restated = None
-            row = balance.next_row(rows[0], rows[-1], trial.measured, terms)
-        else:
-            row = balance.unknown_row(self.system) | known
-        forces_of_step = resultants.of_step(self.problem, step)
-        if impact is not None:
-            for name, impulse in zip(resultants.CONTACTS, impact.impulses, strict=True):
-                forces_of_step[name] = forces_of_step[name] + impulse / self.problem.dt
-        rows.append(row | forces_of_step)
+        step, state, impact = trial.step, trial.state, trial.impact
+        self._ledger.enter(self.problem, trial)
         self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
-        if self._keeps_ledger:
-            self._promises.hold(self.problem, step, trial.impulses)
-            self.solution.switches.extend(balance.switches(self.problem, step, time))
         self._last_steps.take(self.state, self.problem.dt, state)
         self._accept(state)
         tell_step(self.solution, self.problem, step, state)
         if impact is not None:
-            tell_frictionless(self.solution, impact.impulses[0], time)
+            tell_frictionless(self.solution, impact.impulses[0], state.time)
         self.look()
-
-    def _accepted(self, step: Evaluation, dt: float, time: float) -> State:
-        """State at t_{n+1}."""
-        old = self.state
-        u, v, a = list(old.u), list(old.v), list(old.a)
-        for k in self.problem.awake:
-            u[k], a0 = step.bodies[k].u1.copy(), self.problem.acceleration(k)
-            v[k], a1 = self.problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
-            if a1 is not None:
-                a[k] = a1
-            if self.system.bodies[k].has_massless:
-                # What has no momentum has no velocity of its own either.
-                massless = self.system.bodies[k].massless
-                v[k][massless] = step.bodies[k].du[massless] / dt
-        contacts, *joints = (
-            coupling.history(parts) for coupling, parts in self.problem.each(step)
-        )
-        return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))
 
     def mean_force(self, k: int) -> FloatArray:
         """Contact force p_N of the last two steps in the mean over their time [N].

@@ -1,0 +1,43 @@
+"""Parameters of materials that a caller changes in the course of a run."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from dolfinx_nts.system import System
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class MaterialWatch:
+    """Notices that a caller has changed parameters of materials between steps. Collective.
+
+    Args:
+        system: The scene; its bodies take over what has changed since they were made.
+    """
+
+    def __init__(self, system: System) -> None:
+        self._comm = system.comm
+        self._bodies = system.bodies
+        self._known = self._values()
+        for body in self._bodies:
+            body.take_parameters()
+
+    def _values(self) -> list[FloatArray]:
+        return [body.parameters() for body in self._bodies]
+
+    def changed(self) -> list[str]:
+        """Names of the bodies whose parameters differ from those of the last call.
+
+        Those bodies take them over. Collective.
+        """
+        last, self._known = self._known, self._values()
+        differ = [not np.array_equal(a, b) for a, b in zip(last, self._known, strict=True)]
+        flags = np.array(differ, dtype=bool)
+        self._comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.LOR)
+        bodies = [body for body, flag in zip(self._bodies, flags, strict=True) if flag]
+        for body in bodies:
+            body.take_parameters()
+        return [body.name for body in bodies]

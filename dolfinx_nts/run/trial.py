@@ -1,0 +1,86 @@
+"""A solved step before it is accepted: whether it has found all contacts, and where it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.state import State
+from dolfinx_nts.step.impact import Impact
+from dolfinx_nts.step.newton import StepSolver
+from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.validation import StepFailedError
+
+#: Searches for contact, each along the motion that came of the one before.
+_SEARCHES = 4
+
+
+class Trial(NamedTuple):
+    """A solved step that may be accepted.
+
+    Attributes:
+        step: Solution of its equations.
+        state: State at its end.
+        measured: `Ledger.measure` of that state.
+        impulses: Of all forces in the step, see `check_momentum` [kg m/s].
+        impact: What restoring did to its velocities.
+    """
+
+    step: Evaluation
+    state: State
+    measured: Mapping[str, Any]
+    impulses: float
+    impact: Impact | None
+
+
+def solved(problem: StepProblem, solver: StepSolver) -> Evaluation:
+    """Solution of a step, sought again for as long as its motion may have passed by a contact.
+
+    Args:
+        problem: Equations of the step, which has begun.
+        solver: Solves them.
+
+    Raises:
+        StepFailedError: Not solved, or no search found all contacts.
+    """
+    step = solver.solve()
+    iterations = step.iterations
+    for k in range(_SEARCHES + 1):
+        if not problem.misses(step):
+            return replace(step, iterations=iterations)
+        if k < _SEARCHES:
+            problem.begin(problem.state, problem.dt, step)
+            step = solver.solve()
+            iterations += step.iterations
+    far = float(problem.motion(step).max())
+    raise StepFailedError(
+        f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
+        f"{far:.3g} m, and no search found all contacts on the way of their nodes; use a "
+        "smaller dt",
+        advises=True,
+    )
+
+
+def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
+    """State at t_{n+1}.
+
+    Args:
+        problem: Equations of the step.
+        step: Their solution.
+        time: t_{n+1} [s].
+    """
+    old, dt = problem.state, problem.dt
+    u, v, a = list(old.u), list(old.v), list(old.a)
+    for k in problem.awake:
+        u[k], a0 = step.bodies[k].u1.copy(), problem.acceleration(k)
+        v[k], a1 = problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
+        if a1 is not None:
+            a[k] = a1
+        body = problem.system.bodies[k]
+        if body.has_massless:
+            # What has no momentum has no velocity of its own either.
+            v[k][body.massless] = step.bodies[k].du[body.massless] / dt
+    contacts, *joints = (coupling.history(parts) for coupling, parts in problem.each(step))
+    return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))
