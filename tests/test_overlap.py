@@ -11,6 +11,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from mpi4py import MPI
 from rotations import random_rotation
+from scenes import box as solid
 from scipy import ndimage
 
 import dolfinx_nts as nts
@@ -1063,3 +1064,35 @@ def test_a_start_from_another_run_around_an_obstacle_is_refused(cells, caplog):
     options = {"dt": 1e-3, "t_end": run.state.time + 2e-3, "start": run}
     told = nts.simulate(start, nts.EnergyMomentum(), **options)
     assert told.status.startswith("completed, but 'sphere' lies inside 'cube'")
+
+
+@pytest.mark.mpi
+@pytest.mark.fast_on_ranks("obstacle")
+@pytest.mark.parametrize("other", ["obstacle", "body"])
+def test_points_of_a_driven_arm_move_farther_than_its_coordinates(other):
+    """Its tip passes through what no contact holds: how far it moves decides when to look.
+
+    Directors are as long as the gyration of the body, so that they move by half as much.
+    """
+    rate, end = 90.0, 0.01
+    place = 1.95 * np.array([np.cos(0.45), np.sin(0.45), 0.0])
+    arm = nts.RigidBody(
+        solid((0.2, -0.05, -0.2), (2.0, 0.05, 0.2), (18, 1, 4)), density=1e3, name="arm",
+        motion=lambda t: (1.1 * (np.cos(rate * t) - 1), 1.1 * np.sin(rate * t), 0.0),
+        rotation=lambda t: (0, 0, rate * t),
+    )  # fmt: skip
+    if other == "obstacle":
+        ball = nts.Sphere(place, 0.06, name="ball")
+        bodies, pair = [arm], nts.ContactPair(arm.surface(lambda x: x[2] < np.inf), ball)
+    else:
+        stone = nts.RigidBody(solid(place - 0.06, place + 0.06, 1), density=1e3, name="stone")
+        bodies = [arm, stone]
+        pair = nts.ContactPair(
+            stone.surface(lambda x: x[2] > 0.0599), arm.surface(lambda x: x[2] > 0.199)
+        )
+    run = nts.simulate(
+        nts.System(bodies, contacts=[pair]), nts.EnergyMomentum(), dt=5e-4, t_end=end
+    )
+    assert run.status.startswith("completed, but")
+    worst = max(w.worst for w in run.warnings.every if w.grave)
+    assert 0.03 < worst < 0.08

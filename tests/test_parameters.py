@@ -101,6 +101,17 @@ def test_a_rigid_body_whose_density_changes_ends_the_run(kind):
     assert run.status.startswith("density of 'lid': has changed") and len(run.rows) == 3
 
 
+def test_a_changed_density_of_a_rigid_body_is_refused_in_every_step():
+    density = fem.Constant(mesh := box(cells=(1, 1, 1)), 1e3)
+    stepper = nts.Stepper(nts.System([nts.RigidBody(mesh, density=density)]), nts.Midpoint())
+    stepper.advance(DT)
+    density.value = 2e3
+    for _ in range(2):
+        with pytest.raises(nts.UserFunctionError, match="^density of 'rigid': has changed"):
+            stepper.advance(DT)
+    stepper.close()
+
+
 def test_a_density_that_is_doubled_is_told_with_its_momentum():
     """Velocities stay, so that energy and momenta of the flight are twice what they were."""
     mesh = box(cells=(1, 1, 1))

@@ -241,6 +241,16 @@ def test_a_writer_that_fails(failing, written, ranks, mpi_tmp_path):
     assert len((mpi_tmp_path / "b.csv").read_text().splitlines()) == written + 2
 
 
+def test_a_writer_that_fails_at_the_end_hides_no_grave_warning():
+    class Doubts(Writer):
+        def write(self, run, *, last=False):
+            if last:
+                run.solution.warn("ledger", 0.0, 1.0, "something is wrong", grave=True)
+
+    with pytest.raises(nts.OutputError, match=r"^completed, but something is wrong.*; output\[0\]"):
+        nts.simulate(scene(), nts.Midpoint(), dt=DT, t_end=DT, output=[Doubts("close")])
+
+
 @pytest.mark.parametrize("ranks", ["all", "last"])
 def test_a_writer_that_cannot_start_stops_before_any_step(ranks):
     writers = [Writer("start", ranks), Writer()]

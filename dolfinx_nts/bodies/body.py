@@ -13,6 +13,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.kernels.vectors import range_of
 from dolfinx_nts.points import Points
 
 FloatArray = npt.NDArray[np.float64]
@@ -292,7 +293,18 @@ class Body:
         Args:
             du: Change of its owned coordinates [m].
         """
-        return float(np.abs(du).max(initial=0.0))
+        return float(self.motion_range(du).max(initial=0.0))
+
+    def motion_range(self, du: FloatArray) -> FloatArray:
+        """Bounds on the motion of its material points on this rank along the axes, and against [m].
+
+        Args:
+            du: Change of its owned coordinates [m].
+
+        Returns:
+            Largest motion along x, y, z and along -x, -y, -z, shape (2, 3); -inf without points.
+        """
+        return range_of(du)
 
     def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
         """Nodes of its mesh as its material points, for surfaces. Collective.

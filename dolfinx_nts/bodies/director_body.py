@@ -27,6 +27,7 @@ from dolfinx_nts.contact.surfaces import Skin, Surface, in_order
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels import quadratic_energy as kernel
+from dolfinx_nts.kernels.vectors import range_of
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.points import Points
 from dolfinx_nts.validation import at_points, vector, vectors
@@ -348,11 +349,12 @@ class DirectorBody(Body):
         corners: FloatArray = self._whole.positions(u)[self._whole.facets]
         return corners[self.comm.rank :: self.comm.size]
 
-    def motion_of_points(self, du: FloatArray) -> float:
-        """Bound on the components of the motion of the skin's points on this rank [m]."""
+    def motion_range(self, du: FloatArray) -> FloatArray:
+        """Bounds on the motion of the skin's points on this rank, see `Body` [m]."""
         reach = np.abs(self._hull.weights).max(axis=0)
-        moved = np.abs(du).reshape(-1, len(reach), 3)
-        return float(np.einsum("k,nki->ni", reach, moved).max(initial=0.0))
+        moved = du.reshape(-1, len(reach), 3)
+        turned = np.einsum("k,nki->ni", reach[1:], np.abs(moved[:, 1:]))
+        return range_of(moved[:, 0], turned)
 
     def at_mesh(self, values: FloatArray) -> FloatArray:
         """Values of the places at the mesh's nodes on this rank, as of `space`."""

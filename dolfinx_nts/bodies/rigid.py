@@ -29,7 +29,7 @@ from dolfinx_nts.constraints import rank_of
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.kernels.vectors import cross, range_of
 from dolfinx_nts.parallel import gather_rows, raise_together
 from dolfinx_nts.points import Points
 from dolfinx_nts.validation import (
@@ -363,11 +363,11 @@ class RigidBody(Body):
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
         return Surface(self, skin_of_mesh(self, found), smoothing)
 
-    def motion_of_points(self, du: FloatArray) -> float:
-        """Bound on the components of the motion of the mesh's points on this rank [m]."""
-        if not self.num_owned:
-            return 0.0
-        return float((self._reach @ np.abs(du).reshape(4, 3)).max())
+    def motion_range(self, du: FloatArray) -> FloatArray:
+        """Bounds on the motion of the mesh's points on this rank, see `Body` [m]."""
+        moved = du.reshape(-1, 4, 3)
+        turned = np.einsum("k,nki->ni", self._reach[1:], np.abs(moved[:, 1:]))
+        return range_of(moved[:, 0], turned)
 
     # ---- as of Body
     def prescribed(self, time: float) -> FloatArray:

@@ -105,14 +105,14 @@ class ObstacleContact:
         boundary: Callable[[int], Surface],
         start: Callable[[], Sequence[FloatArray]],
     ) -> None:
-        self._contact, self._body, self._slaves = contact, body, slaves
+        self.contact, self._body, self._slaves = contact, body, slaves
         self._boundary, self._start = boundary, start
         #: Another contact with the same obstacle looks at the rest.
         self._sees_rest = slaves[0] is contact.slave and contact.slave.body.mesh is not None
 
     def where(self, u: Sequence[FloatArray], time: float) -> list[FloatArray]:
         """What moves, each a displacement of its points [m], shape (3 n,). Collective."""
-        slave, obstacle = self._contact.slave, self._contact.master
+        slave, obstacle = self.contact.slave, self.contact.master
         return [u[self._body], obstacle.displacement(time, slave.body.comm)]
 
     def look(self, where: list[FloatArray], both: bool) -> tuple[list[Finding], Pause]:
@@ -124,7 +124,7 @@ class ObstacleContact:
         u, moved = where
         watched = self._watched
         x = watched.surface.positions(u) - moved
-        gap = self._contact.master.gap(x).value
+        gap = self.contact.master.gap(x).value
         near, pause = self._facets(watched.surface, watched.facets, x, gap)
         held = watched.held[near.facet]
         found = self._of_slave(near.part(near.deep & held), moved)
@@ -142,7 +142,7 @@ class ObstacleContact:
         if not self._sees_rest:
             return []
         x = self._watched.surface.positions(u) - moved
-        return self._inside(x, self._contact.master.gap(x).value, moved)
+        return self._inside(x, self.contact.master.gap(x).value, moved)
 
     def passed(
         self, before: list[FloatArray], after: list[FloatArray], way: float, through: float
@@ -174,7 +174,7 @@ class ObstacleContact:
     @cached_property
     def _watched(self) -> _Watched:
         """What to look at, gathered at the first look. Collective."""
-        obstacle, slave = self._contact.master, self._contact.slave
+        obstacle, slave = self.contact.master, self.contact.slave
         none = np.zeros(0, dtype=np.int64)
         if not self._sees_rest:
             every = np.arange(len(slave.facets))
@@ -214,7 +214,7 @@ class ObstacleContact:
         depth, size = -float(gap[i]), -float(gap[i] / scale[i])
         if size <= LEAST:
             return [], pause
-        name, other = watched.surface.body.name, self._contact.master.name
+        name, other = watched.surface.body.name, self.contact.master.name
         node = int(watched.surface.original[points[i]])
         place = x[points[i]] + moved
         text = (
@@ -236,7 +236,7 @@ class ObstacleContact:
             x: Points of the surface relative to the obstacle's motion [m], shape (p, 3).
             gap: Gaps of the points [m], shape (p,).
         """
-        obstacle, facets = self._contact.master, surface.facets[chosen]
+        obstacle, facets = self.contact.master, surface.facets[chosen]
         corners, lowest = x[facets], gap[facets].min(axis=1)
         size = fc.size(corners)
         # Nothing is deeper in a thin obstacle than half its width.
@@ -272,7 +272,7 @@ class ObstacleContact:
         if not deep.facet.size:
             return []
         remedy = (
-            f"no contact is declared of it with {self._contact.master.name!r}: extend the marker "
+            f"no contact is declared of it with {self.contact.master.name!r}: extend the marker "
             "of the slave to it, with a mesh fine enough there, as contact holds nodes only"
         )
         return [self._told(self._watched.surface, deep, _worst(deep), moved, remedy)]
@@ -280,7 +280,7 @@ class ObstacleContact:
     def _at_start(self, surface: Surface, deep: _Near) -> list[Finding]:
         """The deepest of the rest's facets at the start that has no node in the obstacle."""
         deep = deep.part(deep.corner <= 0.0)
-        if not (deep.facet.size and np.isfinite(self._contact.master.width)):
+        if not (deep.facet.size and np.isfinite(self.contact.master.width)):
             return []
         remedy = (
             "it starts there, no contact is declared of it, and it is not looked at: if the "
@@ -293,7 +293,7 @@ class ObstacleContact:
         self, surface: Surface, some: _Near, i: int, moved: FloatArray, remedy: str
     ) -> Finding:
         """Number i of some facets in words."""
-        name, other = surface.body.name, self._contact.master.name
+        name, other = surface.body.name, self.contact.master.name
         nodes = tuple(sorted(int(n) for n in surface.original[surface.facets[some.facet[i]]]))
         depth, size = float(some.depth[i]), float(some.depth[i] / some.size[i])
         place: FloatArray = some.place[i] + moved
@@ -311,7 +311,7 @@ class ObstacleContact:
             gap: Their gaps [m], shape (p,).
             moved: That motion [m], shape (3,).
         """
-        obstacle, whole, least = self._contact.master, self._watched.surface, self._watched.least
+        obstacle, whole, least = self.contact.master, self._watched.surface, self._watched.least
         some = np.append(gap.argmin(), np.linspace(0, len(x) - 1, _INNER - 1).astype(int))
         inner = obstacle.inner_points(x[some])
         low, high = x.min(axis=0) + least, x.max(axis=0) - least

@@ -19,6 +19,7 @@ from mpi4py import MPI
 from dolfinx_nts.contact.crossings import STEPS, BodyPair, Finding, Pause
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.kernels.vectors import range_of
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -66,17 +67,22 @@ class OverlapWatch:
             return at_start
 
         between: dict[tuple[int, ...], list[Any]] = {}
-        self._pairs: list[BodyPair | ObstacleContact] = []
+        obstacles: list[ObstacleContact] = []
         for contact, bodies in zip(system.contacts, system.contact_bodies, strict=True):
             if len(contact.bodies) == 1 and len(contact.slave.facets):
                 alike = [c.slave for c in system.contacts if _same_obstacle(contact, c)]
                 slaves = [s for s in alike if len(s.facets)]
-                self._pairs.append(
+                obstacles.append(
                     ObstacleContact(contact, bodies[0], slaves, self._boundary, start)
                 )
             elif len(contact.bodies) == 2 and all(b.mesh is not None for b in contact.bodies):
                 between.setdefault(tuple(sorted(bodies)), []).append(contact)
-        self._pairs += [BodyPair(k, c, self._boundary) for k, c in between.items()]
+        pairs = [BodyPair(k, c, self._boundary) for k, c in between.items()]
+        self._pairs: list[BodyPair | ObstacleContact] = [*obstacles, *pairs]
+        self._movers: list[list[Any]] = [
+            *([o.contact.slave.body, None] for o in obstacles),
+            *([self._bodies[k] for k in bodies] for bodies in between),
+        ]
         self._looked: dict[int, _Looked] = {}
 
     def look(
@@ -124,9 +130,11 @@ class OverlapWatch:
         # Largest motion in each direction; the opposite ones are the least.
         moved = np.full((len(self._looked), 2, 2, 3), -np.inf)
         for i, (k, looked) in enumerate(self._looked.items()):
-            for j, (after, before) in enumerate(zip(now[k], looked.where, strict=True)):
-                d = (after - before).reshape(-1, 3)
-                moved[i, j] = d.max(axis=0, initial=-np.inf), (-d).max(axis=0, initial=-np.inf)
+            both = zip(self._movers[k], now[k], looked.where, strict=True)
+            for j, (body, after, before) in enumerate(both):
+                change = after - before
+                # An obstacle has no body.
+                moved[i, j] = range_of(change) if body is None else body.motion_range(change)
         self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
         apart = np.maximum(moved[:, 0, 0] + moved[:, 1, 1], moved[:, 1, 0] + moved[:, 0, 1])
         ways = np.linalg.norm(np.maximum(apart, 0.0), axis=1)

@@ -16,6 +16,18 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return product
 
 
+def range_of(moved: FloatArray, around: FloatArray | float = 0.0) -> FloatArray:
+    """Largest components of vectors along the axes and against them, shape (2, 3).
+
+    Args:
+        moved: The vectors, shape (3 n,) or (n, 3); of none it is -inf.
+        around: What each component may be larger or smaller by, shape (n, 3).
+    """
+    moved = moved.reshape(-1, 3)
+    ends = (around + moved, around - moved)
+    return np.array([end.max(axis=0, initial=-np.inf) for end in ends])
+
+
 def solve_2x2(
     a: tuple[FloatArray, FloatArray, FloatArray, FloatArray], b: tuple[FloatArray, FloatArray]
 ) -> FloatArray:

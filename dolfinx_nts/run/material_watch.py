@@ -33,11 +33,13 @@ class MaterialWatch:
 
         Those bodies take them over. Collective.
         """
-        last, self._known = self._known, self._values()
-        differ = [not np.array_equal(a, b) for a, b in zip(last, self._known, strict=True)]
+        now = self._values()
+        differ = [not np.array_equal(a, b) for a, b in zip(self._known, now, strict=True)]
         flags = np.array(differ, dtype=bool)
         self._comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.LOR)
         bodies = [body for body, flag in zip(self._bodies, flags, strict=True) if flag]
         for body in bodies:
             body.take_parameters()
+        # After one that refuses them, the next step is to ask again.
+        self._known = now
         return [body.name for body in bodies]

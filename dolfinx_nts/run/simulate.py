@@ -388,7 +388,7 @@ def _stop(stepper: Stepper, reason: str, cause: BaseException | None = None) -> 
 
 def _end(solution: Solution, reason: str) -> None:
     """Keep in the status why a run ended, after what ended it before."""
-    ended = not solution.status.startswith(("running", "completed"))
+    ended = solution.status not in ("running", "completed")
     solution.status = f"{solution.status}; {reason}" if ended else reason
 
 

@@ -174,17 +174,21 @@ def _tell_corners(
     for k, chord in zip(bodies, global_max(system.comm, np.array(chords)), strict=True):
         way = 0.5 * float(chord) * float(np.tan(0.25 * min(turns[k], np.pi)))
         for pair, both in zip(system.contacts, system.contact_bodies, strict=True):
-            if k not in both or len(both) < 2:
+            if k not in both:
                 continue
-            other = pair.master if k == both[0] else pair.slave
-            size = other.smallest
+            if len(both) < 2:
+                size = pair.master.width
+                missed = f"obstacle {pair.master.name!r}, whose radius is {size:.2g} m"
+            else:
+                other = pair.master if k == both[0] else pair.slave
+                size = other.smallest
+                missed = f"facets of {other.body.name!r} that are {size:.2g} m wide"
             if way > size:
                 name = system.bodies[k].name
                 solution.warn(
                     "cut corners", new.time, way,
                     f"body {name!r} turns by {turns[k]:.2g} rad in a step: its points leave their "
                     f"straight ways by up to {way:.2g} m, and contact {pair.name!r}, which is "
-                    f"sought on these, may miss facets of {other.body.name!r} that are "
-                    f"{size:.2g} m wide; use a smaller dt",
+                    f"sought on these, may miss {missed}; use a smaller dt",
                     grave=True, about=(pair.name,),
                 )  # fmt: skip
