@@ -1015,7 +1015,8 @@ SCRIPT = textwrap.dedent(
         start = t.nts.restart(path, system)
     print("ready", flush=True)
     done = t.nts.simulate(
-        system, t.nts.EnergyMomentum(), dt=2e-4, t_end=1.0, newton=t.nts.Newton(reuse=False), start=start,
+        system, t.nts.EnergyMomentum(), dt=2e-4, t_end=1.0, start=start,
+        newton=t.nts.Newton(reuse=False),
         watch_overlap=False, checkpoint=t.nts.Checkpoint(path, every=1),
     )
     """

@@ -82,7 +82,8 @@ class Newton:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
         if self.linear_solver != "auto":
             return self.linear_solver
-        couples, mixed = bool(system.contacts or system.joints), any(b.joints for b in system.bodies)
+        couples = bool(system.contacts or system.joints)
+        mixed = any(b.joints for b in system.bodies)
         return choose(_size(system), couples, inertia, given, mixed)
 
 
