@@ -151,9 +151,7 @@ SCENES = {f.__name__: f for f in (blocks, tetrahedra, mechanism, floor, loaded, 
 def run(scene, integrator="energy-momentum", **options):
     system, own = scene
     t_end = options.pop("t_end", STEPS * DT)
-    more = {"dt": DT, "t_end": t_end}
-    if "accuracy" not in options:
-        more["newton"] = nts.Newton(reuse=False)
+    more = {"accuracy": "exact", "dt": DT, "t_end": t_end}
     return nts.simulate(system, RULES[integrator], **{**more, **own, **options})
 
 
@@ -1015,8 +1013,7 @@ SCRIPT = textwrap.dedent(
         start = t.nts.restart(path, system)
     print("ready", flush=True)
     done = t.nts.simulate(
-        system, t.nts.EnergyMomentum(), dt=2e-4, t_end=1.0, start=start,
-        newton=t.nts.Newton(reuse=False),
+        system, t.nts.EnergyMomentum(), dt=2e-4, t_end=1.0, accuracy="exact", start=start,
         watch_overlap=False, checkpoint=t.nts.Checkpoint(path, every=1),
     )
     """

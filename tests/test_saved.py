@@ -107,7 +107,7 @@ def test_an_equilibrium_is_saved_too(tmp_path):
     settled.save(path)
     found = nts.load(path)
     assert found.settings["load_steps"] == [0.5, 1.0]
-    assert found.settings["newton"] == repr(nts.Newton(reuse=False)) and found.settings["integrator"]
+    assert found.settings["newton"] == repr(nts.Newton()) and found.settings["integrator"]
     assert repr(settled).startswith("<Equilibrium: completed: 2 steps")
     assert found.reactions["block"][-1, 0] == pytest.approx((0, 0, 9810.0), abs=1e-5)
     assert found.bodies["block"]["u"][:, 2].min() < 0 == np.abs(found.bodies["block"]["v"]).max()

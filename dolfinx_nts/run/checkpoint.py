@@ -165,8 +165,8 @@ def restart(path: StrPath, system: System) -> Restart:
             checkpoint=nts.Checkpoint("out/run.h5", every=100),
         )
 
-    With the same options and `newton=Newton(reuse=False)`, the run is the uninterrupted one: to
-    the bit on as many ranks, else to rounding. Its balance, warnings and
+    With the same options, and the solver at its floor (accuracy="exact"), the run is the
+    uninterrupted one: to the bit on as many ranks, else to rounding. Its balance, warnings and
     changes of facet go on, and so do equal steps and those of `Adapt`. A longer `t_end`, another
     `dt`, another integrator are legal: it goes on from the state then. Not in the file are
     materials, loads, prescribed motion and obstacles, as they are functions: they must be the same.

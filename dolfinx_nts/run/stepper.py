@@ -130,7 +130,7 @@ class Stepper:
         self._restitution = float(restitution) if impact == "restored" else None
         self._project_start = project_start
         self._before_step = before_step
-        self.newton = (newton or Newton()).decided(system, integrator.inertia)
+        self.newton = newton or Newton()
         self._materials = MaterialWatch(system)
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from dolfinx_nts.step.linear_solver import SOLVERS, choose
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import is_finite, is_whole, known_options, require_bool
-
-#: Coordinates from which on the bodies' matrices take most of a step.
-_LARGE = 600
 
 
 @known_options
@@ -37,10 +34,7 @@ class Newton:
             steps. Where MUMPS fails, it leaves out equations that repeat others for some steps.
             Nothing takes over from "krylov" or "multigrid" where you ask for them.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
-            and steps for as long as Newton contracts well; contact is always linearised anew. None:
-            in dynamics of 600 coordinates or more, beside those of rigid bodies, beams and shells,
-            where matrices take most of the time. Without, a run that goes on from another one is
-            the whole run to the bit.
+            and steps for as long as Newton contracts well; contact is always linearised anew.
 
     Raises:
         TypeError: An argument is of another type.
@@ -52,7 +46,7 @@ class Newton:
     max_retries: int = 8
     condense: bool = True
     linear_solver: str = "auto"
-    reuse: bool | None = None
+    reuse: bool = False
 
     def __post_init__(self) -> None:
         if not (is_finite(self.rtol) and 0 < self.rtol < 1):
@@ -61,9 +55,8 @@ class Newton:
             value = getattr(self, name)
             if not is_whole(value):
                 raise TypeError(f"{name}={value!r}: pass a whole number")
-        require_bool("condense", self.condense)
-        if self.reuse is not None:
-            require_bool("reuse", self.reuse)
+        for name in ("condense", "reuse"):
+            require_bool(name, getattr(self, name))
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
         if self.max_retries < 0:
@@ -72,24 +65,14 @@ class Newton:
             known = ", ".join(map(repr, SOLVERS))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
 
-    def decided(self, system: System, inertia: bool) -> Newton:
-        """The same with `reuse` as it is for a system, in dynamics or not. Collective."""
-        if self.reuse is not None:
-            return self
-        return replace(self, reuse=inertia and _size(system) >= _LARGE)
-
     def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
         if self.linear_solver != "auto":
             return self.linear_solver
-        couples = bool(system.contacts or system.joints)
-        mixed = any(b.joints for b in system.bodies)
-        return choose(_size(system), couples, inertia, given, mixed)
-
-
-def _size(system: System) -> int:
-    """Coordinates of all bodies without constraints of their own. Collective."""
-    return int(system.comm.allreduce(sum(b.num_owned for b in system.bodies if not b.joints)))
+        flexible = [b for b in system.bodies if not b.joints]
+        size = int(system.comm.allreduce(sum(b.num_owned for b in flexible)))
+        couples, mixed = bool(system.contacts or system.joints), len(flexible) < len(system.bodies)
+        return choose(size, couples, inertia, given, mixed)
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.

@@ -67,7 +67,7 @@ class StepSolver:
     ) -> None:
         self.problem, self.newton = problem, newton
         self._presets = Presets(problem.system, newton, preset, petsc_options, problem.condense)
-        self._tangents = KeptTangents(problem, bool(newton.reuse))
+        self._tangents = KeptTangents(problem, newton.reuse)
         self.iterates, self._upright = Iterates(problem), Upright(problem)
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
@@ -346,7 +346,7 @@ class StepSolver:
         where contact acts, the parts differ.
         """
         acts = any(bool(part.status.any()) for part in e.parts)
-        return bool(self.newton.reuse) and not self.problem.system.comm.allreduce(acts, op=MPI.LOR)
+        return self.newton.reuse and not self.problem.system.comm.allreduce(acts, op=MPI.LOR)
 
     # ---- failure
     def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:

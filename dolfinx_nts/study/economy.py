@@ -312,8 +312,7 @@ class Economy:
         writers = [output.Fields(where, every=feature.every)] if feature.every else []
         run = nts.simulate(
             self.system(feature), nts.EnergyMomentum(), dt=self.dt, t_end=count * self.dt,
-            newton=nts.Newton(rtol=RTOL, reuse=False), petsc_options=_ORDERING,
-            output=[*writers, turn],
+            newton=nts.Newton(rtol=RTOL), petsc_options=_ORDERING, output=[*writers, turn],
             progress=feature.progress, sleep=feature.sleep, ledger=feature.ledger,
         )  # fmt: skip
         if run.status != "completed":
