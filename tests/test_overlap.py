@@ -123,7 +123,9 @@ def test_nodes_and_edges_inside_are_those_of_brute_force(seed, nc):
     """Edges are sampled densely; those within a hundredth of the least depth may be told or not."""
     heap = heaps(seed, nc)
     least, found_any = 0.1, 0
-    scale = max(h.size for h in heap)
+    # A facet counts up to six times the other body's volume by its area.
+    bulk = [6.0 * h.h * h.filled.sum() / len(h.squares) for h in heap]
+    scale = max(min(h.size, w) for h, w in zip(heap, bulk[::-1], strict=True))
     for a, b in (heap, heap[::-1]):
         found = intrusion.intrusions(a.placed, b.placed, least)
         assert np.abs(found.depth - b.depth(found.place)).max(initial=0.0) < 1e-13

@@ -347,3 +347,26 @@ def test_an_impact_of_beam_and_shell_on_more_ranks(ranks, on_ranks, tmp_path):
             np.concatenate([body[of] for body in run.bodies.values()]) for run in (one, other)
         )
         assert np.abs(mine - theirs).max() < 1e-9 * np.abs(mine).max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("across", "speed"), [(0.07, 2.0), (0.3, 3.0), (0.55, 5.0)])
+def test_slender_beams_that_cross_between_their_nodes_are_told(across, speed):
+    """Two beams of four cells and 4 cm that bend as they pass through each other.
+
+    Their width was that of the bent beams as a whole, beside which nothing was deep.
+    """
+    shape = nts.Circle(0.02).section(young=1e7, poisson=0.3, density=1e3)
+    ends = [nts.Clamp(lambda x, end=end: np.isclose(x[0], end)) for end in (0, 1)]
+    held = nts.Beam(line((0, 0, 0), (1, 0, 0), 4), shape, bcs=ends, name="held")
+    axis = line((across, -0.5, 0.06), (across, 0.5, 0.06), 4)
+    free = nts.Beam(axis, shape, velocity=(0, 0, -speed), name="free")
+    system = nts.System([held, free], contacts=[nts.ContactPair(free.surface(), held.surface())])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.16 / speed + 0.06)
+    # The free beam's middle node is above the place at which the axes cross.
+    middle = float(free.u.x.array.reshape(-1, 3)[2, 2]) + 0.06
+    at = np.argsort(held.space.tabulate_dof_coordinates()[:, 0])
+    z = held.u.x.array.reshape(-1, 3)[at, 2]
+    assert middle < np.interp(across, np.linspace(0, 1, 5), z)
+    assert run.warnings["edge through a body"].grave
+    assert run.status.startswith("completed, but")

@@ -145,7 +145,7 @@ class Watched:
         gap = box_gap(*boxes)
         findings: list[Finding] = []
         # While one passes through the other, an edge of one of them is past the other's middle.
-        thickness = max(float(s.extents[0]) for s in sides) if self._whole is None else np.inf
+        thickness = max(s.thickness for s in sides) if self._whole is None else np.inf
         # Boxes of open surfaces do not hold what is behind them.
         if gap > 0.0 and self._whole is None:
             way = min(max(float(s.sizes.min()) for s in sides), thickness)

@@ -32,7 +32,7 @@ _ON_BORDER = 1e-9
 _OPPOSITE, _THIN = -0.9, 0.01
 #: The facets around an edge or a corner are one plane where their mean normal is at least so long.
 _FLAT = 0.95
-#: Part of a body's smallest extent that its box is taken smaller by, at most.
+#: Part of a body's thickness that its box is taken smaller by, at most.
 _SHRINK = 0.25
 
 
@@ -144,10 +144,32 @@ class Placed:
         along = x @ np.linalg.eigh(x.T @ x)[1]
         return np.sort(np.ptp(along, axis=0))
 
+    @cached_property
+    def bulk(self) -> float:
+        """Six times its volume by its area [m]; infinite where the boundary is open.
+
+        That is the diameter of a ball, the edge of a cube, one and a half diameters of a rod and
+        three times the thickness of a plate or of a ring's wall, however these are bent.
+        """
+        if not self.boundary.closed:
+            return np.inf
+        corners = self.corners - self.box.mean(axis=0)
+        volume = area = 0.0
+        for k in range(1, corners.shape[1] - 1):
+            a, b, c = corners[:, [0, k, k + 1]].transpose(1, 0, 2)
+            volume += float(np.einsum("ni,ni->", a, np.cross(b, c))) / 6.0
+            area += float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2.0
+        return 6.0 * abs(volume) / area
+
     @property
     def width(self) -> float:
-        """Length of the shorter side of the smallest hole that it fits through flat [m]."""
-        return float(self.extents[1])
+        """Shorter side of the smallest hole that it fits through flat, at most its bulk [m]."""
+        return min(float(self.extents[1]), self.bulk)
+
+    @property
+    def thickness(self) -> float:
+        """Its least extent, at most its bulk [m]."""
+        return min(float(self.extents[0]), self.bulk)
 
     @cached_property
     def corners(self) -> FloatArray:
@@ -321,7 +343,7 @@ def _edges_near(a: Placed, b: Placed, least: float) -> IntArray:
     """Edges of `a` that may be that deep [m] in `b`, by boxes."""
     ends = a.x[a.boundary.edges]
     if b.boundary.closed:
-        shrink = np.full(3, min(least, _SHRINK * float(b.extents[0])))
+        shrink = np.full(3, min(least, _SHRINK * b.thickness))
     else:  # what is inside need not be in the box
         shrink = np.full(3, -float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max()))
     inner = np.array([b.box[0] + shrink, b.box[1] - shrink])
