@@ -62,3 +62,7 @@ class State:
     a: tuple[FloatArray, ...]
     contacts: tuple[ContactHistory, ...]
     joints: tuple[Any, ...]
+
+    def acceleration(self, k: int) -> FloatArray | None:
+        """Of a body [m/s^2], where the integrator carries any."""
+        return self.a[k] if self.a else None

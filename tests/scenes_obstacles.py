@@ -67,7 +67,8 @@ class Pair:
         stepper = nts.Stepper(nts.System([body], contacts=[pair]), CONTACT_RULES[integrator])
         stepper.problem.begin(stepper.state, STEP)
         problem = stepper.problem
-        (self.step,) = (c for c in (*problem.elements, *problem.contacts.idle) if c.num_elements)
+        found = (*problem.elements, *problem.couplings.contacts.idle)
+        (self.step,) = (c for c in found if c.num_elements)
         stepper.close()
         self.x = start + np.array([0.11, -0.07, 0.05])
 

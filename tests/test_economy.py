@@ -30,6 +30,11 @@ def stepper(scene, name="energy-momentum", *, ledger=True, **newton):
     return nts.Stepper(scene, MID_STEP[name], newton=nts.Newton(**newton), ledger=ledger)
 
 
+def num_idle(s):
+    """Elements of contacts without unknowns, of all ranks."""
+    return COMM.allreduce(sum(c.num_elements for c in s.problem.couplings.contacts.idle))
+
+
 def all_awake(monkeypatch):
     """Give every candidate unknowns, as if each could touch in every step."""
     everyone = lambda self, index, c, had: np.ones(c.num_elements, dtype=bool)  # noqa: E731
@@ -172,7 +177,7 @@ def test_idle_candidates_are_no_unknowns(monkeypatch, integrator, friction):
     near.advance(scenes.dt)
     version = near.problem.version
     near.advance(scenes.dt)
-    assert COMM.allreduce(sum(c.num_elements for c in near.problem.contacts.idle)) == 9
+    assert num_idle(near) == 9
     assert near.problem.version == version and near.problem.unknowns.layout.counts.shape[1] == 2
     fill, near_row = factor_entries(near), near.solution.rows[-1]
     near.close()
@@ -212,7 +217,7 @@ def test_an_impact_is_the_same_as_with_all_candidates_awake(monkeypatch, integra
         s = stepper(system, integrator)
         for _ in range(steps):
             s.advance(dt)
-            idle.append(COMM.allreduce(sum(c.num_elements for c in s.problem.contacts.idle)))
+            idle.append(num_idle(s))
         s.close()
         tables.append(s.solution.balance)
         all_awake(monkeypatch)
@@ -251,7 +256,7 @@ def test_idle_candidates_wake_in_the_step_that_closes_their_gap(
         system = nts.System([cube, plate], contacts=[pair])
         s = stepper(system, integrator)
         s.problem.begin(s.state, dt)
-        states.append(COMM.allreduce(sum(c.num_elements for c in s.problem.contacts.idle)))
+        states.append(num_idle(s))
         s.advance(dt)
         assert s.solution.rows[-1]["active"] > 0
         assert s.solution.rows[-1]["min_gap"] > -1e-10

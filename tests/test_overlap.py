@@ -593,7 +593,7 @@ def test_a_gap_that_raises_on_one_rank_is_told_on_all(monkeypatch):
     stepper = nts.Stepper(nts.System([body], contacts=[pair]), nts.Midpoint())
     stepper.start(1e-3)
     stepper.problem.begin(stepper.state, 1e-3)
-    contact = stepper.problem.contacts.elements[0]
+    contact = stepper.problem.couplings.contacts.elements[0]
     assert pair.redundant and contact.num_elements > 0
     monkeypatch.setattr(Broken, "breaks", [True])
     with pytest.raises(nts.UserFunctionError, match=r"its elements raised KeyError\('no table'\)"):

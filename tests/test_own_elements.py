@@ -449,7 +449,7 @@ def test_the_stiffness_of_springs_is_a_norm_on_all_ranks():
         stepper = nts.Stepper(nts.System([a, b], joints=springs), nts.EnergyMomentum())
         stepper.start(1e-2)
         stepper.problem.begin(stepper.state, 1e-2)
-        norms.append(stepper.problem._springs())
+        norms.append(stepper.problem.stiffness_between())
         stepper.close()
     assert norms[0].all()
     np.testing.assert_allclose(norms[1], np.sqrt(2) * norms[0], rtol=1e-13)
@@ -464,7 +464,7 @@ def test_springs_that_fail_on_one_rank_alone_fail_on_all_when_measured():
     stepper.start(1e-3)
     stepper.problem.begin(stepper.state, 2e-3)
     with pytest.raises(nts.StepFailedError, match="steps are too long for a spring"):
-        stepper.problem._springs()
+        stepper.problem.stiffness_between()
     stepper.close()
 
 
@@ -645,7 +645,7 @@ def test_a_coupling_of_ones_own_warns_and_gives_way():
     assert (found.kind, found.count, found.about) == ("way", 2, ("a",))
     assert found.worst == pytest.approx(0.02, abs=1e-9)
     problem = stepper.problem
-    assert [problem.give_way(), problem.give_way()] == [True, False]
+    assert [problem.couplings.give_way() for _ in range(2)] == [True, False]
     stepper.close()
 
 

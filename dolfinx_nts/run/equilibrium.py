@@ -195,7 +195,7 @@ class _LoadStepper(Stepper):
         """
         histories, works = zip(old.joints, new.joints, strict=True), []
         for joint, both, ledger in zip(
-            self.problem.joints, histories, told.tolist(), strict=True
+            self.problem.couplings.joints, histories, told.tolist(), strict=True
         ):
             found = joint.load_step_work(*both, old.time, new.time)
             works.append(ledger if found is None else found)

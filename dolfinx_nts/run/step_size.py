@@ -158,7 +158,7 @@ class Pace:
         left out: a consistent mass makes their nodes bounce in turn, and to meet each bounce costs
         many steps and saves no energy (measured). Every rank must call it.
         """
-        comm, state, contacts = problem.system.comm, problem.state, problem.contacts
+        comm, state, contacts = problem.system.comm, problem.state, problem.couplings.contacts
         carrying = np.array([bool((c.force > 0.0).any()) for c in state.contacts], dtype=bool)
         comm.Allreduce(MPI.IN_PLACE, carrying, op=MPI.LOR)
         lost, first = 0.0, 1.0
@@ -182,7 +182,7 @@ class Pace:
         """
         h = problem.dt
         acceleration = tuple(
-            (problem.integrator.advance(b.du, v, problem.acceleration(k), h)[0] - v) / h
+            (problem.integrator.advance(b.du, v, problem.state.acceleration(k), h)[0] - v) / h
             for k, (b, v) in enumerate(zip(step.bodies, problem.state.v, strict=True))
         )
         speed, error = self._measure(problem, acceleration)
@@ -224,7 +224,7 @@ class Pace:
 
     def _expels(self, problem: StepProblem, step: Evaluation) -> bool:
         gain = 0.0
-        for c, part, _ in problem.touching(step):
+        for c, part, _ in problem.couplings.touching(step):
             gain += float(np.maximum(c.gains(part, problem.factor), 0.0).sum())
         total = float(problem.system.comm.allreduce(gain))
         return total > self._tolerance * 0.5 * self._top**2

@@ -62,7 +62,7 @@ def tell_couplings(
     solution: Solution, problem: StepProblem, step: Evaluation, state: State
 ) -> None:
     """Warn of what contacts and joints tell. Collective; arguments as of `tell_step`."""
-    for coupling, parts in problem.each(step):
+    for coupling, parts in problem.couplings.each(step):
         for found in coupling.warnings(parts):
             solution.warn(
                 found.kind, state.time, found.size, found.text, about=found.about, grave=found.grave

@@ -180,7 +180,7 @@ class Stepper:
         return {
             "last": self._last_steps.last,
             "promised": self._promises.memory,
-            "bounded": self.problem.contacts.bounded,
+            "bounded": self.problem.couplings.contacts.bounded,
             "measured": self.problem.rounding.measured,
             "recent": self._last_steps.lengths,
             "solver": self.solver.memory,
@@ -192,7 +192,7 @@ class Stepper:
 
         unknowns: whether they had any in the last step; force_before: p_N in the step before [N].
         """
-        found: dict[str, Any] = {"unknowns": self.problem.contacts.had_unknowns}
+        found: dict[str, Any] = {"unknowns": self.problem.couplings.contacts.had_unknowns}
         if (force := self._last_steps.force_before) is not None:
             found["force_before"] = force
         return found
@@ -201,7 +201,7 @@ class Stepper:
         """Begin where a checkpoint was written, with the materials of its last step."""
         memory, nodal = restart.memory, restart.nodal_memory
         self._last_steps.resume(memory, nodal, self.state)
-        self.problem.contacts.resume(nodal["unknowns"], memory["bounded"])
+        self.problem.couplings.contacts.resume(nodal["unknowns"], memory["bounded"])
         self._promises.resume(memory["promised"])
         self.problem.rounding.measured = memory["measured"]
         self.solver.resume(memory["solver"])
@@ -276,7 +276,7 @@ class Stepper:
 
     def _bind(self, retries: int) -> bool:
         """After enough cuts, let couplings give way; return whether one newly does."""
-        return retries >= _CUTS and self.problem.give_way()
+        return retries >= _CUTS and self.problem.couplings.give_way()
 
     def paced(self, pace: Pace, end: float) -> Iterator[None]:
         """Advance in steps of a pace, stopping after each.

@@ -54,7 +54,7 @@ def solved(problem: StepProblem, solver: StepSolver) -> Evaluation:
             problem.begin(problem.state, problem.dt, step)
             step = solver.solve()
             iterations += step.iterations
-    far = float(problem.motion(step).max())
+    far = float(problem.lengths.motion_of(step).max())
     raise StepFailedError(
         f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
         f"{far:.3g} m, and no search found all contacts on the way of their nodes; use a "
@@ -74,7 +74,7 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
     old, dt = problem.state, problem.dt
     u, v, a = list(old.u), list(old.v), list(old.a)
     for k in problem.awake:
-        u[k], a0 = step.bodies[k].u1.copy(), problem.acceleration(k)
+        u[k], a0 = step.bodies[k].u1.copy(), old.acceleration(k)
         v[k], a1 = problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
         if a1 is not None:
             a[k] = a1
@@ -82,5 +82,6 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
         if body.has_massless:
             # What has no momentum has no velocity of its own either.
             v[k][body.massless] = step.bodies[k].du[body.massless] / dt
-    contacts, *joints = (coupling.history(parts) for coupling, parts in problem.each(step))
+    both = problem.couplings.each(step)
+    contacts, *joints = (coupling.history(parts) for coupling, parts in both)
     return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))

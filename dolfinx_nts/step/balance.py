@@ -186,14 +186,14 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     scale = 1.0 / problem.factor
     losses = (name for joint in problem.system.joints for name in joint.losses)
     sums, smallest = dict.fromkeys((*WORKS, *COUNTS, *losses), 0.0), {"min_gap": np.inf}
-    added = problem.work_at_ends(step)
+    added = problem.loads.work_at_ends(step)
     for body, terms, more in zip(problem.system.bodies, step.bodies, added, strict=True):
         work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed] + more
         sums["external_work"] += scale * float(work)
     for elements, part in zip(problem.elements, step.parts, strict=True):
         for name, value in elements.ledger(part, problem.factor).items():
             sums[name] += value
-    for coupling, parts in problem.each(step):
+    for coupling, parts in problem.couplings.each(step):
         for name, value in coupling.smallest(parts).items():
             smallest[name] = min(smallest[name], value)
     comm = problem.system.comm
@@ -214,8 +214,8 @@ def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
         problem: Equations of the step.
         step: Their solution.
     """
-    work = np.zeros(len(problem.joints))
-    for k, (coupling, parts) in enumerate(problem.of_joints(step)):
+    work = np.zeros(len(problem.couplings.joints))
+    for k, (coupling, parts) in enumerate(problem.couplings.of_joints(step)):
         for batch, part in zip(coupling.elements, parts, strict=True):
             work[k] += batch.ledger(part, problem.factor).get("external_work", 0.0)
     return work
@@ -232,7 +232,7 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
     if not problem.system.contacts:
         return []
     found = []
-    for contact, part, old in problem.touching(step):
+    for contact, part, old in problem.couplings.touching(step):
         c = contact.candidates
         before, gain = old.facet[c.node], contact.gains(part, problem.factor)
         stayed = (old.force[c.node] > 0.0) & part.active
@@ -247,7 +247,7 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
 def expelled(problem: StepProblem, step: Evaluation) -> str:
     """The node that brings most energy in by starting behind its facet. Every rank must call it."""
     best = (0.0, "")
-    for contact, part, _ in problem.touching(step):
+    for contact, part, _ in problem.couplings.touching(step):
         gain = contact.gains(part, problem.factor)
         if len(gain) and gain.max() > best[0]:
             i = int(gain.argmax())

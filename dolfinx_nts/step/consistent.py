@@ -39,7 +39,7 @@ def violation(
         [m/s] or [m], or None where all constraints hold.
     """
     worst, name = 0.0, ""
-    for joint, coupling in zip(problem.system.joints, problem.joints, strict=True):
+    for joint, coupling in zip(problem.system.joints, problem.couplings.joints, strict=True):
         for found in filter(None, coupling.kinematics(state, dt)):
             local = np.array([found.size[int(rates)], found.limit[int(rates)]])
             off, limit = global_max(problem.system.comm, local).tolist()
@@ -130,7 +130,7 @@ def _constraints(
     """Elements of joints with constraints that a start has to fit, and their bodies' numbers."""
     return [
         (batch, bodies, found)
-        for c in problem.joints
+        for c in problem.couplings.joints
         for batch, bodies, found in zip(
             c.elements, c.bodies, c.kinematics(state, dt), strict=True
         )

@@ -38,7 +38,7 @@ class ContactLoads(NamedTuple):
     @classmethod
     def of_step(cls, problem: StepProblem, step: Evaluation) -> ContactLoads:
         """Of a solved step; its tangents are not kept."""
-        both = problem.touching(step)
+        both = problem.couplings.touching(step)
         parts = tuple(part._replace(tangent=np.empty(0)) for _, part, _ in both)
         return cls(tuple(elements for elements, _, _ in both), parts, problem.factor)
 

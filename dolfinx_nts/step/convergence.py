@@ -40,7 +40,7 @@ def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
     """
     bodies = problem.system.bodies
     held = {k: problem.stabilization.of(bodies[k]) * e.bodies[k].du for k in problem.awake}
-    found = _over_limits(problem, e, held, problem.rounding.at(problem.displacement(e)))
+    found = _over_limits(problem, e, held, problem.rounding.at(problem.lengths.displacement_of(e)))
     k = int(np.argmax(found))
     return found[k], bodies[k].name
 

@@ -77,7 +77,7 @@ def _held_twice(problem: StepProblem, e: Evaluation) -> list[str]:
     names, pushed, stuck = [], [], []
     # A rigid body's directors are pushed by all that touches it.
     nodal = [not body.oriented for body in problem.system.bodies]
-    for c, bodies, part in zip(problem.elements, problem.bodies, e.parts, strict=True):
+    for c, bodies, part in zip(problem.elements, problem.couplings.bodies, e.parts, strict=True):
         if c.bilateral or not c.widths["constraints"] or not all(nodal[k] for k in bodies):
             continue
         force = np.abs(part.residual[:, : c.num_coordinates]) > 0.0

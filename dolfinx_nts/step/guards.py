@@ -66,7 +66,7 @@ def check_momentum(
         speed = np.abs(v0) + np.abs(v1)
         if rule.accelerations:
             # What the velocity would be without the forces of this step.
-            a0 = problem.acceleration(k)
+            a0 = problem.state.acceleration(k)
             free, _ = rule.advance(rule.ahead(v0, a0, dt), v0, a0, dt)
             local[9:12] += body.linear_momentum(body.inertia(free - v0))
             speed += np.abs(free)
@@ -77,7 +77,7 @@ def check_momentum(
         local[12] += float(np.abs(part.residual[:, : batch.num_coordinates]).sum())
     total = np.empty_like(local)
     problem.system.comm.Allreduce(local, total, op=MPI.SUM)
-    arm = problem.span + math.sqrt(total[8])
+    arm = problem.lengths.span + math.sqrt(total[8])
     total[:7] *= rule.rate(dt)
     activity = total[6] + total[7]
     allowed = max(_MOMENTUM, _TOLERANCES * problem.rtol) * activity + problem.momentum_rounding
@@ -85,8 +85,8 @@ def check_momentum(
     off = after["linear_momentum"] - before["linear_momentum"] - total[:3] - total[9:12]
     # About the middle of the bodies: about a far origin every error of P would look like one of J.
     turn = after["angular_momentum"] - before["angular_momentum"] - total[3:6]
-    turn -= cross(problem.centre, off)
-    far = _FAR * float(np.linalg.norm(problem.centre)) * activity
+    turn -= cross(problem.lengths.centre, off)
+    far = _FAR * float(np.linalg.norm(problem.lengths.centre)) * activity
     checks = [("linear", off, allowed)]
     if rule.keeps_angular_momentum:
         checks.append(("angular", turn, arm * allowed + far))

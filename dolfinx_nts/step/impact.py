@@ -161,7 +161,7 @@ class _New(NamedTuple):
 def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
     """What came to touch in a step, of each contact."""
     found, rate = [], problem.integrator.rate(problem.dt)
-    for batch, part, old in problem.touching(step):
+    for batch, part, old in problem.couplings.touching(step):
         new = part.active & ~(old.force[batch.candidates.node] > 0.0)
         force = np.where(new, -part.multiplier[:, 0], 0.0)
         lost = float(force @ batch.candidates.gap) / problem.factor
@@ -195,7 +195,9 @@ def _response(
     system = problem.system
     chosen: list[tuple[Any, Any, tuple[int, ...]]] = [
         (batch, part, of)
-        for batch, part, of in zip(problem.elements, step.parts, problem.bodies, strict=True)
+        for batch, part, of in zip(
+            problem.elements, step.parts, problem.couplings.bodies, strict=True
+        )
         if batch.bilateral and batch.widths["constraints"]
     ]
     if not chosen:

@@ -115,12 +115,12 @@ class StepSolver:
         assert self.matrix is not None
         iterations, unsolved = 0, False
         # Without friction there is nothing to let slip.
-        for retry in range(3 if self.problem.may_slip else 2):
+        for retry in range(3 if self.problem.couplings.may_slip else 2):
             self._upright.begin(careful=retry > 0)
             if retry:
                 self._tangents.due, self._passed = True, None
                 if retry == 2:
-                    self.problem.let_slip()
+                    self.problem.couplings.let_slip()
                 self.problem.guess(flight=False)
                 self.iterates.forget_last()
                 if unsolved:
@@ -171,7 +171,8 @@ class StepSolver:
         problem = self.problem
         if self._independent:
             return solved
-        space = NullSpace(problem.system.comm, problem.elements, problem.bodies, solved.parts)
+        bodies = problem.couplings.bodies
+        space = NullSpace(problem.system.comm, problem.elements, bodies, solved.parts)
         if self._independent is None:
             self._independent = space.is_empty()
             if self._independent:

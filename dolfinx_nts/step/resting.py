@@ -63,7 +63,7 @@ def with_resting_forces(
         return state
     start = replace(state, a=tuple(np.zeros_like(v) for v in state.v))
     problem.begin(start, _SHORT * dt)
-    batches = (*problem.contacts.elements, *problem.contacts.idle)
+    batches = (*problem.couplings.contacts.elements, *problem.couplings.contacts.idle)
     touches = any(_closed(c).any() for c in batches)
     if not system.comm.allreduce(touches, op=MPI.LOR):
         return state
@@ -87,8 +87,8 @@ def with_resting_forces(
 def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:
     """The state with the forces of a first step at nodes that rest or slide. Collective."""
     found = []
-    flight = problem.contacts.flight_gaps()
-    for after, (c, part, old) in zip(flight, problem.touching(step), strict=True):
+    flight = problem.couplings.contacts.flight_gaps()
+    for after, (c, part, old) in zip(flight, problem.couplings.touching(step), strict=True):
         new, node = c.history(part, problem.factor, old), c.candidates.node
         push = problem.factor * new.force[node] / c.scale
         rests = np.zeros(len(new.force), dtype=bool)

@@ -59,7 +59,7 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
             - of all contacts: forces [N] on the slaves, and their moments about the origin [N m],
               shape (contacts, 3) each.
     """
-    bodies, contacts = problem.system.bodies, problem.touching(step)
+    bodies, contacts = problem.system.bodies, problem.couplings.touching(step)
     joints = problem.system.declared_joints
     parts = [b.reactions(t.residual, t.u1) for b, t in zip(bodies, step.bodies, strict=True)]
     forces = [part.force.sum(axis=0) for _, part, _ in contacts]
@@ -67,7 +67,7 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
     parts.append(np.reshape(moments, (len(contacts), 3)))
     first = [bodies[0] for bodies in problem.system.joint_bodies]
-    held = list(zip(first, problem.of_joints(step), strict=True))[: len(joints)]
+    held = list(zip(first, problem.couplings.of_joints(step), strict=True))[: len(joints)]
     parts += [_of_joint(problem, step, k, *each) for k, each in held]
     total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)

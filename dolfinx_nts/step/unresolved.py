@@ -98,7 +98,7 @@ def _joined(problem: StepProblem, bodies: Iterable[int]) -> set[int]:
     """Bodies that constraints of joints hold to some bodies, with these; after `begin`."""
     held = [
         set(of)
-        for coupling in problem.joints
+        for coupling in problem.couplings.joints
         for batch, of in zip(coupling.elements, coupling.bodies, strict=True)
         if has_constraints(batch)
     ]
