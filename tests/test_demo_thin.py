@@ -61,6 +61,17 @@ def test_leaves_that_slide_on_each_other():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("search", [leaf_spring.SEARCH, {}], ids=["l2", "whole steps"])
+@pytest.mark.parametrize("steps", [5, 10])
+@pytest.mark.parametrize("cells", [4, 8, 12])
+def test_leaves_slide_in_any_steps(monkeypatch, cells, steps, search):
+    """No rounding at the clamp decides whether load steps are solved."""
+    monkeypatch.setattr(leaf_spring, "SEARCH", search)
+    found = leaf_spring.main(comm=MPI.COMM_SELF, cells=cells, steps=steps, t_end=0.0)
+    assert found["status"] == "completed" and found["off theory"] < 0.08
+
+
+@pytest.mark.slow
 def test_leaves_that_are_let_go():
     """Each half swing loses a little more to friction than of a mass on a spring."""
     found = leaf_spring.main(comm=MPI.COMM_SELF, cells=8, t_end=0.025)

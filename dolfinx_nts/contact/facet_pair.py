@@ -37,6 +37,8 @@ _WEDGE = 0.5
 _MOST_PATCHES = 3
 #: A node this part of a facet behind it, or less, is outside.
 _OUTSIDE = 1e-6
+#: Weights of a foot that are rounding.
+_STILL = 1e-9
 
 
 class FacetPair(ContactPair, master=Surface):
@@ -296,7 +298,7 @@ class FacetPair(ContactPair, master=Surface):
         foot, _, normal = facets.frame(control, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
         length = facets.size(master[self.master.facets[facet]])
-        legal = converged & self._movable(node, patch)
+        legal = converged & self._movable(node, patch, xi)
         beyond = np.zeros_like(legal)
         if reach is not None:
             over, beyond = self._over_facet(facet, xi, reach / length)
@@ -366,11 +368,24 @@ class FacetPair(ContactPair, master=Surface):
         inside: BoolArray = (free | (excess <= wedge[:, None])).all(axis=1) & ~beyond
         return inside, beyond
 
-    def _movable(self, node: IntArray, patch: IntArray) -> BoolArray:
-        """Return whether any coordinate of a pair is free; else there is nothing to solve for."""
-        slave = self.slave.fixed[self.slave.share[node]].all(axis=1)
-        master = self.master.fixed[self.master.patches[patch]].all(axis=(1, 2))
-        return ~(slave & master)
+    def _movable(self, node: IntArray, patch: IntArray, xi: FloatArray) -> BoolArray:
+        """Return whether slave or foot of a pair may move; else there is nothing to solve for.
+
+        Over a prescribed point of a facet that bends, the derivative of the gap is rounding, which
+        a factorisation may take for a pivot: any force, and any motion from it.
+        """
+        movable = ~self.slave.fixed[self.slave.share[node]].all(axis=1)
+        held = np.flatnonzero(~movable)
+        points = self.master.patches[patch[held]]
+        if self.master.weights is None:
+            foot, _, _ = facets.shape(xi[held], points.shape[1])
+        else:
+            weights = self.master.weights[patch[held]]
+            foot, _, _ = facets.shape(xi[held], weights.shape[1])
+            foot = np.einsum("nk,nkp->np", foot, weights)
+        free = ~self.master.fixed[points].all(axis=2)
+        movable[held] = (np.abs(foot) * free).max(axis=1) > _STILL
+        return movable
 
 
 def _replace(found: Candidates, other: Candidates) -> Candidates:
