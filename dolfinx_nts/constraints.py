@@ -16,11 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.coupling import StepWarning
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels import quadratic as kernel
-from dolfinx_nts.kinematics import OFF, Kinematics
-from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.kinematics import FAR_TURN, OFF, Kinematics
+from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.point_elements import EveryStep, PointElements
 from dolfinx_nts.points import Points
 from dolfinx_nts.state import State
@@ -89,13 +90,15 @@ class ConstraintPart(NamedTuple):
         tangent: Its derivative.
         multiplier: Factor of the step times lambda [kg m], shape (n, m).
         gap: g - c at t_{n+1} [m], shape (n, m).
-        end: Nodal vectors at t_{n+1} [m], shape (n, k, 3).
+        start: Nodal vectors at t_n [m], shape (n, k, 3).
+        end: The same at t_{n+1}.
     """
 
     residual: FloatArray
     tangent: FloatArray
     multiplier: FloatArray
     gap: FloatArray
+    start: FloatArray
     end: FloatArray
 
     @property
@@ -261,7 +264,7 @@ def _evaluate(
     tangent[:, rows, rows] = -scale * np.where(
         lends[:, None], lent[:, None] + np.abs(gap) * bent, 0.0
     )
-    return ConstraintPart(residual, tangent, multiplier, gap, x)
+    return ConstraintPart(residual, tangent, multiplier, gap, y0, x)
 
 
 class Constraints(EveryStep):
@@ -277,6 +280,7 @@ class Constraints(EveryStep):
         redundant: Whether they may repeat others.
         upright: Numbers that are positive unless directions have turned over, which solves the
             equations, too. Collective.
+        arm: Vectors (n, 3) [m] whose turn in a step is looked at, from nodal vectors (n, k, 3).
     """
 
     def __init__(
@@ -289,6 +293,7 @@ class Constraints(EveryStep):
         *,
         redundant: bool = True,
         upright: Upright | None = None,
+        arm: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         super().__init__(bodies, self._elements, lambda part: part.multiplier / self._factor)
         self._name, self._sides, self._equations = name, tuple(sides), equations
@@ -298,7 +303,7 @@ class Constraints(EveryStep):
         self._curvature = kernel.curvature(equations.weights)
         self._extent = _extent(equations, self._rest)
         self._driven, self._force = driven, np.zeros_like(equations.value)
-        self._upright = upright
+        self._upright, self._arm = upright, arm
 
     def hold_alone(self) -> None:
         """They repeat no others: nothing is lent to them, which light bodies would feel."""
@@ -357,6 +362,23 @@ class Constraints(EveryStep):
             partial(StepFailedError, advises=True),
         )  # fmt: skip
         return False
+
+    def warnings(self, parts: Sequence[ConstraintPart]) -> list[StepWarning]:
+        """Whether the arm has turned too far in the step. Collective."""
+        if self._arm is None:
+            return []
+        (part,) = parts
+        one, two = self._arm(part.start), self._arm(part.end)
+        sine = np.linalg.norm(np.cross(one, two), axis=1)
+        angle = np.arctan2(sine, np.einsum("ni,ni->n", one, two)).max(initial=0.0)
+        turn = float(global_max(self._sides[0].body.comm, np.array([angle]))[0])
+        if turn <= FAR_TURN:
+            return []
+        text = (
+            f"joint {self._name!r} turns by {turn:.2g} rad in a step, too far for how it turns to "
+            "be right, though energy and momenta may be kept; use a smaller dt"
+        )
+        return [StepWarning("turns", turn, text, (self._name,), False)]
 
     def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
         """Do as `JointCoupling`, in closed form but for what is prescribed."""

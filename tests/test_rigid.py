@@ -180,6 +180,21 @@ def test_a_turn_of_a_radian_in_a_step_is_told(spin, told):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize(("spin", "told"), [(9.0, False), (12.0, True)])
+def test_a_rod_that_turns_by_a_radian_in_a_step_is_told(spin, told):
+    """The mass at its end circles without a spin; its chords are h w by a radius of 1."""
+    mass = nts.RigidBody.from_inertia(1.0, (0, 0, 0), centre=(1, 0, 0), velocity=(0, spin, 0))
+    rod = nts.Distance(None, mass, points=((0, 0, 0), (1, 0, 0)), name="rod")
+    system = nts.System([mass], joints=[rod])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.1, t_end=0.5)
+    assert run.status == "completed" and ("turns" in run.warnings) is told
+    if told:
+        found = run.warnings["turns"]
+        assert found.worst == pytest.approx(2 * np.arctan(0.05 * spin), rel=1e-9)
+        assert found.count == 5 and "joint 'rod' turns by 1.1 rad in a step" in found.text
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("turn", [0.9, 1.1, 5.5, 2 * np.pi, 7.0, 10 * np.pi])
 @pytest.mark.parametrize("given", ["vector", "matrix"])
 def test_a_prescribed_turn_counts_whole_turns(turn, given):

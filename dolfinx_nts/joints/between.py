@@ -45,6 +45,10 @@ class Vector:
     def __rmul__(self, factor: float) -> Vector:
         return Vector(factor * self.weights, factor * self.constant)
 
+    def at(self, nodes: FloatArray) -> FloatArray:
+        """Its value from the nodal vectors of elements, (n, k, 3) -> (n, 3)."""
+        return np.tensordot(nodes, self.weights, (1, 0)) + self.constant
+
 
 class Product(NamedTuple):
     """A constraint v . w = c.
@@ -182,6 +186,10 @@ class Between(Joint, ABC):
         """
         return ()
 
+    def arm(self) -> Vector | None:
+        """A vector whose turn in a step is looked at, as no body need turn with it."""
+        return None
+
     def meet(self, *values: FloatArray) -> Iterator[Product]:
         """p_A - p_B = c, which is given at each of the times, (3,), or 0."""
         each = zip(*values, strict=True) if values else ((),) * 3
@@ -237,9 +245,10 @@ class Between(Joint, ABC):
         """Its constraints in a run. Collective."""
         sides = [side.part(slice(self._here)) for side in self._sides]
         equations, _ = self._in_step((0.0,))
+        arm = self.arm()
         return Constraints(
             self.name, bodies, sides, equations, self._in_step if self.motion else None,
-            upright=self._kept_upright(),
+            upright=self._kept_upright(), arm=None if arm is None else arm.at,
         )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from dolfinx_nts.joints.between import (
     Between,
     Product,
     Times,
+    Vector,
     direction,
     triad,
 )
@@ -368,3 +369,7 @@ class Distance(Between):
                 f"{min(lengths)!r}; return a positive length [m]"
             )
         yield Product(0.5 / rest * r, r, [length**2 / (2.0 * rest) for length in lengths])
+
+    def arm(self) -> Vector:
+        """From B to A: a mass at the end of a rod circles without a turn of its own."""
+        return self.p_a - self.p_b

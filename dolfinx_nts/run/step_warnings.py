@@ -10,6 +10,7 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.inversion import describe, smallest_dets
 from dolfinx_nts.bodies.motion import motion_of
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.kinematics import FAR_TURN
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.state import State
@@ -19,9 +20,7 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Smallest det F below which cells count as crushed.
 _CRUSHED = 0.05
-#: Turn in a step [rad] that is told: a steady one comes out short by a twelfth of its cube.
-_FAR = 1.0
-#: The same of a flexible body, by its spin: as it turns it stretches, and turns more slowly.
+#: As `FAR_TURN`, of a flexible body, by its spin: as it turns it stretches, and turns more slowly.
 _STRETCHED = 0.95
 #: Its spin is measured after 1, 2, 4, 8, 16 steps and then every so many, as it costs 1 % of one.
 _SELDOM = 32
@@ -127,7 +126,7 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
     seen, driven, far = (np.zeros(len(turning)) for _ in range(3))
     for place, k in enumerate(turning):
         body = system.bodies[k]
-        far[place] = _FAR if body.oriented else _STRETCHED
+        far[place] = FAR_TURN if body.oriented else _STRETCHED
         if body.oriented:
             driven[place] = body.prescribed_turn(old.time, new.time)
             seen[place] = body.turn(old.u[k], new.u[k])
@@ -140,7 +139,7 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
     if turns[worst] > far[worst]:
         name, turn = system.bodies[turning[worst]].name, float(turns[worst])
         by = "by" if turn < np.pi else "by at least"
-        prescribed = driven[worst] > _FAR
+        prescribed = driven[worst] > FAR_TURN
         solution.warn(
             "turns", new.time, turn,
             f"body {name!r} turns {by} {turn:.2g} rad in a step, too far for how it turns to be "
