@@ -14,6 +14,7 @@ from dolfinx_nts.joints.kinds import (
     Spherical,
     Universal,
 )
+from dolfinx_nts.joints.seam import Seam
 from dolfinx_nts.joints.tie import Tie
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "Planar",
     "Prismatic",
     "Revolute",
+    "Seam",
     "Spherical",
     "Tie",
     "Universal",
