@@ -272,3 +272,31 @@ def test_an_arm_that_cuts_a_corner_is_told(turn, told):
     # By the largest component of a motion, which is at least 1/sqrt(2) of it in the plane.
     worst, exact = run.warnings["cut corners"].worst, 2.0 * (1.0 - np.cos(turn / 2))
     assert 0.7 * exact < worst < 1.01 * exact
+
+
+@pytest.mark.parametrize("facets", [CellType.hexahedron, CellType.tetrahedron])
+@pytest.mark.parametrize("whole", [True, False])
+def test_masters_that_hide_faces_between_them_are_told(whole, facets):
+    """Of two plates side by side with their whole boundaries as masters; not with their tops."""
+
+    def solid(name, low, high, **options):
+        mesh = create_box(COMM, [np.array(low), np.array(high)], (2, 2, 1), facets)
+        return nts.RigidBody(mesh, density=1e3, name=name, **options)
+
+    held = {"motion": (0, 0, 0), "rotation": (0, 0, 0)}
+    plates = [solid(f"plate {k}", (k - 1.0, 0.0, -0.3), (k, 1.0, 0.0), **held) for k in (0, 1)]
+    die = solid("die", (-0.3, 0.4, 0.1), (-0.1, 0.6, 0.3))
+    bottom = die.surface(lambda x: x[2] < 0.1 + 1e-9)
+    pairs = [
+        nts.ContactPair(bottom, plate.surface(lambda x: whole | (x[2] > -1e-9)))
+        for plate in plates
+    ]
+    run = nts.simulate(
+        nts.System([*plates, die], contacts=pairs), nts.EnergyMomentum(), dt=1e-3, t_end=1e-3
+    )
+    assert run.status == "completed" and ("hidden facets" in run.warnings) is whole
+    if whole:
+        found = run.warnings["hidden facets"]
+        # Two squares, or four triangles, of each plate.
+        assert found.worst == (4 if facets == CellType.hexahedron else 8)
+        assert "'plate 0' lies on one of 'plate 1'" in found.text

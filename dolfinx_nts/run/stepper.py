@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.contact.hidden_facets import hidden_facets
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme
 from dolfinx_nts.run.last_steps import LastSteps
@@ -363,6 +364,10 @@ class Stepper:
         fast = tell_unresolved(self.problem, state, dt)
         if fast:
             self.solution.warn("unresolved", state.time, *fast)
+        masters = [state.u[bodies[-1]] for bodies in self.system.contact_bodies]
+        hidden = hidden_facets(self.system.contacts, masters)
+        if hidden:
+            self.solution.warn("hidden facets", state.time, *hidden)
         self._ledger.open(state, self._start)
         # Where bodies were before the first step, for one that carries them through each other.
         self.look()
