@@ -93,6 +93,7 @@ class System:
         if len(set(names)) < len(names):
             raise ValueError(f"bodies: names {names} are not unique; pass name= to each body")
         self.gravity = vector("gravity", gravity, "m/s^2")
+        self.gravity.flags.writeable = False
         for b in self.bodies:
             if MPI.Comm.Compare(b.comm, self.comm) not in (MPI.IDENT, MPI.CONGRUENT):
                 raise ValueError(

@@ -361,6 +361,8 @@ def test_an_option_of_an_object_that_is_made_cannot_be_set():
             setattr(item, option, value)
     with pytest.raises(AttributeError, match="Spring 'coil' has been"):
         spring.stiffness = 2e3
+    with pytest.raises(ValueError, match="read-only"):
+        system.gravity[2] = -1.62
 
 
 @pytest.mark.parametrize("components", [(3,), (), 0, ("x",)])

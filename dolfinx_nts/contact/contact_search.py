@@ -20,7 +20,7 @@ from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import ContactHistory
-from dolfinx_nts.validation import StepFailedError
+from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -29,8 +29,8 @@ BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
-#: A gap of this many roundings of positions, or of forces, that is closed without force is no
-#: contact.
+#: A gap of at most so many roundings of positions, or of forces, counts as closed; without a force
+#: it is no contact.
 _TOUCH = 4.0
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
 _ONE = 1e-6
@@ -256,6 +256,8 @@ class ContactSearch:
         motions = [e.bodies[b].du for b in bodies]
         try:
             hit = pair.missed(positions, motions, path, reach, held)
+        except UserFunctionError:
+            raise
         except StepFailedError as failure:
             time, dt = self._step.state.time, self._step.dt
             text = f"step from t={time:.6g} with dt={dt:.3g}: {failure}"

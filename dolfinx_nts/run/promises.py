@@ -74,8 +74,8 @@ class Promises:
         problem.system.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
         moved = np.sqrt(squares)
         self._rounding += _ROUNDING * float(problem.rounding.forces @ moved) / problem.factor
-        # Where nothing moves, forces still do work over the rounding of positions, of which gaps
-        # are solved to 8 eps: 2,450 N at each corner of a box at rest over 1.7e-15 m.
+        # Forces do some work even where nothing moves, as gaps are solved to 8 eps of positions:
+        # the 2,450 N at each corner of a box at rest act over 1.7e-15 m.
         self._rounding += _ROUNDING * _EPS * impulses / problem.dt * problem.rounded_length
         self._tell_gain(problem, step, before, row)
         missing = abs(row["ledger_residual"])
