@@ -50,6 +50,7 @@ def test_the_plate_rings_at_its_first_frequency():
     assert found["peak_frequency"] == pytest.approx(found["first_frequency"], rel=0.05)
 
 
+@pytest.mark.mpi
 def test_leaves_that_slide_on_each_other():
     """Theory's loop; the clamping pressure stiffens the leaves by 1 %."""
     found = leaf_spring.main(cells=8, steps=5, t_end=0.0)
