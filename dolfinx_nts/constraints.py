@@ -187,15 +187,16 @@ class ConstraintElements(PointElements):
         """`evaluate` of batches that are `alike`, at once: most have a single element."""
         first, counts = batches[0], [batch.num_elements for batch in batches]
         each = [
-            (*b.equations[:2], b.curvature, b.prescribed[1], b.y0, x, y["constraints"])
+            _Iterate(*b.equations[:2], b.curvature, b.prescribed[1], b.y0, x, y["constraints"])
             for b, x, y in zip(batches, places, own, strict=True)
         ]
-        known = (first._start, first._bent) if len(each) == 1 else (None, None)
-        joined = map(np.concatenate, zip(*each, strict=True)) if len(each) > 1 else each[0]
+        several = len(each) > 1
+        known = (None, None) if several else (first._start, first._bent)
+        joined = _Iterate(*map(np.concatenate, zip(*each, strict=True))) if several else each[0]
         scale, lent = (
             np.repeat([getattr(b, name) for b in batches], counts) for name in ("scale", "lent")
         )
-        whole = _evaluate(first.theta, scale, lent, *joined, *known)
+        whole = _evaluate(first.theta, scale, lent, joined, *known)
         stops = np.cumsum(counts)
         return [
             ConstraintPart(*(array[stop - n : stop] for array in whole))
@@ -224,21 +225,43 @@ def _bent(curvature: FloatArray) -> FloatArray:
     return bent
 
 
+class _Iterate(NamedTuple):
+    """What constraints are evaluated of; names as of `ConstraintElements`, axis 0 = element.
+
+    Attributes:
+        x: Nodal vectors at t_{n+1} [m], shape (n, k, 3).
+        unknowns: Multipliers as lengths, shape (n, m).
+        prescribed: c at t_{n+1} [m], shape (n, m).
+    """
+
+    weights: FloatArray
+    constants: FloatArray
+    curvature: FloatArray
+    prescribed: FloatArray
+    y0: FloatArray
+    x: FloatArray
+    unknowns: FloatArray
+
+
 def _evaluate(
     theta: float,
     scale: FloatArray,
     lent: FloatArray,
-    weights: FloatArray,
-    constants: FloatArray,
-    curvature: FloatArray,
-    prescribed: FloatArray,
-    y0: FloatArray,
-    x: FloatArray,
-    unknowns: FloatArray,
+    at: _Iterate,
     start: FloatArray | None,
     bent: FloatArray | None,
 ) -> ConstraintPart:
-    """Residual and tangent of constraints; names as of `ConstraintElements`, axis 0 = element."""
+    """Residual and tangent of constraints.
+
+    Args:
+        theta: As of `ConstraintElements`.
+        scale: The same of each element, shape (n,).
+        lent: Alike.
+        at: The iterate.
+        start: Factors at t_n, if they are known.
+        bent: Curvature of each constraint, if it is known.
+    """
+    weights, constants, curvature, prescribed, y0, x, unknowns = at
     n, m, _, k = weights.shape
     start = kernel.factors(weights, constants, y0) if start is None else start
     bent = _bent(curvature) if bent is None else bent
