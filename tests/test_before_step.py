@@ -287,6 +287,24 @@ def test_what_is_written_between_steps_is_refused_once(rigid):
     stepper.close()
 
 
+@pytest.mark.parametrize("rigid", [False, True])
+def test_nodes_of_a_mesh_that_are_moved_during_a_run_end_it(rigid):
+    """On the last rank alone; forces would be those of another mesh from then on."""
+    body, _ = pulled()
+    if rigid:
+        body = nts.RigidBody(box(), density=DENSITY, velocity=(1.0, 0, 0), name="body")
+
+    def move(time, dt):
+        if time > 1.5 * DT and COMM.rank == COMM.size - 1:
+            body.mesh.geometry.x[0] += 1e-3
+
+    run = nts.simulate(
+        nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=4 * DT, before_step=move
+    )
+    assert "mesh of 'body': its nodes were moved during the run, at t=0.002" in run.status
+    assert len(run.rows) == 3
+
+
 def test_what_is_written_between_load_steps_is_told():
     body, load = pulled([nts.Dirichlet(lambda x: x[2] < 1e-9)])
     load.value = 1.0

@@ -81,20 +81,26 @@ def note_shown(body: Any) -> None:
 
 
 def refuse_written(system: System, time: float) -> None:
-    """Raise on every rank if a caller has written into a body's u or v during a run. Collective.
+    """Raise on every rank if a caller has written into a body's u, v or mesh. Collective.
 
     A run goes on from its own state, so that what was written would be lost, but files and
-    pictures would show it. Other runs of the same bodies may have written, too.
+    pictures would show it, and a mesh whose nodes are moved would have other forces. Other runs of
+    the same bodies may have written, too.
 
     Args:
         system: Its bodies.
         time: At the state of the run [s].
 
     Raises:
-        UserFunctionError: Something was written; it is undone.
+        UserFunctionError: Something was written; what was into u and v is undone.
     """
     here = None
     for body in system.bodies:
+        if _is_moved(body):
+            here = here or (
+                f"mesh of {body.name!r}: its nodes were moved during the run, at t={time!r}; "
+                "move them before the body is made, or add body.u to a copy of them for pictures"
+            )
         for k, known in enumerate(body._shown):
             values = (body.u, body.v)[k].x.array
             # The second test, for NaN, takes four times as long.
@@ -123,13 +129,17 @@ def refuse_moved_meshes(system: System) -> None:
         system: Its bodies.
     """
     for body in system.bodies:
-        made = body.made_on
-        moved = made is not None and made != places_of(body.mesh)
         text = (
             f"mesh of {body.name!r}: its nodes were moved after the body was made; move them "
             "before, or pass displacement= to the body"
         )
-        raise_together(system.comm, text if moved else None)
+        raise_together(system.comm, text if _is_moved(body) else None)
+
+
+def _is_moved(body: Any) -> bool:
+    """Return whether this rank's nodes of a mesh are elsewhere than the body was made with."""
+    made = body.made_on
+    return bool(made is not None and made != places_of(body.mesh))
 
 
 def first_state(system: System, start: Any, time: Any) -> State:
