@@ -692,6 +692,34 @@ def test_another_material_is_told(factor, mpi_tmp_path):
     assert "ledger" not in second.warnings
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("pull", [1.0, 2.0])
+def test_other_loads_are_told(pull, mpi_tmp_path):
+    """Of a continuum and a rigid body; functions of time are not in the file."""
+
+    def scene(pull=1.0):
+        cube = nts.Continuum(
+            box(cells=2), nts.StVenantKirchhoff(1e6, 0.3), density=1e3, name="cube",
+            body_force=(0.0, 0.0, pull), bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
+        )  # fmt: skip
+        ball = nts.RigidBody.from_inertia(
+            1.0, (1, 1, 1), centre=(5, 0, 0), force=(pull, 0, 0), torque=lambda t: (0, 0, pull),
+            name="ball",
+        )  # fmt: skip
+        return nts.System([cube, ball])
+
+    path = mpi_tmp_path / "run.h5"
+    run((scene(), {}), t_end=DT, checkpoint=nts.Checkpoint(path, every=1))
+    system = scene(pull)
+    second = run((system, {}), t_end=2 * DT, start=nts.restart(path, system))
+    assert second.status == "completed" and ("loads changed" in second.warnings) == (pull != 1.0)
+    if pull != 1.0:
+        found = second.warnings["loads changed"]
+        assert found.worst == 2 and found.first == DT
+        assert "body_force[2] is 1.0 there and 2.0 here of 'cube'" in found.text
+        assert "force[0] is 1.0 there and 2.0 here of 'ball'" in found.text
+
+
 class Counter:
     """A joint of the user's own that counts in each of its elements, one on each rank."""
 
@@ -772,7 +800,7 @@ def test_other_files_are_refused(mpi_tmp_path):
     COMM.barrier()
     for path, kind, said in (
         (text, OSError, "cannot be read"), (other, ValueError, "it is no checkpoint"),
-        (newer, ValueError, "version 99, and this package reads version 5"),
+        (newer, ValueError, "version 99, and this package reads version 6"),
     ):  # fmt: skip
         with pytest.raises(kind, match=said):
             nts.restart(path, system)
@@ -874,7 +902,7 @@ def test_the_file_is_as_described(mpi_tmp_path):
         energy = list(notes["columns"]).index("energy")
         assert all(shape == [] for shape in list(notes["columns"].values())[: energy + 1])
         assert np.array_equal(file["balance/table"][:, energy], saved.balance["energy"])
-        assert file.attrs["version"] == 5
+        assert file.attrs["version"] == 6
 
 
 # ---- signals

@@ -370,6 +370,11 @@ class RigidBody(Body):
         return range_of(moved[:, 0], turned)
 
     # ---- as of Body
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return dict(self._loads.settings)
+
     def prescribed(self, time: float) -> FloatArray:
         """Displacements of the prescribed coordinates [m]. Collective."""
         u = np.zeros((4, 3))

@@ -41,6 +41,11 @@ class RigidLoads:
         self._given = ("force", force, "N"), ("torque", torque, "N m")
         self.in_time = callable(force) or callable(torque)
 
+    @property
+    def settings(self) -> dict[str, VectorInTime]:
+        """As they were given, by their names."""
+        return {name: value for name, value, _ in self._given}
+
     def begin(self, time: float, ramp: float, axes: FloatArray) -> None:
         """Set the loads at a time [s]. Collective.
 

@@ -1,8 +1,8 @@
 """Files of states, checkpoints and saved runs: HDF5, in numberings that do not depend on the ranks.
 
-Version 5, with h5py's names of types:
+Version 6, with h5py's names of types:
 
-- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (5) and
+- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (6) and
   `package` (the version that wrote it);
 - `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
   to the run, see `dolfinx_nts.run.checkpoint`;
@@ -57,9 +57,11 @@ _OTHER = {
     CHECKPOINT: "it is no checkpoint; pass the path that Checkpoint had",
     SOLUTION: "it holds no saved run; pass the path that Solution.save had",
 }
-_VERSION = 5
+_VERSION = 6
 #: What stands between the HDF5 part and its checksum.
 _MARK = b"crc32"
+#: Options of bodies that are loads and supports.
+_LOADS = ("body_force", "traction", "bcs", "forces", "force", "torque")
 #: Part of masses and of a body's size by which the same scene may differ on other ranks.
 _ROUNDED = 1e-9
 
@@ -92,8 +94,17 @@ def describe(system: System) -> dict[str, Any]:
     }
 
 
+def loads(system: System) -> list[dict[str, Any]]:
+    """Constant loads and supports of the bodies by their options, for JSON; functions are None."""
+    settings = [_settings(body) for body in system.bodies]
+    return [
+        {"name": body.name} | {name: of[name] for name in _LOADS if name in of}
+        for body, of in zip(system.bodies, settings, strict=True)
+    ]
+
+
 def _settings(item: Any) -> dict[str, Any]:
-    """`settings` of a joint or an obstacle, as they come back from JSON; functions are None."""
+    """`settings` of a body, joint or obstacle, as they come back from JSON; functions are None."""
     text = json.dumps(item.settings, default=lambda a: a.tolist() if hasattr(a, "tolist") else None)
     found: dict[str, Any] = json.loads(text)
     return found

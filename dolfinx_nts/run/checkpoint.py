@@ -9,6 +9,7 @@ The file is described in `dolfinx_nts.output.state_file`; of its `notes` the run
 - `switches`: number, defect, size and worst of `Switches`; the newest are in `switches/time`,
   `contact` (its number in `contacts`), `node`, `facets` and `defect`;
 - `contacts`: names of the contacts of these;
+- `loads`: of each body the loads and supports that are constant, to tell a restart with others;
 - `last`: start and length of the last step [s], or null;
 - `promised`: largest energy and rounding that the ledger is held against [J];
 - `bounded`: whether nodes that infinite friction holds may slip;
@@ -113,7 +114,7 @@ class Saver:
 
         write_on_root(comm, self._what, lambda: files.prepare(self._path))
         self._numbering = files.Numbering(stepper.system)
-        self._scene = files.describe(stepper.system)
+        self._scene, self._loads = files.describe(stepper.system), files.loads(stepper.system)
         self._numbering.pack(stepper.state, {}, {})
 
     def step(self) -> None:
@@ -141,6 +142,7 @@ class Saver:
         tables |= of_record
         notes |= {
             "scene": self._scene,
+            "loads": self._loads,
             "time": state.time,
             "pace": memory and memory._replace(accelerations=())._asdict(),
             **stepper.memory,
@@ -170,7 +172,8 @@ def restart(path: StrPath, system: System) -> Restart:
     changes of facet go on, and so do equal steps and those of `Adapt`. A longer `t_end`, another
     `dt`, another integrator are legal: it goes on from the state then. Not in the file are
     materials, loads, prescribed motion and obstacles, as they are functions: they must be the same.
-    Materials that give the bodies another energy are told, "material changed", with what they add.
+    Materials that give the bodies another energy are told, "material changed", with what they add;
+    so are constant loads and supports with other values, "loads changed".
     `contact_fields` are zero until the first step.
 
     `BalanceCSV` and `ForcesCSV` write the whole table anew; `Fields` goes on with the files in its
@@ -201,10 +204,9 @@ def restart(path: StrPath, system: System) -> Restart:
     notes = comm.bcast(notes)
     found = files.differences(notes["scene"], files.describe(system))
     if found:
-        text = "; ".join(found[:_NAMED]) + ("; ..." if len(found) > _NAMED else "")
         raise ValueError(
-            f"path={str(path)!r}: was written by another system: {text}; make the system as it "
-            "was, or start from the Solution of another run"
+            f"path={str(path)!r}: was written by another system: {_listed(found)}; make the system "
+            "as it was, or start from the Solution of another run"
         )
     numbering = files.Numbering(system)
     numbering.check(tables)
@@ -216,7 +218,7 @@ def restart(path: StrPath, system: System) -> Restart:
         pace = PaceMemory(**{**pace, "accelerations": accelerations})
     two = len(notes["recent"]) > 1
     before = {"force_before": numbering.nodal(tables, "force_before")} if two else {}
-    return Restart(
+    made = Restart(
         system,
         **unpacked(columns, notes) | {"status": f"restart at t={notes['time']!r}"},
         state=numbering.unpack(tables, notes["time"]),
@@ -224,6 +226,16 @@ def restart(path: StrPath, system: System) -> Restart:
         nodal_memory={"unknowns": numbering.nodal(tables, "unknowns")} | before,
         pace=pace,
     )
+    changed = files.differences(notes["loads"], files.loads(system))
+    if changed:
+        text = f"the restart was given other loads or supports: {_listed(changed)}"
+        made.warn("loads changed", notes["time"], len(changed), text)
+    return made
+
+
+def _listed(sentences: list[str]) -> str:
+    """The first of some sentences."""
+    return "; ".join(sentences[:_NAMED]) + ("; ..." if len(sentences) > _NAMED else "")
 
 
 def _read(path: Path) -> tuple[Tables, dict[str, Any]]:
