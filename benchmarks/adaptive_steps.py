@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinx_nts.study import tradeoff
+from dolfinx_nts.study import scene_runs
 
 #: Choices for all runs, factors of the demo's step, and the factor that adaptive runs start from.
 SCENES: dict[str, tuple[dict[str, Any], tuple[float, ...], float]] = {
@@ -51,11 +51,11 @@ def compare(scene: str, level: str, repeats: int, comm: Any) -> dict[str, float]
     fixed = {**choices, "accuracy": level}
     grid = [{"dt_factor": f, "adapt": None} for f in factors]
     grid += [{"dt_factor": top, "adapt": t} for t in TOLERANCES]
-    tradeoff.measure(scene, {**fixed, **grid[0]}, comm)
-    best = tradeoff.measure(scene, {**fixed, "dt_factor": min(factors) / 4}, comm)
+    scene_runs.measure(scene, {**fixed, **grid[0]}, comm)
+    best = scene_runs.measure(scene, {**fixed, "dt_factor": min(factors) / 4}, comm)
     rows = []
     for g in grid:
-        runs = [tradeoff.measure(scene, {**fixed, **g}, comm) for _ in range(repeats)]
+        runs = [scene_runs.measure(scene, {**fixed, **g}, comm) for _ in range(repeats)]
         row = min((r.row(best) for r in runs), key=lambda row: row["cpu [s]"])
         assert row["status"] == "completed", row["status"]
         table = runs[0].solution.balance

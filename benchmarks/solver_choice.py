@@ -15,7 +15,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from dolfinx_nts.study import tradeoff
+from dolfinx_nts.study import scene_runs
 
 _SCHEME = {"integrator": "energy-momentum"}
 #: Label -> demo and choices: few and many coordinates, short and long steps, no contact, friction.
@@ -46,10 +46,10 @@ def fastest(scene: str, repeats: int, comm: Any) -> dict[str, float]:
     """
     demo, choices = SCENES[scene]
     seconds = dict.fromkeys(SOLVERS, math.inf)
-    tradeoff.measure(demo, choices, comm)
+    scene_runs.measure(demo, choices, comm)
     for _ in range(repeats):
         for solver in SOLVERS:
-            run = tradeoff.measure(demo, {**choices, "linear_solver": solver}, comm)
+            run = scene_runs.measure(demo, {**choices, "linear_solver": solver}, comm)
             if run.status != "completed" and comm.rank == 0:
                 print(f"{scene}, {solver}: {run.status}")
             if run.status == "completed":

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
 from dolfinx_nts.step.accuracy import ACCURACY
-from dolfinx_nts.study import tradeoff
+from dolfinx_nts.study import scene_runs, tradeoff
 
 COMM = MPI.COMM_WORLD
 SCRIPT = """
@@ -45,7 +45,7 @@ def test_means_of_a_rigid_body_are_those_of_its_points():
     body = nts.RigidBody.from_inertia(
         4.0, moments, (1, 2, 3), axes, velocity=(3, 0, 1), angular_velocity=(1, 2, 3), name="brick"
     )
-    way, stepper = tradeoff.Motion(), nts.Stepper(nts.System([body]), nts.EnergyMomentum())
+    way, stepper = scene_runs.Motion(), nts.Stepper(nts.System([body]), nts.EnergyMomentum())
     way.start(stepper)
     stepper.advance(0.1)
     way.write(stepper)
@@ -69,7 +69,7 @@ def test_error_of_the_trajectory_is_of_second_order(script):
     assert [r["dt_factor"] for r in rows] == [1 / 16, 1.0, 0.5, 1.0, 0.5]
     assert [r["dt [s]"] for r in rows[1:3]] == [0.02, 0.01]
     first, *others = rows
-    assert all(first[name] == 0.0 for name in tradeoff.ERRORS if name != "ledger")
+    assert all(first[name] == 0.0 for name in scene_runs.ERRORS if name != "ledger")
     assert 3.7 < others[0]["trajectory"] / others[1]["trajectory"] < 4.3
     for exact, fast in zip(others[:2], others[2:], strict=True):
         assert exact["ledger"] < 1e-12 < fast["ledger"] < 1e-4
@@ -104,11 +104,11 @@ def test_sleep_is_a_choice(script):
 
 def test_affine_motion_has_a_closed_form(script):
     """Shear u = a y e_x of a unit cube of size sqrt(3 / 12): a / 12 over the size."""
-    run = tradeoff.measure(script, {}, COMM)
+    run = scene_runs.measure(script, {}, COMM)
     body = run.solution.system.bodies[0]
     u = np.zeros(body.num_owned)
     u[0::3] = 0.2 + 0.3 * body.reference[1::3]
-    mean = COMM.allreduce(body.inertia(u) @ tradeoff._affine(body)[0])
+    mean = COMM.allreduce(body.inertia(u) @ scene_runs.affine(body)[0])
     expected = np.zeros(12)
     expected[0], expected[6] = 0.2 + 0.3 / 2, 0.3 / 12 / 0.5
     assert np.abs(mean - expected).max() < 1e-14
@@ -160,11 +160,11 @@ def test_unfit_arguments(script, arguments, message):
 
 def test_unknown_scene(tmp_path):
     with pytest.raises(ValueError, match="no such file"):
-        tradeoff.load("nowhere")
+        scene_runs.load("nowhere")
     empty = tmp_path / "empty.py"
     empty.write_text("")
     with pytest.raises(ValueError, match="has no function main"):
-        tradeoff.load(str(empty))
+        scene_runs.load(str(empty))
 
 
 def test_command_line(script, tmp_path, capsys):
@@ -209,7 +209,7 @@ def test_a_script_with_a_module_beside_it(tmp_path):
     )
     beside.write_text("CELLS = 3\n")
     for _ in range(2):
-        assert tradeoff.load(str(scene)).main() == 3
+        assert scene_runs.load(str(scene)).main() == 3
     assert str(tmp_path) not in sys.path
 
 
@@ -218,6 +218,6 @@ def test_a_script_may_import_simulate_as_it_likes(tmp_path, call):
     scene, imports = tmp_path / "scene.py", "import dolfinx_nts as nts"
     text = SCRIPT.replace("nts.simulate", call)
     scene.write_text(text.replace(imports, f"{imports}\nfrom dolfinx_nts import simulate"))
-    run = tradeoff.measure(str(scene), {"dt_factor": 2.0}, COMM)
+    run = scene_runs.measure(str(scene), {"dt_factor": 2.0}, COMM)
     assert run.status == "completed" and run.dt == 0.04
     assert run.solution.balance["time"][1] == pytest.approx(0.04)

@@ -29,7 +29,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.study.tradeoff import load
+from dolfinx_nts.study.scene_runs import load
 
 FloatArray = npt.NDArray[np.float64]
 
