@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
-from integrators import ACCELERATED
+from integrators import ACCELERATED, INTEGRATORS
 from mpi4py import MPI
 
 import dolfinx_nts as nts
@@ -20,7 +20,11 @@ COMM = MPI.COMM_WORLD
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SpringElements(nts.PointElements):
-    """One spring, on rank 0: V = k/2 (l - L)^2 and a damper c, by theory section 14."""
+    """One spring, on rank 0: V = k/2 (l - L)^2 and a damper c, by theory section 14.
+
+    Forces are taken where the integrator takes them: with `taken_at` None, between both ends of the
+    step as a discrete gradient. The damper resists the mean rate of the length.
+    """
 
     stiffness: float
     damping: float
@@ -28,16 +32,25 @@ class SpringElements(nts.PointElements):
     step: nts.Step
     x0: np.ndarray
 
+    @property
+    def time(self):
+        """Length of the step [s]; load steps of equilibrium take none."""
+        return self.step.dt if self.step.integrator.inertia else 0.0
+
     def evaluate(self, x, own):
-        k, c, h = self.stiffness, self.damping, self.step.dt
-        weight = self.weights[:, 0] - self.weights[:, 1]
-        r0, r1 = (np.einsum("na,nai->ni", weight, y) for y in (self.x0, x))
-        l0, l1 = (np.linalg.norm(r, axis=1)[:, None] for r in (r0, r1))
+        k, c, h = self.stiffness, self.damping, self.time
+        weight, theta = self.weights[:, 0] - self.weights[:, 1], self.step.integrator.taken_at
+        ends = (self.x0, x) if theta is None else (self.x0 + theta * (x - self.x0),) * 2
+        r0, r1, r = (np.einsum("na,nai->ni", weight, y) for y in (*ends, x))
+        l0, l1, length = (np.linalg.norm(v, axis=1)[:, None] for v in (r0, r1, r))
         middle, both = 0.5 * (r0 + r1), l0 + l1
-        force = k * (1.0 - 2.0 * self.length / both) + 2.0 * c * (l1 - l0) / (h * both)
-        slope = 2.0 * k * self.length / both**2 + 4.0 * c * l0 / (h * both**2)
-        by_r = 0.5 * force[:, :, None] * np.eye(3)
-        by_r = by_r + middle[:, :, None] * (slope * r1 / l1)[:, None]
+        drag = 2.0 * c * (length - self.lengths(self.x0)[:, None]) / (h * both) if h else 0.0 * both
+        force = k * (1.0 - 2.0 * self.length / both) + drag
+        slope = (2.0 * k * self.length / both - drag) / both
+        by_r = 0.5 * force[:, :, None] * np.eye(3) + middle[:, :, None] * (slope * r1 / l1)[:, None]
+        by_r = by_r if theta is None else 2.0 * theta * by_r
+        if h:
+            by_r = by_r + middle[:, :, None] * (2.0 * c / (h * both) * r / length)[:, None]
         factor, n = self.step.factor, len(x)
         residual = factor * np.einsum("na,ni->nai", weight, force * middle)
         tangent = factor * np.einsum("na,nb,nij->naibj", weight, weight, by_r)
@@ -56,17 +69,22 @@ class Spring(nts.Joint):
 
     def __init__(self, a, b, points, *, stiffness, damping=0.0, length=None, name="spring"):
         self.name, self.bodies, self.stiffness, self.damping = name, (a, b), stiffness, damping
-        self._sides = tuple(body.points(x) for body, x in zip((a, b), points, strict=True))
-        if COMM.rank:
-            self._sides = tuple(side.part(slice(0)) for side in self._sides)
-        rest = self._elements(None).lengths(self._elements(None).reference())
-        self.length = length if length is not None else float(COMM.bcast(rest)[0])
+        here = slice(0 if a.comm.rank else 1)
+        self._sides = tuple(
+            body.points(x).part(here) for body, x in zip((a, b), points, strict=True)
+        )
+        rest = float(np.linalg.norm(np.subtract(*points)))
+        self.length = rest if length is None else length
+
+    @property
+    def settings(self):
+        return {"stiffness": self.stiffness, "damping": self.damping, "length": self.length}
 
     def _elements(self, step, x0=None):
         elements = _Kept if step else SpringElements
         return elements(
             name=self.name, sides=self._sides, stiffness=self.stiffness, damping=self.damping,
-            length=getattr(self, "length", 1.0), step=step, x0=x0,
+            length=self.length, step=step, x0=x0,
         )  # fmt: skip
 
     def potential(self, u, history):
@@ -76,11 +94,8 @@ class Spring(nts.Joint):
 
     def _gathered(self, u):
         """Displacements of the spring's nodes, from all ranks."""
-        parts = []
-        for values, side in zip(u, self._sides, strict=True):
-            everywhere = np.concatenate(COMM.allgather(values)).reshape(-1, 3)
-            parts.append(everywhere[side.nodes])
-        return np.concatenate(parts, axis=1)
+        moved = [side.nodal(values) for side, values in zip(self._sides, u, strict=True)]
+        return np.concatenate(moved, axis=1)
 
     def slopes(self, u, history):
         """For the warning of steps that do not resolve it."""
@@ -111,7 +126,8 @@ class _Kept(SpringElements):
         return _Part(part.residual, part.tangent, self.lengths(x) - self.lengths(self.x0))
 
     def ledger(self, part, factor):
-        return {"damping_dissipation": self.damping * float((part.way**2).sum()) / self.step.dt}
+        lost = self.damping * float((part.way**2).sum()) / self.time if self.time else 0.0
+        return {"damping_dissipation": lost}
 
 
 class _Part:
@@ -177,6 +193,44 @@ def test_two_stiff_cubes_vibrate_as_two_masses():
         way = COMM.allreduce(state.u[0].reshape(-1, 3)[:, 0].sum()) / 27
         assert abs(way - 0.1 / omega * np.sin(n * phase)) < 2e-3 * 0.1 / omega
     stepper.close()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("rule", INTEGRATORS)
+def test_it_is_its_built_in_twin_with_every_integrator(rule):
+    """Two tumbling bodies, held at points beside their centres."""
+
+    def energies(kind):
+        a, b = (
+            nts.RigidBody.from_inertia(
+                mass, (0.1, 0.2, 0.25), centre=(x, 0, 0), velocity=(0, speed, 0),
+                angular_velocity=(1, 2, speed), name=name, comm=COMM,
+            )  # fmt: skip
+            for mass, x, speed, name in ((2.0, 0.0, 0.3, "a"), (3.0, 1.0, -0.2, "b"))
+        )
+        spring = kind(a, b, [(0.1, 0.2, 0), (0.9, -0.1, 0.1)], stiffness=50.0, length=0.6)
+        system = nts.System([a, b], joints=[spring])
+        run = nts.simulate(system, INTEGRATORS[rule], dt=0.02, t_end=0.4, accuracy="exact")
+        return np.array([run.balance["kinetic"], run.balance["potential"]])
+
+    own, twin = energies(Spring), energies(nts.Spring)
+    assert np.ptp(own[1]) > 0.5
+    assert own == pytest.approx(twin, rel=0, abs=1e-10)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("stabilization", [None, 0.1])
+def test_a_mass_hangs_on_it_at_rest(stabilization):
+    """It sags by m g/k; load steps and relaxations take no time, and its damper is at rest."""
+    turn = {"rotation": (0, 0, 0)}
+    held, mass = (
+        nts.RigidBody.from_inertia(10.0, (1, 1, 1), centre=(0, 0, z), name=name, comm=COMM, **more)
+        for z, name, more in ((1, "held", {"motion": (0, 0, 0), **turn}), (0, "mass", turn))
+    )
+    spring = Spring(held, mass, [(0, 0, 1), (0, 0, 0)], stiffness=1e3, damping=5.0)
+    system = nts.System([held, mass], joints=[spring], gravity=(0, 0, -9.81))
+    nts.equilibrium(system, stabilization=stabilization)
+    assert mass.position[2] == pytest.approx(-10.0 * 9.81 / 1e3, rel=1e-9)
 
 
 def masses():
