@@ -190,7 +190,7 @@ def flight(kind, scale=1.0, comm=MPI.COMM_WORLD):
                 velocity=np.cross(SPIN, (-0.1 * scale, 0.0, 0.0)),
             )  # fmt: skip
         else:
-            base = block((2, 4, 2), 0.2, 0.3, **common)
+            base = block((2, 2, 2), 0.2, 0.3, **common)
         bodies, joint = [thin, base], nts.Tie(base, root(thin, scale))
     run = nts.simulate(nts.System(bodies, joints=[joint]), EM, dt=0.01, t_end=0.2,
                        project_start=True)  # fmt: skip
@@ -263,3 +263,12 @@ def test_surfaces_of_the_body_itself_are_told():
         nts.Tie(cube, cube.surface(at(0, 0.0)))
     with pytest.raises(ValueError, match="edge: is one of shell 'strip' itself"):
         nts.Seam(plate, root(plate))
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("cells", "free"), [((4, 4, 2), 9), ((3, 4, 1), 4)])
+def test_a_body_finer_than_what_is_tied_to_it_is_refused(cells, free):
+    """Its free nodes on the edge would let the tie give way: by 8 % of (4, 4, 2) cells."""
+    body, base = strip(), block(cells, 1.0)
+    with pytest.raises(ValueError, match=f"^surface of 'tie of .*': {free} nodes of 'block' lie"):
+        nts.Tie(base, root(body))

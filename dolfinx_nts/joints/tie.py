@@ -6,14 +6,20 @@ import zlib
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.constraints import Constraints, Equations
+from dolfinx_nts.contact.search import closest_facets
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.coupling import Joint
 from dolfinx_nts.joints.between import named, points_of
+from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options
+
+#: Nodes lie on a surface up to this part of its largest facet; weights up to the other hold none.
+_ON, _HELD = 1e-3, 1e-9
 
 
 @known_options
@@ -23,7 +29,8 @@ class Tie(Joint):
     Of a rigid body x_k - (phi + theta_ki d_i) = 0. The points of a continuum's surface are its
     nodes, those of a shell's edge, `surface(side="edge")`, its top and bottom, phi -+ D, so that
     places and directors are held: what they are tied to in a continuum keeps its distance there.
-    Those of a beam's end are the corners of its section, which what they are tied to follows.
+    Those of a beam's end are the corners of its section: what they are tied to keeps its shape
+    there.
 
     Args:
         body: A rigid body, or one with cells that the points lie in, such as a continuum.
@@ -33,8 +40,8 @@ class Tie(Joint):
 
     Raises:
         TypeError: An argument is of another kind.
-        ValueError: The surface is one of a rigid body or of `body`, the body is a beam or shell, or
-            a point lies in no cell of it.
+        ValueError: The surface is one of a rigid body or of `body`, the body is a beam or shell, a
+            point lies in no cell of it, or nodes of it lie on the surface between its points.
     """
 
     def __init__(self, body: Any, surface: Any, *, name: str | None = None) -> None:
@@ -67,6 +74,8 @@ class Tie(Joint):
             "which nodes": zlib.crc32(nodes.tobytes()),
         }
         at = points_of(f"surface of {self.name!r}", body, surface.reference)
+        if not body.rigid:
+            _check_covered(self.name, body, surface, at)
         self._sides: tuple[Points, ...] = (at.part(mine), surface.material.part(mine))
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
@@ -79,4 +88,23 @@ class Tie(Joint):
         constants[:, :, 1] = np.eye(3)
         return Constraints(
             self.name, bodies, self._sides, Equations(both, constants, np.zeros((n, 3)))
+        )
+
+
+def _check_covered(name: str, body: Any, surface: Surface, at: Points) -> None:
+    """Raise a ValueError if the body has nodes on the surface that no point of it holds.
+
+    They would go their own way there, and the body give way between the points that are held.
+    """
+    x = body.boundary().reference
+    corners = surface.reference[surface.facets]
+    size = float(fc.size(corners).max())
+    on = closest_facets(x, corners, reach=_ON * size).facet >= 0
+    held = at.reference[np.abs(at.weights) > _HELD]
+    free = int((cKDTree(held).query(x[on])[0] > _ON * size).sum()) if on.any() else 0
+    if free:
+        raise ValueError(
+            f"surface of {name!r}: {free} nodes of {body.name!r} lie on it between its points, "
+            "which do not hold them; make the mesh of the surface finer there, or that of the body "
+            "coarser, or tie the body's surface to the other body where that one has cells"
         )
