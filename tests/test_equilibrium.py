@@ -788,3 +788,26 @@ def test_elements_of_ones_own_say_what_work_they_do(stabilization):
     work = run.balance["external_work"] - bare.balance["external_work"]
     assert work == pytest.approx([0.0, 1.5, 3.0], abs=1e-9)
     assert run.balance["ratchet_loss"] == pytest.approx([0.0, 0.5, 1.0], abs=1e-12)
+
+
+@pytest.mark.mpi
+def test_a_load_step_that_fails_after_others_keeps_what_is_solved():
+    """The failed step had other candidates; motions that nothing resists were looked for in it."""
+
+    def cube(low, high, name, bcs):
+        mesh = box(low=low, high=high, cells=2)
+        return nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3, name=name, bcs=bcs)
+
+    def pushed(t):
+        return 0.0, 0.0, -0.05 * t if t < 0.6 else -5.0
+
+    held = nts.Dirichlet(lambda x: x[2] < 1e-9)
+    lower = cube((0, 0, 0), (1, 1, 1), "lower", [held])
+    top = nts.Dirichlet(lambda x: x[2] > 1.5 - 1e-9, value=pushed)
+    upper = cube((0.25, 0.25, 1), (0.75, 0.75, 1.5), "upper", [top])
+    pair = nts.ContactPair(
+        upper.surface(lambda x: x[2] < 1 + 1e-9), lower.surface(lambda x: x[2] > 1 - 1e-9)
+    )
+    run = nts.equilibrium(nts.System([upper, lower], contacts=[pair]), load_steps=2)
+    assert not run.status.startswith("completed") and len(run.rows) >= 2
+    assert run.rows[1]["time"] <= 0.5

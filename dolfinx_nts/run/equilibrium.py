@@ -127,6 +127,8 @@ class _LoadStepper(Stepper):
         self._started = True
 
     def _step(self, dt: float, time: float) -> None:
+        # The problem is about to begin another step, which may fail.
+        self._solved = None
         self._prepare(dt)
         old = self.state
         step, state, iterations, relaxed = self._relax(dt, time)
