@@ -298,7 +298,7 @@ class FacetPair(ContactPair, master=Surface):
         foot, _, normal = facets.frame(control, xi)
         gap = np.einsum("ni,ni->n", normal, x[node] - foot)
         length = facets.size(master[self.master.facets[facet]])
-        legal = converged & self._movable(node, patch, xi)
+        legal = converged & self._movable(node, patch, xi, -gap / length)
         beyond = np.zeros_like(legal)
         if reach is not None:
             over, beyond = self._over_facet(facet, xi, reach / length)
@@ -368,11 +368,15 @@ class FacetPair(ContactPair, master=Surface):
         inside: BoolArray = (free | (excess <= wedge[:, None])).all(axis=1) & ~beyond
         return inside, beyond
 
-    def _movable(self, node: IntArray, patch: IntArray, xi: FloatArray) -> BoolArray:
+    def _movable(
+        self, node: IntArray, patch: IntArray, xi: FloatArray, depth: FloatArray
+    ) -> BoolArray:
         """Return whether slave or foot of a pair may move; else there is nothing to solve for.
 
         Over a prescribed point of a facet that bends, the derivative of the gap is rounding, which
-        a factorisation may take for a pivot: any force, and any motion from it.
+        a factorisation may take for a pivot: any force, and any motion from it. Where the node lies
+        a little deep (in facet sizes), its foot moves off that point as the facet tilts, but to
+        open the gap by that takes a motion of a whole facet.
         """
         movable = ~self.slave.fixed[self.slave.share[node]].all(axis=1)
         held = np.flatnonzero(~movable)
@@ -384,7 +388,8 @@ class FacetPair(ContactPair, master=Surface):
             foot, _, _ = facets.shape(xi[held], weights.shape[1])
             foot = np.einsum("nk,nkp->np", foot, weights)
         free = ~self.master.fixed[points].all(axis=2)
-        movable[held] = (np.abs(foot) * free).max(axis=1) > _STILL
+        moves = (np.abs(foot) * free).max(axis=1)
+        movable[held] = moves > np.maximum(_STILL, depth[held])
         return movable
 
 
