@@ -388,7 +388,7 @@ class Constraints(EveryStep):
 
     def warnings(self, parts: Sequence[ConstraintPart]) -> list[StepWarning]:
         """Whether the arm has turned too far in the step. Collective."""
-        if self._arm is None:
+        if self._arm is None or self.step is None or not self.step.integrator.inertia:
             return []
         (part,) = parts
         one, two = self._arm(part.start), self._arm(part.end)

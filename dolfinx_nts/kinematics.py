@@ -12,7 +12,7 @@ from dolfinx_nts.state import State
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Turn in a step [rad] that is told: a steady one comes out short by a twelfth of its cube.
+#: A run warns of a larger turn in a step [rad]: a steady one is short by a twelfth of its cube.
 FAR_TURN = 1.0
 #: Part of positions and velocities by which a start may violate a constraint.
 OFF = 1e-9

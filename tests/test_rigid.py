@@ -195,6 +195,15 @@ def test_a_rod_that_turns_by_a_radian_in_a_step_is_told(spin, told):
 
 
 @pytest.mark.mpi
+def test_a_rod_that_swings_in_a_load_step_has_no_turn_to_tell():
+    mass = nts.RigidBody.from_inertia(1.0, (0, 0, 0), centre=(1, 0, 0.1))
+    rod = nts.Distance(None, mass, points=((0, 0, 0), (1, 0, 0.1)))
+    run = nts.equilibrium(nts.System([mass], joints=[rod], gravity=(0, 0, -9.81)))
+    assert np.abs(mass.position) == pytest.approx([0, 0, np.hypot(1, 0.1)], abs=1e-6)
+    assert "turns" not in run.warnings
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("turn", [0.9, 1.1, 5.5, 2 * np.pi, 7.0, 10 * np.pi])
 @pytest.mark.parametrize("given", ["vector", "matrix"])
 def test_a_prescribed_turn_counts_whole_turns(turn, given):

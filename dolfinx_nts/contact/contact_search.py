@@ -29,8 +29,8 @@ BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.
 _TOUCHING = 1e-6
-#: A gap of at most so many roundings of positions, or of forces, counts as closed; without a force
-#: it is no contact.
+#: A gap of at most this many roundings of positions, or of forces, counts as closed; without a
+#: force it is no contact.
 _TOUCH = 4.0
 #: Difference of two normals, or of two gaps over the facet's size, that counts as none.
 _ONE = 1e-6

@@ -98,6 +98,7 @@ class Watched:
         self.surfaces, self._whole = surfaces, whole
         self.needed = [*surfaces, *([whole] if whole else [])]
         self._turn = 0
+        self._bulks: list[float] | None = None
         self._boundaries = [Boundary(s.facets) for s in surfaces]
         self._roles = [
             {role: belong(s, [getattr(c, role) for c in contacts]) for role in ("slave", "master")}
@@ -137,10 +138,12 @@ class Watched:
             both: Look at the nodes and edges of both; else of one and the other in turn. Where
                 edges cross, those of either show it.
         """
+        known = self._bulks or (None, None)
         sides = [
-            Placed(b, positions[id(s)])
-            for b, s in zip(self._boundaries, self.surfaces, strict=True)
+            Placed(b, positions[id(s)], bulk)
+            for b, s, bulk in zip(self._boundaries, self.surfaces, known, strict=True)
         ]
+        self._bulks = [s.bulk for s in sides]
         boxes = sides[0].box, sides[1].box
         gap = box_gap(*boxes)
         findings: list[Finding] = []

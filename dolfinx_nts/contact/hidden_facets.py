@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.search import closest_facets
+from dolfinx_nts.contact.search import apart, closest_facets
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as fc
 
@@ -39,7 +39,8 @@ def hidden_facets(contacts: Sequence[Any], u: Sequence[FloatArray]) -> tuple[int
     ]
     count, text = 0, ""
     for one, two in combinations(masters, 2):
-        beside = one[0].slave.body is two[0].slave.body and one[1].body is not two[1].body
+        bodies = one[0].slave.body, one[1].body, two[1].body
+        beside = one[0].slave.body is two[0].slave.body and len(set(map(id, bodies))) == 3
         for (pair, surface, x), (other, its, y) in permutations((one, two)) if beside else ():
             on = _lying_on(surface, x, its, y)
             if on.size and not text:
@@ -60,6 +61,8 @@ def _lying_on(
     """Facets whose middles lie on those of another surface that face the opposite way."""
     corners, its = x[surface.facets], y[other.facets]
     size = fc.size(corners)
+    if apart(corners.mean(axis=1), its, _ON * float(size.max())):
+        return np.empty(0, dtype=np.int64)
     found = closest_facets(corners.mean(axis=1), its, reach=_ON * size)
     near = np.flatnonzero(found.facet >= 0)
     middle = np.full((len(near), 2), 1 / 3 if corners.shape[1] == 3 else 0.0)

@@ -124,10 +124,13 @@ class Placed:
     Args:
         boundary: Its facets and edges.
         x: Positions of its points [m], shape (p, 3).
+        bulk: As of `bulk` at another instant, which hardly differs; None: of this one.
     """
 
-    def __init__(self, boundary: Boundary, x: FloatArray) -> None:
+    def __init__(self, boundary: Boundary, x: FloatArray, bulk: float | None = None) -> None:
         self.boundary, self.x = boundary, x
+        if bulk is not None:
+            self.bulk = bulk
 
     @cached_property
     def box(self) -> FloatArray:
