@@ -165,33 +165,29 @@ def test_the_impulse_of_a_torque_is_exact_at_any_turn(rule, spin, torque):
     assert run.balance["newton_iterations"].max() <= 8
 
 
-@pytest.mark.mpi
-@pytest.mark.parametrize(("spin", "told"), [(9.0, False), (12.0, True)])
-def test_a_turn_of_a_radian_in_a_step_is_told(spin, told):
-    """By the turn itself: of a symmetric body the steps turn by 2 arctan(h w / 2)."""
+def spinning(spin):
+    """A top beside a body that stands still; of a symmetric one steps turn by 2 arctan(h w / 2)."""
     top = nts.RigidBody.from_inertia(1.0, (1, 1, 1), angular_velocity=(0, 0, spin), name="top")
-    still = nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="still")
-    run = nts.simulate(nts.System([still, top]), nts.EnergyMomentum(), dt=0.1, t_end=0.5)
-    assert run.status == "completed" and ("turns" in run.warnings) is told
-    if told:
-        found = run.warnings["turns"]
-        assert found.worst == pytest.approx(2 * np.arctan(0.05 * spin), rel=1e-9)
-        assert found.count == 5 and "body 'top' turns by 1.1 rad in a step" in found.text
+    return nts.System([nts.RigidBody.from_inertia(1.0, (1, 1, 1), name="still"), top])
 
 
-@pytest.mark.mpi
-@pytest.mark.parametrize(("spin", "told"), [(9.0, False), (12.0, True)])
-def test_a_rod_that_turns_by_a_radian_in_a_step_is_told(spin, told):
-    """The mass at its end circles without a spin; its chords are h w by a radius of 1."""
+def circling(spin):
+    """A mass at the end of a rod, without a spin; its chords are h w by a radius of 1."""
     mass = nts.RigidBody.from_inertia(1.0, (0, 0, 0), centre=(1, 0, 0), velocity=(0, spin, 0))
     rod = nts.Distance(None, mass, points=((0, 0, 0), (1, 0, 0)), name="rod")
-    system = nts.System([mass], joints=[rod])
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.1, t_end=0.5)
+    return nts.System([mass], joints=[rod])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("spin", "told"), [(9.0, False), (12.0, True)])
+@pytest.mark.parametrize(("scene", "name"), [(spinning, "body 'top'"), (circling, "joint 'rod'")])
+def test_a_turn_of_a_radian_in_a_step_is_told(scene, name, spin, told):
+    run = nts.simulate(scene(spin), nts.EnergyMomentum(), dt=0.1, t_end=0.5)
     assert run.status == "completed" and ("turns" in run.warnings) is told
     if told:
         found = run.warnings["turns"]
         assert found.worst == pytest.approx(2 * np.arctan(0.05 * spin), rel=1e-9)
-        assert found.count == 5 and "joint 'rod' turns by 1.1 rad in a step" in found.text
+        assert found.count == 5 and f"{name} turns by 1.1 rad in a step" in found.text
 
 
 @pytest.mark.mpi

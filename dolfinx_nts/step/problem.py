@@ -23,7 +23,6 @@ from dolfinx_nts.elements import Step, evaluate_together
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, Moment, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
-from dolfinx_nts.step.between import stiffness_between
 from dolfinx_nts.step.couplings import Couplings
 from dolfinx_nts.step.lengths import Lengths
 from dolfinx_nts.step.loads import Loads
@@ -31,6 +30,7 @@ from dolfinx_nts.step.rounding import Rounding
 from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.stabilization import Stabilization
+from dolfinx_nts.step.stiffness_between import stiffness_between
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.system import System
 
