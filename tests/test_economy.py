@@ -303,13 +303,13 @@ def test_loads_are_assembled_when_they_change(monkeypatch):
     mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [1] * 3, CellType.hexahedron)
     for force, expected in (((0, 0, 0), 0), ((0, 0, 2), 1), (lambda t: (0, 0, 2 * t), 4)):
         body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e4, body_force=force)
-        count, assemble = [], body._assemble
+        count, assemble = [], body._forms.assemble
 
         def counted(form, body=body, count=count, assemble=assemble):
             count.extend([1] if form is body._load_form else [])
             return assemble(form)
 
-        monkeypatch.setattr(body, "_assemble", counted)
+        monkeypatch.setattr(body._forms, "assemble", counted)
         s = stepper(nts.System([body]))
         for _ in range(4):
             s.advance(1e-2)

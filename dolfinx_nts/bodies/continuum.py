@@ -199,9 +199,9 @@ class Continuum(UflBody):
         if isinstance(self.material, Isotropic):
             self.material.check()
 
-    def _virtual_work(self, rule: Integrator, w: Any) -> Any:
+    def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
         """Virtual work of the rule's stress in UFL."""
-        h0, h1 = ufl.grad(self._u0), ufl.grad(self._u1)
+        h0, h1 = ufl.grad(u0), ufl.grad(u1)
         return ufl.inner(rule.piola(self.law, h0, h1), ufl.grad(w)) * self._dx
 
     # ---- as of Body
@@ -221,20 +221,19 @@ class Continuum(UflBody):
             constant.value[:] = now if callable(value) else moment.ramp * now
         loads = np.concatenate([constant.value for constant in self._loads])
         if not np.array_equal(loads, self._assembled_loads):
-            self._load, self._assembled_loads = self._assemble(self._load_form), loads
+            self._load, self._assembled_loads = self._forms.assemble(self._load_form), loads
 
     def _seek_stress_at_rest(self, rule: Integrator) -> None:
         """Note whether forces of its own move the undeformed body, as where dW/dC(1) is not 0.
 
         Beside them stand those of a small shear x, -y. Costs two evaluations of internal forces.
         """
-        self._seen_at_rest, work = True, self._compile(rule)[0]
+        self._seen_at_rest = True
         shear = _SMALL_STRAIN * np.resize([1.0, -1.0, 0.0], self.num_owned) * self.reference
-        for u in (self._u0, self._u1):
-            self._fill(u, 0.0 * shear)
-        at_rest = self._assemble(work)
-        self._fill(self._u1, shear)
-        change = (self._assemble(work) - at_rest) / (rule.theta * _SMALL_STRAIN)
+        still = np.zeros_like(shear)
+        at_rest = self._forms.forces(rule, still, still)
+        change = self._forms.forces(rule, still, shear) - at_rest
+        change /= rule.theta * _SMALL_STRAIN
         at_rest[self.fixed] = 0.0
         squares = np.array([at_rest @ at_rest, change @ change])
         stress, stiffness = np.sqrt(self.comm.allreduce(squares)).tolist()

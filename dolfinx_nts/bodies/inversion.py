@@ -42,10 +42,9 @@ class Determinants:
         self._table = np.ascontiguousarray(gradients.reshape(-1, gradients.shape[2]))
         nodes = space.tabulate_dof_coordinates()
         # About a node of their own: differences of far positions would lose digits.
-        self._reference = (nodes - nodes[:1].sum(axis=0)).ravel()
+        self._origin = nodes[:1].sum(axis=0)
+        self._reference = (nodes - self._origin).ravel()
         cells = compat.cell_dofs(space)[: space.mesh.topology.index_map(3).size_local]
-        middles = nodes[cells].sum(axis=1) / self._table.shape[1]
-        self._middles = np.concatenate([middles, np.full((1, 3), np.nan)])
         self._parts = []
         for first in range(0, len(cells), _CELLS):
             of_cell = of_nodes(cells[first : first + _CELLS].T)
@@ -79,14 +78,17 @@ class Determinants:
         Returns:
             A det that is not finite is -inf; without cells it is inf.
         """
-        x, least, cell = self._reference + u, np.inf, -1
-        for k, (numbers, inverse) in enumerate(self._parts):
+        x, least, nodes = self._reference + u, np.inf, None
+        for numbers, inverse in self._parts:
             det = self._det(x, numbers)
             det *= inverse
             i = int(det.argmin())  # the first NaN, if there is one
             if not det.flat[i] >= least:
-                least, cell = float(det.flat[i]), k * _CELLS + i % det.shape[1]
-        return least if np.isfinite(least) or cell < 0 else -np.inf, self._middles[cell]
+                least, nodes = float(det.flat[i]), numbers[:, i % det.shape[1] :: det.shape[1]]
+        if nodes is None:
+            return np.inf, np.full(3, np.nan)
+        middle = self._origin + self._reference[nodes].mean(axis=0)
+        return least if np.isfinite(least) else -np.inf, middle
 
 
 def smallest_dets(

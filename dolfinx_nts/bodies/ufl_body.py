@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,12 @@ from dolfinx_nts.bodies.parameters import (
     require_positive_parameter,
     values_of,
 )
+from dolfinx_nts.bodies.step_forms import ExtraForm, StepForms, fill
 from dolfinx_nts.bodies.user_forms import checked_form
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
-from dolfinx_nts.integrators.static import Static
 from dolfinx_nts.parallel import gather_on_root, raise_together
 from dolfinx_nts.points import Points, in_mesh
 from dolfinx_nts.validation import (
@@ -44,7 +44,6 @@ from dolfinx_nts.validation import (
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
-ExtraForm = Callable[[Any, Any, Any, Any], Any]
 
 
 class UflBody(Body):
@@ -86,7 +85,6 @@ class UflBody(Body):
         self.u, self.v = (fem.Function(space, name=f"{stem}_{s}") for s in "uv")
         self.num_owned = 3 * space.dofmap.index_map.size_local
         self.reference = space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
-        self._compiled: dict[Integrator, tuple[Any, Any, Any]] = {}
         self._stiffness: FloatArray | None = None
         self._given_density: Parameter | None = None
         self.allow_inversion = allow_inversion
@@ -94,7 +92,7 @@ class UflBody(Body):
         self._determinants: Determinants | None = None
         if self.mesh.topology.dim == 3:
             self._determinants = Determinants(space, degree, quadrature_degree)
-        self._matrix: Any = None
+        self._forms = StepForms(space, self._virtual_work, self._mass_form, extra_form)
 
     # ---- what a kind of body has of its own
     def _mass_form(self, v: Any, w: Any) -> Any:
@@ -106,8 +104,8 @@ class UflBody(Body):
         if self._given_density is not None:
             require_positive_parameter("density", self._given_density, "kg/m^d")
 
-    def _virtual_work(self, rule: Integrator, w: Any) -> Any:
-        """Internal virtual work between the Functions `_u0` and `_u1` by a rule, in UFL."""
+    def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
+        """Internal virtual work between two displacements by a rule, in UFL."""
         raise NotImplementedError
 
     def surface(
@@ -184,7 +182,7 @@ class UflBody(Body):
         """Take the mass of a surface's nodes, and give it to others. Collective."""
         self.check_alive()
         what = f"mass='redistributed' of a surface of {self.name!r}"
-        if self._compiled:
+        if self._forms.used:
             raise ValueError(f"{what}: the body has moved already; ask for it before the first run")
         massless = self.massless.copy()
         massless.reshape(-1, 3)[surface.rows] = True
@@ -275,7 +273,6 @@ class UflBody(Body):
             self._check_extra_form(self._extra_form, w)
         of_mass, *compiled, self._energy_form = compat.compile_forms([mass, *loads, energy])
         self._load = np.zeros(self.num_owned)
-        self._vector = compat.create_vector(self.space)
         self._mass = MassMatrix(of_mass)
         self._take_mass()
         return compiled
@@ -310,45 +307,10 @@ class UflBody(Body):
             "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx",
         )  # fmt: skip
 
-    def _compile(self, rule: Integrator) -> tuple[Any, Any, Any]:
-        """Compiled internal virtual work, tangent and extra virtual work by a rule."""
-        if rule not in self._compiled:
-            if not self._compiled:
-                self._u0, self._u1, self._drift = (fem.Function(self.space) for _ in range(3))
-                # What multiplies mass and stiffness: in one Constant, as UFL sorts several by their
-                # counts as text, and a form would be compiled again where 9 and 10 meet.
-                self._factors = fem.Constant(self.mesh, np.zeros(2))
-                # Change of the velocity with u_1; time.
-                self._rate, self._time = (fem.Constant(self.mesh, 0.0) for _ in range(2))
-            du, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
-            virtual = work = self._virtual_work(rule, w)
-            extra = None
-            if self._extra_form is not None:
-                moved = self._u1 - self._u0
-                place, velocity = self._u0 + rule.theta * moved, self._rate * moved
-                if rule.accelerations:
-                    velocity += self._drift
-                extra = self._extra_form(place, velocity, w, self._time)
-                if self._u1 in extra.coefficients():  # else the tangent is that without it
-                    virtual = work + extra
-            tangent = self._factors[1] * ufl.derivative(virtual, self._u1, du)
-            if rule.inertia:
-                tangent += self._factors[0] * self._mass_form(du, w)
-            forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
-            self._compiled[rule] = forms[0], forms[1], forms[2] if extra is not None else None
-            if self._matrix is None:
-                self._matrix = compat.create_matrix(forms[1])
-        return self._compiled[rule]
-
     # ---- as of Body
     def begin_step(self, rule: Integrator, moment: Moment) -> None:
         """Set the state at t_n."""
-        self._forms = self._compile(rule)
-        self._fill(self._u0, moment.u0)
-        if self._extra_form is not None:
-            self._rate.value, self._time.value = moment.rate, moment.time
-            if moment.drift is not None:
-                self._fill(self._drift, moment.drift)
+        self._forms.begin(rule, moment)
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]."""
@@ -357,18 +319,15 @@ class UflBody(Body):
 
     def internal(self, u1: FloatArray) -> FloatArray:
         """Internal forces of the step [N]."""
-        self._fill(self._u1, u1)
-        return self._assemble(self._forms[0])
+        self.check_alive()
+        return self._forms.internal(u1)
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
         """Loads and gravity, less the extra work [N]."""
         force = self._load.copy()
         if gravity.any():
             force += self.weight(gravity)
-        if self._forms[2] is not None:
-            self._fill(self._u1, u1)
-            force -= self._assemble(self._forms[2])
-        return force
+        return force - self._forms.extra(u1)
 
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
         """Return mass M + stiffness K, the same matrix in each call."""
@@ -376,10 +335,8 @@ class UflBody(Body):
         diagonal = mass * self._mean(self.nodal_mass)
         if not mass:
             diagonal = stiffness * self._mean(self.nodal_stiffness())
-        self._fill(self._u1, u1)
-        self._factors.value = mass, stiffness
-        compat.assemble_matrix(self._matrix, self._forms[1], self._supports.masks, diagonal)
-        return self._mass.corrected(self._matrix, mass)
+        matrix = self._forms.tangent(u1, mass, stiffness, self._supports.masks, diagonal)
+        return self._mass.corrected(matrix, mass)
 
     def _mean(self, values: FloatArray) -> float:
         """Over all coordinates. Collective."""
@@ -390,23 +347,9 @@ class UflBody(Body):
         """Mean diagonal of the tangent in equilibrium at each node, without deformation [N/m]."""
         self.check_alive()
         if self._stiffness is None:
-            rule: Any = Static()
-            tangent = self._compile(rule)[1]
-            kept, rate = [f.x.array.copy() for f in (self._u0, self._u1)], self._rate.value.copy()
-            for u in (self._u0, self._u1):
-                self._fill(u, np.zeros(self.num_owned))
-            self._factors.value, self._rate.value = (0.0, 1.0), 0.0
-            # The body's matrix may be kept from an earlier step.
-            matrix = compat.create_matrix(tangent)
-            compat.assemble_matrix(matrix, tangent, (), 0.0)
-            diagonal = matrix.getDiagonal()
             # The mean of a node's three entries does not depend on the directions of the axes.
-            self._stiffness = np.repeat(diagonal.array_r.reshape(-1, 3).mean(axis=1), 3)
-            for petsc_object in (diagonal, matrix):
-                petsc_object.destroy()
-            self._rate.value = rate
-            for u, values in zip((self._u0, self._u1), kept, strict=True):
-                u.x.array[:] = values
+            mean = self._forms.stiffness_at_rest().reshape(-1, 3).mean(axis=1)
+            self._stiffness = np.repeat(mean, 3)
         return self._stiffness
 
     def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
@@ -420,7 +363,7 @@ class UflBody(Body):
     def potential(self, u: FloatArray) -> float:
         """Strain energy on this rank [J]."""
         kept = self.u.x.array.copy()
-        self._fill(self.u, u)
+        fill(self.u, u)
         value = float(fem.assemble_scalar(self._energy_form))
         self.u.x.array[:] = kept
         return value
@@ -432,10 +375,7 @@ class UflBody(Body):
         """
         if self._determinants is None:
             return np.inf, np.full(3, np.nan)
-        self._vector.array_w[:] = u
-        self._vector.ghostUpdate()
-        with self._vector.localForm() as here:
-            return self._determinants.smallest(here.array_r)
+        return self._determinants.smallest(self._forms.with_ghosts(u))
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -490,8 +430,8 @@ class UflBody(Body):
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Write the accepted state into the dolfinx Functions u and v."""
-        self._fill(self.u, u)
-        self._fill(self.v, v)
+        fill(self.u, u)
+        fill(self.v, v)
 
     def last_accepted(self) -> tuple[FloatArray, FloatArray]:
         """Owned values of the Functions u [m] and v [m/s]."""
@@ -500,15 +440,5 @@ class UflBody(Body):
     def destroy(self) -> None:
         """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
         super().destroy()
-        for a in (self._mass, self._vector, self._matrix):
-            if a is not None:
-                a.destroy()
-
-    def _fill(self, function: Any, owned: FloatArray) -> None:
-        function.x.array[: self.num_owned] = owned
-        function.x.scatter_forward()
-
-    def _assemble(self, form: Any) -> FloatArray:
-        self.check_alive()
-        compat.assemble_vector(self._vector, form)
-        return self._vector.array_r.copy()
+        for a in (self._mass, self._forms):
+            a.destroy()

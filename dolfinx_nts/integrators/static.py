@@ -59,3 +59,7 @@ class Static:
     def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
         """Virtual work of a potential's forces at t_{n+1} in UFL [J]."""
         return potential.virtual_work(u1, w)
+
+
+#: What every body can be asked for without a scheme in time.
+EQUILIBRIUM: Any = Static()

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.elements import Step, evaluate_together
 from dolfinx_nts.evaluation import BodyTerms, Evaluation
-from dolfinx_nts.integrators.static import Static
+from dolfinx_nts.integrators.static import EQUILIBRIUM
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.step.assembly import StepMatrix
@@ -69,13 +69,12 @@ class ContactTerms:
             raise ValueError(f"reach={reach!r}: must be positive [m]")
         self.destroy()
         u, system = self.state.u, self._system
-        rule: Any = Static()
         size = np.array([np.abs(a).max(initial=0.0) for a in u])
         step = Step(
             state=self.state,
             dt=time - self.state.time,
             factor=1.0,
-            integrator=rule,
+            integrator=EQUILIBRIUM,
             condense=True,
             first=u,
             ahead=[np.zeros_like(a) for a in u],
