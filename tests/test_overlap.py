@@ -434,9 +434,10 @@ def test_looks_are_as_rare_as_the_motion_allows(monkeypatch):
     assert not looks
     assert look(30.0, -0.2) == 1
     assert sum(look(30 + x, -0.2) for x in np.linspace(0.0, 0.3, 31)) == 3
-    # The last of these three was five steps ago. In fewer than four only if it is a facet.
+    # The last of these three was five steps ago. In fewer than four only if it is a facet, and then
+    # at both bodies.
     way = (0.1, 0.2, 0.3, 0.0, 0.4, 0.04)
-    assert [look(30.3 + x, -0.2) for x in way] == [1, 0, 0, 0, 1, 1]
+    assert [look(30.3 + x, -0.2) for x in way] == [1, 0, 0, 0, 1, 2]
     assert [look(30.35, -0.2, last=True) for _ in range(2)] == [2, 0]
 
 

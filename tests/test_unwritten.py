@@ -163,6 +163,14 @@ SLAB = Body(cells=(1, 2, 1), cell="tetrahedron", size=(1.5, 1.5, 0.3), speed=3.0
 FOUND = {
     # The fourth step's look, at the nodes and edges of one of both bodies, counted as the last one.
     "last look at both": Scene(bodies=(RING, CUBE), contacts=(Contact(swapped=True),), steps=4),
+    # In steps of a facet the look at the first one took the side that shows no node inside.
+    "turn of the other side": Scene(
+        bodies=(Body(shape="ring", cells=(5, 1, 1), law="", poisson=0.0, density=100.0, gap=0.0,
+                     speed=4.0, spin=(10.0, -20.0, 5.0)),
+                Body(shape="ball", cells=(3, 3, 3), gap=0.001, speed=30.0, spin=(0.0, 0.0, 5.0))),
+        contacts=(Contact(swapped=True, friction=0.3, smoothing=True),), dt=0.02,
+        newton=(("max_retries", 1),),
+    ),
     # A run that stopped had no last look: what the steps before had done was told by no one.
     "last look of a run that stops": Scene(
         row=(0.0, 0.0, 1.0), bodies=(PLATE, BALL),

@@ -52,7 +52,8 @@ class OverlapWatch:
     other so far that they can touch; then by a quarter of a facet since the last one, and four
     steps or a facet. The radius of a small obstacle counts as a facet, and so does the thickness of
     the thicker one of two bodies. Where they have moved by more than that thickness between two
-    looks, the straight way is looked at, too.
+    looks, the straight way is looked at, too. A look takes the nodes and edges of one and the other
+    body in turn, or of both where fewer than four steps lie between two looks.
 
     Args:
         system: The scene.
@@ -101,7 +102,9 @@ class OverlapWatch:
             before = self._looked.get(k)
             if before and way > before.pause.clear + before.pause.through:
                 findings += self._pairs[k].passed(before.where, now[k], way, before.pause.through)
-            both = last or k not in self._looked
+            # Where few steps bring the next look, a node that one side shows is gone by the turn of
+            # that side.
+            both = last or before is None or before.steps < STEPS
             found, pause = self._pairs[k].look(now[k], both)
             findings += found
             self._looked[k] = _Looked(now[k], pause, both)
