@@ -230,18 +230,14 @@ def node_blocks(mesh: Any, space: Any) -> IntArray:
     return blocks
 
 
-def cells_at(msh: Any, x: FloatArray) -> IntArray:
-    """One of this rank's own cells that holds each point (n, 3), or -1, shape (n,)."""
+def cells_near(msh: Any, x: FloatArray, padding: float) -> list[list[int]]:
+    """This rank's own cells whose boxes, padded [m], hold each point (n, 3)."""
     dim = msh.topology.dim
-    tree = geometry.BoundingBoxTree(msh, dim) if _OLD else geometry.bb_tree(msh, dim)
+    make = geometry.BoundingBoxTree if _OLD else geometry.bb_tree
     collide = geometry.compute_collisions if _OLD else geometry.compute_collisions_points
-    x = np.ascontiguousarray(x, dtype=np.float64)
-    found = geometry.compute_colliding_cells(msh, collide(tree, x), x)
-    owned, cells = msh.topology.index_map(dim).size_local, np.full(len(x), -1)
-    for i in range(len(x)):
-        own = [c for c in found.links(i) if c < owned]
-        cells[i] = own[0] if own else -1
-    return cells
+    found = collide(make(msh, dim, padding=padding), np.ascontiguousarray(x, dtype=np.float64))
+    owned = msh.topology.index_map(dim).size_local
+    return [[int(c) for c in found.links(i) if c < owned] for i in range(len(x))]
 
 
 def with_ghosts(space: Any, chosen: IntArray) -> npt.NDArray[np.bool_]:

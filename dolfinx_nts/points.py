@@ -17,6 +17,9 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
+#: Part of a cell by which a point may lie beside it, and of coordinates that their rounding is.
+_ON_CELL, _ROUNDING = 1e-9, 4 * np.finfo(np.float64).eps
+
 
 def of_nodes(nodes: IntArray) -> IntArray:
     """Numbers of the coordinates of nodes, shape (*nodes.shape, 3)."""
@@ -161,17 +164,14 @@ def in_mesh(body: Any, x: FloatArray, name: str) -> Points:
         ValueError: A point lies in no cell.
     """
     mesh, space, comm = body.mesh, body.space, body.comm
-    cells = compat.cells_at(mesh, x)
-    mine = np.flatnonzero(cells >= 0)
-    dofs, index_map = compat.cell_dofs(space)[cells[mine]], space.dofmap.index_map
-    corners = mesh.geometry.x[compat.geometry_dofmap(mesh)[cells[mine]]]
+    mine, cells, inside = _cells_of(mesh, x)
+    dofs, index_map = compat.cell_dofs(space)[cells], space.dofmap.index_map
     kind = getattr(basix.CellType, compat.cell_name(mesh))
     variant = basix.LagrangeVariant.gll_warped
     element = basix.create_element(basix.ElementFamily.P, kind, body.degree, variant)
-    weights = np.empty((len(mine), dofs.shape[1]))
-    for k, i in enumerate(mine):
-        inside = mesh.geometry.cmap.pull_back(x[i : i + 1], corners[k])
-        weights[k] = element.tabulate(0, inside)[0, 0, :, 0]
+    weights = np.empty(dofs.shape)
+    if len(mine):  # Basix aborts without points
+        weights = element.tabulate(0, inside)[0, :, :, 0]
     nodes = index_map.local_to_global(dofs.ravel().astype(np.int32)).reshape(dofs.shape)
     reference = space.tabulate_dof_coordinates()[dofs]
     fixed = compat.with_ghosts(space, body.fixed)[dofs]
@@ -192,3 +192,33 @@ def in_mesh(body: Any, x: FloatArray, name: str) -> Points:
     columns = zip(*(found[i] for i in range(len(x))), strict=True)
     nodes, weights, reference, fixed = (np.array(values) for values in columns)
     return Points(body, nodes, weights, reference, fixed, np.ones(nodes.shape, dtype=bool))
+
+
+def _cells_of(mesh: Any, x: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return which points (n, 3) this rank's own cells hold, of which one each, and where in it.
+
+    DOLFINx's own search has a tolerance in metres, so that cells of 10 um hold nothing.
+    """
+    nodes = mesh.geometry.x[compat.geometry_dofmap(mesh)]
+    sizes = np.ptp(nodes, axis=1).max(axis=1)
+    rounding = _ROUNDING * float(np.abs(x).max(initial=0.0))
+    padding = float(_ON_CELL * sizes.max(initial=0.0) + rounding)
+    near = compat.cells_near(mesh, x, padding)
+    simplex = nodes.shape[1] == 4
+    which, held, inside = [], [], []
+    for i, cells in enumerate(near):
+        for c in cells:
+            try:
+                at = mesh.geometry.cmap.pull_back(x[i : i + 1], nodes[c])[0]
+            except RuntimeError:  # Newton's method does not converge, as far outside
+                continue
+            off = max(-at.min(), (at.sum() if simplex else at.max()) - 1.0)
+            if off <= _ON_CELL + rounding / sizes[c]:
+                which.append(i)
+                held.append(c)
+                inside.append(at)
+                break
+    return (
+        np.array(which, dtype=np.int64), np.array(held, dtype=np.int64),
+        np.array(inside).reshape(-1, 3),
+    )  # fmt: skip

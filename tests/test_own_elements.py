@@ -304,6 +304,27 @@ def test_points_are_where_they_were_asked_for():
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("kind", [CellType.hexahedron, CellType.tetrahedron])
+@pytest.mark.parametrize("size", [1e-9, 1e-5, 1.0, 1e6])
+def test_points_are_found_in_bodies_of_any_size(kind, size):
+    """Also on faces, and where cells are not straight; those beside the body are none."""
+
+    def bent(x):
+        return np.column_stack([x[:, 0], x[:, 1] + 0.2 * x[:, 0] * x[:, 2], x[:, 2]])
+
+    mesh = create_box(COMM, [(0, 0, 0), (1, 1, 1)], [3, 2, 2], kind)
+    mesh.geometry.x[:] = size * bent(mesh.geometry.x)
+    body = nts.Continuum(mesh, nts.NeoHookean(young=1.0, poisson=0.3), density=1.0, name="a")
+    inner = np.random.default_rng(3).random((20, 3))
+    x = size * bent(np.vstack([inner, np.eye(3), 0.5 * np.eye(3)]))
+    found = body.points(x)
+    assert np.abs(found.combine(found.reference) - x).max() < 1e-14 * size
+    for beside in (1e-6, 0.1, 2.0):
+        with pytest.raises(ValueError, match="lies in no cell of body 'a'"):
+            body.points(size * np.array([0.4, 0.3, -beside]))
+
+
+@pytest.mark.mpi
 def test_a_joint_of_a_stranger_is_refused():
     a, b = cube((0, 0, 0), "a"), cube((2, 0, 0), "b")
     spring = Spring(a, b, [(0.5, 0.5, 0.5), (2.5, 0.5, 0.5)], stiffness=1.0)
