@@ -224,7 +224,7 @@ def test_joined_bodies_in_flight_keep_what_is_kept(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1e3, 1e6])
+@pytest.mark.parametrize("scale", [1e-6, 1e3, 1e6])
 @pytest.mark.parametrize("kind", FLIGHTS)
 def test_units_of_length_take_the_same_iterations(kind, scale):
     (metres, x), (others, y) = (flight(kind, s) for s in (1.0, scale))
@@ -244,6 +244,8 @@ def test_units_of_length_take_the_same_iterations(kind, scale):
         (lambda: nts.Seam(block((1, 1, 1), 1.0), root(strip())), TypeError, "pass a Shell; Tie"),
         (lambda: nts.Seam(strip(), root(bar())), TypeError, "of a shell"),
         (lambda: nts.Seam(strip(), strip().midsurface), TypeError, "of a shell"),
+        (lambda: nts.Seam(tee(90, 4, False)[0], tee(90, 4, False)[1].surface()), ValueError,
+         "edge: is the top or the bottom of shell 'wall'; pass other.surface.*side=.edge"),
         (lambda: tee(15, 2, False), ValueError,
          "meets shell 'floor' at 15 degrees at x=.*make one mesh of both"),
         (lambda: nts.Seam(tee(90, 4, False)[0], tee(90, 4, False)[1].surface(

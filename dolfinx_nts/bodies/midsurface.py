@@ -24,6 +24,8 @@ _CYCLIC = [0, 1, 3, 2]
 _SMOOTH = 0.5
 #: Sine of a cell's angle, over the whole cell's size, below which it is flat.
 _FLAT = 1e-9
+#: What joins shells, for messages.
+_SEAM = 'nts.Seam(shell, other.surface(where, side="edge"))'
 
 
 def check_midsurface(mesh: Any, name: str) -> None:
@@ -71,8 +73,8 @@ def midsurface_of(space: Any, name: str) -> Skeleton:
     if count.max() > 2:
         where = x[cells[np.divmod(np.flatnonzero(count[edge] > 2)[0], 4)]].tolist()
         raise ValueError(
-            f"mesh of {name!r}: {count.max()} cells meet in an edge at x={where}; a shell has no "
-            "T-junctions: make a shell of each part"
+            f"mesh of {name!r}: {count.max()} cells meet in an edge at x={where}; a mesh has no "
+            f"T-junctions: make a shell of each part, and join them by {_SEAM}"
         )
     _check_corners(x, cells, edge, given, name)
     cells = _oriented(x, cells, edge, given, name)
@@ -196,5 +198,5 @@ def _check_folds(x: FloatArray, cells: IntArray, edge: IntArray, name: str) -> N
         raise ValueError(
             f"mesh of {name!r}: folds by {np.degrees(np.arccos(np.clip(cosine[k], -1, 1))):.3g} "
             f"degrees at x={where}, more than 60; refine the mesh, round the fold, or make a shell "
-            "of each part"
+            f"of each part, and join them by {_SEAM}"
         )

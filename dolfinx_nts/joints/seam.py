@@ -37,8 +37,8 @@ class Seam(Joint):
 
     Raises:
         TypeError: An argument is of another kind.
-        ValueError: The edge is one of `shell`, a node of it lies at no node of `shell`, or both
-            meet at less than 20 degrees.
+        ValueError: The surface is no edge, or one of `shell`, a node of it lies at no node of
+            `shell`, or both meet at less than 20 degrees.
     """
 
     def __init__(self, shell: Any, edge: Any, *, name: str | None = None) -> None:
@@ -49,6 +49,12 @@ class Seam(Joint):
         other = edge.body
         if other is shell:
             raise ValueError(f"edge: is one of shell {shell.name!r} itself; pass another shell's")
+        corners = np.sort(edge.material.nodes[edge.facets, 0], axis=1)
+        if ((corners[:, 1:] > corners[:, :-1]).sum(axis=1) != 1).any():
+            raise ValueError(
+                f"edge: is the top or the bottom of shell {other.name!r}; pass "
+                'other.surface(where, side="edge")'
+            )
         self.name, self.bodies = named("Seam", (shell, other), name), (shell, other)
         # The top and the bottom of a node depend on the same vectors.
         nodes, first = np.unique(edge.material.nodes[:, 0], return_index=True)
