@@ -231,6 +231,24 @@ def test_both_sides_of_one_shell_are_no_contact():
 
 
 @pytest.mark.mpi
+def test_surfaces_count_as_redundant_where_contacts_use_them():
+    """A shell's edge for a seam, or both sides of it that are not over each other, ask nothing."""
+    body, plane = shell(n=4), nts.Plane((0, 0, -9), (0, 0, 1))
+
+    def half(sign):
+        return lambda x: sign * (x[0] - 0.5) > 1e-9
+
+    body.surface(side="edge")
+    first = nts.ContactPair(body.surface(half(1), side="bottom"), plane)
+    nts.ContactPair(body.surface(half(-1), side="top"), plane)
+    assert not first.redundant
+    nts.ContactPair(shell().surface(below(9), side="top"), body.surface(half(1), side="top"))
+    assert first.redundant
+    assert nts.ContactPair(shell().surface(side="edge"), plane).redundant
+    assert nts.ContactPair(beam(0.0).surface(), plane).redundant
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, MU])
 @pytest.mark.fast_on_ranks("0.3")
 def test_a_shell_between_two_planes(friction):

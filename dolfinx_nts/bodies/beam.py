@@ -108,9 +108,6 @@ class Beam(DirectorBody):
         outline = np.array(self.section.outline, dtype=np.float64).reshape(-1, 2)
         return of_beam(self._skeleton, outline / self.length)
 
-    def _redundant(self) -> bool:
-        return True  # points of a section, see `DirectorBody`
-
     def surface(self, marker: Any = None, *, smoothing: bool = False) -> Surface:
         """A part of the skin for contact: the section's outline along the axis, and its ends.
 

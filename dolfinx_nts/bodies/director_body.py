@@ -23,7 +23,7 @@ from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.node_conditions import NodeConditions
 from dolfinx_nts.bodies.pressure import Pressure, Pressures
 from dolfinx_nts.bodies.skeleton import Skeleton
-from dolfinx_nts.contact.surfaces import Skin, Surface, in_order
+from dolfinx_nts.contact.surfaces import Skin, Surface, Touching, in_order
 from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels import quadratic_energy as kernel
@@ -68,10 +68,6 @@ class DirectorBody(Body):
 
     def _make_hull(self) -> Hull:
         """Its whole skin."""
-        raise NotImplementedError
-
-    def _redundant(self) -> bool:
-        """Whether more points of its skin may touch at once than it has freedom for."""
         raise NotImplementedError
 
     # ---- set-up
@@ -298,6 +294,10 @@ class DirectorBody(Body):
     def _hull(self) -> Hull:
         return self._make_hull()
 
+    @cached_property
+    def _touching(self) -> Touching:
+        return Touching(self._hull.node)
+
     def _surface(self, chosen: BoolArray, smoothing: bool = False) -> Surface:
         """Some of the facets of the skin, chosen by a mask. Collective."""
         hull = self._hull
@@ -309,7 +309,7 @@ class DirectorBody(Body):
         points = self._points(node, hull.weights[used]).columns(columns)
         rows = node[(node >= self._here.start) & (node < self._here.stop)] - self._first
         skin = Skin(used, facets, original, points.combine(points.reference), rows, points)
-        return Surface(self, skin, smoothing, self._redundant)
+        return Surface(self, skin, smoothing, self._touching)
 
     def _marked(self, marker: Any, facets: BoolArray, x: FloatArray) -> BoolArray:
         """Which of some facets of the skin a user's marker selects, shape (m,). Collective.

@@ -100,7 +100,6 @@ class Shell(DirectorBody):
         spin = vector("angular_velocity", angular_velocity, "rad/s")
         self.young, self.poisson, self.thickness = float(young), float(poisson), float(thickness)
         self.density = float(density)
-        self._sides: set[str] = set()
         self._set_up_mesh(mesh, name)
         surface = midsurface_of(self.space, name)
         # Of the place, and of D: rho t^3/12 on d = D / (t/2).
@@ -130,13 +129,6 @@ class Shell(DirectorBody):
         """Its whole skin, see `DirectorBody`."""
         return of_shell(self._skeleton)
 
-    def _redundant(self) -> bool:
-        """Where both points of a node may touch: between two planes it cannot give way in either.
-
-        Its director's length is a third equation for two freedoms, see `DirectorBody`.
-        """
-        return len(self._sides) > 1 or "edge" in self._sides
-
     def surface(
         self, marker: Any = None, *, side: str = "top", smoothing: bool = False
     ) -> Surface:
@@ -157,7 +149,6 @@ class Shell(DirectorBody):
         choose("side", side, SIDES)
         x = self._skeleton.x[self._hull.node]
         chosen = self._marked(marker, self._hull.part == SIDES.index(side), x)
-        self._sides.add(side)
         return self._surface(chosen, smoothing)
 
     def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:

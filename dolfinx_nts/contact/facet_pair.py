@@ -57,6 +57,7 @@ class FacetPair(ContactPair, master=Surface):
         corners = master.reference[master.facets]
         self._joined = patches.neighbours(master.facets, corners)
         self._beside = patches.neighbours(master.facets, corners, sharp=-np.inf)
+        master.touch()
 
     @property
     def bodies(self) -> tuple[Any, ...]:

@@ -141,6 +141,7 @@ class ContactPair:
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
         self._set_up()
+        slave.touch()
 
     @classmethod
     def between(cls, a: Any, b: Any, **options: Any) -> ContactPair:

@@ -8,7 +8,7 @@ positions are gathered when a search needs them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -149,6 +149,28 @@ def in_order(ids: IntArray) -> tuple[IntArray, IntArray]:
     return roll, np.lexsort(np.sort(ids, axis=1).T[::-1])
 
 
+class Touching:
+    """Which points of a skin contacts use, where the points of a node share its coordinates.
+
+    Two of them may touch at once and ask more of a node than it has freedom for, as those of a
+    shell between two planes.
+
+    Args:
+        node: Node of each point, shape (p,).
+
+    Attributes:
+        points: Whether a contact uses a point, shape (p,).
+    """
+
+    def __init__(self, node: IntArray) -> None:
+        self._node, self.points = node, np.zeros(len(node), dtype=bool)
+
+    @property
+    def redundant(self) -> bool:
+        """Whether contacts use several points of a node."""
+        return bool(np.bincount(self._node[self.points], minlength=1).max() > 1)
+
+
 class Surface:
     """Oriented facets of a body's boundary. Create with `body.surface`.
 
@@ -156,8 +178,8 @@ class Surface:
         body: Its body.
         skin: The facets.
         smoothing: Whether slaves touch the smooth patches over the facets.
-        redundant: Tells whether more points may touch at once than the body has freedom for; None:
-            so it is where points are not nodes, as of rigid bodies.
+        touching: Which points contacts use, of a body whose nodes have several; None: it has none
+            such, or all points share their nodes, as of rigid bodies.
 
     Attributes:
         body: The body it belongs to.
@@ -174,13 +196,13 @@ class Surface:
     """
 
     #: For surfaces of one's own that do not call `__init__`.
-    _redundant: Callable[[], bool] | None = None
+    _touching: Touching | None = None
     #: What a restart compares beside the facets.
     settings: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
         self, body: Any, skin: Skin, smoothing: bool = False,
-        redundant: Callable[[], bool] | None = None,
+        touching: Touching | None = None,
     ) -> None:
         self.body = body
         (
@@ -192,7 +214,7 @@ class Surface:
         self.weights: FloatArray | None = None
         if smoothing:
             self._smooth(x)
-        self._redundant = redundant
+        self._touching = touching
         self.share = np.flatnonzero(_rank_of(self.original, body.comm.size) == body.comm.rank)
         free = ~self.material.fixed & (self.material.weights != 0.0)[:, :, None]
         self.fixed = ~free.any(axis=1)
@@ -200,7 +222,14 @@ class Surface:
     @property
     def redundant(self) -> bool:
         """Whether more points may touch at once than the body has freedom for."""
-        return not self.material.are_nodes if self._redundant is None else self._redundant()
+        if self._touching is None:
+            return not self.material.are_nodes
+        return self._touching.redundant
+
+    def touch(self) -> None:
+        """Note that a contact is made of the surface."""
+        if self._touching is not None:
+            self._touching.points[self.points] = True
 
     def _smooth(self, corners: FloatArray) -> None:
         """Lay patches over the facets with reference corners (m, nc, 3)."""
