@@ -208,6 +208,36 @@ def test_what_was_found_is_mended(name):
     assert not verdict.wrong, f"{verdict.wrong} {verdict.said}"
 
 
+def test_a_body_that_flies_free_goes_on_to_rounding(tmp_path):
+    """The judge held its velocity's rounding, all that changes of it, to a thousandth."""
+    flying = Scene(
+        bodies=(Body(shape="ball", cell="tetrahedron", spin=(0.0, 0.0, 5.0)),
+                Body(shape="ball", cell="tetrahedron", density=1e2, gap=2.0, drift=(0.0, 5.0))),
+        rule="midpoint", dt=0.02, steps=3, newton=(("rtol", 1e-6), ("reuse", True)),
+    )  # fmt: skip
+    if COMM.size > 1:
+        pytest.skip("is of the judge in serial")
+    verdict = judge_restart(flying, COMM, tmp_path / "run.h5")
+    assert verdict.outcome == "completed" and not verdict.wrong
+
+
+@pytest.mark.slow
+def test_a_restart_that_ends_otherwise_is_seen(tmp_path, monkeypatch):
+    """As one with longer steps does."""
+    if COMM.size > 1:
+        pytest.skip("is of the judge in serial")
+    simulate = nts.simulate
+
+    def with_longer_steps(system, **given):
+        longer = {"dt": 2.0 * given["dt"]} if "start" in given else {}
+        return simulate(system, **given | longer)
+
+    monkeypatch.setattr(nts, "simulate", with_longer_steps)
+    scene = replace(METEOR, newton=(("reuse", True),))
+    wrong = judge_restart(scene, COMM, tmp_path / "run.h5").wrong
+    assert "1 rows of the balance are lost" in wrong and any("differs by" in w for w in wrong)
+
+
 # ---- the scenes
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(10))
