@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.kernels import compiled
+from dolfinx_nts.kernels import library
 
 FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -100,6 +100,6 @@ def same_kernels(comm: Any) -> None:
 
     Rank 0 compiles them for all that share its cache.
     """
-    on_root(comm, compiled.is_there)
-    if not all(comm.allgather(compiled.is_there())):
-        compiled.leave_out()
+    on_root(comm, library.is_there)
+    if not all(comm.allgather(library.is_there())):
+        library.leave_out()

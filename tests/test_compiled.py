@@ -3,6 +3,7 @@
 import logging
 import types
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,12 @@ from facet_kinds import CENTRE, FLAT, KINDS
 from measures import relative
 from mpi4py import MPI
 
+import dolfinx_nts as nts
+from dolfinx_nts.contact.coulomb import Together
 from dolfinx_nts.contact.facet_elements import FacetElements
-from dolfinx_nts.kernels import compiled, facets
+from dolfinx_nts.contact.obstacle_elements import ObstacleElements
+from dolfinx_nts.kernels import compiled, compiled_law, facets, library
+from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.parallel import same_kernels
 
 N = 40
@@ -39,7 +44,7 @@ def pairs(nc, friction, rule, condense=True):
 
 
 def test_the_library_is_there():
-    assert compiled.is_there()
+    assert library.is_there()
 
 
 @pytest.mark.parametrize("rule", ["mean-value", "gonzalez", "direct"])
@@ -48,15 +53,160 @@ def test_the_library_is_there():
 def test_elements_are_those_of_numpy(nc, friction, rule, monkeypatch):
     elements, x, multiplier = pairs(nc, friction, rule)
     here = elements._element(x, None, multiplier)
-    with monkeypatch.context() as patch:
-        patch.setattr(compiled, "_library", lambda: None)
-        there = elements._element(x, None, multiplier)
+    there = without_compiler(monkeypatch, elements._element, x, None, multiplier)
     for found, expected in zip(here[:3], there[:3], strict=True):
         assert relative(found, expected) < 1e-13
     assert (here[3] is None) == (there[3] is None) == (not friction)
     if friction:
         for found, expected in zip(here[3], there[3], strict=True):
             assert relative(found, expected) < 1e-13
+
+
+def without_compiler(monkeypatch, function, *arguments):
+    with monkeypatch.context() as patch:
+        patch.setattr(library, "load", lambda: None)
+        return function(*arguments)
+
+
+#: Friction, whether pairs share nodes, and what may slip rather than leave or has a bound.
+LAWS = {
+    "frictionless": (0.0, {}),
+    "friction": (0.3, {}),
+    "lets slip": (0.3, {"lets_slip": True}),
+    "strong": (3.0, {}),
+    "endless": (np.inf, {}),
+    "bounded": (np.inf, {"bounded": True}),
+}
+
+
+def batches(law, *, shared, prescribed, massless):
+    """Elements of quadrilaterals in all states: off, stick and slip, with and without force."""
+    friction, options = LAWS[law]
+    rng = np.random.default_rng(8)
+    elements, x, multiplier = pairs(4, friction, "mean-value")
+    fixed, its = rng.uniform(size=(2, N, 3)) < (0.5 if prescribed else 0.0)
+    slave = types.SimpleNamespace(fixed=fixed, share=np.arange(N))
+    master = types.SimpleNamespace(
+        patches=np.tile(np.arange(4), (N, 1)), weights=None, fixed=np.tile(its[:4], (1, 1))
+    )
+    pair = types.SimpleNamespace(
+        friction=friction, slave=slave, master=master, redundant=shared, yields=not shared
+    )
+    candidates = types.SimpleNamespace(**vars(elements.candidates), patch=np.arange(N))
+    before = None
+    if massless:
+        before = rng.normal(size=(N, 3))
+        before[::5, 1:] *= 0.01
+        before[::2] = np.nan
+    # Prescribed slips that vanish, small and large forces, none, and gaps of rounding.
+    x[::5] = elements.x0[::5]
+    multiplier *= 10.0 ** rng.integers(-3, 1, (N, 1))
+    multiplier[::7, 0] = 0.0
+    multiplier[::5, 1:] *= 0.01
+    return replace(
+        elements, pair=pair, candidates=candidates, scale=rng.uniform(0.5, 2.0, N), before=before,
+        master_scale=rng.uniform(1.0, 2.0, (N, 4)), rounding=1e-9, force_rounding=1e-9, **options
+    ), x, multiplier  # fmt: skip
+
+
+@pytest.mark.parametrize("massless", [False, True])
+@pytest.mark.parametrize("prescribed", [False, True])
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("law", LAWS)
+def test_laws_are_those_of_numpy(law, shared, prescribed, massless, monkeypatch):
+    elements, x, multiplier = batches(
+        law, shared=shared, prescribed=prescribed, massless=massless
+    )
+    together = Together(0.7, 1e-7, 2e-7) if shared else Together(0.0, 0.0, 0.0)
+
+    residual, tangent, gap, slip = elements._element(x, None, multiplier)
+    gap[::3] = residual[::3, -elements.num_constraints] = 0.0
+
+    def laws():
+        arrays = residual.copy(), tangent.copy(), gap, slip, multiplier
+        return elements._laws(x, *arrays, together)
+
+    here, there = laws(), without_compiler(monkeypatch, laws)
+    for found, expected in zip(here, there, strict=True):
+        if expected.dtype == bool:
+            assert (found == expected).all()
+        elif expected.size:
+            size = np.abs(expected).max(axis=tuple(range(1, expected.ndim)), initial=0.0)
+            error = np.abs(found - expected).max(axis=tuple(range(1, expected.ndim)))
+            assert (error <= 1e-13 * size).all()
+    assert here.active.any() and not here.active.all()
+    assert np.isfinite(here.residual).all() and np.isfinite(here.tangent).all()
+    if elements.num_tangential:
+        assert (here.active & here.stick).any()
+        assert (here.active & ~here.stick).any() or np.isinf(elements.pair.friction)
+
+
+@pytest.mark.parametrize("rule", ["mean-value", "direct"])
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("shape", ["plane", "sphere", "cylinder"])
+def test_obstacles_are_those_of_numpy(shape, friction, rule, monkeypatch):
+    rng = np.random.default_rng(9)
+    obstacle = {
+        "plane": nts.Plane((0, 0.1, 0), (1, 2, 3)),
+        "sphere": nts.Sphere((0, 0, 0), 0.8),
+        "cylinder": nts.Cylinder((0.1, 0, 0), (0.1, 0.2, 1), 0.8, inside=True),
+    }[shape]
+    x0 = rng.normal(size=(N, 1, 3))
+    x = x0 + 0.1 * rng.normal(size=x0.shape)
+    candidates = types.SimpleNamespace(
+        node=np.arange(N), normal=obstacle.gap(x0[:, 0]).gradient[:, 0]
+    )
+    elements = ObstacleElements(
+        pair=types.SimpleNamespace(friction=friction), candidates=candidates,
+        contact_gradient=rule, condense=False, x0=x0, scale=np.ones(N), theta=0.5,
+        obstacle=obstacle, displacement=np.zeros((2, 3)),
+    )  # fmt: skip
+    multiplier = rng.normal(size=(N, elements.num_constraints))
+    here = elements._element(x, None, multiplier)
+    there = without_compiler(monkeypatch, elements._element, x, None, multiplier)
+    assert (here[3] is None) == (there[3] is None) == (not friction)
+    pairs = zip([*here[:3], *(here[3] or ())], [*there[:3], *(there[3] or ())], strict=True)
+    for found, expected in pairs:
+        assert np.abs(found - expected).max() <= 1e-13 * max(1.0, np.abs(expected).max())
+
+
+def test_an_obstacle_of_the_users_own_may_have_numbers_of_any_kind(monkeypatch):
+    elements = ObstacleElements(
+        pair=types.SimpleNamespace(friction=0.3),
+        candidates=types.SimpleNamespace(node=np.arange(3), normal=np.tile([0.0, 0, 1], (3, 1))),
+        contact_gradient="direct", condense=False, x0=np.ones((3, 1, 3)), scale=np.ones(3),
+        theta=0.5, obstacle=Table(), displacement=np.zeros((2, 3)),
+    )  # fmt: skip
+    x, multiplier = 1.1 * elements.x0, np.arange(9.0).reshape(3, 3)
+    here = elements._element(x, None, multiplier)
+    there = without_compiler(monkeypatch, elements._element, x, None, multiplier)
+    for found, expected in zip([*here[:3], *here[3]], [*there[:3], *there[3]], strict=True):
+        assert np.abs(found - expected).max() < 1e-14
+    assert elements._normal(x).dtype == np.float64
+
+
+class Table(nts.Obstacle):
+    """z >= 0, told in few numbers."""
+
+    def gap(self, x):
+        """The height."""
+        up, n = np.array([[0, 0, 1]]), len(x)
+        return Gap(x[:, 2].astype(np.float32), np.tile(up, (n, 1, 1)), np.zeros((n, 3, 3), int))
+
+
+@pytest.mark.parametrize("points", [1, 5])
+def test_forces_of_points_are_those_of_nodes(points, monkeypatch):
+    rng, nodes, rest = np.random.default_rng(10), 6, 3
+    weights = rng.normal(size=(N, points, nodes))
+    weights[rng.uniform(size=weights.shape) < 0.3] = 0.0
+    elements, _, _ = pairs(4, 0.3, "mean-value")
+    elements = replace(elements, x0=np.zeros((N, points, 3)))
+    monkeypatch.setattr(FacetElements, "num_coordinates", 3 * nodes)
+    residual = rng.normal(size=(N, 3 * points + rest))
+    tangent = rng.normal(size=(N, *residual.shape[1:] * 2))
+    here = compiled_law.to_nodes(weights, residual, tangent)
+    for found, expected in zip(here, elements._spread(weights, residual, tangent), strict=True):
+        assert np.abs(found - expected).max() < 1e-13
 
 
 @pytest.mark.parametrize("nc", KINDS)
@@ -136,17 +286,17 @@ def test_without_compiler_numpy_does(monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CC", "no-such-compiler")
     with caplog.at_level(logging.WARNING):
-        assert compiled._library.__wrapped__() is None
+        assert library.load.__wrapped__() is None
     assert len(caplog.records) == 1 and "no-such-compiler" in caplog.text
     monkeypatch.setenv("CC", "false")
-    assert compiled._library.__wrapped__() is None
+    assert library.load.__wrapped__() is None
 
 
 def test_without_cache_numpy_does(monkeypatch, tmp_path, caplog):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with caplog.at_level(logging.WARNING):
-        assert compiled._library.__wrapped__() is None
+        assert library.load.__wrapped__() is None
     assert len(caplog.records) == 1
 
 
@@ -154,7 +304,7 @@ def test_without_cache_numpy_does(monkeypatch, tmp_path, caplog):
 def test_several_may_compile_at_once(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with ThreadPoolExecutor(4) as pool:
-        libraries = list(pool.map(lambda _: compiled._library.__wrapped__(), range(4)))
+        libraries = list(pool.map(lambda _: library.load.__wrapped__(), range(4)))
     assert all(libraries)
     assert [path.suffix for path in (tmp_path / "fenics").iterdir()] == [".so"]
 
@@ -163,8 +313,8 @@ def test_several_may_compile_at_once(monkeypatch, tmp_path):
 def test_ranks_have_the_same_kernels(monkeypatch):
     comm, last = MPI.COMM_WORLD, MPI.COMM_WORLD.size - 1
     same_kernels(comm)
-    assert compiled.is_there()
-    real = compiled._library
-    monkeypatch.setattr(compiled, "_library", lambda: None if comm.rank == last else real())
+    assert library.is_there()
+    real = library.load
+    monkeypatch.setattr(library, "load", lambda: None if comm.rank == last else real())
     same_kernels(comm)
-    assert not compiled.is_there()
+    assert not library.is_there()

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution
 from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.elements import over
+from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.points import Points
 from dolfinx_nts.state import ContactHistory
@@ -38,11 +39,6 @@ class ContactElements(ContactLaws):
     """The candidates of one pair in one step, with the rule of the integrator; see `Elements`."""
 
     # ---- what a kind of master has of its own
-    @property
-    def num_augmented(self) -> int:
-        """Unknowns d and f per pair."""
-        return 0
-
     @property
     def master_nodes(self) -> Points | None:
         """Nodes of the master's body that each pair depends on, if it has a body."""
@@ -74,10 +70,6 @@ class ContactElements(ContactLaws):
     def _control_weights(self) -> FloatArray | None:
         """Weights of the masters' nodes in the control points, (n, control, k); None if one."""
         return None
-
-    def _normal(self, x: FloatArray) -> FloatArray:
-        """Normal where the contact force acts, shape (n, 3)."""
-        raise NotImplementedError
 
     def _element(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
@@ -182,20 +174,26 @@ class ContactElements(ContactLaws):
         """The transpose of `_control`: forces and tangents of nodes from those of points."""
         if self._map is None:
             return part
-        n, size = part.residual.shape
-        points, turned = slice(self._num_places), self._map.transpose(0, 2, 1)
+        found = compiled_law.to_nodes(self._map, part.residual, part.tangent)
+        residual, tangent = found or self._spread(self._map, part.residual, part.tangent)
+        return part._replace(residual=residual, tangent=tangent)
+
+    def _spread(
+        self, weights: FloatArray, residual: FloatArray, tangent: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """`_to_nodes`, as `compiled_law.to_nodes` does it."""
+        n, size = residual.shape
+        points, turned = slice(self._num_places), weights.transpose(0, 2, 1)
         places, width = (self.num_control + 1, 3), self.num_coordinates
-        force = np.matmul(turned, part.residual[:, points].reshape(n, *places)).reshape(n, width)
-        residual = np.concatenate([force, part.residual[:, self._num_places :]], axis=1)
-        columns = part.tangent[:, :, points].reshape(n, size, *places)
+        force = np.matmul(turned, residual[:, points].reshape(n, *places)).reshape(n, width)
+        residual = np.concatenate([force, residual[:, self._num_places :]], axis=1)
+        columns = tangent[:, :, points].reshape(n, size, *places)
         columns = np.matmul(turned[:, None], columns).reshape(n, size, width)
-        tangent = np.concatenate([columns, part.tangent[:, :, self._num_places :]], axis=2)
+        tangent = np.concatenate([columns, tangent[:, :, self._num_places :]], axis=2)
         wide = tangent.shape[2]
         rows = np.matmul(turned, tangent[:, points].reshape(n, places[0], 3 * wide))
-        tangent = np.concatenate(
-            [rows.reshape(n, width, wide), tangent[:, self._num_places :]], axis=1
-        )
-        return part._replace(residual=residual, tangent=tangent)
+        rows = rows.reshape(n, width, wide)
+        return residual, np.concatenate([rows, tangent[:, self._num_places :]], axis=1)
 
     def input_node(self, i: int) -> int:
         """Number of a pair's slave node in the user's mesh."""
@@ -233,8 +231,7 @@ class ContactElements(ContactLaws):
         if not self.num_elements:
             self._together(*none)
             return self._nothing()
-        scale = self.scale[:, None]
-        multiplier = scale * own["constraints"]
+        multiplier = self.scale[:, None] * own["constraints"]
         x = self._control(x)
         try:
             residual, tangent, gap, slip = self._element(x, own["augmented"], multiplier)
@@ -243,17 +240,7 @@ class ContactElements(ContactLaws):
             raise
         together = self._together(gap, slip, multiplier)
         part = self._laws(x, residual, tangent, gap, slip, multiplier, together)
-        if slip is not None:
-            normal = self._normal(x)
-            along = np.einsum("ni,ni->n", part.force, normal)
-            part.tangential[:] = part.force - along[:, None] * normal
-        part = self._to_nodes(part)
-        # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
-        rows = slice(part.residual.shape[1] - self.num_constraints, None)
-        part.residual[:, rows] *= scale
-        part.tangent[:, rows] *= scale[:, None]
-        part.tangent[:, :, rows] *= scale[:, None]
-        return part
+        return self._to_nodes(part)
 
     def _nothing(self) -> Contribution:
         """Return the part of no pairs."""

@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.constraints import SHIFT
-from dolfinx_nts.contact.coulomb import STRONG, Coulomb, Slip, Together
+from dolfinx_nts.contact.coulomb import STRONG, UNEVEN, Coulomb, Slip, Together
 from dolfinx_nts.contact.pair import Candidates, ContactPair
+from dolfinx_nts.kernels import compiled_law
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -127,6 +128,15 @@ class ContactLaws:
         return self.foot
 
     @property
+    def num_augmented(self) -> int:
+        """Unknowns d and f per pair."""
+        return 0
+
+    def _normal(self, x: FloatArray) -> FloatArray:
+        """Normal where the contact force acts, shape (n, 3)."""
+        raise NotImplementedError
+
+    @property
     def _ease(self) -> FloatArray:
         """Motion of the foot per force on it [1/kg], shape (n,)."""
         raise NotImplementedError
@@ -234,6 +244,27 @@ class ContactLaws:
             of_end=self._of_end,
         )
 
+    @cached_property
+    def _law(self) -> tuple[Any, list[Any]]:
+        """What the compiled kernel is to know of the pairs in this step."""
+        row = self._num_places + self.num_augmented
+        none, size = self._yielding * self.gap_rounding, row + self.num_constraints
+        law = compiled_law.Law(self.scale, self._yielding, none, self.before, size, row)
+        if self.num_tangential:
+            coulomb = self.coulomb
+            law = law._replace(
+                friction=True,
+                endless=coulomb.endless,
+                strong=self.strong,
+                redundant=coulomb.redundant,
+                coefficient=coulomb.coefficient,
+                pull=coulomb.let_slip if self._may_pull else 0.0,
+                uneven=UNEVEN,
+                tangential_scale=coulomb.tangential_scale,
+                unmoved=coulomb.unmoved if coulomb.prescribes else None,
+            )
+        return law.structure()
+
     def _laws(
         self,
         x: FloatArray,
@@ -250,7 +281,44 @@ class ContactLaws:
         the forces of the step, but at massless nodes those of its end: theirs of the step are the
         mean of both ends (theory section 16).
         """
-        gap, end, scale = gap.copy(), self._at_end(multiplier), self.scale
+        normal = held = None
+        if slip is not None:
+            normal = self._normal(x)
+            held = self.coulomb.held(x) if self.coulomb.prescribes else None
+        found = compiled_law.laws(
+            self._law, together, residual, tangent, gap, slip, multiplier, held, normal
+        )
+        if found is None:
+            found = self._write(x, residual, tangent, gap, slip, multiplier, together, normal)
+        return Contribution(
+            found.residual,
+            found.tangent,
+            multiplier,
+            gap.copy(),
+            found.active,
+            found.stick,
+            slip=np.empty((self.num_elements, 0)) if slip is None else slip.value,
+            distance=found.distance,
+            force=found.force,
+            tangential=found.tangential,
+            coupling=found.residual[:, : self._num_places].reshape(x.shape),
+            place=x[:, 0],
+            end=found.end,
+        )
+
+    def _write(
+        self,
+        x: FloatArray,
+        residual: FloatArray,
+        tangent: FloatArray,
+        gap: FloatArray,
+        slip: Slip | None,
+        multiplier: FloatArray,
+        together: Together,
+        normal: FloatArray | None,
+    ) -> compiled_law.Obeyed:
+        """Write the laws into the pairs' rows, as `compiled_law.laws` does."""
+        end, scale = self._at_end(multiplier), self.scale
         force = end[:, 0]
         active = -force - self._yielding * gap > self._none(slip, end)
         off = ~active
@@ -259,28 +327,22 @@ class ContactLaws:
         tangent[off, row] = 0.0
         tangent[off, row, row] = self._of_end[off] / scale[off]
         tangent[active, row, row] -= together.normal / scale[active]
-        part = Contribution(
-            residual,
-            tangent,
-            multiplier,
-            gap,
-            active,
-            stick=np.zeros_like(active),
-            slip=np.empty((self.num_elements, 0)) if slip is None else slip.value,
-            distance=np.zeros(self.num_elements),
-            force=-residual[:, :3],
-            tangential=np.zeros((self.num_elements, 3)),
-            coupling=residual[:, : self._num_places].reshape(x.shape),
-            place=x[:, 0],
-            end=end,
-        )
+        stick, distance = np.zeros_like(active), np.zeros(self.num_elements)
+        on_slave, tangential = -residual[:, :3], np.zeros((self.num_elements, 3))
         if slip is not None:
-            part.stick[:] = self.coulomb.write(
-                x, residual, tangent, slip, end, active, together
-            )
+            assert normal is not None
+            stick = self.coulomb.write(x, residual, tangent, slip, end, active, together)
             square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
-            part.distance[active] = np.sqrt(square[active])
-        return part
+            distance[active] = np.sqrt(square[active])
+            along = np.einsum("ni,ni->n", on_slave, normal)
+            tangential = on_slave - along[:, None] * normal
+        # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
+        residual[:, row:] *= scale[:, None]
+        tangent[:, row:] *= scale[:, None, None]
+        tangent[:, :, row:] *= scale[:, None, None]
+        return compiled_law.Obeyed(
+            residual, tangent, end, active, stick, distance, on_slave, tangential
+        )
 
     @cached_property
     def _massless(self) -> BoolArray:
@@ -309,6 +371,11 @@ class ContactLaws:
             end[some, -2:] -= self.before[some, 1:]
         return end
 
+    @property
+    def _may_pull(self) -> bool:
+        """Whether a small pull on a node that sticks lets it slip."""
+        return self.lets_slip or self.coulomb.endless
+
     def _none(self, slip: Slip | None, multiplier: FloatArray) -> FloatArray:
         """Contact force that counts as none [kg m], shape (n,).
 
@@ -318,6 +385,6 @@ class ContactLaws:
         lets it slip. A solved step never ends in such a state, so this adds no solution.
         """
         none = self._yielding * self.gap_rounding
-        if slip is None or not (self.lets_slip or self.coulomb.endless):
+        if slip is None or not self._may_pull:
             return none
         return none - self.coulomb.pull(slip, multiplier)

@@ -36,7 +36,7 @@ _IMMOVABLE = 1e-12
 #: Prescribed slip over the size of the facet that counts as none.
 _STILL = 1e-10
 #: Largest ratio of normal forces by which friction of a rigid body's nodes is divided.
-_UNEVEN = 100.0
+UNEVEN = 100.0
 
 
 class Slip(NamedTuple):
@@ -112,11 +112,19 @@ class Coulomb:
         return bool(np.isinf(self.friction)) and not self.bounded
 
     @property
-    def _coefficient(self) -> float:
+    def coefficient(self) -> float:
+        """That of the equations, which is a number."""
         return min(self.friction, _BOUND if np.isinf(self.friction) else _LARGEST)
 
     @property
-    def _tangential_scale(self) -> FloatArray:
+    def let_slip(self) -> float:
+        """Pull over friction up to which a node that sticks is let slip before it is let go."""
+        # Without bound a node may stick by no normal force at all, whose rounding has any sign.
+        return _NO_PULL if self.endless else _PULL
+
+    @cached_property
+    def tangential_scale(self) -> FloatArray:
+        """Algorithmic scale of the return map, shape (n,)."""
         return (TANGENTIAL_SCALE if self.yields else _OF_SHARED) * self.yielding
 
     # ---- what cannot slip
@@ -132,7 +140,7 @@ class Coulomb:
         Forces there act on prescribed coordinates or along the normal: where the gap is closed, the
         slip there is prescribed.
         """
-        if not self._prescribed.any():
+        if not self.prescribes:
             return np.zeros((len(self.size), 3, 3))
         along = np.eye(3) - self.normal[:, :, None] * self.normal[:, None]
         part, vector = np.linalg.eigh(np.matmul(along * self._prescribed[:, None], along))
@@ -141,11 +149,18 @@ class Coulomb:
         return projector
 
     @cached_property
-    def _unmoved(self) -> FloatArray:
+    def prescribes(self) -> bool:
+        """Whether anything is prescribed."""
+        return bool(self._prescribed.any())
+
+    @cached_property
+    def unmoved(self) -> FloatArray:
         """Projector on the part of lambda_T that acts on prescribed coordinates only, (n, 2, 2).
 
         Sticking is no equation there, and lambda_T is set to zero.
         """
+        if not self.prescribes:
+            return np.zeros((len(self.size), 2, 2))
         metric = np.matmul(self.tangents, self.tangents.transpose(0, 2, 1))
         dual = nts_element.solve(metric, self.tangents)
         projector: FloatArray = np.matmul(
@@ -153,18 +168,18 @@ class Coulomb:
         )
         return projector
 
-    def _held(self, x: FloatArray) -> FloatArray:
-        """`_unmoved` where the slip prescribed there is zero, else zero, shape (n, 2, 2).
+    def held(self, x: FloatArray) -> FloatArray:
+        """`unmoved` where the slip prescribed there is zero, else zero, shape (n, 2, 2).
 
         Nodes that slip leave this part of lambda_T out of the trial, too: Coulomb's law says
         nothing about it, and at the edge of sticking the rows would be singular in it.
         """
-        if not self._prescribed.any():
-            return self._unmoved
+        if not self.prescribes:
+            return self.unmoved
         motion = x - self.x0
         motion = motion[:, 0] - np.einsum("nk,nki->ni", self.foot, motion[:, 1:])
         slip = np.einsum("nij,nj->ni", self._blocked, motion * self._prescribed)
-        held: FloatArray = self._unmoved.copy()
+        held: FloatArray = self.unmoved.copy()
         held[np.abs(slip).max(axis=1) > _STILL * self.size] = 0.0
         return held
 
@@ -174,19 +189,19 @@ class Coulomb:
 
         By the law continued beyond zero force, since letting the node go would close its gap again.
         """
-        t, s = multiplier[:, -2:], self._tangential_scale[:, None] * slip.value
+        t, s = multiplier[:, -2:], self.tangential_scale[:, None] * slip.value
         friction = length(slip.metric, t)
         resists = friction**2 + np.einsum("na,na->n", t, s) > 0.0
-        resists &= ~self._unmoved.any(axis=(1, 2))
-        # Without bound a node may stick by no normal force at all, whose rounding has any sign.
-        return np.where(resists, (_NO_PULL if self.endless else _PULL) * friction, 0.0)
+        resists &= ~self.unmoved.any(axis=(1, 2))
+        return np.where(resists, self.let_slip * friction, 0.0)
 
     def _c(self, slip: Slip, bound: FloatArray, held: FloatArray) -> FloatArray:
         """Scale c of the return map; nodes that are made to slip cannot stick, shape (n,)."""
-        c = self._tangential_scale
-        if self.endless:
+        c = self.tangential_scale
+        if self.endless or not self.prescribes:
             return c
-        moved = self._unmoved.any(axis=(1, 2)) & ~held.any(axis=(1, 2))
+        c = c.copy()
+        moved = self.unmoved.any(axis=(1, 2)) & ~held.any(axis=(1, 2))
         s = slip.value[moved]
         distance = np.sqrt(np.einsum("na,nab,nb->n", s, slip.metric[moved], s))
         # Where solved, trial and slip are parallel, whatever c: the tangent needs no slope of c.
@@ -200,9 +215,9 @@ class Coulomb:
 
         A brick at rest on a slope just below the limit needs that of all its nodes.
         """
-        part = np.full(np.count_nonzero(stick), _UNEVEN)
+        part = np.full(np.count_nonzero(stick), UNEVEN)
         np.divide(together.force, -force[stick], out=part, where=force[stick] < 0.0)
-        part = np.clip(part, 1.0 / _UNEVEN, _UNEVEN)
+        part = np.clip(part, 1.0 / UNEVEN, UNEVEN)
         lent: FloatArray = together.tangential * part / self.scale[stick]
         return lent
 
@@ -235,14 +250,14 @@ class Coulomb:
         Returns:
             Which pairs stick, shape (n,).
         """
-        mu, t = self._coefficient, multiplier[:, -2:]
+        mu, t = self.coefficient, multiplier[:, -2:]
         force, scale = multiplier[:, 0], self.scale[:, None, None]
         normal = residual.shape[1] - multiplier.shape[1]
         new = active & (force >= 0.0) & (mu > STRONG or self.redundant)
         bound = mu * np.where(active, -force if mu > STRONG else np.maximum(-force, 0.0), 0.0)
         bound[new] -= mu * self.yielding[new] * residual[new, normal]
         bound[active & self.endless] = np.inf
-        held = self._held(x)
+        held = self.held(x)
         loose = np.eye(2) - held
         trial = np.einsum("nab,nb->na", loose, t)
         of_end = self.of_end[:, None, None]
@@ -257,7 +272,7 @@ class Coulomb:
         value, slipping = law.residual, ~stick
         value[slipping] /= scale[slipping, 0]
         rows[slipping] /= scale[slipping]
-        unsaid = np.where(stick[:, None, None], self._unmoved, held) / scale
+        unsaid = np.where(stick[:, None, None], self.unmoved, held) / scale
         value += np.einsum("nab,nb->na", unsaid, t)
         rows[:, :, -2:] += of_end * unsaid
         if together.tangential:

@@ -17,7 +17,9 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.contact.obstacles import Obstacle, inverse
+from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.kernels.nts_element import Gap
+from dolfinx_nts.kernels.vectors import cross
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -92,9 +94,9 @@ class ObstacleElements(ContactElements):
     def _tangents(self) -> FloatArray:
         """Orthonormal directions along the surface at t_n, shape (n, 2, 3)."""
         normal = self.candidates.normal
-        first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+        first = cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
         first *= inverse(np.linalg.norm(first, axis=1))[:, None]
-        return np.stack([first, np.cross(normal, first)], axis=1)
+        return np.stack([first, cross(normal, first)], axis=1)
 
     def _middle(self, x: FloatArray) -> Gap:
         """Gap and normal where the contact force acts."""
@@ -102,31 +104,56 @@ class ObstacleElements(ContactElements):
         return gap
 
     def _normal(self, x: FloatArray) -> FloatArray:
-        normal: FloatArray = self._middle(x).gradient[:, 0]
-        return normal
+        return np.asarray(self._middle(x).gradient[:, 0], dtype=np.float64)
 
     def _element(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
         """Residual and tangent of (x, lambda_N, lambda_T) in [kg m] and [m], gap and slip."""
-        master, normal = self.obstacle, multiplier[:, :1]
-        end = master.gap(x[:, 0])
+        master, end = self.obstacle, self.obstacle.gap(x[:, 0])
+        # Without friction nothing but the direct rule asks for the middle.
+        middle = self._middle(x) if self.direct or self.num_tangential else end
         if self.direct:
-            middle = self._middle(x)
-            gradient, slope = middle.gradient[:, 0], self.theta * middle.hessian
+            rule = middle.gradient[:, 0], self.theta * middle.hessian
         else:
-            gradient, slope = master.discrete_gradient(self.x0[:, 0], x[:, 0])
+            rule = master.discrete_gradient(self.x0[:, 0], x[:, 0])
+        found = compiled_law.obstacle(
+            self.theta, rule, (end.value, end.gradient[:, 0]),
+            (middle.gradient[:, 0], middle.hessian),
+            self.candidates.normal, self._tangents, (x - self.x0)[:, 0], multiplier,
+        )  # fmt: skip
+        if found is None:
+            return self._assembled(rule, end, middle, x, multiplier)
+        residual, tangent, *slip = found
+        return residual, tangent, residual[:, 3].copy(), Slip(*slip) if slip else None
+
+    def _assembled(
+        self,
+        rule: tuple[FloatArray, FloatArray],
+        end: Gap,
+        middle: Gap,
+        x: FloatArray,
+        multiplier: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """`_element` of the gap and its derivatives, as `compiled_law.obstacle` does it."""
+        normal, (gradient, slope) = multiplier[:, :1], rule
         residual = np.zeros((self.num_elements, 3 + self.num_constraints))
         tangent = np.zeros((*residual.shape, residual.shape[1]))
         residual[:, :3], residual[:, 3] = normal * gradient, end.value
         tangent[:, :3, :3] = normal[:, :, None] * slope
         tangent[:, :3, 3], tangent[:, 3, :3] = gradient, end.gradient[:, 0]
-        if not self.num_tangential:
-            return residual, tangent, end.value, None
-        return residual, tangent, end.value, self._add_friction(residual, tangent, x, multiplier)
+        slip = None
+        if self.num_tangential:
+            slip = self._add_friction(residual, tangent, middle, x, multiplier)
+        return residual, tangent, end.value, slip
 
     def _add_friction(
-        self, residual: FloatArray, tangent: FloatArray, x: FloatArray, multiplier: FloatArray
+        self,
+        residual: FloatArray,
+        tangent: FloatArray,
+        middle: Gap,
+        x: FloatArray,
+        multiplier: FloatArray,
     ) -> Slip:
         """Add lambda_T t^a to the rows of x; returns the slip Df^a = t^a . (x_1 - x_0).
 
@@ -134,7 +161,7 @@ class ObstacleElements(ContactElements):
         acts. Dual to them are t^a = e_a - n_0 (n . e_a) / (n . n_0), which lie along the surface,
         too, and t^a . t_b = t^a . e_b = 1 or 0, because n_0 . e_b = 0.
         """
-        middle, motion, e = self._middle(x), (x - self.x0)[:, 0], self._tangents
+        motion, e = (x - self.x0)[:, 0], self._tangents
         normal, n0, t = middle.gradient[:, 0], self.candidates.normal, multiplier[:, -2:]
         part, turn = np.einsum("nai,ni->na", e, normal), self.theta * np.matmul(e, middle.hessian)
         per_height = inverse(np.einsum("ni,ni->n", normal, n0))[:, None]

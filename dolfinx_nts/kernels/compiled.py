@@ -1,4 +1,4 @@
-"""The kernels of `facets.c` and `nts_element.c`, compiled once; NumPy's where that cannot be.
+"""The kernels of `facets.c` and `nts_element.c`, or NumPy's where they cannot be compiled.
 
 For the few pairs of a small scene the calls of NumPy cost more than what they compute, for many
 pairs its arrays go through memory again and again. Each function here is named like its twin in
@@ -7,16 +7,7 @@ NumPy, which it calls for what it does not do itself.
 
 from __future__ import annotations
 
-import ctypes
-import hashlib
-import logging
-import os
-import platform
-import shlex
-import subprocess
-import tempfile
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +16,7 @@ import numpy.typing as npt
 from dolfinx_nts.kernels import (
     discrete_gradient,
     facets,
+    library,
     nts_element,
     patches,
     triangle_patches,
@@ -34,38 +26,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
 BoolArray = npt.NDArray[np.bool_]
 
-logger = logging.getLogger(__name__)
-
-_SOURCES = [Path(__file__).with_name(name) for name in ("facets.h", "facets.c", "nts_element.c")]
-_FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
 #: Points times facets up to which all pairs' boxes are compared.
 _MOST_PAIRS = 1 << 20
-
-_INT, _LONG, _REAL, _ARRAY = ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_void_p
-
-
-class _Facet(ctypes.Structure):
-    _fields_ = [  # noqa: RUF012
-        *(("nc", _INT), ("degree", _INT), ("together", _INT)),
-        ("coefficients", _ARRAY),
-    ]
-
-
-class _Limits(ctypes.Structure):
-    _fields_ = [("last_step", _REAL), ("far_step", _REAL), ("collinear", _REAL)]  # noqa: RUF012
-
-
-_FACET, _LIMITS = ctypes.POINTER(_Facet), ctypes.POINTER(_Limits)
-#: Arguments of the kernels.
-_KERNELS = {
-    "project": (_FACET, _LIMITS, _LONG, *(_ARRAY,) * 4),
-    "closest_point": (_FACET, _LIMITS, _LONG, *(_ARRAY,) * 4),
-    "closest_facets": (
-        *(_FACET, _LIMITS, _LONG, _ARRAY, _ARRAY),
-        *(_LONG, _ARRAY, _ARRAY, _REAL, *(_ARRAY,) * 3),
-    ),
-    "condensed": (_FACET, _INT, _ARRAY, _ARRAY, _INT, _LONG, *(_ARRAY,) * 13),
-}
 
 
 class Condensed(NamedTuple):
@@ -86,57 +48,6 @@ class Condensed(NamedTuple):
     slip_gradient: FloatArray
     metric: FloatArray
     metric_gradient: FloatArray
-
-
-def _compile(target: Path) -> None:
-    """Make the library; whoever else does so at the same time replaces it by the same."""
-    compiler = shlex.split(os.environ.get("CC", "cc"))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-        made = Path(folder, target.name)
-        files = [*map(str, _SOURCES[1:]), "-o", str(made)]
-        command = [*compiler, *_FLAGS, "-shared", "-fPIC", *files, "-lm"]
-        subprocess.run(command, check=True, capture_output=True)
-        made.replace(target)
-
-
-@lru_cache
-def _library() -> Any:
-    """The library, or None where it can be neither found nor made."""
-    key = hashlib.sha256(" ".join(_FLAGS).encode())
-    for source in _SOURCES:
-        key.update(source.read_bytes())
-    # Beside the forms that DOLFINx compiles.
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    target = Path(cache, "fenics", f"dolfinx_nts_{platform.machine()}_{key.hexdigest()[:16]}.so")
-    try:
-        if not target.exists():
-            _compile(target)
-        library = ctypes.CDLL(str(target))
-    except (OSError, subprocess.CalledProcessError) as error:
-        logger.warning("Contact kernels are not compiled (%s): contact takes longer", error)
-        return None
-    for name, arguments in _KERNELS.items():
-        kernel = getattr(library, name)
-        kernel.argtypes = arguments
-    return library
-
-
-def is_there() -> bool:
-    """Return whether the kernels are compiled, which is done here if it can be."""
-    return _library() is not None
-
-
-def leave_out() -> None:
-    """Use NumPy's from now on."""
-    global _library  # noqa: PLW0603
-    _library = lru_cache(lambda: None)
-
-
-def _run(function: Any, *arguments: Any) -> Any:
-    """Call a kernel with arrays as pointers; those that it writes are contiguous."""
-    held = [np.ascontiguousarray(a) if isinstance(a, np.ndarray) else a for a in arguments]
-    return function(*(a.ctypes.data if isinstance(a, np.ndarray) else a for a in held))
 
 
 def _coefficients(nc: int, degree: int) -> FloatArray:
@@ -170,25 +81,25 @@ def _facet(nc: int) -> tuple[Any, FloatArray]:
     degree = {patches.NUM_POINTS: 3, triangle_patches.NUM_POINTS: 4}.get(nc, 1)
     coefficients = _coefficients(nc, degree)
     together = nc in (3, triangle_patches.NUM_POINTS)
-    return _Facet(nc, degree, together, coefficients.ctypes.data), coefficients
+    return library.Facet(nc, degree, together, coefficients.ctypes.data), coefficients
 
 
 @lru_cache
 def _limits() -> Any:
     """Return the limits that NumPy's kernels have, too."""
-    return _Limits(facets.LAST_STEP, 1e3 * facets.EPS, facets.COLLINEAR)
+    return library.Limits(facets.LAST_STEP, 1e3 * facets.EPS, facets.COLLINEAR)
 
 
 def project(
     points: FloatArray, corners: FloatArray, xi: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """`facets.project`, which takes the pairs for which plain Newton steps do not do."""
-    library = _library()
-    if library is None or not len(points):
+    kernels = library.load()
+    if kernels is None or not len(points):
         return facets.project(points, corners, xi)
     n, nc = corners.shape[:2]
     found, done = np.array(xi, dtype=np.float64), np.empty(n, dtype=bool)
-    _run(library.project, _facet(nc)[0], _limits(), n, points, corners, found, done)
+    library.run(kernels.project, _facet(nc)[0], _limits(), n, points, corners, found, done)
     rest = ~done
     if rest.any():
         found[rest], done[rest] = facets.project(points[rest], corners[rest], found[rest])
@@ -197,12 +108,12 @@ def project(
 
 def closest_point(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """`facets.closest_point`."""
-    library = _library()
-    if library is None or not len(points):
+    kernels = library.load()
+    if kernels is None or not len(points):
         return facets.closest_point(points, corners)
     n, nc = corners.shape[:2]
     xi, distance = np.empty((n, 2)), np.empty(n)
-    _run(library.closest_point, _facet(nc)[0], _limits(), n, points, corners, xi, distance)
+    library.run(kernels.closest_point, _facet(nc)[0], _limits(), n, points, corners, xi, distance)
     return xi, distance
 
 
@@ -227,11 +138,11 @@ def closest_facets(
     Returns:
         Whether it was done: there are not too many, and the kernels are compiled.
     """
-    library, (n, m, nc) = _library(), (len(points), *corners.shape[:2])
-    if library is None or n * m > _MOST_PAIRS:
+    kernels, (n, m, nc) = library.load(), (len(points), *corners.shape[:2])
+    if kernels is None or n * m > _MOST_PAIRS:
         return False
     pairs = n, points, limit, m, corners, sizes, rounding
-    return bool(_run(library.closest_facets, _facet(nc)[0], _limits(), *pairs, *out))
+    return bool(library.run(kernels.closest_facets, _facet(nc)[0], _limits(), *pairs, *out))
 
 
 def condensed(
@@ -257,8 +168,8 @@ def condensed(
     Returns:
         The contribution; None where nothing is compiled.
     """
-    library = _library()
-    if library is None:
+    kernels = library.load()
+    if kernels is None:
         return None
     n, nc = len(x0), x0.shape[1] - 1
     size = 3 * nc + 3 + multiplier.shape[1]
@@ -268,5 +179,5 @@ def condensed(
     rule = points, *discrete_gradient.gauss(points)
     tangential = multiplier.shape[1] - 1
     pairs = x0, x1, normal0, xi0, xi1, length, multiplier
-    _run(library.condensed, _facet(nc)[0], *rule, tangential, n, *pairs, *out)
+    library.run(kernels.condensed, _facet(nc)[0], *rule, tangential, n, *pairs, *out)
     return out

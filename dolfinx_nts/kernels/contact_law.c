@@ -1,0 +1,328 @@
+/* The laws of contact and friction, pair after pair, and what stands before and after them.
+
+   `laws` is contact/contact_laws.py, _write, with contact/coulomb.py, write, and kernels/friction.py,
+   return_map; `obstacle` is contact/obstacle_elements.py, _assembled; `to_nodes` is
+   contact/contact_elements.py, _spread. These have the formulas, stand in where there is no compiler,
+   and are compared with this by tests/test_compiled.py. */
+
+#include "facets.h"
+
+/* ---- the laws */
+
+/* What the pairs have in common, and what each has of its own in a step; `before` is NULL without
+   massless nodes, `unmoved` where nothing is prescribed. */
+typedef struct {
+    const double *scale, *yielding, *none, *before;
+    int size, row, friction, endless, strong, redundant;
+    double coefficient, pull, uneven;
+    const double *tangential_scale, *unmoved;
+} Law;
+
+typedef struct {
+    double force, normal, tangential;
+} Together;
+
+/* Slip [2], metric [2][2] and their gradients [2][size] and [2][2][size]. */
+typedef struct {
+    const double *value, *gradient, *metric, *metric_gradient;
+} Slip;
+
+/* Contravariant components of covariant ones. */
+static void raise(const double *m, const double *t, double *out)
+{
+    double determinant = m[0] * m[3] - m[1] * m[1];
+    out[0] = (m[3] * t[0] - m[1] * t[1]) / determinant;
+    out[1] = (m[0] * t[1] - m[1] * t[0]) / determinant;
+}
+
+static double length(const double *m, const double *t)
+{
+    double up[2];
+    raise(m, t, up);
+    return sqrt(t[0] * up[0] + t[1] * up[1]);
+}
+
+static double distance_of(const Slip *slip)
+{
+    const double *m = slip->metric, *s = slip->value;
+    return sqrt(s[0] * (m[0] * s[0] + m[1] * s[1]) + s[1] * (m[2] * s[0] + m[3] * s[1]));
+}
+
+static int any(const double *a) { return a && (a[0] != 0.0 || a[1] != 0.0 || a[2] != 0.0 || a[3] != 0.0); }
+
+/* Pull up to which a node that sticks is let slip before it is let go. */
+static double pull_of(const Law *law, const Slip *slip, double c, const double *t, const double *unmoved)
+{
+    double friction = length(slip->metric, t);
+    int resists = friction * friction + c * (t[0] * slip->value[0] + t[1] * slip->value[1]) > 0.0;
+    return resists && !any(unmoved) ? law->pull * friction : 0.0;
+}
+
+/* Compliance lent to a pair that sticks. */
+static double lent(const Law *law, const Together *together, double force, double scale)
+{
+    double part = law->uneven;
+    if (force < 0.0)
+        part = smaller(larger(together->force / -force, 1.0 / law->uneven), law->uneven);
+    return together->tangential * part / scale;
+}
+
+/* Rows of lambda_T where it slips along the trial; `t` is lambda_T less what is held of it. */
+static void slide(int size, const Slip *slip, const double *t, const double *trial, double length_of_trial,
+                  double bound, double c, double *value, double (*by_multiplier)[2], double *by_bound, double *rows)
+{
+    const double *m = slip->metric, *s = slip->value;
+    double unit[2], up[2], across[2][2], by_slip, by_metric[2][2];
+    for (int a = 0; a < 2; a++)
+        unit[a] = trial[a] / length_of_trial;
+    raise(m, unit, up);
+    for (int a = 0; a < 2; a++) {
+        for (int b = 0; b < 2; b++) {
+            across[a][b] = ((a == b) - unit[a] * up[b]) / length_of_trial;
+            by_multiplier[a][b] = (a == b) - bound * across[a][b];
+        }
+        value[a] = t[a] - bound * unit[a];
+        by_bound[a] = -unit[a];
+    }
+    for (int a = 0; a < 2; a++) {
+        double *row = rows + a * size;
+        memset(row, 0, size * sizeof(double));
+        for (int b = 0; b < 2; b++) {
+            by_slip = -bound * c * (across[a][0] * m[b] + across[a][1] * m[2 + b]);
+            for (int d = 0; d < 2; d++)
+                by_metric[b][d] = -bound * (c * across[a][b] * s[d] + 0.5 * unit[a] * up[b] * up[d]);
+            for (int z = 0; z < size; z++)
+                row[z] += by_slip * slip->gradient[b * size + z];
+        }
+        for (int b = 0; b < 2; b++)
+            for (int d = 0; d < 2; d++) {
+                const double *gradient = slip->metric_gradient + (2 * b + d) * size;
+                for (int z = 0; z < size; z++)
+                    row[z] += by_metric[b][d] * gradient[z];
+            }
+    }
+}
+
+/* The rows of lambda_T of an active pair; whether it sticks. */
+static int rub(const Law *law, const Together *together, const Slip *slip, const double *end, double of_end,
+               double scale, double yielding, double c, const double *unmoved, const double *held, double *residual,
+               double *tangent)
+{
+    static const double NONE[4] = {0.0};
+    const double *t = end + (law->size - law->row) - 2, *m = slip->metric, *s = slip->value;
+    const double *by_gap = tangent + law->row * law->size;
+    int size = law->size, last = size - 2, stick;
+    int new = end[0] >= 0.0 && (law->strong || law->redundant);
+    double mu = law->coefficient, *value = residual + last, *rows = tangent + last * size;
+    double bound = mu * (law->strong ? -end[0] : larger(-end[0], 0.0)), loose[4], less[2], trial[2];
+    if (new)
+        bound -= mu * yielding * residual[law->row];
+    if (law->endless)
+        bound = INFINITY;
+    if (!unmoved)
+        unmoved = held = NONE;
+    for (int a = 0; a < 4; a++)
+        loose[a] = (a % 3 == 0) - held[a];
+    for (int a = 0; a < 2; a++)
+        less[a] = loose[2 * a] * t[0] + loose[2 * a + 1] * t[1];
+    if (!law->endless && any(unmoved) && !any(held)) {
+        double made = 2.0 * bound / distance_of(slip);
+        c = made <= c ? c : made;
+    }
+    for (int a = 0; a < 2; a++)
+        trial[a] = less[a] + c * (m[2 * a] * s[0] + m[2 * a + 1] * s[1]);
+    double size_of_trial = length(m, trial);
+    stick = size_of_trial <= bound;
+    const double *unsaid = stick ? unmoved : held;
+    if (stick) {
+        memcpy(value, s, 2 * sizeof(double));
+        memcpy(rows, slip->gradient, 2 * size * sizeof(double));
+    } else {
+        double by_multiplier[2][2], by_bound[2];
+        slide(size, slip, less, trial, size_of_trial, bound, c, value, by_multiplier, by_bound, rows);
+        for (int a = 0; a < 2; a++) {
+            double *row = rows + a * size;
+            for (int b = 0; b < 2; b++)
+                row[last + b] += of_end * (by_multiplier[a][0] * loose[b] + by_multiplier[a][1] * loose[2 + b]);
+            row[law->row] -= mu * of_end * by_bound[a];
+            for (int z = 0; new && z < size; z++)
+                row[z] -= mu * yielding * by_bound[a] * by_gap[z];
+            value[a] /= scale;
+            for (int z = 0; z < size; z++)
+                row[z] /= scale;
+        }
+    }
+    for (int a = 0; a < 2; a++) {
+        for (int b = 0; b < 2; b++) {
+            value[a] += unsaid[2 * a + b] / scale * t[b];
+            rows[a * size + last + b] += of_end * unsaid[2 * a + b] / scale;
+        }
+        if (stick && together->tangential != 0.0)
+            rows[a * size + last + a] -= lent(law, together, end[0], scale);
+    }
+    return stick;
+}
+
+/* Residual (n, size), tangent (n, size, size) and slip come as of the element, and leave as of the
+   step; `held` and `normal` may be NULL as `unmoved` and the slip. */
+void laws(const Law *law, const Together *together, long n, const double *gap, const double *value,
+          const double *gradient, const double *metric, const double *metric_gradient, const double *multiplier,
+          const double *held, const double *normal, double *residual, double *tangent, double *end,
+          unsigned char *active, unsigned char *stick, double *distance, double *force, double *tangential)
+{
+    int size = law->size, row = law->row, constraints = size - row;
+    for (long i = 0; i < n; i++) {
+        const double *unmoved = law->unmoved ? law->unmoved + 4 * i : NULL;
+        double scale = law->scale[i], of_end = 1.0, none = law->none[i], c = 0.0;
+        double *r = residual + i * size, *k = tangent + i * size * size, *last = end + i * constraints;
+        double *gap_row = k + row * size;
+        Slip slip = {NULL, NULL, NULL, NULL};
+        memcpy(last, multiplier + i * constraints, constraints * sizeof(double));
+        if (law->before && !isnan(law->before[3 * i])) {
+            of_end = 2.0;
+            for (int j = 0; j < constraints; j++)
+                last[j] *= 2.0;
+            last[0] -= law->before[3 * i];
+            for (int a = 0; law->friction && a < 2; a++)
+                last[constraints - 2 + a] -= law->before[3 * i + 1 + a];
+        }
+        if (law->friction) {
+            slip.value = value + 2 * i;
+            slip.gradient = gradient + 2 * i * size;
+            slip.metric = metric + 4 * i;
+            slip.metric_gradient = metric_gradient + 4 * i * size;
+            c = law->tangential_scale[i];
+            if (law->pull > 0.0)
+                none -= pull_of(law, &slip, c, last + constraints - 2, unmoved);
+        }
+        active[i] = -last[0] - law->yielding[i] * gap[i] > none;
+        stick[i] = 0;
+        distance[i] = active[i] && law->friction ? distance_of(&slip) : 0.0;
+        if (active[i]) {
+            gap_row[row] -= together->normal / scale;
+            if (law->friction)
+                stick[i] = rub(law, together, &slip, last, of_end, scale, law->yielding[i], c, unmoved,
+                               unmoved ? held + 4 * i : NULL, r, k);
+        } else {
+            r[row] = last[0] / scale;
+            memset(gap_row, 0, size * sizeof(double));
+            gap_row[row] = of_end / scale;
+            for (int j = size - 2; law->friction && j < size; j++) {
+                r[j] = last[j - row] / scale;
+                memset(k + j * size, 0, size * sizeof(double));
+                k[j * size + j] = of_end / scale;
+            }
+        }
+        for (int a = 0; a < 3; a++)
+            force[3 * i + a] = -r[a];
+        if (law->friction) {
+            double along = dot(force + 3 * i, normal + 3 * i);
+            for (int a = 0; a < 3; a++)
+                tangential[3 * i + a] = force[3 * i + a] - along * normal[3 * i + a];
+        }
+        for (int j = row; j < size; j++) {
+            r[j] *= scale;
+            for (int z = 0; z < size; z++)
+                k[j * size + z] *= scale;
+            for (int z = 0; z < size; z++)
+                k[z * size + j] *= scale;
+        }
+    }
+}
+
+/* ---- the element without a facet */
+
+/* Of each pair the rule's gradient of the gap and its derivative, the gap and its gradient at the end,
+   gradient and curvature where the force acts, the normal and two directions along the surface at the
+   start, motion and multipliers. Arrays that are written come as zeros. */
+void obstacle(int constraints, double theta, long n, const double *gradient, const double *slope, const double *gap,
+              const double *end, const double *middle, const double *bend, const double *normal0,
+              const double *directions, const double *motion, const double *multiplier, double *residual,
+              double *tangent, double *slip, double *slip_gradient, double *metric, double *metric_gradient)
+{
+    int size = 3 + constraints;
+    for (long i = 0; i < n; i++) {
+        const double *lambda = multiplier + i * constraints;
+        double *r = residual + i * size, *k = tangent + i * size * size;
+        r[3] = gap[i];
+        for (int a = 0; a < 3; a++) {
+            r[a] = lambda[0] * gradient[3 * i + a];
+            k[a * size + 3] = gradient[3 * i + a];
+            k[3 * size + a] = end[3 * i + a];
+            for (int b = 0; b < 3; b++)
+                k[a * size + b] = lambda[0] * slope[9 * i + 3 * a + b];
+        }
+        if (constraints == 1)
+            continue;
+        const double *n0 = normal0 + 3 * i, *d = motion + 3 * i, *t = lambda + 1;
+        double per_height = dot(middle + 3 * i, n0), rise = dot(n0, d), n0_turn[3], part[2], turn[2][3], dual[2][3];
+        per_height = per_height != 0.0 ? 1.0 / per_height : 0.0;
+        for (int b = 0; b < 3; b++) {
+            const double *column = bend + 9 * i + b;
+            n0_turn[b] = theta * (n0[0] * column[0] + n0[1] * column[3] + n0[2] * column[6]);
+        }
+        for (int a = 0; a < 2; a++) {
+            const double *e = directions + 6 * i + 3 * a;
+            double *g = slip_gradient + (2 * i + a) * size, tilt;
+            part[a] = dot(e, middle + 3 * i);
+            tilt = part[a] * per_height;
+            for (int b = 0; b < 3; b++) {
+                const double *column = bend + 9 * i + b;
+                turn[a][b] = theta * (e[0] * column[0] + e[1] * column[3] + e[2] * column[6]);
+                double tilt_gradient = (turn[a][b] - tilt * n0_turn[b]) * per_height;
+                dual[a][b] = e[b] - tilt * n0[b];
+                g[b] = dual[a][b] - rise * tilt_gradient;
+                for (int j = 0; j < 3; j++)
+                    k[j * size + b] -= n0[j] * t[a] * tilt_gradient;
+            }
+            slip[2 * i + a] = dot(dual[a], d);
+            for (int j = 0; j < 3; j++) {
+                r[j] += t[a] * dual[a][j];
+                k[j * size + 4 + a] = dual[a][j];
+            }
+        }
+        for (int a = 0; a < 2; a++)
+            for (int b = 0; b < 2; b++) {
+                double *g = metric_gradient + (4 * i + 2 * a + b) * size;
+                metric[4 * i + 2 * a + b] = (a == b) - part[a] * part[b];
+                for (int j = 0; j < 3; j++)
+                    g[j] = -(part[a] * turn[b][j] + part[b] * turn[a][j]);
+            }
+    }
+}
+
+/* ---- points to nodes */
+
+/* out (nodes, 3 columns), or (nodes, columns) in threes, from in (points, ..): the transpose of weights (points, nodes). */
+static void spread(int points, int nodes, int columns, const double *weights, const double *in, double *out)
+{
+    for (int a = 0; a < nodes; a++) {
+        double *to = out + a * columns;
+        memset(to, 0, columns * sizeof(double));
+        for (int p = 0; p < points; p++) {
+            const double *from = in + p * columns, w = weights[p * nodes + a];
+            for (int j = 0; w != 0.0 && j < columns; j++)
+                to[j] += w * from[j];
+        }
+    }
+}
+
+/* Residual (n, 3 points + rest) and tangent of points as those of nodes; work is (3 points + rest,
+   3 nodes + rest). */
+void to_nodes(int points, int nodes, int rest, long n, const double *weights, const double *residual,
+              const double *tangent, double *work, double *out_residual, double *out_tangent)
+{
+    int size = 3 * points + rest, width = 3 * nodes + rest;
+    for (long i = 0; i < n; i++) {
+        const double *w = weights + i * points * nodes, *r = residual + i * size, *k = tangent + i * size * size;
+        double *out_r = out_residual + i * width, *out_k = out_tangent + i * width * width;
+        spread(points, nodes, 3, w, r, out_r);
+        memcpy(out_r + 3 * nodes, r + 3 * points, rest * sizeof(double));
+        for (int j = 0; j < size; j++) {
+            spread(points, nodes, 3, w, k + j * size, work + j * width);
+            memcpy(work + j * width + 3 * nodes, k + j * size + 3 * points, rest * sizeof(double));
+        }
+        spread(points, nodes, 3 * width, w, work, out_k);
+        memcpy(out_k + 3 * nodes * width, work + 3 * points * width, rest * width * sizeof(double));
+    }
+}

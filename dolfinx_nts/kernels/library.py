@@ -1,0 +1,134 @@
+"""The C files beside this, compiled once into a library, and how its kernels are called."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import logging
+import os
+import platform
+import shlex
+import subprocess
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+logger = logging.getLogger(__name__)
+
+_NAMES = "facets.h", "facets.c", "nts_element.c", "contact_law.c"
+_SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
+_FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
+
+_INT, _LONG, _REAL, _ARRAY = ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_void_p
+
+
+class Facet(ctypes.Structure):
+    """A kind of facet; see `facets.h`."""
+
+    _fields_ = [  # noqa: RUF012
+        *(("nc", _INT), ("degree", _INT), ("together", _INT)),
+        ("coefficients", _ARRAY),
+    ]
+
+
+class Limits(ctypes.Structure):
+    """Where projections end; see `facets.c`."""
+
+    _fields_ = [("last_step", _REAL), ("far_step", _REAL), ("collinear", _REAL)]  # noqa: RUF012
+
+
+class Law(ctypes.Structure):
+    """Laws of contact and friction of pairs in a step; see `contact_law.c`."""
+
+    _fields_ = [  # noqa: RUF012
+        *((name, _ARRAY) for name in ("scale", "yielding", "none", "before")),
+        *((name, _INT) for name in ("size", "row", "friction", "endless", "strong", "redundant")),
+        *((name, _REAL) for name in ("coefficient", "pull", "uneven")),
+        *((name, _ARRAY) for name in ("tangential_scale", "unmoved")),
+    ]
+
+
+class Together(ctypes.Structure):
+    """What pairs have in common; see `contact_law.c`."""
+
+    _fields_ = [("force", _REAL), ("normal", _REAL), ("tangential", _REAL)]  # noqa: RUF012
+
+
+_FACET, _LIMITS = ctypes.POINTER(Facet), ctypes.POINTER(Limits)
+#: Arguments of the kernels.
+_KERNELS = {
+    "project": (_FACET, _LIMITS, _LONG, *(_ARRAY,) * 4),
+    "closest_point": (_FACET, _LIMITS, _LONG, *(_ARRAY,) * 4),
+    "closest_facets": (
+        *(_FACET, _LIMITS, _LONG, _ARRAY, _ARRAY),
+        *(_LONG, _ARRAY, _ARRAY, _REAL, *(_ARRAY,) * 3),
+    ),
+    "condensed": (_FACET, _INT, _ARRAY, _ARRAY, _INT, _LONG, *(_ARRAY,) * 13),
+    "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 16),
+    "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),
+    "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
+}
+
+
+def _compile(target: Path) -> None:
+    """Make the library; whoever else does so at the same time replaces it by the same."""
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+        made = Path(folder, target.name)
+        files = [*map(str, _SOURCES[1:]), "-o", str(made)]
+        command = [*compiler, *_FLAGS, "-shared", "-fPIC", *files, "-lm"]
+        subprocess.run(command, check=True, capture_output=True)
+        made.replace(target)
+
+
+@lru_cache
+def load() -> Any:
+    """The library, or None where it can be neither found nor made."""
+    key = hashlib.sha256(" ".join(_FLAGS).encode())
+    for source in _SOURCES:
+        key.update(source.read_bytes())
+    # Beside the forms that DOLFINx compiles.
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    target = Path(cache, "fenics", f"dolfinx_nts_{platform.machine()}_{key.hexdigest()[:16]}.so")
+    try:
+        if not target.exists():
+            _compile(target)
+        library = ctypes.CDLL(str(target))
+    except (OSError, subprocess.CalledProcessError) as error:
+        logger.warning("Contact kernels are not compiled (%s): contact takes longer", error)
+        return None
+    for name, arguments in _KERNELS.items():
+        kernel = getattr(library, name)
+        kernel.argtypes = arguments
+    return library
+
+
+def is_there() -> bool:
+    """Return whether the kernels are compiled, which is done here if it can be."""
+    return load() is not None
+
+
+def leave_out() -> None:
+    """Use NumPy's from now on."""
+    global load  # noqa: PLW0603
+    load = lru_cache(lambda: None)
+
+
+def plain(value: Any) -> Any:
+    """An array as kernels read it; anything else as it is."""
+    return np.ascontiguousarray(value) if isinstance(value, np.ndarray) else value
+
+
+def pointer(value: Any) -> Any:
+    """Where an array begins; anything else as it is."""
+    return value.ctypes.data if isinstance(value, np.ndarray) else value
+
+
+def run(function: Any, *arguments: Any) -> Any:
+    """Call a kernel with arrays as pointers; those that it writes are contiguous."""
+    held = [plain(a) for a in arguments]
+    return function(*map(pointer, held))
