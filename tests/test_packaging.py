@@ -21,11 +21,16 @@ def stated():
         "CHANGELOG.md": changes[1],
         "CITATION.cff": re.search(r"^version: (\S+)$", cite, re.MULTILINE)[1],
         "debian/changelog": re.match(r"\S+ \((\S+?)(?:-\d+)?\)", debian())[1],
+        "conda/recipe.yaml": re.search(r'^  version: "(\S+)"$', recipe(), re.MULTILINE)[1],
     }, (changes[2], re.search(r'^date-released: "(\S+)"$', cite, re.MULTILINE)[1])
 
 
 def debian():
     return (ROOT / "debian/changelog").read_text()
+
+
+def recipe():
+    return (ROOT / "conda/recipe.yaml").read_text()
 
 
 def test_the_version_is_one():
