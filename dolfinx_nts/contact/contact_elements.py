@@ -32,6 +32,8 @@ _CYCLE = 8
 #: What messages say of such a node; what follows says what to do.
 UNSETTLED = "settles in neither; "
 _EPS = float(np.finfo(float).eps)
+#: Components whose products make those of a cross product.
+_ONE, _TWO = [1, 2, 0], [2, 0, 1]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -353,11 +355,14 @@ class ContactElements(ContactLaws):
         force = rows.reshape(y.shape)
         for side in self._nodes:
             here = slice(start, start + side.nodes.shape[1])
-            push = np.where(side.fixed[on], 0.0, force[:, here])
-            places = side.places[on][:, :, None].astype(float)
-            middle = (y[:, here] * places).sum(axis=1, keepdims=True) / places.sum(axis=1)[:, None]
-            moment = cross(y[:, here] - middle * places, push).sum(axis=1)
-            found.append(np.concatenate([(push * places).sum(axis=1), moment], axis=1))
+            push, fixed, places = force[:, here], side.fixed[on], side.places[on].astype(float)
+            if fixed.any():
+                push = np.where(fixed, 0.0, push)
+            middle = np.einsum("nk,nki->ni", places, y[:, here]) / places.sum(axis=1)[:, None]
+            arm = y[:, here] - middle[:, None] * places[:, :, None]
+            turned = np.matmul(arm.transpose(0, 2, 1), push)
+            moment = turned[:, _ONE, _TWO] - turned[:, _TWO, _ONE]
+            found.append(np.column_stack([np.einsum("nk,nki->ni", places, push), moment]))
             start = here.stop
         return found
 

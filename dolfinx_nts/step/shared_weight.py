@@ -90,16 +90,16 @@ class SharedWeight:
         """
         if not self._any:
             return
-        found, chosen = [_none()], []
+        found, chosen = [], []
         for batch, numbers, part, x in zip(elements, bodies, parts, places, strict=True):
             on = np.flatnonzero(part.active)
             if on.size and _is_rigid(batch.pair):
                 scale = batch.scale[on]
                 found.append(_rows(batch, numbers, part, x, on, closed(batch)))
                 chosen.append((part, on, batch.gap_row, scale))
-        own = _Rows(*map(np.concatenate, zip(*found, strict=True)))
+        own = _joined(found)
         every = self._comm.allgather(own) if self._comm.size > 1 else [own]
-        rows = _Rows(*map(np.concatenate, zip(*every, strict=True)))
+        rows = _joined(every)
         if not len(rows.body):
             return
         first = sum(len(other.body) for other in every[: self._comm.rank])
@@ -111,8 +111,12 @@ class SharedWeight:
             part.residual[on, row] -= scale * (none[:, 0] + lent * none[:, 1])
 
 
-def _none() -> _Rows:
-    return _Rows(np.empty((0, 2), dtype=int), np.empty((0, 2, 6)), np.empty((0, 2)), np.empty(0))
+def _joined(rows: Sequence[_Rows]) -> _Rows:
+    """Those of several batches or ranks, one after the other."""
+    if len(rows) == 1:
+        return rows[0]
+    none = np.empty((0, 2), dtype=int), np.empty((0, 2, 6)), np.empty((0, 2)), np.empty(0)
+    return _Rows(*map(np.concatenate, zip(none, *rows, strict=True)))
 
 
 def _rows(
@@ -140,22 +144,25 @@ def _null_part(rows: _Rows) -> FloatArray:
     n = len(rows.body)
     known, place = np.unique(rows.body, return_inverse=True)
     place = place.reshape(n, 2)
-    columns = (6 * place[:, :, None] + np.arange(6)).reshape(n, 12)
-    pushes, few = rows.push.reshape(n, 12), len(known) <= _FEW
+    few, width = len(known) <= _FEW, 6 * len(known)
+    g: Any
+    if few:
+        g = np.zeros((n, len(known), 6))
+        for side in range(2):
+            g[np.arange(n), place[:, side]] += rows.push[:, side]
+        g = g.reshape(n, width)
+        square = np.einsum("nk,nk->k", g, g)
+    else:
+        columns = 6 * place[:, :, None] + np.arange(6)
+        at = np.repeat(np.arange(n), 12), columns.ravel()
+        g = scipy.sparse.csr_array((rows.push.ravel(), at), shape=(n, width))
+        square = g.power(2).sum(axis=0)
     # Turns in the length that makes their gaps as large as those of translations, if any do.
-    square = np.bincount(columns.ravel(), pushes.ravel() ** 2, 6 * len(known))
     square = square.reshape(-1, 2, 3).sum(axis=2)
     wanted = np.where(square[:, :1] > 0.0, square[:, :1], 1.0)
     unit = np.sqrt(np.divide(wanted, square, out=np.zeros_like(square), where=square > 0.0))
-    pushes = pushes * np.repeat(unit.ravel(), 3)[columns]
-    g: Any
-    if few:
-        g = np.zeros((n, 6 * len(known)))
-        for side in (slice(6), slice(6, None)):
-            g[np.arange(n)[:, None], columns[:, side]] += pushes[:, side]
-    else:
-        at = np.repeat(np.arange(n), 12), columns.ravel()
-        g = scipy.sparse.csr_array((pushes.ravel(), at), shape=(n, 6 * len(known)))
+    unit = np.repeat(unit.ravel(), 3)
+    g = g * unit if few else g @ scipy.sparse.diags(unit)
     a, b = g.T @ g, g.T @ rows.value
     largest = a.diagonal().reshape(-1, 6).max(axis=1)
     held = np.repeat(_NONE * np.where(largest > 0.0, largest, 1.0), 6)
