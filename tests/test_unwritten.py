@@ -163,13 +163,24 @@ SLAB = Body(cells=(1, 2, 1), cell="tetrahedron", size=(1.5, 1.5, 0.3), speed=3.0
 FOUND = {
     # The fourth step's look, at the nodes and edges of one of both bodies, counted as the last one.
     "last look at both": Scene(bodies=(RING, CUBE), contacts=(Contact(swapped=True),), steps=4),
-    # In steps of a facet the look at the first one took the side that shows no node inside.
+    # Looks took one body and the other in turn, in steps of a facet the one that shows nothing, ...
     "turn of the other side": Scene(
         bodies=(Body(shape="ring", cells=(5, 1, 1), law="", poisson=0.0, density=100.0, gap=0.0,
                      speed=4.0, spin=(10.0, -20.0, 5.0)),
                 Body(shape="ball", cells=(3, 3, 3), gap=0.001, speed=30.0, spin=(0.0, 0.0, 5.0))),
         contacts=(Contact(swapped=True, friction=0.3, smoothing=True),), dt=0.02,
         newton=(("max_retries", 1),),
+    ),
+    # ... and came after four steps at the earliest, when all was over.
+    "four steps": Scene(
+        row=(0.0, 0.0, 1.0),
+        bodies=(Body(cells=(2, 3, 2), size=(0.4, 1.0, 1.0), young=1e8, poisson=0.49, density=1e4,
+                     gap=0.0, speed=30.0, drift=(0.0, 5.0), spin=(10.0, -20.0, 5.0)),
+                Body(cells=(3, 1, 1), cell="tetrahedron", young=1e8, poisson=0.0, gap=0.04,
+                     speed=30.0)),
+        contacts=(Contact(swapped=True, friction=0.3, smoothing=True),),
+        joints=(("Damper", 1, True),), dt=5e-3, steps=6,
+        options=(("accuracy", "fast"), ("project_start", True)), unit=1e-3,
     ),
     # A run that stopped had no last look: what the steps before had done was told by no one.
     "last look of a run that stops": Scene(

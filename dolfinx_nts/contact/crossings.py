@@ -16,9 +16,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Bodies whose boxes meet are looked at again after a relative motion of this many facet sizes,
-#: but only after so many steps, which resolve a crossing at all, unless they have moved by a facet.
-_LOOK, STEPS = 0.25, 4
+#: Bodies whose boxes meet are looked at again after a relative motion of this many facet sizes.
+_LOOK = 0.25
 #: A motion within which one may pass through the other is looked at after so many of the least of
 #: such motions, but at no more places than this.
 _BETWEEN, _MOST = 0.5, 64
@@ -68,14 +67,9 @@ class Pause(NamedTuple):
     through: float = np.inf
 
     @property
-    def least(self) -> float:
-        """A look is due after this motion [m] and `STEPS` steps."""
+    def due(self) -> float:
+        """A look is due after this motion [m]."""
         return self.clear + _LOOK * self.unit
-
-    @property
-    def most(self) -> float:
-        """A look is due after this motion [m], in however few steps."""
-        return self.clear + self.unit
 
     def shorter(self, other: Pause) -> Pause:
         """One that is no longer than both."""
@@ -97,7 +91,6 @@ class Watched:
     ) -> None:
         self.surfaces, self._whole = surfaces, whole
         self.needed = [*surfaces, *([whole] if whole else [])]
-        self._turn = 0
         self._bulks: list[float] | None = None
         self._boundaries = [Boundary(s.facets) for s in surfaces]
         self._roles = [
@@ -128,15 +121,13 @@ class Watched:
         number = places((last - first) * way, through)
         for part in np.linspace(first, last, number) if first < last else ():
             x = {i: (1.0 - part) * before[i] + part * after[i] for i in after}
-            yield from self.look(x, True)[0]
+            yield from self.look(x)[0]
 
-    def look(self, positions: dict[int, FloatArray], both: bool) -> tuple[list[Finding], Pause]:
+    def look(self, positions: dict[int, FloatArray]) -> tuple[list[Finding], Pause]:
         """Return what is inside, and how long nothing else may be.
 
         Args:
             positions: Points of each of the surfaces `needed` [m], by its id.
-            both: Look at the nodes and edges of both; else of one and the other in turn. Where
-                edges cross, those of either show it.
         """
         known = self._bulks or (None, None)
         sides = [
@@ -153,14 +144,12 @@ class Watched:
         if gap > 0.0 and self._whole is None:
             way = min(max(float(s.sizes.min()) for s in sides), thickness)
             return findings, Pause(gap, way, thickness)
-        self._turn = 1 - self._turn
         common = np.array([np.maximum(*(b[0] for b in boxes)), np.minimum(*(b[1] for b in boxes))])
         near = [s.sizes[s.facets_near(common)] for s in sides]
         smallest = [n.min() if n.size else s.sizes.min() for n, s in zip(near, sides, strict=True)]
         facet = float(max(smallest))
         way = min(facet, thickness)
-        # Of a body smaller than a facet no edge of the other one tells anything.
-        for k in (0, 1) if both or way < facet else (self._turn,):
+        for k in (0, 1):
             found = intrusions(sides[k], sides[1 - k])
             if self._whole is not None:
                 found = self._enclosed(found, k, positions[id(self._whole)])
@@ -297,15 +286,14 @@ class BodyPair:
             return [Watched((c.slave, c.master), [c], one) for c in self._contacts]
         return [Watched((one, two), self._contacts, None)]
 
-    def look(self, where: list[FloatArray], both: bool) -> tuple[list[Finding], Pause]:
+    def look(self, where: list[FloatArray]) -> tuple[list[Finding], Pause]:
         """Return what is inside, and how long nothing else may be. Collective.
 
         Args:
             where: Of `where`.
-            both: Look at the nodes and edges of both bodies; else of one and the other in turn.
         """
         positions = self._positions(where)
-        looks = [part.look(positions, both) for part in self._parts]
+        looks = [part.look(positions) for part in self._parts]
         pause = reduce(Pause.shorter, (pause for _, pause in looks))
         return [f for found, _ in looks for f in found], pause
 

@@ -115,7 +115,7 @@ class ObstacleContact:
         slave, obstacle = self.contact.slave, self.contact.master
         return [u[self._body], obstacle.displacement(time, slave.body.comm)]
 
-    def look(self, where: list[FloatArray], both: bool) -> tuple[list[Finding], Pause]:
+    def look(self, where: list[FloatArray]) -> tuple[list[Finding], Pause]:
         """The deepest facet of the slave, node and facet of the rest, or the obstacle. Collective.
 
         Of the rest a facet is told only where its nodes are not as deep and the slave's facets are
@@ -158,12 +158,12 @@ class ObstacleContact:
             through: That which may take the obstacle through a facet [m].
         """
         # Where the ends are clear, so is as much of the way.
-        first, last = (self.look(w, True)[1].clear / way for w in (before, after))
+        first, last = (self.look(w)[1].clear / way for w in (before, after))
         part, findings = max(0.0, 1.0 - first - last), []
         for k in range(number := places(part * way, through)):
             s = first + part * k / (number - 1)
             between = [(1.0 - s) * b + s * a for b, a in zip(before, after, strict=True)]
-            findings += self.look(between, True)[0]
+            findings += self.look(between)[0]
         return findings
 
     @cached_property

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from dolfinx_nts.contact.crossings import STEPS, BodyPair, Finding, Pause
+from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels.vectors import range_of
@@ -33,14 +33,10 @@ class _Looked:
     Attributes:
         where: What was where, as of `where`.
         pause: Until the next look.
-        both: Whether it was one at both of the pair.
-        steps: Since then.
     """
 
     where: list[FloatArray]
     pause: Pause
-    both: bool
-    steps: int = 0
 
 
 class OverlapWatch:
@@ -49,11 +45,10 @@ class OverlapWatch:
     Also whether obstacles end up inside facets of a slave that they are the master of, inside those
     or over nodes of its body's remaining boundary, or inside the body. Bodies of which no contact
     is declared may pass through each other. A look is due when the two have moved relative to each
-    other so far that they can touch; then by a quarter of a facet since the last one, and four
-    steps or a facet. The radius of a small obstacle counts as a facet, and so does the thickness of
-    the thicker one of two bodies. Where they have moved by more than that thickness between two
-    looks, the straight way is looked at, too. A look takes the nodes and edges of one and the other
-    body in turn, or of both where fewer than four steps lie between two looks.
+    other so far that they can touch; then by a quarter of a facet since the last one. The radius of
+    a small obstacle counts as a facet, and so does the thickness of the thicker one of two bodies.
+    Where they have moved by more than that thickness between two looks, the straight way is looked
+    at, too.
 
     Args:
         system: The scene.
@@ -94,7 +89,7 @@ class OverlapWatch:
         Args:
             u: Owned displacements of all bodies [m]; kept until the next look, not to be changed.
             time: At which they are so [s].
-            last: Look again wherever anything has moved, or was looked at from one side only.
+            last: Look again wherever anything has moved.
         """
         now = [pair.where(u, time) for pair in self._pairs]
         findings: list[Finding] = []
@@ -102,12 +97,9 @@ class OverlapWatch:
             before = self._looked.get(k)
             if before and way > before.pause.clear + before.pause.through:
                 findings += self._pairs[k].passed(before.where, now[k], way, before.pause.through)
-            # Where few steps bring the next look, a node that one side shows is gone by the turn of
-            # that side.
-            both = last or before is None or before.steps < STEPS
-            found, pause = self._pairs[k].look(now[k], both)
+            found, pause = self._pairs[k].look(now[k])
             findings += found
-            self._looked[k] = _Looked(now[k], pause, both)
+            self._looked[k] = _Looked(now[k], pause)
         worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
             key = f.kind, f.about
@@ -143,9 +135,7 @@ class OverlapWatch:
         ways = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
         due = []
         for (k, looked), way in zip(self._looked.items(), ways.tolist(), strict=True):
-            looked.steps += 1
-            enough = way > (looked.pause.least if looked.steps >= STEPS else looked.pause.most)
-            if enough or (last and (way > 0.0 or not looked.both)):
+            if way > (0.0 if last else looked.pause.due):
                 due.append((k, way))
         return fresh + due
 
