@@ -210,8 +210,9 @@ def test_a_facet_counts_up_to_the_width_of_a_body_in_it():
         pin = box((0.3, 0.4, -0.15), (0.32, 0.42, 0.25), (1, 1, cells))
         found = intrusion.intrusions(pin, block)
         assert np.isclose(found.depth.max(), 0.15)
-        # Of a square section any width up to the diagonal may count; or the pin's own facets.
-        own = (0.02 + 0.4 / cells) / 2
+        # Of a square section any width up to the diagonal may count; or the pin's own facets, up
+        # to six times its volume by its area.
+        own = min((0.02 + 0.4 / cells) / 2, 6 * 0.02**2 * 0.4 / (2 * 0.02**2 + 4 * 0.02 * 0.4))
         counted = 0.15 / found.size.max()
         assert max(0.02, own) - 1e-12 <= counted <= max(0.02 * np.sqrt(2), own) + 1e-12
     bead = box((0.3, 0.4, -0.11), (0.4, 0.5, -0.01), (1, 1, 1))

@@ -182,8 +182,11 @@ class Placed:
 
     @cached_property
     def sizes(self) -> FloatArray:
-        """Mean edge length of each facet [m], shape (m,)."""
-        return fc.size(self.corners)
+        """Mean edge length of each facet, at most the body's bulk [m], shape (m,).
+
+        A long facet of a slender body does not explain how deep all of the body lies in another.
+        """
+        return np.minimum(fc.size(self.corners), self.bulk)
 
     def edge_sizes(self, edge: IntArray) -> FloatArray:
         """Size of the larger facet beside each of the edges [m], shape (n,)."""
