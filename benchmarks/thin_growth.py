@@ -1,6 +1,6 @@
 """CPU time a step of beams and shells that swing freely, beside continua of as many coordinates.
 
-    python benchmarks/thin_growth.py --beam 250 1000 4000 --shell 25 50 --continuum 15 27
+    python benchmarks/thin_growth.py --beam 1000 8300 --shell 25 50 100 128 --continuum 15 26 31
 
 A beam has as many elements as is said, a shell and a continuum as many along a side.
 """

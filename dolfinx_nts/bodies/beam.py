@@ -60,7 +60,7 @@ class Beam(DirectorBody):
             has a cell without length, a branch or a corner.
     """
 
-    kind = "beam"
+    kind, bound = "beam", True
 
     def __init__(
         self,

@@ -45,6 +45,7 @@ class Body:
         loads_in_time: Whether loads on it may change by themselves in time.
         rigid: Whether no motion changes distances in it, so that `directions` turn with it.
         oriented: Whether it has directors, and with them `length`, `directions_at` and `turn`.
+        bound: Whether its own constraints are half as many as its coordinates, or about that.
         length: What its directors are multiples of [m].
         rounded: Length [m] whose rounding enters the forces in addition to that of u, the same on
             all ranks; None: the size of the positions.
@@ -71,6 +72,7 @@ class Body:
     loads_in_time: bool = True
     rigid: bool = False
     oriented: bool = False
+    bound: bool = False
     length: float
     rounded: float | None = None
     allow_inversion: bool = False

@@ -91,7 +91,7 @@ class RigidBody(Body):
         ValueError: An argument is out of range, or the mesh is not a valid 3D mesh.
     """
 
-    rigid = oriented = True
+    rigid = oriented = bound = True
     _densities: Sequence[Any] = ()
     _made = False
 

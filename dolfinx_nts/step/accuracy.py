@@ -6,9 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from dolfinx_nts.step.linear_solver import SOLVERS, choose
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import is_finite, is_whole, known_options, require_bool
+
+#: Coordinates of shells from which a Krylov solver is worth it where they are stiff and steps long.
+_MANY = 2000
 
 
 @known_options
@@ -69,9 +74,14 @@ class Newton:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
         if self.linear_solver != "auto":
             return self.linear_solver
-        flexible = [b for b in system.bodies if not b.joints]
-        size = int(system.comm.allreduce(sum(b.num_owned for b in flexible)))
-        couples, mixed = bool(system.contacts or system.joints), len(flexible) < len(system.bodies)
+        continua = [b for b in system.bodies if not b.joints]
+        loose = [b for b in system.bodies if b.joints and not b.bound]
+        local = [sum(b.num_owned for b in bodies) for bodies in (continua, loose)]
+        size, other = (int(n) for n in system.comm.allreduce(np.array(local)))
+        # Multigrid knows nothing of constraints; incomplete factors take a few well.
+        if inertia and other >= _MANY:
+            size += other
+        couples, mixed = bool(system.contacts or system.joints), len(continua) < len(system.bodies)
         return choose(size, couples, inertia, given, mixed)
 
 

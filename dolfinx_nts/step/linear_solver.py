@@ -132,7 +132,8 @@ def choose(
     Without inertia incomplete factors are poor, and "multigrid" takes their place.
 
     Args:
-        size: Coordinates of all bodies without constraints of their own.
+        size: Coordinates of all bodies without constraints of their own, and of those with a few
+            that are worth it.
         contact: Whether contacts are declared.
         inertia: Whether the step equations have inertia.
         given: The user's PETSc options; those of a linear solver are meant for "direct".
