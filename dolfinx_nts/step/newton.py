@@ -320,6 +320,8 @@ class StepSolver:
             worst = self._worst(last)
         self._solved |= iteration > 0
         self._tangents.due |= unchanged and worst > max(1.0, _SLOW * self._before)
+        if iteration > 0 and unchanged:
+            self._presets.learn(worst, self._before)
         self._before = worst
         if worst <= 1.0:
             enough = self._passed is not None or iteration >= self.newton.max_iterations
@@ -334,7 +336,7 @@ class StepSolver:
             return reasons.DIVERGED_FUNCTION_DOMAIN
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
-        self._presets.aim(self.snes, worst, lambda: self._adds_up(last))
+        self._presets.aim(self.snes, worst)
         return reasons.ITERATING
 
     def _is_inside_out(self, e: Evaluation) -> bool:

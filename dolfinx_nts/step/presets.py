@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from petsc4py import PETSc
@@ -17,10 +17,11 @@ from dolfinx_nts.system import System
 _AIM = 1e-3
 #: Range of the linear solver's tolerance that is worth it.
 _FINE, _COARSE = 1e-12, 1e-5
-#: Its tolerance with kept matrices, with which an iteration gains two or three digits anyway.
+#: With kept matrices it is this part of what an iteration leaves of the residual, as more digits
+#: than the matrices allow are in vain, ...
+_BELOW = 0.1
+#: ... and at most this.
 _KEPT = 1e-3
-#: An iteration from a residual of this many tolerances, or less, may be the last.
-_LAST = 1e5
 #: Steps before the first linear solver is tried again, at the price of about one of them.
 _PATIENCE = 10
 #: What MUMPS says in INFOG(1) where more pivots were put off than it has workspace for ...
@@ -64,6 +65,7 @@ class Presets:
     ) -> None:
         self._system, self._newton, self._given = system, newton, given
         self._condense, self._patience = condense, 0
+        self.forget()
         self._workspace: dict[str, int] = {}
         mumps: tuple[str, ...] = ("direct", "null-pivots")
         if any(pair.redundant for pair in system.contacts):
@@ -128,21 +130,38 @@ class Presets:
         self._patience = _PATIENCE
         return self._chosen + 1
 
-    def aim(self, snes: Any, worst: float, adds_up: Callable[[], bool]) -> None:
+    def forget(self) -> None:
+        """Forget what iterations with kept matrices have left."""
+        self._left = 1.0
+
+    def learn(self, worst: float, before: float) -> None:
+        """Take note of an iteration with kept matrices in which no element changed its status.
+
+        Args:
+            worst: Residual after it over its tolerance.
+            before: The same before it.
+        """
+        left = worst / before
+        # In the end rounding is left, which says nothing of the matrices.
+        self._left = left if worst > 1.0 else min(left, self._left)
+
+    def aim(self, snes: Any, worst: float) -> None:
         """Let the Krylov solver of "krylov" and "multigrid" go as far as is worth it at an iterate.
 
         Args:
             snes: The SNES.
             worst: Residual of the iterate over its tolerance.
-            adds_up: Tells whether what an iteration leaves adds up over steps; collective.
         """
         if self.name not in ITERATIVE or self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
             return
         aim, limit = _AIM / worst, self.options.most_iterations
         if self._newton.reuse:
-            rtol = aim if worst <= _LAST and adds_up() else _KEPT
+            # What the linear solver leaves of the last iteration is missing in the momenta.
+            last = worst * self._left <= 1.0
+            rtol = min(max(aim, _FINE if last else _BELOW * self._left), _KEPT)
         else:
             rtol = aim if _FINE <= aim <= _COARSE else _COARSE
+        if rtol < _COARSE:
             limit = int(limit * math.log(rtol) / math.log(_COARSE))
         snes.getKSP().setTolerances(rtol=rtol, max_it=limit)
 
