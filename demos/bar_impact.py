@@ -34,7 +34,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 LENGTH, AREA, YOUNG, DENSITY = 10.0, 1.0, 900.0, 1.0
@@ -246,7 +246,9 @@ def main(
         recorder, clock = Recorder(), time.perf_counter()
         system = scene(comm, elements, gravity, mass)
         folder = output and Path(output) / name
-        writers = [recorder, *([Fields(folder, every=5)] if folder else [])]
+        writers = [recorder]
+        if folder:
+            writers += [Fields(folder, every=5), Film(folder / "film.gif", interval=end / 30)]
         run = nts.simulate(
             system, INTEGRATORS[name], dt=dt, t_end=end, output=writers, progress=progress
         )

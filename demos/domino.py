@@ -44,7 +44,7 @@ from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 HEIGHT, WIDTH, THICK, PITCH = 0.048, 0.024, 0.0075, 0.0235
@@ -269,10 +269,14 @@ def main(
         raise ValueError(f"dominoes={dominoes!r}: a wave takes at least 3")
     tilts, clock = Tilts(), time.perf_counter()
     system, folder = scene(comm, dominoes, friction), output and Path(output)
+    writers = []
+    if folder:
+        film = Film(folder / "film.gif", interval=max(0.02, dt), view=(15.0, -70.0))
+        writers = [Fields(folder, interval=max(0.01, dt)), film]
     run = nts.simulate(
         system, nts.EnergyMomentum(), dt=dt,
         t_end=duration or impacts(dominoes, friction)[-1] + LAST, progress=progress,
-        output=[tilts, *([Fields(folder, interval=max(0.01, dt))] if folder else [])],
+        output=[tilts, *writers],
     )  # fmt: skip
     r = figures(run, tilts, dominoes, friction) | {"seconds": time.perf_counter() - clock}
     if folder:

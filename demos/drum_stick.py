@@ -27,7 +27,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 SIDE, THICKNESS, GAP = 0.3, 2e-3, 1e-4
@@ -132,10 +132,13 @@ def main(
         See `figures`, and the seconds it took.
     """
     clock, system, path = time.perf_counter(), scene(comm, cells), Recorder()
-    fields = [Fields(output, interval=t_end / 40)] if output else []
+    writers = []
+    if output:
+        film = Film(Path(output) / "film.gif", interval=t_end / 40)
+        writers = [Fields(output, interval=t_end / 40), film]
     run = nts.simulate(
         system, nts.EnergyMomentum(), dt=dt, t_end=t_end, progress=progress,
-        output=[path, *fields],
+        output=[path, *writers],
     )  # fmt: skip
     result = figures(run, path) | {"seconds": time.perf_counter() - clock}
     if comm.rank == 0:

@@ -24,7 +24,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 LENGTH, SPIN = 10.0, (0.3, 0.5, 1.0)
@@ -104,9 +104,13 @@ def main(
         for dt in steps:
             clock, system = time.perf_counter(), scene(comm)
             folder = output and Path(output) / f"{name}_{dt:g}"
+            writers = []
+            if folder:
+                film = Film(folder / "film.gif", interval=t_end / 40)
+                writers = [Fields(folder, interval=t_end / 20), film]
             run = nts.simulate(
                 system, INTEGRATORS[name], dt=dt, t_end=t_end, newton=NEWTON, progress=progress,
-                output=[Fields(folder, interval=t_end / 20)] if folder else [],
+                output=writers,
             )  # fmt: skip
             if folder:
                 picture(system.bodies, folder / "beam.png")

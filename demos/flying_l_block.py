@@ -25,7 +25,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 LOAD = np.array([256.0, 512.0, 768.0]) / 9
@@ -124,9 +124,13 @@ def main(
     results, balances = {}, {}
     for name in integrators:
         clock, system = time.perf_counter(), scene(comm)
+        writers = []
+        if output:
+            folder = Path(output) / name
+            writers = [Fields(folder), Film(folder / "film.gif", interval=t_end / 30)]
         run = nts.simulate(
             system, INTEGRATORS[name], dt=dt, t_end=t_end, newton=NEWTON, progress=progress,
-            petsc_options=LINE_SEARCH, output=[Fields(Path(output) / name)] if output else [],
+            petsc_options=LINE_SEARCH, output=writers,
         )  # fmt: skip
         results[name], balances[name] = figures(run), run.balance
         results[name]["seconds"] = time.perf_counter() - clock

@@ -32,7 +32,7 @@ from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 HEIGHT, RADIUS, DENSITY, GRAVITY = 0.1, 0.05, 2700.0, 9.81
@@ -251,7 +251,8 @@ def main(
     if output is not None:
         folder, dt = Path(output), steps[len(steps) // 2]
         system = scene(comm, precession=PRECESSION, mesh=cone_mesh(comm, size))
-        writers = [Fields(folder, interval=max(t_end / 50, dt))]
+        film = Film(folder / "film.gif", interval=max(t_end / 50, dt), view=(8.0, 20.0))
+        writers = [Fields(folder, interval=max(t_end / 50, dt)), film]
         results["meshed"] = {dt: run(system, dt, steady, writers)}
         picture(system.bodies, folder / "top.png", title=f"t = {t_end:g} s", view=(8.0, 20.0))
         if comm.rank == 0:

@@ -37,7 +37,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import BalanceCSV, Fields
+from dolfinx_nts.output import BalanceCSV, Fields, Film
 from dolfinx_nts.output.pictures import picture
 from dolfinx_nts.parallel import write_on_root
 
@@ -213,6 +213,7 @@ def main(
         writers = [
             BalanceCSV(folder / "balance.csv"),
             Fields(folder, interval=0.05),
+            Film(folder / "film.gif", interval=0.05),
             Pictures(folder, (*BAND, end)),
         ]
     clock = time.perf_counter()

@@ -30,7 +30,7 @@ from flying_plate import plate_mesh
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 LENGTH, WIDTH, HEIGHT = 0.3, 0.05, 5e-3
@@ -179,7 +179,10 @@ def main(
     )
     result, path = figures(run, loads, deflection), None
     if t_end > 0.0:
-        writers = [Fields(folder / "swing", interval=t_end / 40)] if output else []
+        writers = []
+        if output:
+            film = Film(folder / "film.gif", interval=t_end / 40)
+            writers = [Fields(folder / "swing", interval=t_end / 40), film]
         free, path = let_go(comm, cells, dt, t_end, writers, progress)
         result |= swing(free, path)
     result["seconds"] = time.perf_counter() - clock

@@ -49,7 +49,7 @@ from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 RADIUS, DENSITY, YOUNG, SPEED = 0.02, 1100.0, 5e6, 0.5
@@ -245,9 +245,13 @@ def main(
             system = scene(comm, kind, balls, cells, first + theta * way, gap)
             t_end = duration or ENDS[kind.split()[-1]]
             folder = output and Path(output) / f"{kind.replace(', ', '_')}_{theta:g}"
+            writers, interval = [path], max(t_end / 30, dt)
+            if folder:
+                film = Film(folder / "film.gif", interval=interval, view=(20.0, -70.0))
+                writers += [Fields(folder, interval=interval), film]
             run = nts.simulate(
                 system, nts.EnergyMomentum(), dt=dt, t_end=t_end, progress=progress,
-                output=[path, *([Fields(folder, interval=max(t_end / 30, dt))] if folder else [])],
+                output=writers,
             )  # fmt: skip
             if folder:
                 picture(system.bodies, folder / "balls.png", view=(20.0, -70.0))

@@ -34,7 +34,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 RADIUS, WIDTH, DENSITY, GRAVITY = 1.0, 0.5, 1e3, 9.81
@@ -268,13 +268,16 @@ def main(
     for name in integrators:
         wheel, clock = Recorder(), time.perf_counter()
         system = scene(*meshes, facets, settle=False, smoothing=smoothing)
-        folder = output and Path(output) / name
+        folder, writers = output and Path(output) / name, [wheel]
+        if folder:
+            film = Film(folder / "film.gif", interval=duration / 30)
+            writers += [Fields(folder, every=5), film]
         run = nts.simulate(
             system,
             INTEGRATORS[name],
             dt=dt,
             t_end=duration,
-            output=[wheel, *([Fields(folder, every=5)] if folder else [])],
+            output=writers,
             progress=progress,
             start=settled,
             start_time=0.0,

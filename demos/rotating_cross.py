@@ -25,7 +25,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 DENSITY, OMEGA, ARM = 1000.0, 4.0, 3
@@ -117,10 +117,13 @@ def main(
         for dt in steps:
             clock, system = time.perf_counter(), scene(comm, refine)
             folder = output and Path(output) / f"{name}_{dt:g}"
+            writers = []
+            if folder:
+                film = Film(folder / "film.gif", interval=t_end / 30, colour="stress")
+                writers = [Fields(folder, interval=0.1), film]
             run = nts.simulate(
                 system, INTEGRATORS[name], dt=dt, t_end=t_end, newton=NEWTON,
-                petsc_options=LINE_SEARCH, progress=progress,
-                output=[Fields(folder, interval=0.1)] if folder else [],
+                petsc_options=LINE_SEARCH, progress=progress, output=writers,
             )  # fmt: skip
             if folder:
                 picture(system.bodies, folder / "cross.png", colour="stress")

@@ -36,7 +36,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 ARM, LENGTH, SPEED, GRAVITY, FRICTION = 0.1, 0.3, 30.0, 9.81, 0.3
@@ -293,9 +293,12 @@ def main(
     for kind in rods:
         path, clock, system = Recorder(), time.perf_counter(), scene(comm, kind, cells)
         folder = output and Path(output) / kind
+        writers = [path]
+        if folder:
+            film = Film(folder / "film.gif", interval=t_end / 50, view=(50.0, -80.0))
+            writers += [Fields(folder, interval=t_end / 50), film]
         run = nts.simulate(
-            system, nts.EnergyMomentum(), dt=dt, t_end=t_end, progress=progress,
-            output=[path, *([Fields(folder, interval=t_end / 50)] if folder else [])],
+            system, nts.EnergyMomentum(), dt=dt, t_end=t_end, progress=progress, output=writers,
         )  # fmt: skip
         if folder:
             drawn = [body for body in system.bodies if body.mesh is not None]

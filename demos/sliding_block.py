@@ -30,7 +30,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import BalanceCSV, Fields
+from dolfinx_nts.output import BalanceCSV, Fields, Film
 from dolfinx_nts.output.pictures import picture
 from dolfinx_nts.parallel import write_on_root
 
@@ -190,6 +190,7 @@ def slide(
     writers: list[nts.Writer] = [centre]
     if folder:
         writers += [BalanceCSV(folder / "balance.csv"), Fields(folder, interval=0.05)]
+        writers += [Film(folder / "film.gif", interval=0.05)]
     run = nts.simulate(
         scenery,
         INTEGRATORS[integrator],

@@ -34,7 +34,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 LENGTH, WIDTH, HEIGHT, TOP, UNDERCUT = 30e-3, 5e-3, 1.5e-3, 2.25e-3, 1e-3
@@ -174,10 +174,13 @@ def main(
             still.system.bodies, folder / "snap_fit.png", labels=True, view=(8.0, -80.0)
         )
     if t_end > 0.0:
-        fields = [Fields(folder / "snap", interval=t_end / 40)] if output else []
+        writers = []
+        if output:
+            film = Film(folder / "film.gif", interval=t_end / 40, view=(8.0, -80.0))
+            writers = [Fields(folder / "snap", interval=t_end / 40), film]
         run = nts.simulate(
             scene(comm, cells, lambda t: SPEED * t), nts.EnergyMomentum(), dt=dt, t_end=t_end,
-            output=fields, progress=progress,
+            output=writers, progress=progress,
         )  # fmt: skip
         result |= snap(run)
     result["seconds"] = time.perf_counter() - clock

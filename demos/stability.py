@@ -26,7 +26,7 @@ import numpy as np
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 from dolfinx_nts.study.extreme_scenes import long_run
 
@@ -82,9 +82,13 @@ def main(*, comm=MPI.COMM_WORLD, output=None, steps=STEPS, integrators=tuple(INT
         for name in integrators:
             case = long_run(comm, scene)
             folder = Path(output) / scene if output else None
+            writers = []
+            if folder:
+                film = Film(folder / f"{name}.gif", every=max(1, number // 30))
+                writers = [Fields(folder / name, every=20), film]
             run = nts.simulate(
                 case.system, INTEGRATORS[name], dt=case.dt, t_end=number * case.dt,
-                progress=progress, output=[Fields(folder / name, every=20)] if folder else [],
+                progress=progress, output=writers,
             )  # fmt: skip
             results[scene][name], balances[name] = figures(run), run.balance
             if folder:

@@ -27,7 +27,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from mpi4py import MPI
 
 import dolfinx_nts as nts
-from dolfinx_nts.output import BalanceCSV, Fields
+from dolfinx_nts.output import BalanceCSV, Fields, Film
 from dolfinx_nts.output.pictures import picture
 from dolfinx_nts.output.plots import compare_balances
 
@@ -138,6 +138,7 @@ def main(
             folder = Path(output) / name
             folder.mkdir(parents=True, exist_ok=True)
             writers = [Fields(folder, every=5), BalanceCSV(folder / "balance.csv")]
+            writers += [Film(folder / "film.gif", interval=t_end / 25)]
         run = nts.simulate(
             system, integrator, dt=dt, t_end=t_end, output=writers, progress=progress
         )

@@ -147,11 +147,12 @@ def writers(output):
     """Return what a run leaves in the folder, if there is one."""
     if output is None:
         return []
-    from dolfinx_nts.output import BalanceCSV, Fields
+    from dolfinx_nts.output import BalanceCSV, Fields, Film
 
     folder = Path(output)
     fields = Fields(folder, interval=0.1)
-    return [fields, BalanceCSV(folder / "balance.csv"), Pictures(folder, 2.0)]
+    film = Film(folder / "film.gif", interval=0.4)
+    return [fields, film, BalanceCSV(folder / "balance.csv"), Pictures(folder, 2.0)]
 
 
 def main(

@@ -33,7 +33,7 @@ from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh
-from dolfinx_nts.output import Fields
+from dolfinx_nts.output import Fields, Film
 from dolfinx_nts.output.pictures import picture
 
 #: Radii of hub, bead and tread, and the width [m].
@@ -245,10 +245,13 @@ def main(
     clock, path = time.perf_counter(), Recorder()
     settled = nts.equilibrium(scene(comm, facets, settle=True), load_steps=4, progress=progress)
     system, folder = scene(comm, facets, settle=False), output and Path(output)
+    writers = [path]
+    if folder:
+        film = Film(folder / "film.gif", interval=max(duration / 30, dt))
+        writers += [Fields(folder, interval=max(duration / 60, dt)), film]
     run = nts.simulate(
         system, nts.EnergyMomentum(), dt=dt, t_end=duration, start=settled, start_time=0.0,
-        progress=progress,
-        output=[path, *([Fields(folder, interval=max(duration / 60, dt))] if folder else [])],
+        progress=progress, output=writers,
     )  # fmt: skip
     r = figures(run, path, facets) | {"seconds": time.perf_counter() - clock}
     if folder:

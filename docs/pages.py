@@ -171,22 +171,24 @@ def run_page(page: Path, scripts: list[Block]) -> None:
 
 # ---- pages that are made
 def demo_page(demo: Path) -> str:
-    """The page of a demo: its text, its pictures with the command that made them, its code."""
+    """The page of a demo: its text, what a run draws with its command, and its code."""
     text = ast.get_docstring(ast.parse(demo.read_text())) or ""
     title, _, rest = text.partition("\n")
     options = SHORT.get(demo.stem, "")
     folder = MADE / "runs" / demo.stem
-    pictures = [f"![{p.stem}](runs/{demo.stem}/{p.relative_to(folder)})" for p in pngs(folder)]
+    runs = f"runs/{demo.stem}"
+    pictures = [f"![{p.stem}]({runs}/{p.relative_to(folder)})" for p in drawn(folder)]
     return "\n".join([
-        f"# {demo.stem}\n", f"**{title}**\n", rest, "\n## Pictures\n",
+        f"# {demo.stem}\n", f"**{title}**\n", rest, "\n## Films and pictures\n",
         f"`python demos/{demo.name} {options}".rstrip() + "` makes these:\n", "\n\n".join(pictures),
         "\n## Code\n", f"```{{literalinclude}} ../../demos/{demo.name}\n:language: python\n```\n",
     ])  # fmt: skip
 
 
-def pngs(folder: Path) -> list[Path]:
-    """Pictures of a run, those of the folder itself first."""
-    return sorted(folder.rglob("*.png"), key=lambda p: (len(p.parts), p))
+def drawn(folder: Path) -> list[Path]:
+    """Films and pictures of a run: films first, then those of the folder itself."""
+    found = [p for p in folder.rglob("*.*") if p.suffix in (".gif", ".png")]
+    return sorted(found, key=lambda p: (p.suffix, len(p.parts), p))
 
 
 def reference() -> dict[str, str]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.output.cadence import Cadence
 from dolfinx_nts.output.pictures import (
     Drawn,
     axes_of,
@@ -23,7 +24,7 @@ from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.step import contact_fields
-from dolfinx_nts.validation import StrPath, as_path, is_whole, require_bool, require_positive
+from dolfinx_nts.validation import StrPath, as_path, require_bool, require_positive
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -60,6 +61,8 @@ class Film:
     Args:
         path: File, whose ending is .gif; its folder is made if missing.
         every: A frame after every `every`-th step, >= 1; the first and the last state are in it.
+        interval: Instead of `every`: a frame after the first step that reaches each multiple of
+            this time [s].
         frames_per_second: Of the film.
         forces: Whether to draw contact forces.
         colour: As of `pictures.picture`, as are the next ones.
@@ -77,6 +80,7 @@ class Film:
         path: StrPath,
         *,
         every: int = 1,
+        interval: float | None = None,
         frames_per_second: float = 15.0,
         forces: bool = True,
         colour: str = "speed",
@@ -87,11 +91,10 @@ class Film:
         self.path = as_path("path", path)
         if self.path.suffix.lower() != ".gif":
             raise ValueError(f"path={str(path)!r}: pass a file that ends with .gif")
-        if not is_whole(every) or every < 1:
-            raise ValueError(f"every={every!r}: pass a whole number of steps >= 1")
+        self._cadence = Cadence(every, interval)
         require_positive("frames_per_second", frames_per_second, "1/s")
         require_bool("forces", forces)
-        self.every, self.pace, self.forces = every, frames_per_second, forces
+        self.pace, self.forces = frames_per_second, forces
         self._look: tuple[Any, ...] = (colour, view, limits, width)
         self._frames: list[_Frame] = []
 
@@ -99,13 +102,13 @@ class Film:
         """Take the initial state."""
         self._bodies = [b for b in stepper.system.bodies if b.mesh is not None]
         check_picture(self._bodies, *self._look)
-        self._frames, self._steps = [], 0
+        self._frames = []
+        self._cadence.start(stepper)
         self._take(stepper)
 
     def write(self, stepper: Running, *, last: bool = False) -> None:
         """Take the accepted state if it is due, or the last."""
-        self._steps += 1
-        if last or self._steps % self.every == 0:
+        if self._cadence.due(stepper) or last:
             self._take(stepper)
 
     def close(self, stepper: Running) -> None:

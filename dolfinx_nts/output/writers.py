@@ -19,13 +19,14 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.output.cadence import Cadence
 from dolfinx_nts.output.own_functions import Own, checked, of_body
 from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
 from dolfinx_nts.step import balance as ledger
 from dolfinx_nts.step import contact_fields, resultants
-from dolfinx_nts.validation import StrPath, as_path, is_whole, require_positive
+from dolfinx_nts.validation import StrPath, as_path
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -274,13 +275,7 @@ class Fields:
         interval: float | None = None,
         functions: Iterable[Own] = (),
     ) -> None:
-        if not is_whole(every) or every < 1:
-            raise ValueError(f"every={every!r}: pass a whole number of steps >= 1")
-        if interval is not None:
-            require_positive("interval", interval, "s")
-            if every != 1:
-                raise ValueError(f"every={every!r}, interval={interval!r}: pass one of the two")
-        self.folder, self.every, self.interval = as_path("folder", folder), every, interval
+        self.folder, self._cadence = as_path("folder", folder), Cadence(every, interval)
         self.functions = checked(functions)
         self._series: list[_Series] = []
 
@@ -298,8 +293,7 @@ class Fields:
         files = [s.path.name for s in self._series]
         if len(set(files)) < len(files):
             raise ValueError(f"name of bodies: file names {files} are not unique; rename a body")
-        self._seen = len(stepper.solution.rows) - 1
-        due = self._due(stepper)
+        due = self._cadence.start(stepper)
         if stepper.restart is not None and self._go_on(stepper, due):
             return
         for series in self._series:
@@ -327,20 +321,8 @@ class Fields:
 
     def write(self, stepper: Running, *, last: bool = False) -> None:
         """Write the accepted state if the cadence asks for it, or if it is the last."""
-        if self._due(stepper) or last:
+        if self._cadence.due(stepper) or last:
             self._append(stepper)
-
-    def _due(self, stepper: Running) -> bool:
-        """Return whether the cadence asks for this state; the first one of a run is due."""
-        times = stepper.solution.rows.column("time")
-        before, self._seen = self._seen, len(times)
-        if not before:
-            return True
-        if self.interval is None:
-            return (len(times) - 1) // self.every > (before - 1) // self.every
-        multiples = times[[before - 1, -1]] / self.interval
-        then, now = np.floor(multiples + 1e-12 * np.abs(multiples))
-        return bool(now > then)
 
     def close(self, stepper: Running) -> None:
         """Write the last accepted state of a run that failed."""
