@@ -11,6 +11,7 @@ import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.step import linear_solver, node_blocks
 from dolfinx_nts.step.assembly import StepMatrix
+from dolfinx_nts.step.presets import Presets
 
 COMM = MPI.COMM_WORLD
 
@@ -562,6 +563,59 @@ def test_nodes_with_more_constraints_than_coordinates(integrator, fine, friction
     assert table["min_gap"].min() > -1e-12
     if isinstance(integrator, nts.EnergyMomentum):
         assert np.abs(table["ledger_residual"]).max() < 1e-11 * energy
+
+
+def boxes(*kinds):
+    """Boxes of these kinds that slide along a floor into a wall; edges of rigid ones repeat it."""
+    floor, wall = nts.Plane((0, 0, 0), (0, 0, 1)), nts.Plane((0.42, 0, 0), (-1, 0, 0))
+    rubber = nts.StVenantKirchhoff(young=1e6, poisson=0.3)
+    bodies, pairs = [], []
+    for y, kind in enumerate(kinds):
+        ends = [[0, y, 0], [0.4, y + 0.2, 0.2]]
+        mesh = create_box(COMM, ends, [2, 2, 2], CellType.hexahedron)
+        options = {"density": 1e3, "velocity": (2, 0, 0), "name": kind}
+        rigid = kind == "rigid"
+        body = nts.RigidBody(mesh, **options) if rigid else nts.Continuum(mesh, rubber, **options)
+        bodies.append(body)
+        pairs += [
+            nts.ContactPair(body.surface(lambda x: x[2] < 1e-9), floor, friction=0.3),
+            nts.ContactPair(body.surface(lambda x: x[0] > 0.4 - 1e-9), wall),
+        ]
+    return nts.System(bodies, contacts=pairs, gravity=(0, 0, -9.81))
+
+
+@pytest.mark.parametrize(
+    ("kinds", "inertia", "name"),
+    [
+        (("soft",), True, "direct"),
+        (("soft",), False, "direct"),
+        (("rigid",), True, "redundant"),
+        (("rigid",), False, "redundant null-pivots"),
+        (("rigid", "soft"), True, "redundant null-pivots"),
+    ],
+)
+def test_equations_that_repeat_others_are_looked_for_where_there_may_be_some(kinds, inertia, name):
+    presets = Presets(boxes(*kinds), nts.Newton(), "direct", {}, True, inertia)
+    assert presets.name == name
+    while (other := presets.alternative()) is not None:
+        presets.use(other)
+    assert presets.name == "null-pivots"
+
+
+@pytest.mark.mpi
+def test_of_redundant_contacts_no_equation_repeats_another():
+    """MUMPS finds none, and to look for some changes no solution."""
+    tables = []
+    for options in ({}, {"mat_mumps_icntl_24": 1, "mat_mumps_icntl_8": 77}):
+        stepper = nts.Stepper(boxes("rigid"), nts.EnergyMomentum(), petsc_options=options)
+        for _ in range(30):
+            stepper.advance(1e-3)
+            factors = stepper.solver.snes.getKSP().getPC().getFactorMatrix()
+            assert factors.getMumpsInfog(28) == 0
+        assert stepper.solver.memory[0] == "redundant"
+        tables.append(stepper.solution.balance)
+        stepper.close()
+    assert tables[0]["active"].max() == 18 and difference(*tables) < 1e-9
 
 
 def test_the_users_own_solver_is_not_replaced():

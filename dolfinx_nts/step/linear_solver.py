@@ -104,15 +104,18 @@ PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}
 # Where many do, as of a rigid body, it would put off all pivots of the compliance that they are
 # lent (`constraints.SHIFT`), and run out of workspace. With them a contact costs 12 coordinates of
 # the body and no more.
-PRESETS |= {
-    "redundant": PRESETS["null-pivots"]
+_REDUNDANT = {
     # Small pivots cost digits, of which a second solve brings back some.
-    | {
-        "mat_mumps_cntl_1": 1e-9,
-        "ksp_type": "richardson",
-        "ksp_norm_type": "none",
-        "ksp_max_it": 2,
-    }
+    "mat_mumps_cntl_1": 1e-9,
+    "ksp_type": "richardson",
+    "ksp_norm_type": "none",
+    "ksp_max_it": 2,
+    # Columns are scaled once: to make rows and columns alike by iteration takes as long as a solve.
+    "mat_mumps_icntl_8": 4,
+}
+PRESETS |= {
+    "redundant": PRESETS["direct"] | _REDUNDANT,
+    "redundant null-pivots": PRESETS["null-pivots"] | _REDUNDANT,
 }
 #: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
 #: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.

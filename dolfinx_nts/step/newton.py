@@ -66,7 +66,10 @@ class StepSolver:
         self, problem: StepProblem, newton: Newton, preset: str, petsc_options: Mapping[str, Any]
     ) -> None:
         self.problem, self.newton = problem, newton
-        self._presets = Presets(problem.system, newton, preset, petsc_options, problem.condense)
+        self._presets = Presets(
+            problem.system, newton, preset, petsc_options, problem.condense,
+            problem.integrator.inertia,
+        )  # fmt: skip
         self._tangents = KeptTangents(problem, newton.reuse)
         self.iterates, self._upright = Iterates(problem), Upright(problem)
         self._assembled: Evaluation | None = None
