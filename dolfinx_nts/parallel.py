@@ -30,13 +30,35 @@ def gather_on_root(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def global_max(comm: Any, values: FloatArray) -> FloatArray:
     """Largest of each value over all ranks, on every rank."""
+    return _over_ranks(comm, values, MPI.MAX)
+
+
+def global_sum(comm: Any, values: FloatArray) -> FloatArray:
+    """Sum of each value over all ranks, on every rank."""
+    return _over_ranks(comm, values, MPI.SUM)
+
+
+def _over_ranks(comm: Any, values: FloatArray, op: Any) -> FloatArray:
     out = np.array(values, dtype=np.float64)
-    comm.Allreduce(MPI.IN_PLACE, out, op=MPI.MAX)
+    if comm.size > 1:
+        comm.Allreduce(MPI.IN_PLACE, out, op=op)
     return out
+
+
+def anywhere(comm: Any, flag: bool) -> bool:
+    """Whether it holds on any rank, on every rank."""
+    return bool(flag) if comm.size == 1 else bool(comm.allreduce(bool(flag), op=MPI.LOR))
+
+
+def everywhere(comm: Any, flag: bool) -> bool:
+    """Whether it holds on all ranks, on every rank."""
+    return bool(flag) if comm.size == 1 else bool(comm.allreduce(bool(flag), op=MPI.LAND))
 
 
 def first_problem(comm: Any, problem: str | None) -> str | None:
     """The first rank's problem, on every rank."""
+    if comm.size == 1:
+        return problem
     return next((p for p in comm.allgather(problem) if p is not None), None)
 
 

@@ -17,6 +17,7 @@ from dolfinx_nts.constraints import SHIFT
 from dolfinx_nts.contact.coulomb import STRONG, UNEVEN, Coulomb, Slip, Together
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.kernels import compiled_law
+from dolfinx_nts.parallel import gather_rows
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -197,7 +198,7 @@ class ContactLaws:
             np.abs(gap[on]).max(initial=0.0),
             0.0 if slip is None else np.abs(slip.value[on]).max(initial=0.0),
         ])  # fmt: skip
-        ranks = np.array(self.pair.slave.body.comm.allgather(local))
+        ranks = gather_rows(self.pair.slave.body.comm, local[None])
         total, number = ranks[:, :2].sum(axis=0)
         extent = self.pair.extent
         return Together(total / max(number, 1.0), *(SHIFT + ranks[:, 2:].max(axis=0) / extent))

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
@@ -18,7 +17,7 @@ from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.coupling import StepWarning
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import anywhere, global_max
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
@@ -116,7 +115,7 @@ class ContactSearch:
             self.elements = [replace(c, bounded=True) for c in self.elements]
         self.idle_gaps = [np.empty(0) for _ in self.idle]
         watching = any(c.num_elements for c in self.idle)
-        self._watching = self._comm.allreduce(watching, op=MPI.LOR)
+        self._watching = anywhere(self._comm, watching)
 
     def touched(self) -> set[int]:
         """Bodies of contacts that have unknowns, the same on all ranks. Collective."""
@@ -224,7 +223,7 @@ class ContactSearch:
         closed = [
             ~(gap >= -c.gap_rounding) for c, gap in zip(self.idle, self.idle_gaps, strict=True)
         ]
-        if not self._comm.allreduce(any(c.any() for c in closed), op=MPI.LOR):
+        if not anywhere(self._comm, any(c.any() for c in closed)):
             return False
         for awake, late in zip(self._with_unknowns, closed, strict=True):
             awake[np.flatnonzero(~awake)[late]] = True
@@ -269,7 +268,7 @@ class ContactSearch:
         # What is held at a facet that its path led to is to be so again.
         at = np.where(self._aimed[k] >= 0, held, -1)
         self._aimed[k] = np.where(new | (at < 0), self._aimed[k], at)
-        return bool(self._comm.allreduce(bool(new.any()), op=MPI.LOR))
+        return anywhere(self._comm, bool(new.any()))
 
     def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
         """Return what each contact remembers of an accepted step."""

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from dolfinx_nts.bodies.inversion import smallest_dets
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 
@@ -197,7 +198,7 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
         for name, value in coupling.smallest(parts).items():
             smallest[name] = min(smallest[name], value)
     comm = problem.system.comm
-    total = comm.allreduce(np.array(list(sums.values())))
+    total = global_sum(comm, np.array(list(sums.values())))
     least = np.array(list(smallest.values()))
     comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
     return {

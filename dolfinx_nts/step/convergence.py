@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.elements import over
 from dolfinx_nts.evaluation import Evaluation, free
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import global_max, global_sum
 from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]
@@ -60,7 +60,7 @@ def _over_limits(
         parts = (forces[k], problem.flight[k], t.internal, t.external, t.coupling)
         squares[k, :5] = [float(p @ p) for p in parts]
     squares[:, 5] = problem.laid.gross_forces(problem.elements, e.parts, len(e.bodies))
-    norms = np.sqrt(problem.system.comm.allreduce(squares))
+    norms = np.sqrt(global_sum(problem.system.comm, squares))
     limits = problem.rtol * norms[:, 1:5].max(axis=1) + _CANCELLED * norms[:, 5] + rounding
     return [over(a, b) for a, b in zip(norms[:, 0], limits, strict=True)]
 

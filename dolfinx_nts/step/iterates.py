@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.parallel import everywhere
 from dolfinx_nts.step.problem import StepProblem
 
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -47,7 +47,7 @@ class Iterates:
         """
         last = self.last
         same = last is not None and np.array_equal(last.x, x.array_r)
-        if self._problem.system.comm.allreduce(same, op=MPI.LAND):
+        if everywhere(self._problem.system.comm, same):
             assert last is not None
             return last
         # A diverging iterate may overflow; the convergence test sees it.
@@ -68,4 +68,4 @@ class Iterates:
     @property
     def settled(self) -> bool:
         """Whether no element changed its status in the last iteration. Collective."""
-        return bool(self._problem.system.comm.allreduce(self._settled, op=MPI.LAND))
+        return everywhere(self._problem.system.comm, self._settled)

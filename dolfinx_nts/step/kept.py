@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from mpi4py import MPI
-
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.step.problem import StepProblem
 
 #: Relative difference of the factors of two equal steps of a caller whose lengths are rounded.
@@ -47,7 +46,7 @@ class KeptTangents:
         """
         awake = self._problem.awake
         changed = any(a.stateGet() != self._states[k] for k, a in self._matrices.items())
-        fresh = self._problem.system.comm.allreduce(self.due or changed, op=MPI.LOR)
+        fresh = anywhere(self._problem.system.comm, self.due or changed)
         if fresh:
             self._matrices = dict(zip(awake, self._problem.body_tangents(e), strict=True))
             self.due = not self._reuse

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.augmented import AugmentedMatrix
@@ -352,7 +352,7 @@ class StepSolver:
         where contact acts, the parts differ.
         """
         acts = any(bool(part.status.any()) for part in e.parts)
-        return self.newton.reuse and not self.problem.system.comm.allreduce(acts, op=MPI.LOR)
+        return self.newton.reuse and not anywhere(self.problem.system.comm, acts)
 
     # ---- failure
     def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:

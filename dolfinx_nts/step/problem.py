@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.elements import Step, evaluate_together
 from dolfinx_nts.evaluation import BodyTerms, Evaluation, Moment, free
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import everywhere, global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.step.couplings import Couplings
 from dolfinx_nts.step.lengths import Lengths
@@ -187,7 +186,7 @@ class StepProblem:
         elements = self.elements
         widths = np.array([list(c.widths.values()) for c in elements])
         numbers = (np.array(self.awake), widths, *(a for c in elements for a in c.points()))
-        if not system.comm.allreduce(_equal(numbers, self._numbers), op=MPI.LAND):
+        if not everywhere(system.comm, _equal(numbers, self._numbers)):
             self.destroy()
             sizes = {k: system.bodies[k].num_owned for k in self.awake}
             of = self.couplings.bodies
