@@ -149,6 +149,10 @@ class ContactElements(ContactLaws):
 
     def reference(self) -> FloatArray:
         """Reference values of these nodes [m], places in the pair's frame, shape (n, k, 3)."""
+        return self._reference
+
+    @cached_property
+    def _reference(self) -> FloatArray:
         origin = self.pair.origin
         each = [n.reference - np.where(n.places[:, :, None], origin, 0.0) for n in self._nodes]
         return np.concatenate(each, axis=1)

@@ -228,11 +228,15 @@ class FacetPair(ContactPair, master=Surface):
         for edge in range(nc):
             other = self._beside[near.facet, edge] // nc
             some = np.flatnonzero((excess[:, edge] > search.PREFERENCE) & (other >= 0))
+            if not some.size:
+                continue
             start, _ = compiled.closest_point(end[some], moved[self.master.facets[other[some]]])
             gap = self._gap_at(other[some], start, end[some], moved)
             outer = gap > far[some] + search.PREFERENCE * near.length[some]
             best[some[outer]], far[some[outer]] = other[some[outer]], gap[outer]
         change = np.flatnonzero(best != near.facet)
+        if not change.size:
+            return found
         node, facet = near.node[change], best[change]
         start, _ = compiled.closest_point(x[node], master[self.master.facets[facet]])
         other, _ = self._measure(x, master, node, facet, start, None)

@@ -94,11 +94,12 @@ def project(
     points: FloatArray, corners: FloatArray, xi: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """`facets.project`, which takes the pairs for which plain Newton steps do not do."""
-    kernels = library.load()
-    if kernels is None or not len(points):
-        return facets.project(points, corners, xi)
-    n, nc = corners.shape[:2]
+    kernels, (n, nc) = library.load(), corners.shape[:2]
     found, done = np.array(xi, dtype=np.float64), np.empty(n, dtype=bool)
+    if not n:
+        return found, done
+    if kernels is None:
+        return facets.project(points, corners, xi)
     library.run(kernels.project, _facet(nc)[0], _limits(), n, points, corners, found, done)
     rest = ~done
     if rest.any():
@@ -108,11 +109,12 @@ def project(
 
 def closest_point(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """`facets.closest_point`."""
-    kernels = library.load()
-    if kernels is None or not len(points):
-        return facets.closest_point(points, corners)
-    n, nc = corners.shape[:2]
+    kernels, (n, nc) = library.load(), corners.shape[:2]
     xi, distance = np.empty((n, 2)), np.empty(n)
+    if not n:
+        return xi, distance
+    if kernels is None:
+        return facets.closest_point(points, corners)
     library.run(kernels.closest_point, _facet(nc)[0], _limits(), n, points, corners, xi, distance)
     return xi, distance
 

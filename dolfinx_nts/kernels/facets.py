@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.kernels import patches, triangle_patches
-from dolfinx_nts.kernels.vectors import solve_2x2
+from dolfinx_nts.kernels.vectors import cross, solve_2x2
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
@@ -108,7 +108,7 @@ def frame(corners: FloatArray, xi: FloatArray) -> tuple[FloatArray, FloatArray, 
     values, first, _ = shape(xi, corners.shape[1])
     point = np.einsum("ni,nij->nj", values, corners)
     tangents = np.einsum("nia,nij->naj", first, corners)
-    normal = np.cross(tangents[:, 0], tangents[:, 1])
+    normal = cross(tangents[:, 0], tangents[:, 1])
     with np.errstate(invalid="ignore"):
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     return point, tangents, normal
