@@ -78,8 +78,10 @@ class ContactSearch:
         """Which of this rank's slave nodes had unknowns in the last step, of each contact."""
         if not self.elements:
             return self._had
-        both = zip(self._had, self.elements, strict=True)
-        return [np.isin(np.arange(len(had)), c.candidates.node) for had, c in both]
+        found = [np.zeros_like(had) for had in self._had]
+        for has, c in zip(found, self.elements, strict=True):
+            has[c.candidates.node] = True
+        return found
 
     def resume(self, had: Sequence[BoolArray], bounded: bool) -> None:
         """Go on from another run's `had_unknowns` and `bounded`, before the first step."""

@@ -222,7 +222,7 @@ class Plane(Obstacle):
         normal, n = np.asarray(self.normal), len(x)
         # Not (x - point) @ normal, whose rounding would grow with the distance of `point`.
         value = x @ normal - self._height
-        return Gap(value, np.tile(normal, (n, 1, 1)), np.zeros((n, 3, 3)))
+        return Gap(value, np.full((n, 1, 3), normal), np.zeros((n, 3, 3)))
 
     def lowest_gap(self, x0: FloatArray, x1: FloatArray) -> FloatArray:
         """That of one of the ends: the gap is linear."""
@@ -231,7 +231,7 @@ class Plane(Obstacle):
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The normal: the gap is linear."""
         n = len(x0)
-        return np.tile(np.asarray(self.normal), (n, 1)), np.zeros((n, 3, 3))
+        return np.full((n, 3), self.normal), np.zeros((n, 3, 3))
 
 
 def _placed(obstacle: Any, name: str, place: FloatArray) -> Any:

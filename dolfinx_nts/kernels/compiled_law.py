@@ -155,10 +155,14 @@ def obstacle(
         (*rule, *end, *middle), (vectors, matrices, (n,), vectors, vectors, matrices), strict=True
     )
     # An obstacle of a user's may have numbers of any kind, and arrays of a wrong shape.
-    read = [np.ascontiguousarray(np.broadcast_to(a, shape), dtype=float) for a, shape in given]
+    read = [np.ascontiguousarray(_shaped(a, shape), dtype=float) for a, shape in given]
     pairs = normal0, tangents, motion, multiplier
     library.run(kernels.obstacle, constraints, theta, n, *read, *pairs, *out[:2], *slip)
     return out
+
+
+def _shaped(a: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    return a if a.shape == shape else np.broadcast_to(a, shape)
 
 
 def to_nodes(
