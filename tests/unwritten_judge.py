@@ -411,10 +411,9 @@ def thickness(solid):
 def judge_restart(scene, comm, path):
     """Judge whether a scene that goes on from a checkpoint in mid run ends as it did without.
 
-    Collective. In serial, where all matrices are new in each iteration, to the bit; else to 1e-9 of
-    the largest motion, with kept matrices to 1e-3, and to rounding of the places and velocities
-    themselves, which is all that changes of a body that flies free. A scene that is refused says
-    nothing.
+    Collective. In serial to the bit; else to 1e-9 of the largest motion, with kept matrices to
+    1e-3, and to rounding of the places and velocities themselves, which is all that changes of a
+    body that flies free. A scene that is refused says nothing.
 
     Args:
         scene: The scene.
@@ -444,7 +443,7 @@ def judge_restart(scene, comm, path):
     again.system.destroy()
     exact = dict(scene.options).get("accuracy", "exact") == "exact"
     reuses = dict(scene.newton).get("reuse") or not exact
-    loose = 1e-3 if reuses else (1e-9 if comm.size > 1 else 0.0)
+    loose = 0.0 if comm.size == 1 else (1e-3 if reuses else 1e-9)
     wrong = []
     rows = len(whole.rows) - len(found.rows)
     if rows:
@@ -460,7 +459,7 @@ def judge_restart(scene, comm, path):
     # A restart looks for overlaps at once, so that it may find more of them.
     lost = {k for k in whole.warnings if k not in found.warnings}
     more = {k for k in found.warnings if k not in whole.warnings} - OVERLAPS - IN_OBSTACLES
-    if not reuses and (lost or more):
+    if (comm.size == 1 or not reuses) and (lost or more):
         wrong.append(f"warns otherwise: {found.warnings}")
     if not found.status.startswith("completed"):
         wrong.append(f"ends otherwise: {found.status}")

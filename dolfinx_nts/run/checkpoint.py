@@ -154,6 +154,8 @@ class Saver:
             stepper.solution.warn("checkpoint", state.time, 1.0, str(error))
         else:
             self._saved = state
+        # A restart has no matrices of earlier steps: without them here, it is the same run.
+        stepper.solver.forget()
         self._since = time.monotonic()
 
 
@@ -167,11 +169,12 @@ def restart(path: StrPath, system: System) -> Restart:
             checkpoint=nts.Checkpoint("out/run.h5", every=100),
         )
 
-    With the same options, and the solver at its floor (accuracy="exact"), the run is the
-    uninterrupted one: to the bit on as many ranks, else to rounding. Its balance, warnings and
-    changes of facet go on, and so do equal steps and those of `Adapt`. A longer `t_end`, another
-    `dt`, another integrator are legal: it goes on from the state then. Not in the file are
-    materials, loads, prescribed motion and obstacles, as they are functions: they must be the same.
+    With the same options, and checkpoints after the same steps, the run is the uninterrupted one:
+    to the bit in serial, else to its tolerance. (Where matrices are kept, they are made anew after
+    each checkpoint.) Its balance, warnings and changes of facet go on, and so do equal steps and
+    those of `Adapt`. A longer `t_end`, another `dt`, another integrator are legal: it goes on from
+    the state then. Not in the file are materials, loads, prescribed motion and obstacles, as they
+    are functions: they must be the same.
     Materials that give the bodies another energy are told, "material changed", with what they add;
     so are constant loads and supports with other values, "loads changed".
     `contact_fields` are zero until the first step.

@@ -95,6 +95,11 @@ class StepSolver:
         *of_presets, self._independent = memory
         self._presets.resume(of_presets)
 
+    def forget(self) -> None:
+        """Make all matrices anew in the next step, as a run does that goes on from here."""
+        self._tangents.due = True
+        self._presets.forget()
+
     def solve(self) -> Evaluation:
         """Solve the step that `problem.begin` fixed.
 
