@@ -86,30 +86,52 @@ class System:
             self.comm, **{f"names of {k}": [item.name for item in v] for k, v in given.items()}
         )
         self.check_alive()
+        self._check_bodies()
+        self.gravity = vector("gravity", gravity, "m/s^2")
+        self.gravity.flags.writeable = False
+        self.size = int(self.comm.allreduce(sum(b.num_owned for b in self.bodies)))
+        self.declared_joints = self.joints
+        own = (joint for body in self.bodies for joint in body.joints)
+        self.joints = (*self.declared_joints, *own)
+        self._check_members()
+        index = {id(b): i for i, b in enumerate(self.bodies)}
+        self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
+        self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
+        self._check_overlap()
+        if self.contacts:
+            same_kernels(self.comm)
+        start = self.initial_state()
+        depths = self.penetration(start)
+        for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
+            # The search looks half a facet deep; this, the whole body.
+            depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
+        self._check_penetration(depths)
+        self._check_enclosed(start)
+
+    def _check_bodies(self) -> None:
+        """Raise a ValueError unless bodies differ, have different names, and one communicator."""
         for k, b in enumerate(self.bodies):
             if any(b is other for other in self.bodies[:k]):
                 raise ValueError(f"bodies[{k}]: {b.name!r} is given twice; drop one")
         names = [b.name for b in self.bodies]
         if len(set(names)) < len(names):
             raise ValueError(f"bodies: names {names} are not unique; pass name= to each body")
-        self.gravity = vector("gravity", gravity, "m/s^2")
-        self.gravity.flags.writeable = False
         for b in self.bodies:
             if MPI.Comm.Compare(b.comm, self.comm) not in (MPI.IDENT, MPI.CONGRUENT):
                 raise ValueError(
                     f"bodies: {b.name!r} and {names[0]!r} live on different communicators; "
                     "make all meshes on one"
                 )
-        self.size = int(self.comm.allreduce(sum(b.num_owned for b in self.bodies)))
+
+    def _check_members(self) -> None:
+        """Raise a ValueError unless contacts and joints are of these bodies, and joints differ."""
+        names = [b.name for b in self.bodies]
         for pair in self.contacts:
             for role, body in zip(("slave", "master"), pair.bodies, strict=False):
                 if not any(body is b for b in self.bodies):
                     raise ValueError(
                         f"contacts: the {role} body {body.name!r} {_missing(body, names)}"
                     )
-        self.declared_joints = self.joints
-        own = (joint for body in self.bodies for joint in body.joints)
-        self.joints = (*self.declared_joints, *own)
         for k, joint in enumerate(self.declared_joints):
             if any(joint is other for other in self.declared_joints[:k]):
                 raise ValueError(f"joints[{k}]: {joint.name!r} is given twice; drop one")
@@ -126,19 +148,6 @@ class System:
                         f"joints: {joint.name!r} holds body {body.name!r}, which "
                         f"{_missing(body, names)}"
                     )
-        index = {id(b): i for i, b in enumerate(self.bodies)}
-        self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
-        self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
-        self._check_overlap()
-        if self.contacts:
-            same_kernels(self.comm)
-        start = self.initial_state()
-        depths = self.penetration(start)
-        for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
-            # The search looks half a facet deep; this, the whole body.
-            depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
-        self._check_penetration(depths)
-        self._check_enclosed(start)
 
     def destroy(self) -> None:
         """Free the PETSc objects of its bodies, which are of no use then. Collective.
