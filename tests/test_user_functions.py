@@ -4,10 +4,12 @@ Where a test has one rank raise, it is the last one, which is the only one in se
 """
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from point_mass import PointMass
 from scenes import RUBBER, bottom, box, top
 
 import dolfinx_nts as nts
@@ -175,6 +177,29 @@ def test_a_support_that_fails_at_the_start_of_the_motion():
     speed = stepper.state.v[0][held[held % 3 == 2]]
     assert np.allclose(speed, 1.0)
     stepper.close()
+
+
+@pytest.mark.parametrize(
+    ("what", "says"),
+    [("internal", "the internal forces of 'mass' are not finite"), ("external", "not finite"),
+     ("potential", "completed, but the energy is not finite")],
+)  # fmt: skip
+def test_a_body_of_ones_own_whose_numbers_are_none(what, says, monkeypatch):
+    """In the third step, on the rank that has its coordinates; what was accepted is finite."""
+    right = getattr(PointMass, what)
+
+    def late(body, *given):
+        return right(body, *given) * (np.nan if body.moment.time > LATE else 1.0)
+
+    monkeypatch.setattr(PointMass, what, late)
+    body = PointMass(COMM, 1.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    body.begin_step(None, SimpleNamespace(time=0.0))
+    run = nts.simulate(
+        nts.System([body], gravity=(0, 0, -9.81)), nts.EnergyMomentum(), dt=DT, t_end=5 * DT
+    )
+    assert says in same_on_all_ranks(run.status)
+    assert len(run.rows) >= 3 and np.isfinite(run.state.u[0]).all()
+    assert np.isfinite(run.balance["linear_momentum"]).all()
 
 
 @pytest.mark.parametrize("what", NAMES)
