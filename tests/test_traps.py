@@ -351,6 +351,9 @@ def test_nodes_that_flip_are_named_with_their_states(friction, row, states, inte
             assert text.startswith("contact 'cube-plate': node ")
             assert (f"flips between {states} and settles in neither" in text) == (count == 8)
             assert text.endswith("settles in neither; try another dt") == (count == 8)
+            beyond = np.full_like(step.parts[0].residual, np.inf)
+            with np.errstate(over="raise"):
+                assert contact.describe(step.parts[0]._replace(residual=beyond), flips)[0] == np.inf
     stepper.close()
 
 

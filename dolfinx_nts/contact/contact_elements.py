@@ -440,7 +440,7 @@ class ContactElements(ContactLaws):
             flips: How often `Contribution.status` changed, shape (2, n).
         """
         rows = np.abs(part.residual[:, self.num_coordinates :]).max(axis=1)
-        weight = np.nan_to_num(rows, nan=np.inf) * (1 + flips.sum(axis=0))
+        weight = np.where(np.isnan(rows), np.inf, rows) * (1 + flips.sum(axis=0))
         i = int(np.argmax(weight))
         touch, slide = (int(n) for n in flips[:, i])
         text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
