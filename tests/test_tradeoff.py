@@ -2,10 +2,12 @@
 
 import csv
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
@@ -13,9 +15,11 @@ from dolfinx_nts.step.accuracy import ACCURACY
 from dolfinx_nts.study import scene_runs, tradeoff
 
 COMM = MPI.COMM_WORLD
+ROOT = Path(__file__).parents[1]
 SCRIPT = """
 from dolfinx.mesh import create_box
 from mpi4py import MPI
+from scipy.integrate import solve_ivp
 import dolfinx_nts as nts
 
 
@@ -221,3 +225,18 @@ def test_a_script_may_import_simulate_as_it_likes(tmp_path, call):
     run = scene_runs.measure(str(scene), {"dt_factor": 2.0}, COMM)
     assert run.status == "completed" and run.dt == 0.04
     assert run.solution.balance["time"][1] == pytest.approx(0.04)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["rigid", "beam", "shell", "linear", "quadratic"])
+def test_a_slender_arm_of_any_kind_falls_as_a_pendulum(part):
+    """A stiff one, whose angle is that of an arm that turns about the middle of its end."""
+    slender = scene_runs.load(str(ROOT / "benchmarks/slender.py"))
+    long, thick = slender.LONG, slender.THICK
+    rate = 0.5 * long * 9.81 / (long**2 / 3 + thick**2 / 12)
+    mass = slender.DENSITY * long * slender.WIDE * thick
+    found = slender.main(part=part, young=1e10, dt=1e-2).balance
+    fall = solve_ivp(lambda _, y: [y[1], rate * np.cos(y[0])], (0, 0.4), [0.0, 0.0], rtol=1e-10)
+    energy = 0.5 * mass * 9.81 * long * np.sin(fall.y[0, -1])
+    assert np.abs(found["ledger_residual"]).max() < 1e-8 * energy
+    assert found["kinetic"][-1] == pytest.approx(energy, rel=5e-4)
