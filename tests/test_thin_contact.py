@@ -30,70 +30,84 @@ def line(start, end, n=8, comm=MPI.COMM_WORLD):
     return surface_mesh(x, np.column_stack([np.arange(n), np.arange(1, n + 1)]), comm, "interval")
 
 
-def beam(z, comm=MPI.COMM_WORLD, **options):
+def beam(z, comm=MPI.COMM_WORLD, scale=1.0, **options):
     """Along x over the plate; 0.06 wide and 0.05 high."""
-    shape = nts.Rectangle(0.05, 0.06).section(young=1e6, poisson=0.3, density=1e3)
-    mesh = line((0.05, 0.5, z), (0.95, 0.5, z), comm=comm)
+    s = scale
+    elastic = {"young": 1e6 / s, "poisson": 0.3, "density": 1e3 / s**3}
+    shape = nts.Rectangle(0.05 * s, 0.06 * s).section(**elastic)
+    mesh = line((0.05 * s, 0.5 * s, z * s), (0.95 * s, 0.5 * s, z * s), comm=comm)
     return nts.Beam(mesh, shape, direction=(0, 0, 1), **options)
 
 
-def box(low, high, n, rigid, **options):
-    mesh = create_box(MPI.COMM_WORLD, [low, high], n, CellType.hexahedron)
+def box(low, high, n, rigid, scale=1.0, name="box", **options):
+    ends = [scale * np.array(end) for end in (low, high)]
+    mesh, density = create_box(MPI.COMM_WORLD, ends, n, CellType.hexahedron), 1e3 / scale**3
     if rigid:
-        return nts.RigidBody(mesh, density=1e3, name="box", **options)
-    return nts.Continuum(
-        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, name="box", **options
-    )
+        return nts.RigidBody(mesh, density=density, name=name, **options)
+    rubber = nts.NeoHookean(young=1e6 / scale, poisson=0.3)
+    return nts.Continuum(mesh, rubber, density=density, name=name, **options)
 
 
-def below(z):
-    return lambda x: x[2] < z + 1e-9
+def below(z, scale=1.0):
+    return lambda x: x[2] < (z + 1e-9) * scale
 
 
-def over(z):
-    return lambda x: x[2] > z - 1e-9
+def over(z, scale=1.0):
+    return lambda x: x[2] > (z - 1e-9) * scale
 
 
-def block(rigid, n=2):
-    """It comes down on the plate's top."""
-    return box((0.3, 0.3, 0.03), (0.7, 0.7, 0.3), (n, n, 1), rigid, velocity=FAST)
+def block(rigid, n=2, low=0.03, scale=1.0, **options):
+    """It comes down on the top of what lies below."""
+    return box((0.3, 0.3, low), (0.7, 0.7, low + 0.27), (n, n, 1), rigid, scale, **options)
 
 
-def table(rigid):
-    return box((0, 0, 0), (1, 1, 0.2), (6, 6, 1), rigid)
+def table(rigid, scale=1.0):
+    return box((0, 0, 0), (1, 1, 0.2), (6, 6, 1), rigid, scale, "table")
 
 
-def rod(z):
-    shape = nts.Circle(0.03).section(young=1e6, poisson=0.3, density=1e3)
-    return nts.Beam(line((0.5, 0.1, z), (0.53, 0.9, z)), shape, velocity=FAST, name="rod")
+def rod(z, scale=1.0, **options):
+    s = scale
+    shape = nts.Circle(0.03 * s).section(young=1e6 / s, poisson=0.3, density=1e3 / s**3)
+    axis = line((0.5 * s, 0.1 * s, z * s), (0.53 * s, 0.9 * s, z * s))
+    return nts.Beam(axis, shape, name="rod", **options)
 
 
-def meeting(case):
-    """Bodies, slave and master of an impact."""
-    down = {"velocity": FAST}
+def meeting(case, s=1.0):
+    """Bodies, slave and master of an impact, in a unit of length 1/s m.
+
+    No step is cut: whether one is, where many nodes stick, rounding may decide.
+    """
+    down, of = {"velocity": tuple(s * v for v in FAST), "scale": s}, {"scale": s}
     rigid = "rigid" in case
     match case:
         case "shell on rigid" | "shell on continuum":
-            a, b = shell(), block(rigid)
-            return [a, b], a.surface(side="top"), b.surface(below(0.03))
+            a, b = shell(**of), block(rigid, **down)
+            return [a, b], a.surface(side="top"), b.surface(below(0.03, s))
         case "rigid on shell" | "continuum on shell":
-            a, b = block(rigid, 3), shell()
-            return [a, b], a.surface(below(0.03)), b.surface(side="top")
+            a, b = block(rigid, 3, **down), shell(**of)
+            return [a, b], a.surface(below(0.03, s)), b.surface(side="top")
+        case "rigid on beam" | "continuum on beam":
+            a, b = block(rigid, 4, **down), beam(0.0, **of)
+            return [a, b], a.surface(below(0.03, s)), b.surface()
         case "shell on shell":
-            a, b = shell(), shell(0.06, 5, 0.9, name="upper", **down)
+            a, b = shell(**of), shell(0.06, 5, 0.9, name="upper", **down)
             return [a, b], b.surface(side="bottom"), a.surface(side="top")
         case "beam on shell":
-            a, b = beam(0.06, **down), shell()
+            a, b = beam(0.0557, **down), shell(**of)
             return [a, b], a.surface(), b.surface(side="top")
         case "shell on beam":
-            a, b = shell(n=12), beam(0.06, **down)
+            a, b = shell(n=12, **of), beam(0.06, **down)
             return [a, b], a.surface(side="top"), b.surface()
         case "beam on rigid" | "beam on continuum":
-            a, b = beam(0.23, **down), table(rigid)
-            return [a, b], a.surface(), b.surface(over(0.2))
+            a, b = beam(0.2347, **down), table(rigid, **of)
+            return [a, b], a.surface(), b.surface(over(0.2, s))
         case "beam on beam":
-            a, b = rod(0.06), beam(0.0)
+            a, b = rod(0.06, **down), beam(0.0, **of)
             return [a, b], a.surface(), b.surface()
+        case _ if "beam" not in case and "shell" not in case:
+            upper, lower = (kind == "rigid" for kind in case.split(" on "))
+            a, b = block(upper, 2, 0.2053, **down), table(lower, **of)
+            return [a, b], a.surface(below(0.2053, s)), b.surface(over(0.2, s))
         case "shell on obstacle":
             a = shell(0.0303, **down)
             return [a], a.surface(side="bottom"), nts.Plane((0, 0, 0), (0, 0, 1))
@@ -101,10 +115,20 @@ def meeting(case):
     return [a], a.surface(), nts.Plane((0, 0, 0), (0, 0, 1))
 
 
+def impact(case, scale=1.0):
+    """An impact in a unit of length 1/scale m."""
+    bodies, slave, master = meeting(case, scale)
+    contact = nts.ContactPair(slave=slave, master=master, friction=MU)
+    run = nts.simulate(nts.System(bodies, contacts=[contact]), EM, dt=1e-3, t_end=0.012)
+    return bodies, run
+
+
 CASES = [
     "shell on rigid", "shell on continuum", "rigid on shell", "continuum on shell",
-    "shell on shell", "beam on shell", "shell on beam", "beam on rigid", "beam on continuum",
-    "beam on beam", "shell on obstacle", "beam on obstacle",
+    "rigid on beam", "continuum on beam", "shell on shell", "beam on shell", "shell on beam",
+    "beam on rigid", "beam on continuum", "beam on beam", "continuum on rigid",
+    "continuum on continuum", "rigid on continuum", "rigid on rigid", "shell on obstacle",
+    "beam on obstacle",
 ]  # fmt: skip
 
 
@@ -117,14 +141,12 @@ ON_RANKS = {"shell on obstacle", "shell on shell", "beam on continuum"}
 @pytest.mark.fast("shell on rigid", "shell on obstacle", "beam on beam")
 @pytest.mark.fast_on_ranks("shell on obstacle")
 def test_impacts_keep_the_ledger_and_the_momenta(case):
-    bodies, slave, master = meeting(case)
-    contact = nts.ContactPair(slave=slave, master=master, friction=MU)
-    run = nts.simulate(nts.System(bodies, contacts=[contact]), EM, dt=1e-3, t_end=0.012)
+    _, run = impact(case)
     balance = run.balance
     assert run.status == "completed"
     assert balance["active"].max() > 0
     assert np.abs(balance["ledger_residual"]).max() < 1e-11 * balance["energy"][0]
-    if not isinstance(master, nts.Plane):
+    if "obstacle" not in case:
         for name in ("linear_momentum", "angular_momentum"):
             size = np.abs(balance[name]).max()
             assert np.abs(balance[name] - balance[name][0]).max() < 1e-12 * size
@@ -176,30 +198,19 @@ def test_skins_are_closed_and_as_large_as_their_bodies():
     assert chosen.area.sum() == pytest.approx(0.5)
 
 
-def drop(scale=1.0, comm=MPI.COMM_WORLD):
-    upper = shell(0.06, 5, 0.9, scale, comm, "upper", velocity=tuple(scale * v for v in FAST))
-    lower = shell(0.0, 6, 1.0, scale, comm)
-    contact = nts.ContactPair(upper.surface(side="bottom"), lower.surface(side="top"), friction=MU)
-    run = nts.simulate(
-        nts.System([upper, lower], contacts=[contact]), EM, dt=1e-3, t_end=0.012
-    )
-    return run, upper.midsurface()[1] / scale
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1e3, 1e6])
-def test_units_of_length_take_the_same_iterations(scale):
-    (metres, x), (others, y) = (drop(s) for s in (1.0, scale))
-    assert y == pytest.approx(x, abs=1e-10)
-    assert (others.balance["newton_iterations"] == metres.balance["newton_iterations"]).all()
-
-
-@pytest.mark.mpi
-@pytest.mark.slow
-def test_ranks_give_the_impact_of_one():
-    (several, x), (alone, y) = drop(), drop(comm=MPI.COMM_SELF)
-    assert x == pytest.approx(y, abs=1e-9)
-    assert several.balance["active"] == pytest.approx(alone.balance["active"])
+@pytest.mark.parametrize("case", CASES)
+def test_units_of_length_take_the_same_iterations(case):
+    """Metres, millimetres and micrometres."""
+    iterations, motions = [], []
+    for scale in (1.0, 1e3, 1e6):
+        bodies, run = impact(case, scale)
+        assert run.status == "completed"
+        motions.append(np.concatenate([body.last_accepted()[0] for body in bodies]) / scale)
+        iterations.append(run.balance["newton_iterations"])
+    for n, u in zip(iterations[1:], motions[1:], strict=True):
+        assert (n == iterations[0]).all()
+        assert u == pytest.approx(motions[0], abs=1e-10)
 
 
 @pytest.mark.mpi
@@ -339,32 +350,37 @@ def test_a_checkpoint_goes_on_on_other_ranks(mpi_tmp_path):
         assert y == pytest.approx(x, abs=1e-12)
 
 
-def strike(file):
-    """A beam falls on a shell, slips and leaves; the run is saved.
-
-    No step is cut: whether one is, where many nodes stick, rounding may decide.
-    """
-    stick, plate = beam(0.0505, velocity=FAST), shell()
-    contact = nts.ContactPair(stick.surface(), plate.surface(side="top"), friction=0.1)
-    run = nts.simulate(nts.System([plate, stick], contacts=[contact]), EM, dt=5e-4, t_end=2e-3)
-    assert run.status == "completed" and run.retries == 0 and run.balance["active"].max() > 0
-    assert run.balance["friction_dissipation"][-1] > 0.0
-    run.save(file)
+def save_impacts(folder):
+    """Run and save all impacts."""
+    for k, case in enumerate(CASES):
+        _, run = impact(case)
+        assert run.status == "completed" and run.retries == 0
+        run.save(Path(folder) / f"{k}.h5")
 
 
-@pytest.mark.parametrize("ranks", [3, 4])
-def test_an_impact_of_beam_and_shell_on_more_ranks(ranks, on_ranks, tmp_path):
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Folder with the impacts on one rank."""
+    folder = tmp_path_factory.mktemp("alone")
+    save_impacts(folder)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [2, 3, 4])
+def test_impacts_on_more_ranks(ranks, on_ranks, alone, tmp_path):
     """Places and velocities to 1e-9 of those of one rank."""
-    folder = str(Path(__file__).parent)
-    code = f"import sys; sys.path.insert(0, {folder!r}); import test_thin_contact as t; "
-    on_ranks(ranks, "-c", f"{code}t.strike({str(tmp_path / 'many.h5')!r})")
-    strike(tmp_path / "one.h5")
-    one, other = (nts.load(tmp_path / f"{name}.h5") for name in ("one", "many"))
-    for of in ("u", "v"):
-        mine, theirs = (
-            np.concatenate([body[of] for body in run.bodies.values()]) for run in (one, other)
-        )
-        assert np.abs(mine - theirs).max() < 1e-9 * np.abs(mine).max()
+    here = str(Path(__file__).parent)
+    code = f"import sys; sys.path.insert(0, {here!r}); import test_thin_contact as t; "
+    on_ranks(ranks, "-c", f"{code}t.save_impacts({str(tmp_path)!r})")
+    for k, case in enumerate(CASES):
+        one, several = (nts.load(folder / f"{k}.h5") for folder in (alone, tmp_path))
+        for of in ("u", "v"):
+            mine, theirs = (
+                np.concatenate([body[of] for body in run.bodies.values()])
+                for run in (one, several)
+            )
+            assert np.abs(mine - theirs).max() < 1e-9 * np.abs(mine).max(), case
 
 
 @pytest.mark.slow
