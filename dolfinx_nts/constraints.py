@@ -319,6 +319,7 @@ class Constraints(EveryStep):
         arm: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         super().__init__(bodies, self._elements, lambda part: part.multiplier / self._factor)
+        self._of = bodies
         self._name, self._sides, self._equations = name, tuple(sides), equations
         self._lent = SHIFT if redundant else 0.0
         self._scale: float | None = None
@@ -327,6 +328,29 @@ class Constraints(EveryStep):
         self._extent = _extent(equations, self._rest)
         self._driven, self._force = driven, np.zeros_like(equations.value)
         self._upright, self._arm = upright, arm
+
+    @property
+    def driven(self) -> bool:
+        """Whether their values are prescribed."""
+        return self._driven is not None
+
+    def begin(self, step: Step, history: Any, again: Evaluation | None, search: bool) -> None:
+        """Make the elements of a step."""
+        self.bodies = [self._of]
+        super().begin(step, history, again, search)
+
+    def rest(self) -> None:
+        """Leave the step: their bodies stay where they are, and they have no forces."""
+        self.elements, self.bodies = [], []
+
+    def rouse(self) -> None:
+        """Be in the step again."""
+        assert self.step is not None
+        self.begin(self.step, self._history, None, False)
+
+    def history(self, parts: Sequence[Any]) -> Any:
+        """Multipliers of an accepted step."""
+        return super().history(parts) if parts else self._force
 
     def hold_alone(self) -> None:
         """They repeat no others: nothing is lent to them, which light bodies would feel."""
@@ -372,7 +396,7 @@ class Constraints(EveryStep):
             StepFailedError: Directions have turned over.
         """
         step = self.step
-        if self._upright is None or step is None:
+        if self._upright is None or step is None or not parts:
             return False
         (part,) = parts
         along = self._upright(part.end, (step.state.time, step.state.time + step.dt))
@@ -388,7 +412,7 @@ class Constraints(EveryStep):
 
     def warnings(self, parts: Sequence[ConstraintPart]) -> list[StepWarning]:
         """Whether the arm has turned too far in the step. Collective."""
-        if self._arm is None or self.step is None or not self.step.integrator.inertia:
+        if not parts or self._arm is None or self.step is None or not self.step.integrator.inertia:
             return []
         (part,) = parts
         one, two = self._arm(part.start), self._arm(part.end)
@@ -405,6 +429,8 @@ class Constraints(EveryStep):
 
     def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
         """Do as `JointCoupling`, in closed form but for what is prescribed."""
+        if not self.elements:
+            return []
         (batch,) = self.elements
         gap, off = self._gap(state)
         first, second, doubt = self._rates(state, dt)

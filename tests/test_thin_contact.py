@@ -152,6 +152,53 @@ def test_impacts_keep_the_ledger_and_the_momenta(case):
             assert np.abs(balance[name] - balance[name][0]).max() < 1e-12 * size
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    "case", ["shell on continuum", "rigid on beam", "shell on shell", "rigid on shell"]
+)
+@pytest.mark.fast("shell on continuum", "rigid on beam")
+@pytest.mark.fast_on_ranks("rigid on beam")
+def test_what_is_hit_sleeps_until_then(case):
+    """Beams, shells and rigid bodies, with what holds their directors; the motion is the same."""
+    ends = []
+    for sleep in (False, True):
+        bodies, slave, master = meeting(case)
+        still = nts.RigidBody(
+            create_box(MPI.COMM_WORLD, [(5, 5, 5), (6, 6, 6)], [1] * 3), density=1.0, name="still"
+        )
+        contact = nts.ContactPair(slave, master, friction=MU)
+        system = nts.System([*bodies, still], contacts=[contact])
+        stepper, awake = nts.Stepper(system, EM, sleep=sleep), []
+        for _ in range(12):
+            stepper.advance(1e-3)
+            awake.append(len(stepper.problem.awake))
+        assert stepper.solution.balance["active"].max() > 0
+        assert stepper.solution.balance["newton_iterations"].max() > 1
+        assert (awake[0], awake[-1]) == ((1, 2) if sleep else (3, 3))
+        stepper.close()
+        ends.append((np.concatenate(stepper.state.u), np.concatenate(stepper.state.v)))
+    for a, b in zip(*ends, strict=True):
+        assert MPI.COMM_WORLD.allreduce(np.abs(a - b).max(initial=0.0)) < 1e-10
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_from_a_checkpoint_asleep(tmp_path):
+    """Of a shell that a block will hit, to the bit; it wakes after the restart."""
+    file, ends = tmp_path / "asleep.h5", []
+    for parts in ((0.012,), (0.004, 0.012)):
+        for t_end in parts:
+            bodies, slave, master = meeting("continuum on shell")
+            system = nts.System(bodies, contacts=[nts.ContactPair(slave, master, friction=MU)])
+            run = nts.simulate(
+                system, EM, dt=1e-3, t_end=t_end, sleep=True,
+                checkpoint=nts.Checkpoint(file, every=4) if t_end < 0.012 else None,
+                start=nts.restart(file, system) if t_end > parts[0] else None,
+            )  # fmt: skip
+        assert run.status == "completed" and run.balance["active"].max() > 0
+        ends.append(np.concatenate([body.last_accepted()[0] for body in bodies]))
+    assert (ends[0] == ends[1]).all()
+
+
 def rest(body, surface, weight, friction=0.0):
     """Height at which a body comes to rest on a plane, and the force there."""
     plane = nts.Plane((0, 0, 0), (0, 0, 1))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.constraints import Constraints
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
@@ -37,6 +38,12 @@ class Couplings:
         self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
         both = zip(system.joints, system.joint_bodies, strict=True)
         self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
+        own = slice(len(system.declared_joints), None)
+        alone = zip(self.joints[own], system.joint_bodies[own], strict=True)
+        # What holds a body together may leave a step with it; what drives it may move it.
+        self._own = [
+            (c, k) for c, (k, *_) in alone if isinstance(c, Constraints) and not c.driven
+        ]
         self._remembered: tuple[ContactHistory, ...] = ()
         _lend_less(system, self.joints)
 
@@ -105,8 +112,24 @@ class Couplings:
         return np.concatenate(guess)
 
     def touched(self) -> set[int]:
-        """Bodies that elements move, the same on all ranks. Collective."""
-        return set().union(*(coupling.touched() for coupling in self._all))
+        """Bodies that elements move but for those that hold one together, alike on all ranks.
+
+        Collective.
+        """
+        own = {id(coupling) for coupling, _ in self._own}
+        return set().union(*(c.touched() for c in self._all if id(c) not in own))
+
+    def rest(self, bodies: Container[int]) -> None:
+        """Leave out of the step what holds bodies together that are left out."""
+        for coupling, k in self._own:
+            if k in bodies:
+                coupling.rest()
+
+    def rouse(self, bodies: Container[int]) -> None:
+        """Take in again what `rest` left out."""
+        for coupling, k in self._own:
+            if k in bodies:
+                coupling.rouse()
 
     def wake(self, u1: Sequence[FloatArray]) -> bool:
         """Whether a solved step asks for more elements, which are made. Collective."""

@@ -10,7 +10,7 @@ pure: nothing here changes a State, and history changes only when a step is acce
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import Any
 
 import numpy as np
@@ -161,8 +161,7 @@ class StepProblem:
         u1 = [terms.u1 for terms in e.bodies]
         if not self.couplings.wake(u1):
             return False
-        for k in self._asleep.keys() & self.couplings.touched():
-            del self._asleep[k]
+        self._rouse(self._asleep.keys() & self.couplings.touched())
         self._lay_out()
         return True
 
@@ -181,7 +180,7 @@ class StepProblem:
         system = self.system
         if len(self._asleep) == len(system.bodies):
             # SNES needs an unknown; at rest it takes no iteration.
-            del self._asleep[0]
+            self._rouse({0})
         self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
         elements = self.elements
         widths = np.array([list(c.widths.values()) for c in elements])
@@ -222,11 +221,18 @@ class StepProblem:
         chosen = sorted(set(np.flatnonzero(rest).tolist()) - self.couplings.touched())
         u, f = self.state.u, self.factor
         found = self._sleepers.find(chosen, u, self.loads.gravity, self.rounding.at_rest)
+        self.couplings.rest(found)
         none = {k: np.zeros_like(u[k]) for k in found}
         return {
             k: BodyTerms(u[k], none[k], f * a, f * b, none[k], f * (a - b))
             for k, (a, b) in found.items()
         }
+
+    def _rouse(self, bodies: Set[int]) -> None:
+        """Take bodies into the step that were left out."""
+        for k in bodies:
+            del self._asleep[k]
+        self.couplings.rouse(bodies)
 
     def _inertial(self, body: Any, du: FloatArray) -> FloatArray:
         """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
