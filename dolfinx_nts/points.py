@@ -204,21 +204,24 @@ def _cells_of(mesh: Any, x: FloatArray) -> tuple[IntArray, IntArray, FloatArray]
     rounding = _ROUNDING * float(np.abs(x).max(initial=0.0))
     padding = float(_ON_CELL * sizes.max(initial=0.0) + rounding)
     near = compat.cells_near(mesh, x, padding)
-    simplex = nodes.shape[1] == 4
+    dim, cmap = mesh.topology.dim, mesh.geometry.cmap
+    simplex = nodes.shape[1] == dim + 1
     which, held, inside = [], [], []
     for i, cells in enumerate(near):
         for c in cells:
             try:
-                at = mesh.geometry.cmap.pull_back(x[i : i + 1], nodes[c])[0]
+                at = cmap.pull_back(x[i : i + 1], nodes[c])
             except RuntimeError:  # Newton's method does not converge, as far outside
                 continue
             off = max(-at.min(), (at.sum() if simplex else at.max()) - 1.0)
-            if off <= _ON_CELL + rounding / sizes[c]:
+            # A cell of a surface or line says nothing of what is beside it.
+            aside = np.linalg.norm(cmap.push_forward(at, nodes[c]) - x[i]) / sizes[c]
+            if max(off, aside) <= _ON_CELL + rounding / sizes[c]:
                 which.append(i)
                 held.append(c)
                 inside.append(at)
                 break
     return (
         np.array(which, dtype=np.int64), np.array(held, dtype=np.int64),
-        np.array(inside).reshape(-1, 3),
+        np.array(inside).reshape(-1, dim),
     )  # fmt: skip

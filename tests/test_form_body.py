@@ -224,6 +224,9 @@ def test_points_of_a_membrane():
     x = np.array([[0.5, 0.5 * 0.8, 0.5 * 0.6], [0.1, 0.16, 0.12]])
     points = body.points(x)
     assert np.allclose(points.at(body.reference), x, atol=1e-14)
+    beside = x[:1] + 1e-6 * np.array([0.0, -0.6, 0.8])
+    with pytest.raises(ValueError, match="lies in no cell"):
+        body.points(beside)
 
 
 def _heavy_on_one_side(v, w):
