@@ -12,6 +12,7 @@ from measures import relative
 from mpi4py import MPI
 
 import dolfinx_nts as nts
+from dolfinx_nts.contact import contact_elements
 from dolfinx_nts.contact.coulomb import Together
 from dolfinx_nts.contact.facet_elements import FacetElements
 from dolfinx_nts.contact.obstacle_elements import ObstacleElements
@@ -207,6 +208,24 @@ def test_forces_of_points_are_those_of_nodes(points, monkeypatch):
     here = compiled_law.to_nodes(weights, residual, tangent)
     for found, expected in zip(here, elements._spread(weights, residual, tangent), strict=True):
         assert np.abs(found - expected).max() < 1e-13
+
+
+def test_wrenches_are_those_of_numpy():
+    rng = np.random.default_rng(11)
+    y, push = rng.normal(size=(2, N, 5, 3))
+    places, fixed = rng.uniform(size=(N, 5)) < 0.5, rng.uniform(size=(N, 5, 3)) < 0.3
+    places[:, 3] = True
+    found = compiled_law.wrenches(y, push, places, fixed)
+    assert np.abs(found - contact_elements._wrench(y, push, places, fixed)).max() < 1e-13
+
+
+def test_arrays_that_may_not_be_written_or_are_not_contiguous_are_read():
+    rng = np.random.default_rng(12)
+    corners, points = rng.normal(size=(2 * N, 4, 3)), rng.normal(size=(3, N)).T
+    expected = compiled.closest_point(points.copy(), corners[::2].copy())
+    points.flags.writeable = corners.flags.writeable = False
+    for found, right in zip(compiled.closest_point(points, corners[::2]), expected, strict=True):
+        assert np.array_equal(found, right)
 
 
 @pytest.mark.parametrize("nc", KINDS)

@@ -32,8 +32,6 @@ _CYCLE = 8
 #: What messages say of such a node; what follows says what to do.
 UNSETTLED = "settles in neither; "
 _EPS = float(np.finfo(float).eps)
-#: Components whose products make those of a cross product.
-_ONE, _TWO = [1, 2, 0], [2, 0, 1]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -359,14 +357,9 @@ class ContactElements(ContactLaws):
         force = rows.reshape(y.shape)
         for side in self._nodes:
             here = slice(start, start + side.nodes.shape[1])
-            push, fixed, places = force[:, here], side.fixed[on], side.places[on].astype(float)
-            if fixed.any():
-                push = np.where(fixed, 0.0, push)
-            middle = np.einsum("nk,nki->ni", places, y[:, here]) / places.sum(axis=1)[:, None]
-            arm = y[:, here] - middle[:, None] * places[:, :, None]
-            turned = np.matmul(arm.transpose(0, 2, 1), push)
-            moment = turned[:, _ONE, _TWO] - turned[:, _TWO, _ONE]
-            found.append(np.column_stack([np.einsum("nk,nki->ni", places, push), moment]))
+            given = y[:, here], force[:, here], side.places[on], side.fixed[on]
+            wrench = compiled_law.wrenches(*given)
+            found.append(_wrench(*given) if wrench is None else wrench)
             start = here.stop
         return found
 
@@ -454,3 +447,14 @@ class ContactElements(ContactLaws):
                 remedy = "its motion is prescribed, so make its surface the master"
             text += f": it flips between {states} and {UNSETTLED}{remedy}"
         return float(weight[i]), text
+
+
+def _wrench(
+    y: FloatArray, push: FloatArray, places: BoolArray, fixed: BoolArray
+) -> FloatArray:
+    """`compiled_law.wrenches`."""
+    number = places.astype(float)
+    push = np.where(fixed, 0.0, push)
+    middle = np.einsum("nk,nki->ni", number, y) / number.sum(axis=1)[:, None]
+    moment = cross(y - middle[:, None] * number[:, :, None], push).sum(axis=1)
+    return np.column_stack([np.einsum("nk,nki->ni", number, push), moment])

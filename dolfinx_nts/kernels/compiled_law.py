@@ -189,3 +189,26 @@ def to_nodes(
     work = np.empty((residual.shape[1], width))
     library.run(kernels.to_nodes, points, nodes, rest, n, weights, residual, tangent, work, *out)
     return out
+
+
+def wrenches(
+    y: FloatArray, push: FloatArray, places: BoolArray, fixed: BoolArray
+) -> FloatArray | None:
+    """Force and moment about the middle of their places of forces on nodes, shape (n, 6).
+
+    Args:
+        y: The nodes [m], shape (n, k, 3).
+        push: Forces on them, shape (n, k, 3).
+        places: Whether they are places, shape (n, k).
+        fixed: Where forces do not count, shape (n, k, 3).
+
+    Returns:
+        None where nothing is compiled.
+    """
+    kernels = library.load()
+    if kernels is None:
+        return None
+    n, nodes, _ = y.shape
+    out = np.empty((n, 6))
+    library.run(kernels.wrenches, nodes, n, y, push, places, fixed, out)
+    return out

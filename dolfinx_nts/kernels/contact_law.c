@@ -1,8 +1,8 @@
 /* The laws of contact and friction, pair after pair, and what stands before and after them.
 
    `laws` is contact/contact_laws.py, _write, with contact/coulomb.py, write, and kernels/friction.py,
-   return_map; `obstacle` is contact/obstacle_elements.py, _assembled; `to_nodes` is
-   contact/contact_elements.py, _spread. These have the formulas, stand in where there is no compiler,
+   return_map; `obstacle` is contact/obstacle_elements.py, _assembled; `to_nodes` and `wrenches` are
+   contact/contact_elements.py, _spread and _wrench. These have the formulas, stand in where there is no compiler,
    and are compared with this by tests/test_compiled.py. */
 
 #include "facets.h"
@@ -324,5 +324,35 @@ void to_nodes(int points, int nodes, int rest, long n, const double *weights, co
         }
         spread(points, nodes, 3 * width, w, work, out_k);
         memcpy(out_k + 3 * nodes * width, work + 3 * points * width, rest * width * sizeof(double));
+    }
+}
+
+/* ---- what forces on nodes do to a body */
+
+/* Force and moment about the middle of the places of forces on nodes at y, both (n, nodes, 3), where
+   these are not fixed; which nodes are places (n, nodes). */
+void wrenches(int nodes, long n, const double *y, const double *push, const unsigned char *places,
+              const unsigned char *fixed, double *out)
+{
+    for (long i = 0; i < n; i++, y += 3 * nodes, push += 3 * nodes, fixed += 3 * nodes, places += nodes, out += 6) {
+        double middle[3] = {0.0}, number = 0.0;
+        for (int k = 0; k < 6; k++)
+            out[k] = 0.0;
+        for (int a = 0; a < nodes; a++)
+            if (places[a]) {
+                number += 1.0;
+                for (int k = 0; k < 3; k++)
+                    middle[k] += y[3 * a + k];
+            }
+        for (int a = 0; a < nodes; a++) {
+            double arm[3], force[3];
+            for (int k = 0; k < 3; k++) {
+                force[k] = fixed[3 * a + k] ? 0.0 : push[3 * a + k];
+                arm[k] = y[3 * a + k] - (places[a] ? middle[k] / number : 0.0);
+                out[k] += places[a] ? force[k] : 0.0;
+            }
+            for (int k = 0; k < 3; k++)
+                out[3 + k] += arm[(k + 1) % 3] * force[(k + 2) % 3] - arm[(k + 2) % 3] * force[(k + 1) % 3];
+        }
     }
 }
