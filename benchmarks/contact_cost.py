@@ -126,7 +126,9 @@ def main() -> None:
             if solver == "balanced":
                 newton = ACCURACY[solver]
             else:
-                newton = nts.Newton(rtol=1e-10, condense=case["condense"], linear_solver=solver)
+                newton = nts.Newton(
+                    rtol=1e-10, condense=case["condense"], linear_solver=solver, reuse=False
+                )
             c = cost(system, options.steps, options.dt, newton)
             base = base or c
             if comm.rank == 0:

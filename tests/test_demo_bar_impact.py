@@ -3,6 +3,9 @@
 import bar_impact as demo
 import numpy as np
 import pytest
+from mpi4py import MPI
+
+import dolfinx_nts as nts
 
 #: Elements: E/E0, rebound of the centre of mass over v0.
 REFERENCE = {50: (0.9978, 0.9841), 100: (0.9987, 0.9892), 200: (0.9992, 0.9927)}
@@ -67,7 +70,22 @@ def check_impact(result, elements):
     assert result["impulse"].sum() == pytest.approx(mass * demo.SPEED * (1 + result["rebound"]))
     assert result["shortening"] == pytest.approx(demo.SPEED / 3, rel=0.2 / elements**0.5)
     assert result["min_gap"] > -1e-13 * demo.LENGTH
-    assert result["newton_iterations"] < 2
+    # From 600 coordinates on matrices are kept, which the strain v / c makes wrong: each iteration
+    # gains that part. Otherwise the linear problem takes one, and one more where contact changes.
+    kept = 12 * (elements + 1) >= 600
+    most = np.log(1e-12) / np.log(demo.SPEED / demo.WAVE) if kept else 2
+    assert result["newton_iterations"] < most
+
+
+@pytest.mark.slow
+def test_new_matrices_take_one_iteration_where_nothing_changes():
+    dt = demo.LENGTH / 50 / demo.WAVE
+    run = nts.simulate(
+        demo.scene(MPI.COMM_WORLD, 50, gravity=False), nts.EnergyMomentum(), dt=dt, t_end=1.5,
+        newton=nts.Newton(reuse=False),
+    )  # fmt: skip
+    assert run.balance["active"].max() == 4
+    assert run.balance["newton_iterations"][1:].mean() < 2
 
 
 @pytest.mark.mpi

@@ -12,6 +12,7 @@ from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.step import balance
+from dolfinx_nts.step.accuracy import EXACT
 from dolfinx_nts.step.problem import StepProblem
 
 #: What the ledger may miss of the energy, over the tolerance of Newton's method ...
@@ -25,8 +26,6 @@ _DOUBTFUL, _OPEN = 1e-3, 1e-2
 _GAIN = 0.01
 #: Part of the energy that contact may take over a run without a word.
 _LOSS = 0.1
-#: Tolerance of Newton's method of accuracy="exact".
-_EXACT = 1e-12
 _EPS = float(np.finfo(float).eps)
 #: Rounding of a step's energy over that of its forces times its motion.
 _ROUNDING = 10.0
@@ -43,7 +42,7 @@ class Promises:
 
     def __init__(self, solution: Solution, integrator: Integrator, rtol: float) -> None:
         self._solution, self._closes = solution, integrator.closes_ledger
-        self._remedy = "use a smaller dt" if rtol <= _EXACT else 'pass accuracy="exact"'
+        self._remedy = "use a smaller dt" if rtol <= EXACT else 'pass accuracy="exact"'
         self._remedy += integrator.ledger_remedy
         self._open = f"use EnergyMomentum(){integrator.ledger_remedy}"
         self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if self._closes else _OPEN

@@ -94,11 +94,12 @@ def simulate(
         progress: Show a progress line on rank 0.
         start: Result of `equilibrium` (see there) or of another run to start from; or of `restart`,
             with which an interrupted run goes on. With the same dt and whole steps before and after
-            the result is that of one run, to the bit with the same solver at its floor on one rank.
+            the result is that of one run, on one rank to the bit where no matrices are kept (see
+            `Newton.reuse`) or with `restart`, else to the tolerance.
         start_time: Time at which a run from `start` begins [s], from which functions of time and
             `t_end` count; default: the time of `start`, which is a pseudo time in equilibrium.
-        accuracy: In place of `newton`: "exact" closes the ledger to rounding; "balanced" to about
-            1e-8 and "fast" to about 1e-5 of the energy, with matrices kept over many steps.
+        accuracy: In place of `newton`: "exact", the default, closes the ledger to rounding;
+            "balanced" to about 1e-8 and "fast" to about 1e-5 of the energy.
         sleep: Leave a body out of a step while its velocity is exactly zero, its forces balance to
             rounding and no contact may reach it; it wakes in the first step in which that ends. The
             solution is the same; a body that has moved hardly ever comes to rest exactly. When a

@@ -14,6 +14,10 @@ from dolfinx_nts.validation import is_finite, is_whole, known_options, require_b
 
 #: Coordinates of shells from which a Krylov solver is worth it where they are stiff and steps long.
 _MANY = 2000
+#: Tolerance that leaves rounding.
+EXACT = 1e-12
+#: Coordinates from which on the bodies' matrices take most of a step.
+_LARGE = 600
 
 
 @known_options
@@ -39,19 +43,22 @@ class Newton:
             steps. Where MUMPS fails, it leaves out equations that repeat others for some steps.
             Nothing takes over from "krylov" or "multigrid" where you ask for them.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
-            and steps for as long as Newton contracts well; contact is always linearised anew.
+            and steps for as long as Newton contracts well; contact is always linearised anew. None:
+            while "krylov" is in use in dynamics of 600 coordinates or more, beside those of rigid
+            bodies, beams and shells, where matrices take most of the time; MUMPS would factorise
+            about twice as often.
 
     Raises:
         TypeError: An argument is of another type.
         ValueError: An argument is out of range.
     """
 
-    rtol: float = 1e-12
+    rtol: float = EXACT
     max_iterations: int = 25
     max_retries: int = 8
     condense: bool = True
     linear_solver: str = "auto"
-    reuse: bool = False
+    reuse: bool | None = None
 
     def __post_init__(self) -> None:
         if not (is_finite(self.rtol) and 0 < self.rtol < 1):
@@ -60,8 +67,9 @@ class Newton:
             value = getattr(self, name)
             if not is_whole(value):
                 raise TypeError(f"{name}={value!r}: pass a whole number")
-        for name in ("condense", "reuse"):
-            require_bool(name, getattr(self, name))
+        require_bool("condense", self.condense)
+        if self.reuse is not None:
+            require_bool("reuse", self.reuse)
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
         if self.max_retries < 0:
@@ -69,6 +77,18 @@ class Newton:
         if self.linear_solver not in SOLVERS:
             known = ", ".join(map(repr, SOLVERS))
             raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
+
+    def keeps(self, system: System, inertia: bool) -> bool:
+        """Whether matrices are kept while an iterative solver is in use. Collective.
+
+        Args:
+            system: The scene.
+            inertia: Whether the step equations have inertia.
+        """
+        if self.reuse is not None:
+            return self.reuse
+        size = system.comm.allreduce(sum(b.num_owned for b in system.bodies if not b.joints))
+        return inertia and bool(size >= _LARGE)
 
     def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
         """Preset of the linear solver to begin with; arguments as of `choose`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from dolfinx_nts.evaluation import Evaluation
@@ -20,13 +21,13 @@ class KeptTangents:
 
     Args:
         problem: Equations of the step.
-        reuse: Whether iterations may use matrices of an earlier iterate.
+        reuse: Tells whether iterations may use matrices of an earlier iterate now.
 
     Attributes:
         due: Whether the matrices are to be made anew at the next iterate.
     """
 
-    def __init__(self, problem: StepProblem, reuse: bool) -> None:
+    def __init__(self, problem: StepProblem, reuse: Callable[[], bool]) -> None:
         self._problem, self._reuse = problem, reuse
         self.due, self._factor = True, 0.0
         self._matrices: dict[int, Any] = {}
@@ -36,7 +37,7 @@ class KeptTangents:
         """Begin a step: matrices of another step size are of no use."""
         factor = self._problem.factor
         changed = abs(factor / self._factor - 1.0) > _EQUAL if self._factor else True
-        self.due |= changed or not self._reuse
+        self.due |= changed or not self._reuse()
         self._factor = factor
 
     def at(self, e: Evaluation) -> tuple[list[Any], bool]:
@@ -49,7 +50,7 @@ class KeptTangents:
         fresh = anywhere(self._problem.system.comm, self.due or changed)
         if fresh:
             self._matrices = dict(zip(awake, self._problem.body_tangents(e), strict=True))
-            self.due = not self._reuse
+            self.due = not self._reuse()
         for k in awake:
             if k not in self._matrices:
                 self._matrices[k] = self._problem.body_tangent(k, e.bodies[k].u1)

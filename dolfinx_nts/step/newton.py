@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere
-from dolfinx_nts.step.accuracy import Newton
+from dolfinx_nts.step.accuracy import EXACT, Newton
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.augmented import AugmentedMatrix
 from dolfinx_nts.step.convergence import ratios
@@ -70,7 +70,7 @@ class StepSolver:
             problem.system, newton, preset, petsc_options, problem.condense,
             problem.integrator.inertia,
         )  # fmt: skip
-        self._tangents = KeptTangents(problem, newton.reuse)
+        self._tangents = KeptTangents(problem, lambda: self._presets.keeps)
         self.iterates, self._upright = Iterates(problem), Upright(problem)
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
@@ -238,7 +238,7 @@ class StepSolver:
             )
             if options.augmented:
                 self._augmented = AugmentedMatrix(self.problem, bodies)
-        elif self._solved and self.newton.reuse and self.problem.laid.own and not options.augmented:
+        elif self._solved and self.problem.laid.own and not options.augmented:
             # Of an augmented matrix contacts that close change the bodies' part.
             keep_bodies(self.snes, not fresh)
         if fresh or new or self.problem.laid.blocks:
@@ -354,10 +354,12 @@ class StepSolver:
         """Whether what an iteration leaves adds up over steps; every rank must call it.
 
         Kept matrices leave the same part of a smooth motion in each step, whose work has one sign;
-        where contact acts, the parts differ.
+        where contact acts, the parts differ, and only what is to be exact is to have none of them.
         """
+        if not self._presets.keeps or self.newton.rtol <= EXACT:
+            return self._presets.keeps
         acts = any(bool(part.status.any()) for part in e.parts)
-        return self.newton.reuse and not anywhere(self.problem.system.comm, acts)
+        return not anywhere(self.problem.system.comm, acts)
 
     # ---- failure
     def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:

@@ -68,6 +68,7 @@ class Presets:
     ) -> None:
         self._system, self._newton, self._given = system, newton, given
         self._condense, self._patience = condense, 0
+        self._keeps = newton.keeps(system, inertia)
         self.forget()
         self._workspace: dict[str, int] = {}
         mumps: tuple[str, ...] = ("direct", "null-pivots")
@@ -89,6 +90,11 @@ class Presets:
     def name(self) -> str:
         """The preset in use."""
         return self._names[self._chosen]
+
+    @property
+    def keeps(self) -> bool:
+        """Whether iterations may use matrices of an earlier iterate, see `Newton.reuse`."""
+        return self._keeps and (self.name in ITERATIVE or self._newton.reuse is True)
 
     @property
     def memory(self) -> tuple[str, int, dict[str, int]]:
@@ -162,7 +168,7 @@ class Presets:
         if self.name not in ITERATIVE or self._given.keys() & {"ksp_rtol", "ksp_max_it"}:
             return
         aim, limit = _AIM / worst, self.options.most_iterations
-        if self._newton.reuse:
+        if self.keeps:
             # What the linear solver leaves of the last iteration is missing in the momenta.
             last = worst * self._left <= 1.0
             rtol = min(max(aim, _FINE if last else _BELOW * self._left), _KEPT)
