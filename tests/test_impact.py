@@ -221,7 +221,7 @@ def ball(cells, low, rigid=False, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("restitution", [0.5, 0.8])
+@pytest.mark.parametrize("restitution", [0.5, 0.8, 1.0])
 def test_a_bouncing_ball_rises_by_its_restitution(restitution):
     """B24: e^(2 n) of the height from which it fell, and the ledger names what it lost."""
     height, gravity = 1.0, 9.81
@@ -245,7 +245,26 @@ def test_a_bouncing_ball_rises_by_its_restitution(restitution):
         assert flight[0] == pytest.approx(restitution ** (2 * n), abs=5e-3)
     assert np.abs(table["ledger_residual"]).max() < 1e-11 * size
     lost = table["contact_defect"][-1] - table["impact_restored"][-1]
-    assert lost == pytest.approx(size * (1.0 - gravitational[-1]), rel=1e-9)
+    assert lost == pytest.approx(size * (1.0 - gravitational[-1]), rel=1e-9, abs=1e-11 * size)
+
+
+def test_a_ball_without_restitution_stays_where_it_falls():
+    """B24 at e = 0: what its fall brought is lost, and it lies there."""
+    height, gravity = 0.1, 9.81
+    body = ball(2, height, rigid=True)
+    pair = nts.ContactPair(slave=body.surface(lambda x: x[2] < height + 0.5), master=FLOOR)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -gravity))
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=1e-3, t_end=0.2, impact="restored", restitution=0.0
+    )
+    table, size = run.balance, body.mass * gravity * height
+    assert run.status == "completed" and table["active"][-1] == 1
+    # A body that comes to rest within a step keeps up to half a step's fall, with changing sign.
+    assert np.linalg.norm(body.velocity) <= gravity * 1e-3
+    assert body.position[2] == pytest.approx(1.0, abs=1e-10)
+    lost = table["contact_defect"][-1] - table["impact_restored"][-1]
+    assert lost == pytest.approx(size, rel=1e-4)
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * size
 
 
 @pytest.mark.slow
