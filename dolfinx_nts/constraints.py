@@ -328,11 +328,8 @@ class Constraints(EveryStep):
         self._extent = _extent(equations, self._rest)
         self._driven, self._force = driven, np.zeros_like(equations.value)
         self._upright, self._arm = upright, arm
-
-    @property
-    def driven(self) -> bool:
-        """Whether their values are prescribed."""
-        return self._driven is not None
+        # What is prescribed may move its bodies in any step.
+        self.rests = driven is None
 
     def begin(self, step: Step, history: Any, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step."""
@@ -340,7 +337,7 @@ class Constraints(EveryStep):
         super().begin(step, history, again, search)
 
     def rest(self) -> None:
-        """Leave the step: their bodies stay where they are, and they have no forces."""
+        """Leave the step."""
         self.elements, self.bodies = [], []
 
     def rouse(self) -> None:

@@ -211,7 +211,19 @@ class Coupling(Protocol):
 
 
 class JointCoupling(Coupling, Protocol):
-    """What a `Joint` makes: a `Coupling` that also says what its forces do."""
+    """What a `Joint` makes: a `Coupling` that also says what its forces do.
+
+    Attributes:
+        rests: Whether a step does without it where its bodies do not move, by `rest`.
+    """
+
+    rests: bool
+
+    def rest(self) -> None:
+        """Leave the step that has begun: its bodies stay where they are, and it has no forces."""
+
+    def rouse(self) -> None:
+        """Be in the step again."""
 
     def hold_alone(self) -> None:
         """Take note that its constraints repeat no others: its equations need no compliance.

@@ -173,6 +173,7 @@ class EveryStep:
     """
 
     may_slip = False
+    rests = False
 
     def __init__(
         self,
@@ -189,6 +190,12 @@ class EveryStep:
         """Make the elements of a step."""
         self.step, self._history = step, history
         self.elements = [self.make(step, history)]
+
+    def rest(self) -> None:
+        """It never rests."""
+
+    def rouse(self) -> None:
+        """It never rests."""
 
     def hold_alone(self) -> None:
         """Nothing is lent."""

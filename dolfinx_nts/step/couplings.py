@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.constraints import Constraints
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
@@ -40,10 +39,8 @@ class Couplings:
         self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
         own = slice(len(system.declared_joints), None)
         alone = zip(self.joints[own], system.joint_bodies[own], strict=True)
-        # What holds a body together may leave a step with it; what drives it may move it.
-        self._own = [
-            (c, k) for c, (k, *_) in alone if isinstance(c, Constraints) and not c.driven
-        ]
+        # What holds a body together may leave a step with it.
+        self._own = [(c, k) for c, (k, *_) in alone if c.rests]
         self._remembered: tuple[ContactHistory, ...] = ()
         _lend_less(system, self.joints)
 
