@@ -94,6 +94,12 @@ class System:
         own = (joint for body in self.bodies for joint in body.joints)
         self.joints = (*self.declared_joints, *own)
         self._check_members()
+        surfaces = [surface for pair in self.contacts for surface in pair.surfaces]
+        # What contacts of other systems use says nothing of this one.
+        for surface in surfaces:
+            surface.leave()
+        for surface in surfaces:
+            surface.touch()
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]

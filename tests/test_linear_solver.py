@@ -613,6 +613,7 @@ def test_of_redundant_contacts_no_equation_repeats_another():
             stepper.advance(1e-3)
             factors = stepper.solver.snes.getKSP().getPC().getFactorMatrix()
             assert factors.getMumpsInfog(28) == 0
+            assert factors.getMumpsInfog(33) != 0, "nothing is scaled"
         assert stepper.solver.memory[0] == "redundant"
         tables.append(stepper.solution.balance)
         stepper.close()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -101,6 +102,7 @@ def test_what_is_left_of_a_destroyed_system(tmp_path):
         lambda: body.inertia(zero),
         lambda: body.tangent(zero, 1.0, 0.0),
         lambda: body.nodal_stiffness(),
+        lambda: body.smallest_det(zero),
     ):
         with pytest.raises(ValueError, match="^body 'left' was destroyed"):
             use()
@@ -109,6 +111,20 @@ def test_what_is_left_of_a_destroyed_system(tmp_path):
 
 
 @pytest.mark.mpi
+def test_forces_of_a_users_own_in_a_destroyed_body_say_so():
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(1e6, 0.3), density=1e3, name="box",
+        extra_form=lambda u, v, w, t: 3.0 * ufl.inner(v, w) * ufl.dx,
+    )  # fmt: skip
+    stepper = nts.Stepper(nts.System([body]), nts.Midpoint())
+    stepper.advance(1e-3)
+    stepper.close()
+    body.destroy()
+    with pytest.raises(ValueError, match="^body 'box' was destroyed"):
+        body.external(np.zeros(body.num_owned), np.zeros(3))
+
+
 def test_a_stepper_of_a_destroyed_system_says_so():
     stepper = nts.Stepper(scene(COMM), nts.EnergyMomentum())
     stepper.advance(1e-3)

@@ -1097,3 +1097,24 @@ def test_points_of_a_driven_arm_move_farther_than_its_coordinates(other):
     assert run.status.startswith("completed, but")
     worst = max(w.worst for w in run.warnings.every if w.grave)
     assert 0.03 < worst < 0.08
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("on", ["plane", "block"])
+def test_a_thin_plate_that_is_held_at_its_far_face_is_told(on):
+    """Its upper face is the slave, so that all of it sinks in: a tenth of a facet, but all of it."""
+    thick, kind = 0.03, dict(cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, thick]], [3, 3, 1], **kind)
+    plate = nts.RigidBody(mesh, density=1e3, name="plate")
+    bodies, master = [plate], nts.Plane((0, 0, 0), (0, 0, 1))
+    if on == "block":
+        mesh = create_box(COMM, [[-0.5, -0.5, -1], [1.5, 1.5, 0]], [3, 3, 2], **kind)
+        still = dict(motion=(0, 0, 0), rotation=(0, 0, 0))
+        bodies.append(nts.RigidBody(mesh, density=1e3, name="block", **still))
+        master = bodies[1].surface(lambda x: x[2] > -1e-9)
+    pair = nts.ContactPair(plate.surface(lambda x: x[2] > thick - 1e-9), master)
+    system = nts.System(bodies, contacts=[pair], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=4e-3, t_end=0.1)
+    assert run.status.startswith("completed, but node")
+    kind = "node in an obstacle" if on == "plane" else "node inside a body"
+    assert 0.9 * thick < run.warnings[kind].worst <= (1 + 1e-9) * thick

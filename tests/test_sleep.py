@@ -390,3 +390,17 @@ def test_a_material_that_changes_wakes():
 
     right, found = moved(False), moved(True)
     assert found == pytest.approx(right, rel=1e-9, abs=1e-12) and right[-1] > 1e-3 > right[2]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("sleep", [True, False])
+def test_a_sleeper_s_own_constraints_hold_at_the_start(sleep):
+    """A rigid body at rest whose first director is too long, beside a body that flies."""
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron)
+    body = nts.RigidBody(mesh, density=1e3, name="a")
+    if body.num_owned:
+        body.initial_displacement = body.initial_displacement.copy()
+        body.initial_displacement[3:6] = 0.05
+    system = nts.System([body, cube((5, 0, 0), "other", velocity=(1.0, 0.0, 0.0))])
+    with pytest.raises(ValueError, match="joints: at the start 'a directors' is off by"):
+        nts.simulate(system, nts.EnergyMomentum(), dt=DT, t_end=DT, sleep=sleep)

@@ -296,14 +296,21 @@ def test_surfaces_count_as_redundant_where_contacts_use_them():
     def half(sign):
         return lambda x: sign * (x[0] - 0.5) > 1e-9
 
+    def redundant(*contacts):
+        bodies = {id(b): b for contact in contacts for b in contact.bodies}
+        nts.System(list(bodies.values()), contacts=contacts)
+        return contacts[0].redundant
+
     body.surface(side="edge")
     first = nts.ContactPair(body.surface(half(1), side="bottom"), plane)
-    nts.ContactPair(body.surface(half(-1), side="top"), plane)
-    assert not first.redundant
-    nts.ContactPair(shell().surface(below(9), side="top"), body.surface(half(1), side="top"))
-    assert first.redundant
-    assert nts.ContactPair(shell().surface(side="edge"), plane).redundant
-    assert nts.ContactPair(beam(0.0).surface(), plane).redundant
+    other = nts.ContactPair(body.surface(half(-1), side="top"), plane)
+    low = shell(0.5, name="low")
+    over = nts.ContactPair(low.surface(below(9), side="top"), body.surface(half(1), side="top"))
+    assert not redundant(first, other)
+    assert redundant(first, other, over)
+    assert not redundant(first), "the contacts of another system count"
+    assert redundant(nts.ContactPair(shell().surface(side="edge"), plane))
+    assert redundant(nts.ContactPair(beam(0.0).surface(), plane))
 
 
 @pytest.mark.mpi

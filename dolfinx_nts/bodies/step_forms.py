@@ -30,6 +30,7 @@ class StepForms:
             (rule, u0, u1, w) -> form.
         mass: Kinetic energy's second derivative in UFL, (v, w) -> form.
         extra: As `extra_form` of `Continuum`.
+        check_alive: Raises an error once the body was destroyed.
     """
 
     def __init__(
@@ -38,7 +39,9 @@ class StepForms:
         virtual_work: Callable[[Integrator, Any, Any, Any], Any],
         mass: Callable[[Any, Any], Any],
         extra: ExtraForm | None,
+        check_alive: Callable[[], None],
     ) -> None:
+        self._check_alive = check_alive
         self._space, self._virtual_work, self._mass, self._extra = space, virtual_work, mass, extra
         self._forms: dict[Integrator, tuple[Any, Any, Any]] = {}
         self._u0, self._u1, self._drift = (fem.Function(space) for _ in range(3))
@@ -123,11 +126,13 @@ class StepForms:
 
     def assemble(self, form: Any) -> FloatArray:
         """Owned entries of a compiled linear form."""
+        self._check_alive()
         compat.assemble_vector(self._vector, form)
         return self._vector.array_r.copy()
 
     def with_ghosts(self, u: FloatArray) -> FloatArray:
         """Values at all nodes of this rank. Collective."""
+        self._check_alive()
         self._vector.array_w[:] = u
         self._vector.ghostUpdate()
         with self._vector.localForm() as here:

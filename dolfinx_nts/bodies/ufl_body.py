@@ -92,7 +92,9 @@ class UflBody(Body):
         self._determinants: Determinants | None = None
         if self.mesh.topology.dim == 3:
             self._determinants = Determinants(space, degree, quadrature_degree)
-        self._forms = StepForms(space, self._virtual_work, self._mass_form, extra_form)
+        self._forms = StepForms(
+            space, self._virtual_work, self._mass_form, extra_form, self.check_alive
+        )
 
     # ---- what a kind of body has of its own
     def _mass_form(self, v: Any, w: Any) -> Any:
@@ -319,7 +321,6 @@ class UflBody(Body):
 
     def internal(self, u1: FloatArray) -> FloatArray:
         """Internal forces of the step [N]."""
-        self.check_alive()
         return self._forms.internal(u1)
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:

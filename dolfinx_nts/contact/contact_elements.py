@@ -452,7 +452,7 @@ class ContactElements(ContactLaws):
 def _wrench(
     y: FloatArray, push: FloatArray, places: BoolArray, fixed: BoolArray
 ) -> FloatArray:
-    """`compiled_law.wrenches`."""
+    """Do as `compiled_law.wrenches`."""
     number = places.astype(float)
     push = np.where(fixed, 0.0, push)
     middle = np.einsum("nk,nki->ni", number, y) / number.sum(axis=1)[:, None]

@@ -57,7 +57,11 @@ class FacetPair(ContactPair, master=Surface):
         corners = master.reference[master.facets]
         self._joined = patches.neighbours(master.facets, corners)
         self._beside = patches.neighbours(master.facets, corners, sharp=-np.inf)
-        master.touch()
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """The slave and the master."""
+        return self.slave, self.master
 
     @property
     def bodies(self) -> tuple[Any, ...]:

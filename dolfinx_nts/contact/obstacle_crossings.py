@@ -67,7 +67,8 @@ class _Watched(NamedTuple):
         facets: Facets of the slave, and those of the rest that are outside at the start, (m,).
         held: Whether each facet of the surface is the slave's.
         points: Points of the rest that are outside at the start, shape (n,).
-        scale: Size of the largest facet of each, which counts up to the obstacle's width [m], (n,).
+        scale: Size of the largest facet of each, which counts up to the obstacle's width and the
+            body's bulk [m], (n,).
         crossed: What the obstacle goes through between nodes at the start.
         least: Smallest depth of an obstacle in the body that is told [m].
     """
@@ -185,7 +186,9 @@ class ObstacleContact:
         gap, size = obstacle.gap(x).value, np.zeros(len(x))
         for corner in whole.facets.T:
             np.maximum.at(size, corner, fc.size(x[whole.facets]))
-        scale = np.minimum(size, obstacle.width)
+        # A facet does not explain how deep a body lies in the obstacle that is thinner than it.
+        thin = min(obstacle.width, Placed(Boundary(whole.facets), x).bulk)
+        scale = np.minimum(size, thin)
         free = np.flatnonzero(~belong(whole, self._slaves) & (gap >= -LEAST * scale))
         rest = np.flatnonzero(~_shared(whole, self._slaves))
         begun, _ = self._facets(whole, rest, x, gap)

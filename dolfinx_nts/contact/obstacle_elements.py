@@ -104,7 +104,8 @@ class ObstacleElements(ContactElements):
         return gap
 
     def _normal(self, x: FloatArray) -> FloatArray:
-        return np.asarray(self._middle(x).gradient[:, 0], dtype=np.float64)
+        normal = np.asarray(self._middle(x).gradient[:, 0], dtype=np.float64)
+        return np.broadcast_to(normal, (len(x), 3))
 
     def _element(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray

@@ -141,7 +141,11 @@ class ContactPair:
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
         self._set_up()
-        slave.touch()
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """The surfaces of bodies that it holds apart."""
+        return (self.slave,)
 
     @classmethod
     def between(cls, a: Any, b: Any, **options: Any) -> ContactPair:

@@ -226,8 +226,13 @@ class Surface:
             return not self.material.are_nodes
         return self._touching.redundant
 
+    def leave(self) -> None:
+        """Forget what contacts use of the body."""
+        if self._touching is not None:
+            self._touching.points[:] = False
+
     def touch(self) -> None:
-        """Note that a contact is made of the surface."""
+        """Note that a contact of the system uses the surface."""
         if self._touching is not None:
             self._touching.points[self.points] = True
 

@@ -250,7 +250,7 @@ def consistent_start(
     if not problem.system.joints:
         return state
     still = tuple(np.zeros_like(v) for v in state.v)
-    problem.begin(replace(state, a=state.a or still), dt)
+    problem.begin(replace(state, a=state.a or still), dt, sleep=False)
     found = consistent.violation(problem, state, dt, rates=False)
     if found is not None:
         raise ValueError(

@@ -44,9 +44,9 @@ class Newton:
             Nothing takes over from "krylov" or "multigrid" where you ask for them.
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew. None:
-            while "krylov" is in use in dynamics of 600 coordinates or more, beside those of rigid
-            bodies, beams and shells, where matrices take most of the time; MUMPS would factorise
-            about twice as often.
+            while "krylov" is in use in dynamics of 600 coordinates or more, not counting those of
+            rigid bodies, beams and shells. There matrices take most of the time; MUMPS would
+            factorise about twice as often.
 
     Raises:
         TypeError: An argument is of another type.

@@ -110,13 +110,14 @@ _REDUNDANT = {
     "ksp_type": "richardson",
     "ksp_norm_type": "none",
     "ksp_max_it": 2,
-    # Columns are scaled once: to make rows and columns alike by iteration takes as long as a solve.
-    "mat_mumps_icntl_8": 4,
 }
 PRESETS |= {
     "redundant": PRESETS["direct"] | _REDUNDANT,
     "redundant null-pivots": PRESETS["null-pivots"] | _REDUNDANT,
 }
+#: Rows and columns are scaled in one pass: to make them alike by iteration takes as long as a
+#: solve. MUMPS cannot on several ranks, and would scale nothing.
+_ONE_PASS = {"mat_mumps_icntl_8": 4}
 #: Below so many coordinates, without and with contact, both presets cost much the same, and MUMPS
 #: leaves nothing but rounding, so that Newton's iterations hardly depend on units and ranks.
 _FEW = (100, 600)
@@ -197,6 +198,8 @@ class SolverOptions:
         known = dict(PRESETS[preset])
         if preset == "krylov" and comm.size > 1:
             known |= _PARTS
+        if preset.startswith("redundant") and comm.size == 1:
+            known |= _ONE_PASS
         if limit is not None:
             known["ksp_max_it"] = limit
         if workspace is not None:

@@ -89,6 +89,7 @@ class StepProblem:
         again: Evaluation | None = None,
         *,
         search: bool = True,
+        sleep: bool = True,
         moments: Sequence[Moment] | None = None,
     ) -> None:
         """Fix the state at t_n and the step: loads, candidates, layout, first guess.
@@ -99,6 +100,7 @@ class StepProblem:
             again: Solution of this step whose motion the elements did not cover, see `misses`:
                 contact is sought along that motion in place of the one that velocities predict.
             search: Seek contacts; False keeps the candidates of the last step, for statics only.
+            sleep: Leave out bodies at rest, if the run does; else all constraints are in the step.
             moments: Where the forces on each body are taken; None: as the integrator's step has it.
         """
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
@@ -117,7 +119,7 @@ class StepProblem:
             self.rounding.of,
         )  # fmt: skip
         self.couplings.begin(step, again, search)
-        self._asleep = self._find_asleep(at_rest & (lengths.motion == 0.0))
+        self._asleep = self._find_asleep(at_rest & (lengths.motion == 0.0)) if sleep else {}
         self._lay_out()
 
     def _fly(self) -> BoolArray:
