@@ -189,8 +189,10 @@ class System:
             joints=tuple(joint.start() for joint in self.joints),
         )
 
-    def state_from(self, other: System, state: State, *, moving: bool) -> State:
-        """State at the displacements and time of another system's state. Collective.
+    def state_from(
+        self, other: System, state: State, *, moving: bool, time: float | None = None
+    ) -> State:
+        """State at the displacements of another system's state. Collective.
 
         Bodies and joints correspond by name.
 
@@ -198,11 +200,13 @@ class System:
             other: System with bodies of the same names on the same meshes.
             state: Its state.
             moving: Whether bodies move on as there; else with their initial velocities.
+            time: Of the result [s], if not that of the state.
 
         Raises:
             ValueError: A body has no counterpart, stands off its prescribed displacement, or lies
-                in a master or around an obstacle.
+                in a master or around an obstacle, or an obstacle would jump.
         """
+        time = state.time if time is None else time
         index = {b.name: k for k, b in enumerate(other.bodies)}
         missing = [b.name for b in self.bodies if b.name not in index]
         if missing:
@@ -212,21 +216,20 @@ class System:
         u = tuple(state.u[index[b.name]].copy() for b in self.bodies)
         for body, now in zip(self.bodies, u, strict=True):
             old = other.bodies[index[body.name]]
-            self._check_start(body, old, now, state.time)
+            self._check_start(body, old, now, time)
         found = self.initial_state()
         contacts = list(found.contacts)
         for k, pair in enumerate(self.contacts):
             for j, known in enumerate(other.contacts):
                 if pair.is_like(known):
                     contacts[k] = state.contacts[j]
+                    self._check_jump(pair, known, state.time, time)
         joints = list(found.joints)
         for k, joint in enumerate(self.joints):
             for known, history in zip(other.joints, state.joints, strict=True):
                 if is_like(joint, known):
                     joints[k] = history
-        start = replace(
-            found, time=state.time, u=u, contacts=tuple(contacts), joints=tuple(joints)
-        )
+        start = replace(found, time=time, u=u, contacts=tuple(contacts), joints=tuple(joints))
         if moving:
             v = tuple(state.v[index[b.name]].copy() for b in self.bodies)
             a = tuple(state.a[index[b.name]].copy() for b in self.bodies) if state.a else ()
@@ -253,6 +256,26 @@ class System:
                     f"{off:.3g} m off its displacement; let them go on from there"
                 )
         raise_together(body.comm, problem)
+
+    @staticmethod
+    def _check_jump(pair: ContactPair, old: ContactPair, end: float, begin: float) -> None:
+        """Raise if what a pair presses on stands elsewhere than where the other run left it.
+
+        Args:
+            pair: Of this system.
+            old: Its counterpart there.
+            end: Time at which the other run ended [s].
+            begin: Time at which this one begins [s].
+        """
+        left, found = old.path(end, end)[0], pair.path(begin, begin)[0]
+        off = np.abs(found - left).max()
+        size = max(np.abs(a).max() for a in (left, found, pair.slave.reference))
+        if off > _ON_SUPPORT * size:
+            raise ValueError(
+                f"start: the motion of obstacle {pair.master.name!r} at t={begin:.6g} is "
+                f"{off:.3g} m off its displacement at the end of what it starts from; let it go on "
+                "from there, e.g. by leaving start_time out"
+            )
 
     @staticmethod
     def _at_start(body: Body) -> FloatArray:

@@ -529,6 +529,34 @@ def test_supports_are_where_they_say_at_the_time_it_is_given():
         )
 
 
+@pytest.mark.mpi
+def test_an_obstacle_is_where_it_was_at_the_time_it_is_given():
+    """A plane that has pressed by 0.02 m must not be back where it began."""
+
+    def pressed(motion):
+        body = quarter_cube([nts.Dirichlet(at(2, 0.0))])
+        press = nts.Plane((0, 0, 1.0), (0, 0, -1), motion=motion)
+        return nts.System([body], contacts=[nts.ContactPair(body.surface(at(2, 1.0)), press)])
+
+    held = nts.equilibrium(pressed(lambda t: (0, 0, -0.02 * t)))
+    assert held.status == "completed"
+    rule, times = nts.EnergyMomentum(), {"dt": 1e-3, "start": held}
+    for system in (held.system, pressed(None)):
+        with pytest.raises(
+            ValueError,
+            match=r"^start: the motion of obstacle 'plane' at t=0 is 0.02 m off its displacement "
+            "at the end of what it starts from; let it go on from there, e.g. by leaving start_ti",
+        ):
+            nts.simulate(system, rule, t_end=2e-3, start_time=0.0, **times)
+    stays = pressed(lambda t: (0, 0, -0.02 * min(2 * t, 1.0)))
+    for system, begin in ((held.system, None), (stays, 0.5)):
+        end = (begin or 1.0) + 2e-3
+        run = nts.simulate(system, rule, t_end=end, start_time=begin, **times)
+        assert run.status == "completed"
+    # The plane at rest pushes from the first step on as hard as at the end of the load steps.
+    assert np.isclose(run.contact_forces[1, 0, 2], held.contact_forces[-1, 0, 2], rtol=1e-6)
+
+
 @pytest.mark.parametrize("value", [np.nan, "0", True, (0.0,)])
 def test_the_time_it_is_given_is_checked(value):
     cube, rule = held_cube((0, 0, 0)), nts.EnergyMomentum()

@@ -155,8 +155,8 @@ def first_state(system: System, start: Any, time: Any) -> State:
             f"start of type {type(start).__name__}: pass the result of equilibrium(...), of "
             "simulate(...) or of restart(...)"
         )
-    state = start.state if time is None else replace(start.state, time=float(time))
-    return system.state_from(start.system, state, moving=start.moving)
+    time = None if time is None else float(time)
+    return system.state_from(start.system, start.state, moving=start.moving, time=time)
 
 
 def refuse_moved(system: System) -> None:
