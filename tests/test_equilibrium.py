@@ -530,6 +530,29 @@ def test_supports_are_where_they_say_at_the_time_it_is_given():
 
 
 @pytest.mark.mpi
+def test_a_run_from_an_equilibrium_that_failed_says_so():
+    """Its load is a number in the first of two load steps only."""
+
+    def load(t):
+        return (0, 0, 1e3 * t if t < 0.6 else np.nan)
+
+    body = quarter_cube([nts.Dirichlet(at(2, 0.0))], traction=[nts.Traction(at(2, 1.0), load)])
+    system, rule = nts.System([body]), nts.EnergyMomentum()
+    held = nts.equilibrium(system, load_steps=2)
+    assert held.state.time == 0.5 and not held.status.startswith("completed")
+    free = nts.System([quarter_cube([nts.Dirichlet(at(2, 0.0))])])
+    run = nts.simulate(free, rule, dt=1e-3, t_end=2e-3, start=held, start_time=0.0)
+    told = run.warnings["start"]
+    assert (told.first, told.count, told.grave) == (0.0, 1, True)
+    assert "is not complete: it ended at t=0.5 of 1 (" in told.text and held.status in told.text
+    assert run.status == f"completed, but {told.text}"
+    done = nts.equilibrium(system, load_steps=[0.25, 0.5])
+    assert "start" not in nts.simulate(
+        free, rule, dt=1e-3, t_end=2e-3, start=done, start_time=0.0
+    ).warnings
+
+
+@pytest.mark.mpi
 def test_an_obstacle_is_where_it_was_at_the_time_it_is_given():
     """A plane that has pressed by 0.02 m must not be back where it began."""
 

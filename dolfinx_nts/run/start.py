@@ -159,6 +159,25 @@ def first_state(system: System, start: Any, time: Any) -> State:
     return system.state_from(start.system, start.state, moving=start.moving, time=time)
 
 
+def incomplete(start: Solution | None) -> str | None:
+    """What is wrong with an equilibrium that ended before its last load step, or None.
+
+    Args:
+        start: As of `simulate`.
+    """
+    # One that is still running is asked for by a writer of its own, which knows.
+    fine = ("completed", "running")
+    if start is None or start.moving or start.state is None or start.status.startswith(fine):
+        return None
+    last = start.settings["load_steps"][-1]
+    return (
+        f"start: the equilibrium that it begins from is not complete: it ended at "
+        f"t={start.state.time:.6g} of {last:.6g} ({start.status}), so loads and supports may act "
+        "at once that it had not reached; let it complete, e.g. with more load_steps or "
+        "stabilization=0.1, and begin from that one"
+    )
+
+
 def refuse_moved(system: System) -> None:
     """Raise a ValueError where something moves as prescribed; the same on all ranks.
 

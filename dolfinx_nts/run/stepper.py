@@ -25,6 +25,7 @@ from dolfinx_nts.run.start import (
     check_restart,
     consistent_start,
     first_state,
+    incomplete,
     note_shown,
     refuse_moved_meshes,
     refuse_overwritten,
@@ -358,6 +359,9 @@ class Stepper:
                 logger.info("%s; starting with dt=%.3g", failure, dt)
         self._accept(state)
         self._started = True
+        doubt = incomplete(self._start)
+        if doubt:
+            self.solution.warn("start", state.time, 1.0, doubt, grave=True)
         missing, text = off_balance(self.problem, state, dt)
         if text:
             self.solution.warn("massless nodes", state.time, missing, text)
