@@ -1102,7 +1102,7 @@ def test_points_of_a_driven_arm_move_farther_than_its_coordinates(other):
 @pytest.mark.mpi
 @pytest.mark.parametrize("on", ["plane", "block"])
 def test_a_thin_plate_that_is_held_at_its_far_face_is_told(on):
-    """Its upper face is the slave, so that all of it sinks in: a tenth of a facet, but all of it."""
+    """Its upper face is the slave, so that all of it sinks in, which is a tenth of a facet."""
     thick, kind = 0.03, dict(cell_type=CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
     mesh = create_box(COMM, [[0, 0, 0], [1, 1, thick]], [3, 3, 1], **kind)
     plate = nts.RigidBody(mesh, density=1e3, name="plate")
