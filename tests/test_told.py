@@ -300,3 +300,28 @@ def test_masters_that_hide_faces_between_them_are_told(whole, facets):
         # Two squares, or four triangles, of each plate.
         assert found.worst == (4 if facets == CellType.hexahedron else 8)
         assert "'plate 0' lies on one of 'plate 1'" in found.text
+
+
+@pytest.mark.parametrize(
+    ("gravity", "load", "told"),
+    [(9.81, None, True), (0.0, (0, 0, -10.0), True), (0.0, lambda t: (0, 0, -10.0 * t), False)],
+    ids=["gravity", "constant", "function"],
+)
+def test_load_steps_that_end_before_all_loads_act(gravity, load, told):
+    traction = [] if load is None else [nts.Traction(lambda x: x[2] > 1 - 1e-9, load)]
+    mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [2, 2, 2], CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, nts.StVenantKirchhoff(1e6, 0.0), density=1e3, traction=traction,
+        bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9)],
+    )  # fmt: skip
+    system = nts.System([body], gravity=(0, 0, -gravity))
+    run = nts.equilibrium(system, load_steps=[0.25, 0.5])
+    assert run.status == "completed" and ("part of the loads" in run.warnings) == told
+    if told:
+        warning = run.warnings["part of the loads"]
+        assert (warning.first, warning.worst, warning.grave) == (0.5, 0.5, False)
+        assert "end at t=0.5, with 50 % of the constant loads" in warning.text
+    # Half of the loads is what it supports, and the look at them has changed nothing.
+    half = 0.5 * (1e3 * gravity + (10.0 if load else 0.0))
+    assert run.reactions[body.name][-1, 0, 2] == pytest.approx(half, rel=1e-9)
+    assert "part of the loads" not in nts.equilibrium(system, load_steps=2).warnings

@@ -101,9 +101,11 @@ class _LoadStepper(Stepper):
     makes = Equilibrium
     solution: Equilibrium
 
-    def __init__(self, system: System, stabilization: float, **options: Any) -> None:
+    def __init__(
+        self, system: System, stabilization: float, end: float, **options: Any
+    ) -> None:
         super().__init__(system, Static(), **options)
-        self._stabilization = stabilization
+        self._stabilization, self._end = stabilization, end
         self._solved: Evaluation | None = None
         #: Work of each load, support, joint and contact so far [J], and the largest energy.
         self._worked: FloatArray | float = 0.0
@@ -204,10 +206,11 @@ class _LoadStepper(Stepper):
         return works
 
     def look(self, *, last: bool = False) -> None:
-        """Look as `Stepper` does, and at the end for motions that nothing resists."""
+        """Look as `Stepper` does, and at the end for motions that nothing resists and for loads."""
         super().look(last=last)
         if last:
             self._tell_free_motion()
+            self._tell_part_of_loads()
 
     def _tell_free_motion(self) -> None:
         """Warn of motions that nothing resists; stabilization would leave them at rest."""
@@ -221,6 +224,16 @@ class _LoadStepper(Stepper):
                 "a joint or prescribed motion, or pass "
                 "stabilization=0.1, which leaves it where it is",
                 grave=True,
+            )  # fmt: skip
+
+    def _tell_part_of_loads(self) -> None:
+        """Warn if the load steps were asked to end before all of the constant loads act."""
+        now = self.state.time
+        if now == self._end < 1.0 and self.problem.loads.grow():
+            self.solution.warn(
+                "part of the loads", now, 1.0 - now,
+                f"load_steps end at t={now:.6g}, with {100 * now:.3g} % of the constant loads "
+                "(gravity and loads that are no functions of time); all of them act at t=1",
             )  # fmt: skip
 
     def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, _Relaxed]:
@@ -416,7 +429,7 @@ def equilibrium(
     if isinstance(system, System):
         _check_bodies(system)
     stepper = _LoadStepper(
-        system, float(stabilization or 0.0), newton=newton, petsc_options=petsc_options,
+        system, float(stabilization or 0.0), times[-1], newton=newton, petsc_options=petsc_options,
         watch_overlap=watch_overlap, before_step=before_step,
     )  # fmt: skip
     stepper.solution.settings |= {"load_steps": times, "stabilization": stabilization}

@@ -100,3 +100,15 @@ class Loads:
             largest = max(largest, float(load.max(initial=0.0)))
             body.begin_step(self._integrator, moment)
         return float(global_max(self._system.comm, np.array([largest]))[0])
+
+    def grow(self) -> bool:
+        """Whether constant loads push what is free, which grow with pseudo time. Collective."""
+        found, gravity = False, self._system.gravity
+        for body, moment in zip(self._system.bodies, self.moments, strict=True):
+            loads = []
+            for part in (0.0, 1.0):
+                body.begin_step(self._integrator, moment._replace(ramp=part))
+                loads.append(body.external(moment.u0, part * gravity).copy())
+            body.begin_step(self._integrator, moment)
+            found = found or bool(free(body, loads[1] - loads[0]).any())
+        return bool(global_max(self._system.comm, np.array([float(found)]))[0])
