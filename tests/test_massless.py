@@ -170,6 +170,8 @@ def test_what_makes_no_sense_is_refused():
         pair = nts.ContactPair(slave=slave, master=wall, friction=friction)
         with pytest.raises(ValueError, match=f"mass='redistributed' of 'cube'.*{text}"):
             nts.Stepper(nts.System([body], contacts=[pair]), integrator, impact=impact)
+    with pytest.raises(ValueError, match="'cube': equilibrium knows no mass.*'consistent' for"):
+        nts.equilibrium(nts.System([body], contacts=[pair]))
     mesh = box((1.1, 0, 0), (2, 1, 1), 1)
     other = nts.Continuum(mesh, RUBBER, density=1e3, name="other")
     pair = nts.ContactPair(slave=other.surface(lambda x: x[0] < 1.1 + 1e-9), master=slave)

@@ -148,7 +148,9 @@ class UflBody(Body):
         t_{n+1}, and those of the step are the mean of both ends, so that momenta and the ledger
         are as exact as without (`massless_defect` in the balance). Only the slave of a contact may
         have it, of a Continuum with some four cells behind the surface, with `EnergyMomentum()` or
-        `Midpoint()` and without restored impacts; in statics it changes nothing.
+        `Midpoint()` and without restored impacts. `equilibrium` refuses it: a run begins from that
+        of a body of the same mesh and name without it. Gravity then moves with the mass, so that
+        what rests under its weight starts as far off balance, which the run tells.
 
         Args:
             marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet

@@ -31,6 +31,12 @@ def check_massless(system: System, integrator: Any, impact: str) -> None:
     if not with_massless:
         return
     what = f"mass='redistributed' of {', '.join(map(repr, with_massless))}"
+    if not integrator.inertia:
+        raise ValueError(
+            f"{what}: equilibrium knows no mass, and contact forces of its load steps are those at "
+            "their ends; make a body of the same mesh and name with mass='consistent' for it, and "
+            "begin simulate(..., start=...) from there with this one"
+        )
     if not integrator.keeps_energy:
         raise ValueError(
             f"{what}: contact forces of a step are the mean of its ends, which {integrator!r} does "
