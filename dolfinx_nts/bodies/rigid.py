@@ -252,7 +252,11 @@ class RigidBody(Body):
 
     @property
     def rotation(self) -> FloatArray:
-        """Directors d_i as columns, shape (3, 3), the same on all ranks."""
+        """Directors d_i as columns, shape (3, 3), the same on all ranks.
+
+        They are the principal axes of inertia as they stand now, so this is not the identity at the
+        start. The rotation from there is `body.rotation @ at_start.T`, with a copy of it made then.
+        """
         turned: FloatArray = self._y[1:].T / self.length
         return turned
 

@@ -95,7 +95,9 @@ def simulate(
         start: Result of `equilibrium` (see there) or of another run to start from; or of `restart`,
             with which an interrupted run goes on. With the same dt and whole steps before and after
             the result is that of one run, on one rank to the bit where no matrices are kept (see
-            `Newton.reuse`) or with `restart`, else to the tolerance.
+            `Newton.reuse`) or with `restart`, else to the tolerance. From `equilibrium` bodies
+            begin with their `velocity`; from a run or a `restart` they move on as there, and
+            their `velocity` and `angular_velocity` are ignored, as `displacement` always is.
         start_time: Time at which a run from `start` begins [s], from which functions of time and
             `t_end` count; default: the time of `start`, which is a pseudo time in equilibrium.
         accuracy: In place of `newton`: "exact", the default, closes the ledger to rounding;
