@@ -45,7 +45,7 @@ def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: st
         comm: MPI communicator.
         cells: This rank's part of the cells in DOLFINx vertex order, shape (m, corners).
         x: This rank's part of the points [m], shape (n, 3).
-        cell_type: "hexahedron" or "tetrahedron".
+        cell_type: Of DOLFINx, e.g. "hexahedron", "tetrahedron", "quadrilateral", "interval".
     """
     cells, x = np.ascontiguousarray(cells, np.int64), np.ascontiguousarray(x, np.float64)
     part = _partitioner()
