@@ -1,5 +1,7 @@
 """Displacements that are prescribed by what varies in space: functions, Constants, Functions."""
 
+import re
+
 import numpy as np
 import pytest
 import ufl
@@ -158,3 +160,21 @@ def test_values_that_fail_in_a_run_end_it():
     run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=0.02, t_end=0.2)
     assert "Dirichlet.value of bcs[0] of 'body' at t=0.06" in run.status
     assert "not finite at x=" in run.status
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_nodes_inside_that_a_marker_holds_at_are_told(caplog, degree):
+    """Of 4^3 cells 3^3 nodes lie inside, of degree 2 there are 7^3; below z = 0.3 9, or 49 x 2."""
+    mesh = box(cells=(4, 4, 4))
+    told = {}
+    for height in (0.0, 0.3, 1.0):
+        caplog.clear()
+        held = nts.Dirichlet(lambda x, h=height: x[2] <= h + 1e-9)
+        nts.Continuum(
+            mesh, nts.NeoHookean(1e6, 0.3), density=1e3, bcs=[held], degree=degree, name="cube"
+        )
+        text = "".join(COMM.allgather("\n".join(r.getMessage() for r in caplog.records)))
+        found = re.findall(r"Dirichlet.where of bcs\[0\] of 'cube': is true at (\d+) nodes", text)
+        assert len(found) == (height > 0)
+        told[height] = int(found[0]) if found else 0
+    assert told == ({0.0: 0, 0.3: 9, 1.0: 27} if degree == 1 else {0.0: 0, 0.3: 98, 1.0: 343})

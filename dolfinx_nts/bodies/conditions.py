@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -25,6 +26,8 @@ from dolfinx_nts.validation import (
     vector,
     vector_in_time,
 )
+
+logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -50,7 +53,8 @@ class Dirichlet:
     """Prescribed displacement on a part of the boundary.
 
     Attributes:
-        where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag).
+        where: Function x (3, n) -> bool (n,), or a pair (facet meshtags, tag). Nodes inside a
+            Continuum or FormBody at which the function is true stay free, which is told.
         value: Displacement [m], whose work is external work; the nodes start where and as fast as
             it says at the start. It is
             - a vector, or a function of time t -> (3,), the same for all nodes;
@@ -228,6 +232,7 @@ class Supports:
             what = f"Dirichlet.where of bcs[{number}] of {name!r}"
             facets = facets_of(space.mesh, bc.where, what)
             blocks = np.sort(np.asarray(fem.locate_dofs_topological(space, dim - 1, facets)))
+            self._tell_inside(what, bc.where)
             owned = blocks[3 * blocks < self._num_owned]
             self._parts.append((bc.value, owned, []))
             try:
@@ -252,6 +257,24 @@ class Supports:
         of_each = [np.concatenate([d for _, d in parts]) for _, _, parts in self._parts]
         self._meetings = Meetings(comm, name, [bc.value for bc in bcs], of_each, x)
         self._meetings.check([self._at_dofs(*both) for both in enumerate(start)], 0.0, anew=False)
+
+    def _tell_inside(self, what: str, where: Any) -> None:
+        """Tell of nodes inside the body at which a function of x holds, too. Collective."""
+        if not callable(where):
+            return
+        mesh = self._space.mesh
+        outer = fem.locate_dofs_topological(
+            self._space, mesh.topology.dim - 1, compat.exterior_facets(mesh)
+        )
+        inner = np.setdiff1d(np.arange(self._num_owned // 3), outer)
+        chosen = at_points(self._comm, what, where, self._nodes[inner].T, (), "b")
+        free = self._comm.allreduce(int(np.count_nonzero(chosen)))
+        if free and self._comm.rank == 0:
+            logger.warning(
+                "%s: is true at %d nodes inside the body, too, which stay free: only nodes of the "
+                "boundary are prescribed; let it hold there alone, or take a RigidBody for what "
+                "moves as a whole", what, free,
+            )  # fmt: skip
 
     @property
     def settings(self) -> list[Any]:
