@@ -1,5 +1,7 @@
 """Equilibrium of bodies pressed by rigid planes and spheres without a mesh."""
 
+import math
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
@@ -114,3 +116,39 @@ def test_obstacles_of_two_scenes_are_alike_though_their_motions_are_two_function
 
     assert floor() == floor()
     assert floor() != nts.Plane((0, 0, 1), (0, 0, 1))
+
+
+def on_slope(degrees, cells, newton=None):
+    """Equilibrium of a rigid block of base 0.2 m and height 0.5 m."""
+    a = math.radians(degrees)
+    mesh = create_box(COMM, [[0, 0, 0], [0.2, 0.2, 0.5]], cells, CellType.hexahedron)
+    block = nts.RigidBody(mesh, density=1e3, name="block")
+    slope = nts.Plane((0, 0, 0), (0, 0, 1))
+    pair = nts.ContactPair(block.surface(lambda x: x[2] < 1e-9), slope, friction=0.8)
+    down = (9.81 * math.sin(a), 0, -9.81 * math.cos(a))
+    system = nts.System([block], contacts=[pair], gravity=down)
+    return block, nts.equilibrium(system, load_steps=2, newton=newton)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("cells", [(2, 2, 3), (4, 4, 4)])
+@pytest.mark.parametrize("degrees", [12, 18, 20, 21.7])
+@pytest.mark.fast_on_ranks("20-cells0")
+def test_a_rigid_block_on_a_slope_stays_where_it_rests(degrees, cells):
+    """Its weight acts within its base, tan a < b / h = 0.4: nothing moves, however many nodes.
+
+    It turned on its lower edge, where it is in equilibrium, too, but in an unstable one.
+    """
+    block, run = on_slope(degrees, cells)
+    a, weight = math.radians(degrees), 9.81 * 1e3 * 0.2 * 0.2 * 0.5
+    assert run.status == "completed"
+    assert not run.warnings
+    assert np.abs(block.position - [0.1, 0.1, 0.25]).max() < 1e-12
+    assert np.abs(block.u.x.array).max(initial=0.0) < 1e-12
+    force = weight * np.array([-math.sin(a), 0, math.cos(a)])
+    assert np.abs(run.contact_forces[-1, 0] - force).max() < 1e-10 * weight
+
+
+def test_a_rigid_block_on_a_slope_that_is_too_steep_has_no_equilibrium():
+    _, run = on_slope(22, (2, 2, 3), nts.Newton(max_retries=1))
+    assert "not solved" in run.status

@@ -24,6 +24,7 @@ class Lengths:
     Attributes:
         centre: Middle of all bodies in the reference, shape (3,).
         radius: Half the diagonal of the box around them.
+        director: The longest one of all bodies, about the size of the largest rigid one.
         motion: Largest motion of a point of each body that is predicted, shape (bodies,).
         extent: Largest coordinate, likewise.
         moved: Largest displacement at t_n, likewise.
@@ -31,7 +32,7 @@ class Lengths:
 
     def __init__(self, system: System) -> None:
         self._system = system
-        self.centre, self.radius, self._director = _box(system)
+        self.centre, self.radius, self.director = _box(system)
         self.motion, self.extent, self.moved = np.zeros((3, len(system.bodies)))
 
     def begin(self, state: State, first: Sequence[FloatArray], dt: float) -> FloatArray:
@@ -75,7 +76,7 @@ class Lengths:
     @property
     def span(self) -> float:
         """Distance of the bodies' farthest coordinate from `centre`, at most."""
-        return self.radius + self._director + float((self.moved + self.motion).max())
+        return self.radius + self.director + float((self.moved + self.motion).max())
 
     def motion_of(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in an evaluation, shape (bodies,). Collective."""

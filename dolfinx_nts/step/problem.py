@@ -76,7 +76,11 @@ class StepProblem:
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
-        self.stabilization = Stabilization(system, self.lengths.radius, self.loads.largest)
+        lengths = self.lengths
+        self.stabilization = Stabilization(
+            system, lengths.radius or lengths.director, lengths.director or lengths.radius,
+            self.loads.largest,
+        )  # fmt: skip
         self.rounding = Rounding(
             system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self.stiffness_between
         )
