@@ -13,8 +13,8 @@ from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Contact takes rigid bodies to give way under their loads by no more than this part of their
-#: size. Of gaps that repeat each other an iteration leaves the change of the forces over this
+#: Where all bodies are rigid, contact takes them to give way under their loads by this part of
+#: their size. Of gaps that repeat each other an iteration leaves the change of the forces over this
 #: stiffness, in their sizes (`constraints.SHIFT`). With the weight over the size for it, gaps did
 #: not shrink once a node had been let go: a block came to rest on its edge instead of its face.
 _YIELD = 1e-4
@@ -44,17 +44,23 @@ class Stabilization:
     def of(self, body: Any) -> FloatArray:
         """Stiffness of the springs of a body [N/m], shape (num_owned,). Collective."""
         # Bodies in search of each other cross the scene.
-        others = self._of_flexible or self._of_rigid(self._span)
-        stiffness = self.share * _around(body, others)
+        stiffness = self.share * self._around(body, self._span)
         stiffness[body.fixed] = 0.0
         return stiffness
 
     def stiffness(self, body: Any) -> FloatArray:
         """Stiffness of each coordinate's surroundings [N/m], what contact is scaled by. Collective.
 
-        Where there is none, of the others, but no less than what holds rigid bodies in their place.
+        Where there is none, of the others.
         """
-        return _around(body, max(self._of_flexible, self._of_rigid(_YIELD * self._size)))
+        return self._around(body, _YIELD * self._size)
+
+    def _around(self, body: Any, way: float) -> FloatArray:
+        """Of each coordinate's surroundings [N/m]; rigid ones give way by `way` [m]. Collective."""
+        own: FloatArray = body.nodal_stiffness()
+        others = self._of_flexible or self._of_springs + _over(self._weight, way)
+        # Nothing moves what nothing pushes: any number does there.
+        return np.where(own > 0.0, own, others or _over(self._of_loads(), way) or 1.0)
 
     @cached_property
     def _of_flexible(self) -> float:
@@ -66,22 +72,12 @@ class Stabilization:
         total, number = self._system.comm.allreduce(local).tolist()
         return float(total / number) if number else 0.0
 
-    def _of_rigid(self, way: float) -> float:
-        """Of springs and of what gives way by `way` [m] under rigid bodies [N/m]. Collective."""
-        number, weight = self._rigid
-        if not number:
-            return 0.0
-        return self._of_springs + _over(weight, way) or _over(self._of_loads(), way)
-
     @cached_property
-    def _rigid(self) -> tuple[float, float]:
-        """Number of rigid bodies and their weight [N]. Collective."""
-        local = np.zeros(2)
-        for body in self._system.bodies:
-            if body.num_owned and not body.nodal_stiffness().any():
-                local += 1.0, float(body.nodal_mass.max(initial=0.0))
-        number, mass = self._system.comm.allreduce(local).tolist()
-        return float(number), float(mass) * float(np.linalg.norm(self._system.gravity))
+    def _weight(self) -> float:
+        """Of all bodies [N]. Collective."""
+        masses = sum(float(body.nodal_mass.max(initial=0.0)) for body in self._system.bodies)
+        gravity = float(np.linalg.norm(self._system.gravity))
+        return float(self._system.comm.allreduce(masses)) * gravity
 
     @cached_property
     def _of_springs(self) -> float:
@@ -101,12 +97,6 @@ class Stabilization:
         # One number for all load steps, or the last relaxations would differ from the first.
         self._load = self._load or self._largest_load()
         return self._load
-
-
-def _around(body: Any, others: float) -> FloatArray:
-    own: FloatArray = body.nodal_stiffness()
-    # Nothing moves what nothing pushes: any number does there.
-    return np.where(own > 0.0, own, others or 1.0)
 
 
 def _over(force: float, way: float) -> float:
