@@ -44,7 +44,8 @@ class Step:
         ahead: Motion of each body along which contact is sought [m].
         motion: Largest component of each body's motion [m], shape (bodies,).
         length: Displacement of each body that sets the rounding of its forces [m], shape (bodies,).
-        stiffness: Of a body, that of each of its coordinates' neighbourhood [N/m]; for statics.
+        stiffness: Of a body, that of each of its coordinates' neighbourhood [N/m]; for statics. Of
+            bodies in contact these are the second argument, see `Stabilization`.
         moments: Of each body, when its forces are taken and how fast it moves there.
         force_rounding: Of some bodies, the norm of forces that is rounding [kg m]. Collective.
     """
@@ -58,7 +59,7 @@ class Step:
     ahead: Sequence[FloatArray]
     motion: FloatArray
     length: FloatArray
-    stiffness: Callable[[Any], FloatArray]
+    stiffness: Callable[..., FloatArray]
     moments: Sequence[Moment]
     force_rounding: Callable[[Sequence[int]], float]
 
@@ -70,18 +71,22 @@ class Step:
         total = body.comm.allreduce(np.array([chosen.sum(), len(chosen)]))
         return float(total[0] / total[1])
 
-    def scale(self, surface: Any) -> FloatArray:
+    def scale(self, surface: Any, bodies: Sequence[Any]) -> FloatArray:
         """Force per motion of a `Surface`'s points in the units of the step, (p,). Collective.
 
         Massless nodes have their stiffness for it: with more, Newton's method would go to and fro
         between contact and none, and stick and slip, in small steps.
+
+        Args:
+            surface: The surface.
+            bodies: Those of its contact.
         """
         massless = surface.massless
         if self.integrator.inertia and not massless.any():
             mass: FloatArray = surface.mass
             return mass
         change = self.factor * self.integrator.theta
-        stiff = change * surface.material.divided(self.stiffness(surface.body))
+        stiff = change * surface.material.divided(self.stiffness(surface.body, bodies))
         return np.where(massless, stiff, surface.mass) if self.integrator.inertia else stiff
 
 

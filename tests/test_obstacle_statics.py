@@ -118,15 +118,15 @@ def test_obstacles_of_two_scenes_are_alike_though_their_motions_are_two_function
     assert floor() != nts.Plane((0, 0, 1), (0, 0, 1))
 
 
-def on_slope(degrees, cells, newton=None):
-    """Equilibrium of a rigid block of base 0.2 m and height 0.5 m."""
+def on_slope(degrees, cells, newton=None, others=()):
+    """Equilibrium of a rigid block of base 0.2 m and height 0.5 m, and of other bodies."""
     a = math.radians(degrees)
     mesh = create_box(COMM, [[0, 0, 0], [0.2, 0.2, 0.5]], cells, CellType.hexahedron)
     block = nts.RigidBody(mesh, density=1e3, name="block")
     slope = nts.Plane((0, 0, 0), (0, 0, 1))
     pair = nts.ContactPair(block.surface(lambda x: x[2] < 1e-9), slope, friction=0.8)
     down = (9.81 * math.sin(a), 0, -9.81 * math.cos(a))
-    system = nts.System([block], contacts=[pair], gravity=down)
+    system = nts.System([block, *others], contacts=[pair], gravity=down)
     return block, nts.equilibrium(system, load_steps=2, newton=newton)
 
 
@@ -147,6 +147,19 @@ def test_a_rigid_block_on_a_slope_stays_where_it_rests(degrees, cells):
     assert np.abs(block.u.x.array).max(initial=0.0) < 1e-12
     force = weight * np.array([-math.sin(a), 0, math.cos(a)])
     assert np.abs(run.contact_forces[-1, 0] - force).max() < 1e-10 * weight
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("young", [10.0, 1e3, 1e7])
+def test_a_body_elsewhere_does_not_turn_a_rigid_block(young):
+    """However soft it is: contact of the rigid one was scaled by its stiffness."""
+    mesh = create_box(COMM, [[5, 0, 0], [5.1, 0.1, 0.1]], [2, 2, 2], CellType.hexahedron)
+    held = nts.Dirichlet(at(2, 0.0))
+    law = nts.NeoHookean(young=young, poisson=0.3)
+    other = nts.Continuum(mesh, law, density=1e-6, bcs=[held], name="other")
+    block, run = on_slope(20, (2, 2, 3), others=[other])
+    assert run.status == "completed"
+    assert np.abs(block.u.x.array).max(initial=0.0) < 1e-12
 
 
 def test_a_rigid_block_on_a_slope_that_is_too_steep_has_no_equilibrium():

@@ -164,9 +164,9 @@ class FacetPair(ContactPair, master=Surface):
             contact_gradient=rule.contact_gradient,
             condense=step.condense,
             x0=self.points(positions, found),
-            scale=step.scale(self.slave)[self.slave.share[found.node]],
+            scale=step.scale(self.slave, self.bodies)[self.slave.share[found.node]],
             theta=rule.theta,
-            master_scale=step.scale(master)[master.patches[found.patch]],
+            master_scale=step.scale(master, self.bodies)[master.patches[found.patch]],
         )
 
     def _along_paths(

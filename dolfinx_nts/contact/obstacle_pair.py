@@ -85,7 +85,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
             contact_gradient=rule.contact_gradient,
             condense=step.condense,
             x0=self.points(positions, found) - path[0],
-            scale=step.scale(self.slave)[self.slave.share[found.node]],
+            scale=step.scale(self.slave, self.bodies)[self.slave.share[found.node]],
             theta=rule.theta,
             displacement=path,
         )

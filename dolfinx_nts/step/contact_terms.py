@@ -80,7 +80,7 @@ class ContactTerms:
             ahead=[np.zeros_like(a) for a in u],
             motion=np.full(len(u), float(reach)),
             length=global_max(system.comm, size),
-            stiffness=lambda body: body.nodal_stiffness(),
+            stiffness=lambda body, _=(): body.nodal_stiffness(),
             moments=[],
             force_rounding=lambda bodies: 0.0,
         )

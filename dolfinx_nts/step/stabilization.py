@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -48,19 +48,28 @@ class Stabilization:
         stiffness[body.fixed] = 0.0
         return stiffness
 
-    def stiffness(self, body: Any) -> FloatArray:
+    def stiffness(self, body: Any, among: Sequence[Any] = ()) -> FloatArray:
         """Stiffness of each coordinate's surroundings [N/m], what contact is scaled by. Collective.
 
-        Where there is none, of the others.
-        """
-        return self._around(body, _YIELD * self._size)
+        Where there is none, of the others. Between rigid bodies it is no less than what holds
+        these: a soft body elsewhere in the scene does not make their contact soft.
 
-    def _around(self, body: Any, way: float) -> FloatArray:
+        Args:
+            body: The body.
+            among: Bodies of the contact.
+        """
+        rigid = bool(among) and all(b.rigid for b in among)
+        return self._around(body, _YIELD * self._size, rigid)
+
+    def _around(self, body: Any, way: float, rigid: bool = False) -> FloatArray:
         """Of each coordinate's surroundings [N/m]; rigid ones give way by `way` [m]. Collective."""
         own: FloatArray = body.nodal_stiffness()
-        others = self._of_flexible or self._of_springs + _over(self._weight, way)
-        # Nothing moves what nothing pushes: any number does there.
-        return np.where(own > 0.0, own, others or _over(self._of_loads(), way) or 1.0)
+        others = self._of_flexible
+        if rigid or not others:
+            held = self._of_springs + _over(self._weight, way) or _over(self._of_loads(), way)
+            # Nothing moves what nothing pushes: any number does there.
+            others = max(others, held) or 1.0
+        return np.where(own > 0.0, own, others)
 
     @cached_property
     def _of_flexible(self) -> float:
