@@ -28,11 +28,12 @@ class Finding(NamedTuple):
 
     Attributes:
         kind: "edge through a body", "node inside a body", "facet in an obstacle", "node in an
-            obstacle", "obstacle in a body" or "facet starts in an obstacle".
-        depth: Of the deepest point [m].
-        size: The same in facet sizes [-].
+            obstacle", "obstacle in a body", "facet starts in an obstacle" or "contact inside a
+            rim".
+        depth: Of the deepest point, or of a contact the distance from the rim [m].
+        size: The same in facet sizes, of a contact in widths of the slave's surface [-].
         place: Where it is [m], shape (3,).
-        bodies: Name of the body it belongs to, and of the body or obstacle it is in.
+        bodies: Name of the body it belongs to, and of the body or obstacle it is in or on.
         nodes: Input numbers of the edge's ends, of the node, or of the facet's corners.
         text: Sentence with all this and a remedy.
         grave: Whether the result may be wrong.
@@ -272,7 +273,7 @@ class BodyPair:
         contacts: Sequence[Any],
         boundary: Callable[[int], Surface],
     ) -> None:
-        self._bodies, self._contacts, self._boundary = bodies, contacts, boundary
+        self._bodies, self.contacts, self._boundary = bodies, contacts, boundary
 
     def where(self, u: Sequence[FloatArray], time: float) -> list[FloatArray]:
         """Return what moves, each a displacement of its points [m], shape (3 n,)."""
@@ -283,8 +284,8 @@ class BodyPair:
         """What to look at, gathered at the first look. Collective."""
         one, two = (self._boundary(k) for k in self._bodies)
         if one is two:
-            return [Watched((c.slave, c.master), [c], one) for c in self._contacts]
-        return [Watched((one, two), self._contacts, None)]
+            return [Watched((c.slave, c.master), [c], one) for c in self.contacts]
+        return [Watched((one, two), self.contacts, None)]
 
     def look(self, where: list[FloatArray]) -> tuple[list[Finding], Pause]:
         """Return what is inside, and how long nothing else may be. Collective.

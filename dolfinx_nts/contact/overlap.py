@@ -8,7 +8,7 @@ their motion asks for it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ from mpi4py import MPI
 
 from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
+from dolfinx_nts.contact.overhang import inside_rim
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels.vectors import range_of
 
@@ -64,7 +65,8 @@ class OverlapWatch:
 
         between: dict[tuple[int, ...], list[Any]] = {}
         obstacles: list[ObstacleContact] = []
-        for contact, bodies in zip(system.contacts, system.contact_bodies, strict=True):
+        self._contacts = list(zip(system.contacts, system.contact_bodies, strict=True))
+        for contact, bodies in self._contacts:
             if len(contact.bodies) == 1 and len(contact.slave.facets):
                 alike = [c.slave for c in system.contacts if _same_obstacle(contact, c)]
                 slaves = [s for s in alike if len(s.facets)]
@@ -82,13 +84,20 @@ class OverlapWatch:
         self._looked: dict[int, _Looked] = {}
 
     def look(
-        self, u: Sequence[FloatArray], time: float = 0.0, *, last: bool = False
+        self,
+        u: Sequence[FloatArray],
+        time: float = 0.0,
+        *,
+        forces: Sequence[FloatArray] = (),
+        last: bool = False,
     ) -> list[Finding]:
         """The worst finding of each kind and pair, if a look is due. Collective, same on all ranks.
 
         Args:
             u: Owned displacements of all bodies [m]; kept until the next look, not to be changed.
             time: At which they are so [s].
+            forces: Of each contact of the system the normal forces of its share [N]; may be left
+                out, and then contact that ends inside a rim is not told.
             last: Look again wherever anything has moved.
         """
         now = [pair.where(u, time) for pair in self._pairs]
@@ -99,6 +108,7 @@ class OverlapWatch:
                 findings += self._pairs[k].passed(before.where, now[k], way, before.pause.through)
             found, pause = self._pairs[k].look(now[k])
             findings += found
+            findings += self._inside_rims(self._pairs[k], u, forces)
             self._looked[k] = _Looked(now[k], pause)
         worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
@@ -106,6 +116,22 @@ class OverlapWatch:
             if key not in worst or f.size > worst[key].size:
                 worst[key] = f
         return list(worst.values())
+
+    def _inside_rims(
+        self,
+        pair: BodyPair | ObstacleContact,
+        u: Sequence[FloatArray],
+        forces: Sequence[FloatArray],
+    ) -> Iterator[Finding]:
+        """Contacts of a pair that end inside the rim of a master; as of `look`. Collective."""
+        if isinstance(pair, ObstacleContact) or not forces:
+            return  # obstacles have no rim
+        for (contact, bodies), force in zip(self._contacts, forces, strict=True):
+            # The surface of a contact of a body with itself may end where the body does not.
+            if contact in pair.contacts and len(set(bodies)) == 2:
+                found = inside_rim(contact, [u[k] for k in bodies], force)
+                if found:
+                    yield found
 
     def enclosed(self, u: Sequence[FloatArray], time: float) -> list[Finding]:
         """Obstacles inside bodies that a contact is to hold out of them. Collective.

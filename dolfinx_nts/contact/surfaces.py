@@ -336,7 +336,7 @@ class Surface:
         return found
 
     @cached_property
-    def _dealt(self) -> IntArray:
+    def dealt(self) -> IntArray:
         """Shares of all ranks one after another. Collective."""
         return gather_rows(self.body.comm, self.share)
 
@@ -344,7 +344,7 @@ class Surface:
         """Values at the points of `rows` from those at the points of `share`. Collective."""
         comm = self.body.comm
         table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
-        table[self._dealt] = gather_rows(comm, values)
+        table[self.dealt] = gather_rows(comm, values)
         return self.owned(table)
 
     def owned(self, table: npt.NDArray[Any]) -> npt.NDArray[Any]:

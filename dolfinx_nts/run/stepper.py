@@ -410,9 +410,10 @@ class Stepper:
         """
         tell_stressed(self.solution, self.state.time)
         if self._overlap is not None:
-            for found in self._overlap.look(self.state.u, self.state.time, last=last):
+            state, forces = self.state, [c.force for c in self.state.contacts]
+            for found in self._overlap.look(state.u, state.time, forces=forces, last=last):
                 self.solution.warn(
-                    found.kind, self.state.time, found.depth, found.text, grave=found.grave,
+                    found.kind, state.time, found.depth, found.text, grave=found.grave,
                     about=found.about,
                 )  # fmt: skip
 

@@ -1,0 +1,123 @@
+"""Slaves that reach over a master's rim, before which contact ends at the last of their nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.crossings import Finding
+from dolfinx_nts.contact.search import closest_facets
+from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.parallel import gather_rows
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+#: All but this part of a contact's force must act at the rim: a body that tips stands on one edge.
+_ELSEWHERE = 0.01
+#: A node is beyond the rim if it is beside the master by this part of a facet, and more beside it
+#: than above it.
+_BESIDE = 0.05
+#: The rim touches a facet that it is no farther above or below than this part of the distance from
+#: the node that carries.
+_FLAT = 0.2
+#: Distance from the rim, in widths of the slave's surface, that is told, and that is grave.
+_LEAST, _GRAVE = 0.05, 0.2
+
+
+class Overhang(NamedTuple):
+    """How far inside the rim a contact ends.
+
+    Attributes:
+        distance: From the nodes that carry to the rim [m], weighted by their forces.
+        size: The same in widths of the slave's surface [-].
+        node: The point of the slave that carries most.
+    """
+
+    distance: float
+    size: float
+    node: int
+
+
+def overhang(
+    x: FloatArray, facets: IntArray, force: FloatArray, corners: FloatArray
+) -> Overhang | None:
+    """Return how far inside the rim of a master contact ends, if all of its force acts there.
+
+    Between nodes facets of the slave carry nothing. Where one of them reaches over the rim of the
+    master, its nodes before the rim carry for the part up to there, so a body tips about these
+    nodes, not about the rim.
+
+    Args:
+        x: Points of the slave's surface [m], shape (p, 3).
+        facets: Its facets, shape (m, nc).
+        force: Normal force of each point [N], >= 0, shape (p,).
+        corners: Corners of the master's facets [m], shape (n, nc, 3).
+    """
+    total, on = float(force.sum()), (force > 0.0)[facets]
+    part = on.any(axis=1) & ~on.all(axis=1)
+    facets, on = facets[part], on[part]
+    # Most often some carry amid others that do.
+    if not total or float(force[np.unique(facets)].sum()) < (1.0 - _ELSEWHERE) * total:
+        return None
+    corner = x[facets]
+    at = closest_facets(corner[~on], corners, reach=np.inf)
+    foot = np.full_like(corner, np.nan)
+    foot[~on] = fc.frame(corners[at.facet], at.xi)[0]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, -1] - corner[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    way = corner - foot
+    above = np.einsum("mki,mi->mk", way, normal)
+    beside = np.linalg.norm(way - above[..., None] * normal[:, None], axis=2)
+    beyond = (beside > _BESIDE * fc.size(corner)[:, None]) & (beside > np.abs(above))
+    # From each corner to the nearest of the places at the rim below corners beyond it.
+    arm = foot[:, None] - corner[:, :, None]
+    way = np.where(beyond[:, None], np.linalg.norm(arm, axis=3), np.inf)
+    chosen = way.argmin(axis=2)[..., None]
+    height = np.abs(np.einsum("mkli,mi->mkl", arm, normal))
+    nearest, height = (np.take_along_axis(a, chosen, axis=2)[..., 0] for a in (way, height))
+    nearest[~(height <= _FLAT * nearest)] = np.inf
+    inside = np.full(len(x), np.inf)
+    np.minimum.at(inside, facets[on], nearest[on])
+    rim = np.flatnonzero((force > 0.0) & np.isfinite(inside))
+    if float(force[rim].sum()) < (1.0 - _ELSEWHERE) * total:
+        return None
+    mean = float(np.average(inside[rim], weights=force[rim]))
+    size = mean / float(np.ptp(x, axis=0).max())
+    node = int(rim[force[rim].argmax()])
+    return Overhang(mean, size, node) if size > _LEAST else None
+
+
+def inside_rim(contact: Any, u: Sequence[FloatArray], force: FloatArray) -> Finding | None:
+    """As `overhang`, of a contact, with a sentence and a remedy. Collective, alike on all ranks.
+
+    Args:
+        contact: A contact of two surfaces.
+        u: Owned displacements of its bodies [m].
+        force: Normal force of each slave node of this rank's share [N].
+    """
+    slave, master = contact.slave, contact.master
+    if not len(slave.facets):
+        return None
+    of_points = np.zeros(len(slave.points))
+    of_points[slave.dealt] = gather_rows(slave.body.comm, force)
+    if not of_points.any():
+        return None
+    x, y = contact.positions(u)
+    found = overhang(x, slave.facets, of_points, y[master.facets])
+    if found is None:
+        return None
+    one, two, node = slave.body.name, master.body.name, int(slave.original[found.node])
+    text = (
+        f"facets of {one!r} reach over the rim of {two!r}, and all of contact {contact.name!r} "
+        f"acts at their nodes before it, most at node {node}, {found.distance:.3g} m inside the "
+        f"rim, or {found.size:.2g} of the surface's width: {one!r} tips about these nodes, not "
+        f"about the rim; use a finer mesh of {one!r} there, or take {two!r} as the slave"
+    )
+    place, grave = x[found.node] + contact.origin, found.size > _GRAVE
+    return Finding(
+        "contact inside a rim", found.distance, found.size, place, (one, two), (node,), text, grave
+    )

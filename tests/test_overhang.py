@@ -1,0 +1,141 @@
+"""Contact that ends at the last slave node before a master's rim: told, and nothing else is."""
+
+import numpy as np
+import pytest
+from rotations import random_rotation
+from scenes import at, box
+
+import dolfinx_nts as nts
+from dolfinx_nts.contact.overhang import overhang
+
+#: The top of a table, 2 m by 1 m, whose rim is at x = 2.
+TABLE = np.array([[[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]]], dtype=float)
+#: Its side at that rim.
+SIDE = np.array([[[2, 0, 0], [2, 0, -1], [2, 1, -1], [2, 1, 0]]], dtype=float)
+
+
+def face(n, start=1.62, width=0.6, tilt=0.0, about=None):
+    """Points and facets of a square face of n x n facets over the table, seen from below.
+
+    It begins at x = `start` and is turned down by `tilt` about the line x = `about`.
+    """
+    x, y = np.meshgrid(np.linspace(0, width, n + 1), np.linspace(0.2, 0.8, n + 1), indexing="ij")
+    points = np.column_stack([x.ravel() + start, y.ravel(), np.zeros(x.size)])
+    if tilt:
+        arm = points[:, 0] - about
+        points[:, 0], points[:, 2] = about + arm * np.cos(tilt), -arm * np.sin(tilt)
+    number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    corners = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
+    return points, np.stack([c.ravel() for c in corners], axis=1)
+
+
+def last_row(points):
+    """Unit forces on the last nodes before the rim, all others carry nothing."""
+    last = points[points[:, 0] < 2.0, 0].max()
+    return (np.abs(points[:, 0] - last) < 1e-9).astype(float), last
+
+
+@pytest.mark.parametrize("n", [1, 2, 4])
+@pytest.mark.parametrize(
+    "tilt, side", [(0.0, False), (0.05, False), (0.15, False), (0.0, True), (0.05, True)]
+)
+def test_distance_from_the_rim_is_told(n, tilt, side):
+    points, facets = face(n)
+    force, last = last_row(points)
+    points, _ = face(n, tilt=tilt, about=last)
+    master = np.concatenate([TABLE, SIDE]) if side else TABLE
+    found = overhang(points, facets, force, master)
+    # Of the side the place as low as the next nodes is the nearest to these.
+    low = 0.6 / n * np.sin(tilt) if side else 0.0
+    distance = np.hypot(2.0 - last, low)
+    assert found.distance == pytest.approx(distance, rel=1e-9)
+    assert found.size == pytest.approx(distance / np.ptp(points, axis=0).max(), rel=1e-9)
+    assert force[found.node] == 1.0
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e6])
+def test_distance_in_other_units_and_directions(unit):
+    turn = random_rotation(np.random.default_rng(3))
+    points, facets = face(3)
+    force, last = last_row(points)
+    found = overhang(
+        unit * points @ turn.T, facets, 1e-12 * force, unit * TABLE @ turn.T
+    )
+    assert found.distance == pytest.approx(unit * (2.0 - last), rel=1e-9)
+
+
+def test_triangles():
+    points, facets = face(2)
+    force, last = last_row(points)
+    split = np.concatenate([facets[:, [0, 1, 2]], facets[:, [0, 2, 3]]])
+    table = np.concatenate([TABLE[:, [0, 1, 2]], TABLE[:, [0, 2, 3]]])
+    found = overhang(points, split, force, table)
+    assert found.distance == pytest.approx(2.0 - last, rel=1e-9)
+
+
+def forces_elsewhere(points):
+    """Row before the last one carries a part."""
+    force, last = last_row(points)
+    return force + 0.1 * (points[:, 0] < last - 1e-9)
+
+
+@pytest.mark.parametrize(
+    "points, facets, force",
+    [
+        pytest.param(*face(3), forces_elsewhere(face(3)[0]), id="other nodes carry"),
+        pytest.param(*face(3, start=1.0), last_row(face(3, start=1.0)[0])[0], id="all over it"),
+        pytest.param(*face(3), np.zeros(16), id="no force"),
+        # With the edge x = 1 down: the nodes that carry nothing hang above the table.
+        pytest.param(
+            *face(3, start=1.0, tilt=-0.5, about=1.0), (face(3)[0][:, 0] < 1.63) * 1.0,
+            id="on its edge",
+        ),
+        pytest.param(
+            *face(3, tilt=-0.5, about=1.82), last_row(face(3)[0])[0],
+            id="far above the rim",
+        ),
+        # 20 facets: 0.01 of 0.6 m.
+        pytest.param(*face(20, start=1.69), last_row(face(20, start=1.69)[0])[0], id="fine mesh"),
+    ],
+)  # fmt: skip
+def test_nothing_is_told(points, facets, force):
+    assert overhang(points, facets, force, TABLE) is None
+
+
+def slide(n, exchange=False, cells=(5, 3, 1)):
+    """A rigid block leaves a table at 2 m/s (n x n facets); half a second."""
+    options = dict(motion=lambda t: (0, 0, 0), rotation=lambda t: (0, 0, 0))
+    table = nts.RigidBody(
+        box([0, -0.5, -0.4], [2, 0.5, 0], cells), density=1e3, name="table", **options
+    )
+    block = nts.RigidBody(
+        box([1.4, -0.2, 0], [1.8, 0.2, 0.2], [n, n, 1]), density=1e3, velocity=(2, 0, 0),
+        name="block",
+    )  # fmt: skip
+    surfaces = [block.surface(at(2, 0.0)), table.surface(at(2, 0.0))]
+    pair = nts.ContactPair(*(surfaces[::-1] if exchange else surfaces))
+    system = nts.System([table, block], contacts=[pair], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=4e-3, t_end=0.4, progress=False)
+    return run, float(np.linalg.norm(block.angular_velocity))
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("n", [1, 2])
+def test_a_block_that_tips_too_early(n):
+    """It turns about its last nodes and leaves the table with far too much spin: told."""
+    run, _ = slide(n)
+    told = run.warnings["contact inside a rim"]
+    assert told.grave and told.about == ("block", "table")
+    assert run.status.startswith("completed, but facets of 'block' reach over the rim of 'table'")
+    # The centre is over the rim when 0.2 m of the block are; the nodes before it are farther in.
+    assert 0.1 < told.worst < 0.4
+
+
+@pytest.mark.slow
+def test_finer_blocks_and_the_table_as_slave_are_right():
+    """The finer the block, the nearer its spin to that with the table as slave."""
+    exact, spin = slide(1, exchange=True, cells=(160, 5, 1))
+    coarse, fine = slide(1), slide(8)
+    assert "contact inside a rim" not in exact.warnings
+    assert coarse[1] > 3.0 * spin and coarse[0].warnings["contact inside a rim"].grave
+    assert spin < fine[1] < 1.15 * spin and fine[0].status == "completed"
