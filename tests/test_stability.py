@@ -81,6 +81,27 @@ def test_the_program_writes_table_and_picture(tmp_path, capsys):
     with (tmp_path / "stability.csv").open() as file:
         assert [row["value"] for row in csv.DictReader(file)] == ["1.0", "1000.0", "1000000.0"]
     assert (tmp_path / "stability.png").stat().st_size > 1e4
+    assert "| offset | 1000.0 | completed (" in (tmp_path / "stability.md").read_text()
+
+
+def test_levels_of_a_scheme_share_a_column():
+    def row(value, name, level, outcome, ledger=0.0, steps=9):
+        return dict(axis="speed", value=value, integrator=name, accuracy=level, outcome=outcome,
+                    ledger=ledger, steps=steps)  # fmt: skip
+
+    text = stability.summary([
+        row(1.0, "midpoint", "exact", "completed", 2e-5), row(1.0, "midpoint", "fast", "told", 0.1),
+        row(2.0, "midpoint", "exact", "stopped", 0.3), row(2.0, "midpoint", "fast", "stopped"),
+        row(1.0, "newmark", "exact", "completed", 3e-2),
+    ])  # fmt: skip
+    lines = text.splitlines()
+    assert lines[0] == "| outcome | midpoint | midpoint, fast | newmark |"
+    assert lines[2] == "| completed | 1 | 0 | 1 |" and lines[5] == "| stopped | 1 | 1 | 0 |"
+    assert lines[-4:] == [
+        "| axis | value | midpoint | newmark |", "|---|---|---|---|",
+        "| speed | 1.0 | completed (2e-05); told (1e-01) | completed (3e-02) |",
+        "| speed | 2.0 | stopped (step 9, step 9) |  |",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("option", ["--only", "--integrators", "--accuracy"])

@@ -8,7 +8,7 @@ with each integrator, and with the energy-momentum scheme at each level of accur
 scenes of their own, among them two of 20,000 steps. A run is judged by what does not depend on the
 solver: momenta, the energy beside all that is accounted for, and whether a body has come out on the
 other side of the other.
-Written are a table of all runs and a picture. Each run ends as one of
+Written are tables of all runs, as CSV and as Markdown, and a picture. Each run ends as one of
 
     completed   right, and no step was cut
     cut back    right, after steps were cut
@@ -191,6 +191,37 @@ def _scheme(row: Mapping[str, Any]) -> str:
     return str(row["integrator"]) + ("" if level == "exact" else f", {level}")
 
 
+def summary(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown: how many runs ended how, and all runs with a column for each integrator.
+
+    A run's number in brackets is the largest part of the energy that nothing accounts for, or the
+    step at which it stopped; those of several levels of accuracy stand one after another.
+    """
+    names = list(dict.fromkeys(row["integrator"] for row in rows))
+    schemes = list(dict.fromkeys(map(_scheme, rows)))
+    lines = ["| outcome | " + " | ".join(schemes) + " |", "|---" * (len(schemes) + 1) + "|"]
+    for outcome in OUTCOMES:
+        ended = [row for row in rows if row["outcome"] == outcome]
+        counts = [sum(_scheme(row) == scheme for row in ended) for scheme in schemes]
+        lines.append(f"| {outcome} | " + " | ".join(map(str, counts)) + " |")
+    lines += ["", "| axis | value | " + " | ".join(names) + " |", "|---" * (len(names) + 2) + "|"]
+    for axis, value in dict.fromkeys((row["axis"], row["value"]) for row in rows):
+        here = [row for row in rows if (row["axis"], row["value"]) == (axis, value)]
+        cells = [_in_words([row for row in here if row["integrator"] == n]) for n in names]
+        lines.append(f"| {axis} | {value} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _in_words(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Outcomes of one scheme's levels, e.g. "completed (2e-14, 1e-10)"."""
+    told: dict[str, list[str]] = {}
+    for row in rows:
+        stopped = row["outcome"] == "stopped"
+        number = f"step {row['steps']}" if stopped else f"{row['ledger']:.0e}"
+        told.setdefault(row["outcome"], []).append(number)
+    return "; ".join(f"{outcome} ({', '.join(numbers)})" for outcome, numbers in told.items())
+
+
 def picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """A field for each axis: values across, schemes down, outcomes as colours."""
     import matplotlib as mpl
@@ -201,10 +232,11 @@ def picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
     axes = list(dict.fromkeys(row["axis"] for row in rows))
     names = list(dict.fromkeys(map(_scheme, rows)))
-    rows_of_fields = len(axes) // 2 + 1
+    rows_of_fields, height = len(axes) // 2 + 1, 0.8 + 0.18 * len(names)
     figure, fields = plt.subplots(
-        rows_of_fields, 2, figsize=(12, 1.9 * rows_of_fields), squeeze=False, layout="constrained"
-    )
+        rows_of_fields, 2, figsize=(12, height * rows_of_fields), squeeze=False,
+        layout="constrained",
+    )  # fmt: skip
     for field in fields.ravel()[len(axes) :]:
         field.axis("off")
     for axis, field in zip(axes, fields.ravel(), strict=False):
@@ -237,7 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
         "--integrators", nargs="+", default=[], help=f"among {', '.join(INTEGRATORS)}"
     )
     parser.add_argument("--accuracy", nargs="+", default=[], help=f"among {', '.join(ACCURACY)}")
-    parser.add_argument("--output", default="out/stability", help="folder for table and picture")
+    parser.add_argument("--output", default="out/stability", help="folder for tables and picture")
     options = parser.parse_args(arguments)
     comm = MPI.COMM_WORLD
     folder = Path(options.output)
@@ -257,9 +289,10 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     rows = chart(options.only, options.integrators, options.accuracy, comm, told)
     if comm.rank == 0:
         picture(rows, folder / "stability.png")
+        Path(folder, "stability.md").write_text(summary(rows), encoding="utf-8")
         counts = {name: sum(row["outcome"] == name for row in rows) for name in OUTCOMES}
         print(", ".join(f"{number} {name}" for name, number in counts.items()))
-        print(f"table and picture in {folder}")
+        print(f"tables and picture in {folder}")
     return rows
 
 
