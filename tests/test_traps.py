@@ -60,7 +60,9 @@ def scene(
 def run(system, integrator, dt=2e-3, steps=8):
     """Run and check what holds in every scene; the balance table."""
     solution = nts.simulate(system, integrator, dt=dt, t_end=steps * dt)
-    assert solution.status == "completed"
+    # The cube's only facet below may reach over the plate's rim.
+    told = {w.kind for w in solution.warnings.grave} - {"contact inside a rim"}
+    assert solution.status.startswith("completed") and not told
     assert solution.retries == 0
     table = solution.balance
     # No shorter step may be needed for what these scenes contain.
