@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import CELLS, RUBBER, box
@@ -84,6 +85,44 @@ def test_what_cannot_be_written_is_refused(mpi_tmp_path):
         writer = Fields(mpi_tmp_path, functions=[fem.Function(space)])
         with pytest.raises(ValueError, match="other values than one at each node or in each cell"):
             nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=1e-4, output=[writer])
+
+
+def named(space, name):
+    """A Function of zeros; without a name of its own DOLFINx calls each one "f"."""
+    return fem.Function(space) if name is None else fem.Function(space, name=name)
+
+
+@mpi
+@pytest.mark.parametrize("names", [(None, None), ("displacement",), ("von_mises",)])
+def test_two_fields_of_one_name_are_refused(names, mpi_tmp_path):
+    """One of the two would be missing in the file."""
+    body, system = moving()
+    space = compat.scalar_space(body.mesh, "DG", 0)
+    functions = [nts.von_mises, *(named(space, name) for name in names)]
+    writer = Fields(mpi_tmp_path, functions=functions)
+    text = rf"of body 'soft': there is another field '{names[-1] or 'f'}' in its file"
+    with pytest.raises(ValueError, match=text):
+        nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=1e-4, output=[writer])
+
+
+@mpi
+def test_a_function_on_no_mesh_of_the_scene_is_refused(mpi_tmp_path):
+    _, system = moving()
+    elsewhere = fem.Function(compat.scalar_space(box(cells=1), "DG", 0))
+    writer = Fields(mpi_tmp_path, functions=[nts.von_mises, elsewhere])
+    with pytest.raises(ValueError, match=r"functions\[1\]=f: is on none of the bodies' meshes"):
+        nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=1e-4, output=[writer])
+
+
+@mpi
+def test_what_makes_no_function_is_refused(mpi_tmp_path):
+    body, system = moving()
+    with pytest.raises(TypeError, match=r"functions\[0\]=.*: pass a sequence of Functions, or"):
+        Fields(mpi_tmp_path, functions=[ufl.SpatialCoordinate(body.mesh)])
+    writer = Fields(mpi_tmp_path, functions=[lambda body: body.u.x.array])
+    text = r"(?s)functions\[0\] of body 'soft': .* returned array\(.*return a dolfinx Function"
+    with pytest.raises(TypeError, match=text):
+        nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=1e-4, output=[writer])
 
 
 def test_another_reader_sees_them(tmp_path):

@@ -35,30 +35,64 @@ class OwnField(NamedTuple):
 def checked(functions: Iterable[Any]) -> tuple[Own, ...]:
     """The argument `functions` of a writer."""
     wanted = "Functions, or callables body -> Function such as dolfinx_nts.von_mises"
-    return items("functions", functions, callable, wanted)
+    return items("functions", functions, _fits, wanted)
 
 
-def of_body(functions: Sequence[Own], body: Any) -> list[OwnField]:
+def _fits(given: Any) -> bool:
+    """Whether it may be one of them; other expressions of UFL can be called, but of points."""
+    return isinstance(given, fem.Function) or (callable(given) and not hasattr(given, "ufl_shape"))
+
+
+def require_meshes(functions: Sequence[Own], bodies: Iterable[Any]) -> None:
+    """Raise ValueError if a Function is on the mesh of none of the bodies."""
+    known = [body.mesh.ufl_domain() for body in bodies]
+    for k, given in enumerate(functions):
+        if isinstance(given, fem.Function) and given.function_space.mesh.ufl_domain() not in known:
+            raise ValueError(
+                f"functions[{k}]={given!s}: is on none of the bodies' meshes; make it on body.mesh"
+            )
+
+
+def of_body(functions: Sequence[Own], body: Any, taken: Iterable[str]) -> list[OwnField]:
     """What is to be written of a body. Collective.
 
     Args:
         functions: A Function is written with the body on whose mesh it is; a callable is called of
             each body with a material.
         body: A body with a mesh.
+        taken: Names of its other fields.
 
     Raises:
-        ValueError: A Function has no value at each node or in each cell.
+        TypeError: A callable returns no Function.
+        ValueError: A Function has no value at each node or in each cell, or the name of another
+            field.
     """
-    found, domain = [], body.mesh.ufl_domain()
+    found, domain, names = [], body.mesh.ufl_domain(), set(taken)
     for k, given in enumerate(functions):
+        what = f"functions[{k}] of body {body.name!r}"
         function: Any = given
         if not isinstance(given, fem.Function):
             if body.law is None:
                 continue
-            function = given(body)
+            function = _made(what, given, body)
         if function.function_space.mesh.ufl_domain() == domain:
             found.append(_field(f"functions[{k}]", function, body))
+            if function.name in names:
+                raise ValueError(
+                    f"{what}: there is another field {function.name!r} in its file; give this one "
+                    "a name of its own, e.g. function.name = 'damage'"
+                )
+            names.add(function.name)
     return found
+
+
+def _made(what: str, make: Callable[[Any], fem.Function], body: Any) -> Any:
+    """The Function that a callable makes of a body. Collective."""
+    function: Any = make(body)
+    wrong = not isinstance(function, fem.Function)
+    text = f"{what}: {make!r} returned {function!r}; return a dolfinx Function"
+    raise_together(body.comm, text if wrong else None, TypeError)
+    return function
 
 
 def _field(what: str, function: Any, body: Any) -> OwnField:

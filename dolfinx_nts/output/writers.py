@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.output.cadence import Cadence
-from dolfinx_nts.output.own_functions import Own, checked, of_body
+from dolfinx_nts.output.own_functions import Own, checked, of_body, require_meshes
 from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
@@ -170,10 +170,14 @@ class _Series:
                 )
         return fields | {name: self._nodal(values) for name, values in found.items()}
 
-    def own(self) -> dict[str, tuple[bool, FloatArray]]:
-        """The user's functions: whether on cells, and values on rank 0. Collective."""
+    def own(self, taken: Iterable[str]) -> dict[str, tuple[bool, FloatArray]]:
+        """The user's functions: whether on cells, and values on rank 0. Collective.
+
+        Args:
+            taken: Names of the other fields.
+        """
         found = {}
-        for name, on_cells, values in of_body(self._functions, self.body):
+        for name, on_cells, values in of_body(self._functions, self.body, taken):
             here = values if on_cells else values[self._nodes]
             order = self._cell_order if on_cells else self._order
             found[name] = on_cells, gather_on_root(self.body.comm, here)[order]
@@ -256,12 +260,14 @@ class Fields:
         functions: More to write: scalars, 3-vectors or 3 x 3 tensors, in cells (DG 0) or at nodes
             (Lagrange 1), under their names. A Function is written with the body on whose mesh it
             is, as it then is; a callable body -> Function such as `dolfinx_nts.von_mises` is
-            called of each body with a material.
+            called of each body with a material whenever fields are written. So pass `von_mises`
+            itself: `von_mises(body)` is the stress of now and would be written at all times.
 
     Raises:
-        TypeError: An item of `functions` is none.
+        TypeError: An item of `functions` is none, or, from `start`, a callable returns none.
         ValueError: The cadence is out of range or given twice; from `start`: no body has a mesh,
-            two bodies' names give one file, or a Function has no values in cells or at nodes.
+            two bodies' names give one file, or a Function has no values in cells or at nodes, is on
+            no body's mesh, or has the name of another field.
         OSError: From `start`, before any step and on all ranks: the folder cannot be written, or
             what a run from a checkpoint would go on with is of another mesh or run, or is not
             complete.
@@ -293,6 +299,7 @@ class Fields:
         files = [s.path.name for s in self._series]
         if len(set(files)) < len(files):
             raise ValueError(f"name of bodies: file names {files} are not unique; rename a body")
+        require_meshes(self.functions, (series.body for series in self._series))
         due = self._cadence.start(stepper)
         if stepper.restart is not None and self._go_on(stepper, due):
             return
@@ -334,7 +341,8 @@ class Fields:
     def _append(self, stepper: Running) -> None:
         self._tried = time = stepper.state.time
         for series in self._series:
-            fields, own = series.fields(stepper), series.own()
+            fields = series.fields(stepper)
+            own = series.own(fields)
             self._root(stepper, partial(series.append, time, fields, own))
 
     def _root(self, stepper: Running, action: Callable[[], Any]) -> None:
