@@ -120,6 +120,13 @@ def exterior_facets(msh: Any) -> IntArray:
     return np.sort(mesh.exterior_facet_indices(t))
 
 
+def is_tagging(tags: Any, msh: Any) -> bool:
+    """Whether meshtags are of this mesh, or of one with the same cells of the same vertices."""
+    theirs = getattr(tags, "mesh", tags).topology  # only 0.5 has a mesh there
+    cells = [t.connectivity(t.dim, 0).array for t in (theirs, msh.topology)]
+    return bool(np.array_equal(*cells))
+
+
 def cell_name(msh: Any) -> str:
     """Name of the mesh's cell type, e.g. "hexahedron"."""
     name = str(msh.topology.cell_type)

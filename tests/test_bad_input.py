@@ -459,6 +459,26 @@ def test_marker_of_wrong_kind():
     edges = facet_tags(body.mesh, dim=1)
     raises(ValueError, pattern, lambda: body.surface(edges, 3))
     raises(TypeError, "a function of x takes no tag, but 3 is given", lambda: body.surface(top, 3))
+    pattern = r"meshtags and a tag as two arguments, e.g. surface\(\*part.where\('top'\)\)"
+    raises(TypeError, pattern, lambda: body.surface((tags, 3)))
+    pattern = r"meshtags and a tag, which part.where\('top'\) has of a surface with this name"
+    raises(TypeError, pattern, lambda: body.surface("top"))
+
+
+def test_tags_of_another_mesh():
+    """Their facets have the numbers of other ones in this body."""
+    body, tags = continuum(), facet_tags(box(cells=(1, 1, 3)))
+    pattern = r"^marker of a surface of 'body' \(tag 3\): these meshtags are of another mesh"
+    raises(ValueError, pattern, lambda: body.surface(tags, 3))
+    pattern = r"^Dirichlet.where of bcs\[0\] of 'body' \(tag 3\): these meshtags are of another"
+    raises(ValueError, pattern, lambda: continuum(bcs=[nts.Dirichlet((tags, 3))]))
+
+
+def test_tags_without_their_tag():
+    tags = facet_tags(box())
+    for kind, value in ((nts.Dirichlet, 3), (nts.Traction, 3)):
+        pattern = rf"^{kind.__name__}.where=.*: is meshtags alone; pass the pair .* without a star"
+        raises(TypeError, pattern, partial(kind, tags, value))
 
 
 def test_marker_of_wrong_shape():

@@ -283,10 +283,10 @@ def spoil(blocks, how):
 @pytest.mark.parametrize(
     "how, message",
     [
-        ("unmeshed", "physical volume 'left' holds none"),
+        ("unmeshed", "physical volume 'left' has no mesh; call gmsh.model.mesh.generate"),
         ("overlapping volumes", "overlap; a cell has one body"),
-        ("overlapping surfaces", "physical surfaces 3 and 20 overlap"),
-        ("degree", "'left' holds 'Hexahedron 27'.*of degree 1"),
+        ("overlapping surfaces", "physical surfaces 'interface' and 20 overlap"),
+        ("degree", "'left' holds 'Hexahedron 27'.*of degree 1 .*setOrder"),
         ("no volumes", "no physical volume in this model.*addPhysicalGroup"),
     ],
 )

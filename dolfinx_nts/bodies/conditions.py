@@ -64,7 +64,7 @@ class Dirichlet:
         components: Which of x, y, z are prescribed.
 
     Raises:
-        TypeError: `value` is a UFL expression.
+        TypeError: `value` is a UFL expression, or `where` is meshtags alone.
         ValueError: Unknown component, or `value` is none of these.
     """
 
@@ -73,6 +73,7 @@ class Dirichlet:
     components: tuple[int, ...] = (0, 1, 2)
 
     def __post_init__(self) -> None:
+        _check_where("Dirichlet", self.where)
         given = self.components
         listed = isinstance(given, Sequence) and all(is_whole(c) and 0 <= c <= 2 for c in given)
         if not listed or not given:
@@ -97,6 +98,7 @@ class Traction:
         value: Force per reference area [Pa]: a vector, or a function of time.
 
     Raises:
+        TypeError: `where` is meshtags alone.
         ValueError: `value` is neither three finite numbers nor a function.
     """
 
@@ -104,7 +106,17 @@ class Traction:
     value: VectorInTime
 
     def __post_init__(self) -> None:
+        _check_where("Traction", self.where)
         _check_value("Traction.value", self.value, "Pa", "a function of time that returns them")
+
+
+def _check_where(name: str, where: Any) -> None:
+    """Raise if it is meshtags without a tag, as a pair with a star leaves them."""
+    if hasattr(where, "find"):
+        raise TypeError(
+            f"{name}.where={where!r}: is meshtags alone; pass the pair of meshtags and tag, "
+            f"without a star, e.g. {name}(part.where('bottom'), ...)"
+        )
 
 
 def _check_value(name: str, value: Any, unit: str, or_else: str) -> None:

@@ -72,6 +72,11 @@ def read_gmsh(file_or_model: Any) -> Input:
     if not isinstance(file_or_model, str | os.PathLike):
         if not hasattr(file_or_model, "getPhysicalGroups"):
             raise ValueError(f"file_or_model={file_or_model!r}: pass a path or gmsh.model")
+        if not _is_running(gmsh):
+            raise ValueError(
+                "file_or_model=gmsh.model: Gmsh is not initialised; call gmsh.finalize() only when "
+                "the bodies are made"
+            )
         return _read_model(file_or_model, "this model")
     path = os.fspath(file_or_model)
     if not os.path.isfile(path):
@@ -156,11 +161,15 @@ def _read_volume(
     """Cells of a physical volume, with all tagged facets of its shape."""
     name = model.getPhysicalName(3, tag) or f"volume_{tag}"
     elements = _elements(model, 3, tag)
+    if not elements:
+        raise ValueError(
+            f"file_or_model: physical volume {name!r} has no mesh; call gmsh.model.mesh.generate(3)"
+        )
     if len(elements) != 1 or not set(elements) <= set(_GMSH_CELLS):
         kinds = [model.mesh.getElementProperties(kind)[0] for kind in elements]
         raise ValueError(
             f"file_or_model: physical volume {name!r} holds {listed(kinds)}; it must be meshed "
-            "with hexahedra or with tetrahedra only, of degree 1"
+            "with hexahedra or with tetrahedra only, of degree 1 (gmsh.model.mesh.setOrder(1))"
         )
     ((number, cells),) = elements.items()
     kind, order = _GMSH_CELLS[number]
@@ -184,9 +193,11 @@ def _read_surfaces(
             surfaces[name] = int(tag)
         for entity in model.getEntitiesForPhysicalGroup(2, tag):
             if owner.setdefault(entity, tag) != tag:
+                both = (model.getPhysicalName(2, t) or t for t in (owner[entity], tag))
                 raise ValueError(
-                    f"file_or_model: physical surfaces {owner[entity]} and {tag} overlap; a facet "
-                    "has one tag, so make them disjoint"
+                    f"file_or_model: physical surfaces {' and '.join(map(repr, both))} overlap; a "
+                    "facet has one tag, so make them disjoint; one surface between two volumes is "
+                    "a surface of both bodies"
                 )
         for kind, table in _elements(model, 2, tag).items():
             if kind in _GMSH_FACETS:

@@ -46,20 +46,26 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
 
     Raises:
         TypeError: `marker` is neither callable nor meshtags with a tag.
-        ValueError: The marker raises or returns no truth values, the tags are not facet tags, or
-            no exterior facet is selected, or an interior facet is.
+        ValueError: The marker raises or returns no truth values, the tags are not facet tags or of
+            another mesh, or no exterior facet is selected, or an interior facet is.
     """
     exterior, dim = compat.exterior_facets(mesh), mesh.topology.dim - 1
     if tag is None:
         if not callable(marker):
+            advice = ""
+            if isinstance(marker, tuple):
+                advice = " as two arguments, e.g. surface(*part.where('top'))"
+            elif isinstance(marker, str):
+                advice = f", which part.where({marker!r}) has of a surface with this name"
             raise TypeError(
                 f"{what}={marker!r}: pass a function of x with shape (3, n), or meshtags and a tag"
+                f"{advice}"
             )
         nodes = compat.entities_to_geometry(mesh, dim, exterior)
         used, chosen = np.unique(nodes), np.zeros(len(mesh.geometry.x), dtype=bool)
         chosen[used] = at_points(mesh.comm, what, marker, mesh.geometry.x[used].T, (), "b")
         found = exterior[chosen[nodes].all(axis=1)]
-        wrong = 0
+        wrong = foreign = 0
     else:
         if callable(marker):
             raise TypeError(f"{what}: a function of x takes no tag, but {tag!r} is given")
@@ -73,8 +79,12 @@ def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArra
         found = np.intersect1d(tagged, exterior).astype(np.int32)
         owned = tagged < mesh.topology.index_map(dim).size_local
         wrong = int(np.count_nonzero(owned) - len(found))
-    total, wrong = (int(n) for n in np.sum(mesh.comm.allgather((len(found), wrong)), axis=0))
+        foreign = int(not compat.is_tagging(marker, mesh))
+    every = mesh.comm.allgather((len(found), wrong, foreign))
+    total, wrong, foreign = (int(n) for n in np.sum(every, axis=0))
     name = what if tag is None else f"{what} (tag {tag})"
+    if foreign:
+        raise ValueError(f"{name}: these meshtags are of another mesh; pass those of this body's")
     if wrong:
         raise ValueError(
             f"{name}: {wrong} interior facets selected; a contact surface must lie on the boundary"
