@@ -481,6 +481,14 @@ def test_tags_without_their_tag():
         raises(TypeError, pattern, partial(kind, tags, value))
 
 
+def test_stress_of_a_rigid_body(tmp_path):
+    rigid = nts.RigidBody(box(), density=1.0, name="hard")
+    for stress in (nts.von_mises, nts.cauchy_stress):
+        raises(TypeError, r"^body='hard': has no material W\(C\)", partial(stress, rigid))
+    pattern = r"^colour='stress': body 'hard' has no material; colour by 'speed', or leave it out"
+    raises(ValueError, pattern, lambda: picture([rigid], tmp_path / "p.png", colour="stress"))
+
+
 def test_marker_of_wrong_shape():
     pattern = r"returned shape \(3, \d+\) for x of shape \(3, \d+\); return shape \(\d+,\)"
     raises(ValueError, pattern, lambda: continuum().surface(lambda x: x > 0))

@@ -30,6 +30,9 @@ def cauchy_stress(body: Any) -> Any:
     Returns:
         Function of degree 0, a 3 x 3 tensor in each cell [Pa]. The mean is over the cell's
         reference volume.
+
+    Raises:
+        TypeError: The body has no material.
     """
     return _cell_means(body, _cauchy(body), "cauchy_stress")
 
@@ -45,12 +48,18 @@ def von_mises(body: Any) -> Any:
 
     Returns:
         Function of degree 0 [Pa].
+
+    Raises:
+        TypeError: The body has no material.
     """
     deviator = ufl.dev(_cauchy(body))
     return _cell_means(body, ufl.sqrt(1.5 * ufl.inner(deviator, deviator)), "von_mises")
 
 
 def _cauchy(body: Any) -> Any:
+    if getattr(body, "law", None) is None:
+        name = getattr(body, "name", body)
+        raise TypeError(f"body={name!r}: has no material W(C), so no stress; pass a Continuum")
     h = ufl.grad(body.u)
     f = ufl.Identity(3) + h
     return f * body.law.stress(green_strain(h)) * f.T / ufl.det(f)

@@ -88,6 +88,11 @@ def check_picture(bodies: Sequence[Any], colour: str, view: Any, limits: Any, wi
                 f"colour={colour!r}: {body.kind} {body.name!r} has none; colour by 'speed', or see "
                 "its resultants()"
             )
+        if colour != "speed" and body.law is None:
+            raise ValueError(
+                f"colour={colour!r}: body {body.name!r} has no material; colour by 'speed', or "
+                "leave it out"
+            )
         if not (body.has_skin if thin else body.mesh.topology.dim == 3):
             raise ValueError(f"bodies: {body.name!r} has no volume; leave it out")
 
