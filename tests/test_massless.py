@@ -209,6 +209,20 @@ def check_kept(table, integrator):
 
 
 @pytest.mark.mpi
+def test_without_such_nodes_there_is_no_massless_defect():
+    """Not even of the rounding of nodes that leave, which a summary would tell."""
+    left = nts.Continuum(box(cells=2), RUBBER, density=1e3, velocity=(2, 0, 0), name="left")
+    right = nts.Continuum(box((1.005, -0.1, -0.1), (2, 1.1, 1.1), 1), RUBBER, density=1e3, name="b")
+    pair = nts.ContactPair(
+        left.surface(lambda x: x[0] > 1 - 1e-9), right.surface(lambda x: x[0] < 1.005 + 1e-9)
+    )
+    system = nts.System([left, right], contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.03)
+    assert (np.diff(run.balance["active"]) < 0).any()  # some have left
+    assert not run.balance["massless_defect"].any() and "massless" not in run.summary
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.slow
 def test_small_blocks_lose_little(friction):

@@ -303,7 +303,7 @@ class ContactElements(ContactLaws):
             external_work, friction_dissipation, contact_defect, massless_defect [J], active, stick,
             slip.
         """
-        slipping, gone = part.active & ~part.stick, ~part.active
+        slipping, gone = part.active & ~part.stick, ~part.active & self._massless
         dissipation, counts = 0.0, (0.0, 0.0)
         if self.num_tangential:
             dissipation = float((part.multiplier[:, -2:] * part.slip)[slipping].sum())
