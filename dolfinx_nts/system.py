@@ -111,6 +111,7 @@ class System:
         for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
             # The search looks half a facet deep; this, the whole body.
             depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
+        self._check_sides(start)
         self._check_penetration(depths)
         self._check_enclosed(start)
 
@@ -325,6 +326,16 @@ class System:
                     f"contact {pair.name!r}: {deep.sum()} slave nodes start inside the master, "
                     f"up to {depth.max():.3g} of a facet (allowed {INITIAL_PENETRATION}), nodes "
                     f"{np.sort(pair.slave.original[deep])[:10].tolist()}; move the bodies apart"
+                )
+
+    def _check_sides(self, state: State) -> None:
+        """Raise on every rank if a body starts on the wrong side of an obstacle."""
+        for pair, where in zip(self.contacts, self.contact_bodies, strict=True):
+            if pair.encloses([state.u[b] for b in where], state.time):
+                raise ValueError(
+                    f"contact {pair.name!r}: all of {pair.slave.body.name!r} starts inside "
+                    f"{pair.master.name!r}; move the two apart, let the normal of a plane point to "
+                    "the body, or pass inside=True to a sphere or cylinder around it"
                 )
 
     def _check_enclosed(self, state: State) -> None:

@@ -455,6 +455,19 @@ def test_bad_contacts():
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize(
+    "obstacle",
+    [nts.Plane((0, 0, 0.1), (0, 0, -1)), nts.Cylinder((0.5, 0, 2.0), (0, 1, 0), 2.0)],
+)
+def test_a_body_on_the_wrong_side_is_refused(obstacle):
+    """It is near the obstacle's surface inside, where nothing would hold it."""
+    _, face = block(low=(0, 0, 0.1))
+    text = f"all of 'block' starts inside '{obstacle.name}'.*normal of a plane point to the body"
+    with pytest.raises(ValueError, match=text):
+        nts.System([face.body], contacts=[nts.ContactPair(face, obstacle)])
+
+
+@pytest.mark.mpi
 def test_a_motion_that_breaks_down_ends_the_run():
     motion = {0.0: (0, 0, 0)}
     floor = nts.Plane((0, 0, -1), (0, 0, 1), motion=lambda t: motion.get(t, (0, 0, np.nan)))

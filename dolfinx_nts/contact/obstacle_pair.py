@@ -10,8 +10,16 @@ import numpy.typing as npt
 
 from dolfinx_nts.contact.obstacle_elements import ObstacleElements
 from dolfinx_nts.contact.obstacles import Obstacle
-from dolfinx_nts.contact.pair import MARGIN, Candidates, ContactPair, Found, Motion
+from dolfinx_nts.contact.pair import (
+    INITIAL_PENETRATION,
+    MARGIN,
+    Candidates,
+    ContactPair,
+    Found,
+    Motion,
+)
 from dolfinx_nts.elements import Step
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.validation import StepFailedError
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,6 +60,18 @@ class ObstaclePair(ContactPair, master=Obstacle):
         """Displacements of the obstacle at two times [m], shape (2, 3). Collective."""
         comm = self.slave.body.comm
         return np.stack([self.master.displacement(t, comm) for t in (start, end)])
+
+    def encloses(self, u: Sequence[FloatArray], time: float) -> bool:
+        """Return whether no part of the slave's body starts outside. Collective."""
+        body = self.slave.body
+        if body.mesh is None:
+            return False
+        corners = body.boundary_now(u[0]).reshape(-1, 3) - self.origin - self.path(time, time)[0]
+        gap = self.obstacle.gap(corners).value
+        ends = np.array([gap.max(initial=-np.inf), -gap.min(initial=np.inf)])
+        highest, depth = global_max(body.comm, ends).tolist()
+        limit = INITIAL_PENETRATION * np.sqrt(self.slave.area.max())
+        return bool(highest <= limit < depth)
 
     def find(
         self,

@@ -234,6 +234,15 @@ class ContactPair:
         """
         return 0.0
 
+    def encloses(self, u: Sequence[FloatArray], time: float) -> bool:
+        """Return whether all of the slave's body starts inside an obstacle. Collective.
+
+        Args:
+            u: As of `depth`.
+            time: Of the start [s].
+        """
+        return False
+
     def find(
         self,
         positions: Sequence[FloatArray],
