@@ -11,15 +11,18 @@ from dolfinx_nts import dolfinx_compat
 
 
 class _Lines(logging.Handler):
-    """Writes messages above a bar."""
+    """Writes messages above a bar, equal ones once."""
 
     def __init__(self, bar: Any) -> None:
         super().__init__()
-        self._bar = bar
+        self._bar, self._written = bar, set[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write one of them."""
-        self._bar.write(record.getMessage())
+        text = record.getMessage()
+        if text not in self._written:
+            self._bar.write(text)
+        self._written.add(text)
 
 
 @contextmanager
