@@ -42,7 +42,7 @@ def told(run):
         return 0.0
     assert found.count == 1 and not found.grave
     assert found.text.startswith("body 'block' is under a stress of about ")
-    assert found.text.endswith("let W(C) have dW/dC = 0 at C = 1")
+    assert found.text.endswith("let W(C), where C = F^T F, have dW/dC = 0 at C = 1")
     assert float(re.search(r"about (\S+) of its stiffness", found.text)[1]) == pytest.approx(
         found.worst, rel=0.05
     )

@@ -85,8 +85,8 @@ def tell_stressed(solution: Solution, time: float) -> None:
         "stress at rest", time, worst,
         f"{f'body {names} is' if one else f'bodies {names} are'} under a stress of about "
         f"{worst:.2g} of {'its' if one else 'their'} stiffness while undeformed, and "
-        f"{'moves by itself' if one else 'move by themselves'}; unless that is meant, let W(C) "
-        "have dW/dC = 0 at C = 1",
+        f"{'moves by itself' if one else 'move by themselves'}; unless that is meant, let "
+        "W(C), where C = F^T F, have dW/dC = 0 at C = 1",
     )  # fmt: skip
 
 
