@@ -17,6 +17,7 @@ import ufl
 from dolfinx import cpp, fem, geometry, jit, mesh
 from ffcx.codegeneration import jit as ffcx_jit
 from petsc4py import PETSc
+from ufl.core.expr import Expr
 
 from dolfinx_nts.kernels.canonical import canonical
 
@@ -144,6 +145,31 @@ def create_submesh(msh: Any, dim: int, entities: npt.ArrayLike) -> tuple[Any, In
 
 
 # ---- spaces and functions
+@contextmanager
+def without_floats() -> Iterator[None]:
+    """Refuse a float of an expression, which what makes one in UFL has no value for yet.
+
+    UFL of 0.5 tries again and again, with a warning each time, and does not end; a Constant of
+    later versions hands over its value of now, as if it were one for all times.
+    """
+
+    def refuse(expression: Any) -> float:
+        raise TypeError(
+            f"{type(expression).__name__} has no value yet: take ufl.sin, ufl.ln, ... in place of "
+            "math.sin, math.log"
+        )
+
+    kinds = [kind for kind in (Expr, fem.Constant) if "__float__" in vars(kind)]
+    before = [kind.__float__ for kind in kinds]
+    for kind in kinds:
+        kind.__float__ = refuse
+    try:
+        yield
+    finally:
+        for kind, known in zip(kinds, before, strict=True):
+            kind.__float__ = known
+
+
 @contextmanager
 def _told_compiler(what: str) -> Iterator[None]:
     """Tell in one line that something is compiled, which is not in FFCx's cache, and nothing else.

@@ -3,6 +3,7 @@
 Serial tests show the message; on two ranks the wrong data sit on one rank only where they can.
 """
 
+import math
 import re
 from functools import partial
 from types import SimpleNamespace
@@ -206,6 +207,23 @@ def test_material_that_is_no_scalar():
     raises(TypeError, pattern, lambda: continuum(None, lambda c: c))
     pattern = r"^material=<function.*raised .*return a UFL scalar"
     raises(TypeError, pattern, lambda: continuum(None, lambda c: None))
+
+
+@pytest.mark.parametrize("function", [math.log, np.log])
+def test_material_of_functions_of_numbers(function):
+    pattern = r"^material=<function.*raised TypeError.*; return a UFL scalar, made of functions of"
+    raises(TypeError, pattern, lambda: continuum(None, lambda c: function(ufl.det(c))))
+
+
+def test_extra_form_of_functions_of_numbers(caplog):
+    """UFL of DOLFINx 0.5 tries without an end to make a number of the time."""
+
+    def load(u, v, w, t):
+        return math.sin(t) * w[2] * ufl.ds
+
+    pattern = r"^extra_form=<function.*Constant has no value yet: take ufl.sin.*return a UFL form"
+    raises(TypeError, pattern, lambda: continuum(extra_form=load))
+    assert not caplog.records
 
 
 def test_material_that_raises():

@@ -176,9 +176,11 @@ class Continuum(UflBody):
         """W of the displacement in UFL; what is wrong with it raises on every rank."""
         problem, cause, energy = None, None, None
         try:
-            energy = ufl.as_ufl(self.law(green_strain(ufl.grad(self.u))))
+            with compat.without_floats():
+                energy = ufl.as_ufl(self.law(green_strain(ufl.grad(self.u))))
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
-            problem, cause = f"raised {error!r}; return a UFL scalar", error
+            remedy = "return a UFL scalar, made of functions of ufl as ufl.ln"
+            problem, cause = f"raised {error!r}; {remedy}", error
         else:
             if energy.ufl_shape != ():
                 problem = f"has shape {energy.ufl_shape}; return a UFL scalar"

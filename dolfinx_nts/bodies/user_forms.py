@@ -7,6 +7,7 @@ from typing import Any
 
 import ufl
 
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.parallel import raise_together
 
@@ -29,7 +30,8 @@ def checked_form(
     """
     problem, cause, form, domain = None, None, None, body.mesh.ufl_domain()
     try:
-        form = make()
+        with compat.without_floats():
+            form = make()
         arguments = set(form.arguments()) if isinstance(form, ufl.Form) else set()
     except Exception as error:  # any: a rank that raises alone would leave the others waiting
         problem, cause = f"raised {error!r}; {remedy}", error
