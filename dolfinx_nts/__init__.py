@@ -8,7 +8,7 @@ from dolfinx_nts.bodies.conditions import Dirichlet, Traction
 from dolfinx_nts.bodies.continuum import Continuum
 from dolfinx_nts.bodies.form_body import FormBody
 from dolfinx_nts.bodies.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
-from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.bodies.mesh_input import Part, bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
@@ -107,6 +107,7 @@ __all__ = [
     "Obstacle",
     "ObstaclePair",
     "OutputError",
+    "Part",
     "Planar",
     "Plane",
     "PointElements",

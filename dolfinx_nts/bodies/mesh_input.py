@@ -59,7 +59,7 @@ class Part:
     regions: Mapping[str, int]
 
     def where(self, surface: str | int) -> tuple[Any, int]:
-        """A tagged surface, as `Dirichlet`, `Traction` and (with *) `Continuum.surface` take it.
+        """A tagged surface, as `Dirichlet`, `Traction` and, with a star, `surface` take it.
 
         Args:
             surface: Name or tag.
