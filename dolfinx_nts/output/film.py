@@ -56,7 +56,8 @@ class Film:
     Arrows are contact forces on the nodes of slaves and masters, the longest that of the largest
     force in the film. In dynamics with a consistent mass the forces of single steps alternate. The
     frames are kept on rank 0, 50 bytes for each corner of a facet, and drawn when the run ends, a
-    second each; where it fails, the film ends there.
+    second each; where it fails, the film ends there. A run that goes on from a checkpoint makes a
+    film of what follows alone, so give it a path of its own.
 
     Args:
         path: File, whose ending is .gif; its folder is made if missing.
