@@ -593,7 +593,9 @@ def test_slave_is_master():
     pattern = r"^slave, master: both surfaces of 'body' share nodes; choose disjoint markers"
     raises(ValueError, pattern, lambda: nts.ContactPair(surface, surface))
     raises(ValueError, pattern, lambda: nts.ContactPair(surface, other))
-    assert nts.ContactPair(surface, body.surface(bottom)).name == "body-body"
+    pair = nts.ContactPair(surface, body.surface(bottom))
+    assert pair.name == "body-body" and repr(pair) == "<ContactPair 'body-body', slave 'body'>"
+    raises(TypeError, r"^slave=<Continuum 'body'>: pass a Surface", lambda: nts.ContactPair(body, 0))
 
 
 def test_contact_of_no_surface():

@@ -84,6 +84,10 @@ class Body:
     _accepted: tuple[FloatArray, FloatArray] | None = None
     _shown: tuple[FloatArray, ...] = ()
 
+    def __repr__(self) -> str:
+        # One of a class of the user's own may not have its name yet.
+        return f"<{type(self).__name__} {getattr(self, 'name', '')!r}>"
+
     # ---- what each body has of its own
     def _missing(self, name: str) -> NotImplementedError:
         return NotImplementedError(

@@ -142,6 +142,9 @@ class ContactPair:
         self.extent = slave.material.extent(self.origin)
         self._set_up()
 
+    def __repr__(self) -> str:
+        return f"<ContactPair {self.name!r}, slave {self.slave.body.name!r}>"
+
     @property
     def surfaces(self) -> tuple[Surface, ...]:
         """The surfaces of bodies that it holds apart."""
