@@ -194,7 +194,10 @@ def simulate(
     )  # fmt: skip
     begin = stepper.state.time
     if not t_end > begin:
-        raise ValueError(f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]")
+        raise ValueError(
+            f"t_end={t_end!r}: must lie after the start's time {begin!r} [s]; pass a later one, or "
+            "begin after an equilibrium with start_time=0.0"
+        )
     remedy = "Try a smaller dt"
     end, dt = float(t_end), float(dt)
     stepper.solution.settings |= {"dt": dt, "t_end": end, "adapt": adapt and repr(adapt)}
