@@ -301,7 +301,7 @@ class Supports:
         if isinstance(value, fem.Function):
             return at_nodes(self._space, f"{what}={value!s}", value)[nodes]
         if callable(value) and takes_place(value):
-            x, at = self._nodes[nodes].T, f"{what} at t={float(time)!r}"
+            x, at = self._nodes[nodes].T, f"{what} at t={float(time)!r}, called with (x, t)"
             found: FloatArray = at_points(
                 self._comm, at, lambda x: value(x, time), x, (3,), error=UserFunctionError
             )
