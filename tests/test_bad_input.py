@@ -595,7 +595,8 @@ def test_slave_is_master():
     raises(ValueError, pattern, lambda: nts.ContactPair(surface, other))
     pair = nts.ContactPair(surface, body.surface(bottom))
     assert pair.name == "body-body" and repr(pair) == "<ContactPair 'body-body', slave 'body'>"
-    raises(TypeError, r"^slave=<Continuum 'body'>: pass a Surface", lambda: nts.ContactPair(body, 0))
+    wrong = r"^slave=<Continuum 'body'>: pass a Surface"
+    raises(TypeError, wrong, lambda: nts.ContactPair(body, 0))
 
 
 def test_contact_of_no_surface():

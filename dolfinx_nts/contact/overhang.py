@@ -25,7 +25,7 @@ _BESIDE = 0.05
 #: the node that carries.
 _FLAT = 0.2
 #: Distance from the rim, in widths of the slave's surface, that is told, and that is grave.
-_LEAST, _GRAVE = 0.05, 0.2
+_LEAST, _GRAVE = 0.05, 0.3
 
 
 class Overhang(NamedTuple):

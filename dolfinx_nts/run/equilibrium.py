@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
+from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
@@ -25,6 +26,7 @@ from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
 from dolfinx_nts.step.convergence import unrest
 from dolfinx_nts.step.free_motion import free_motion
+from dolfinx_nts.step.instability import releasing_motions
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -210,6 +212,7 @@ class _LoadStepper(Stepper):
         super().look(last=last)
         if last:
             self._tell_free_motion()
+            self._tell_unstable()
             self._tell_part_of_loads()
 
     def _tell_free_motion(self) -> None:
@@ -225,6 +228,26 @@ class _LoadStepper(Stepper):
                 "stabilization=0.1, which leaves it where it is",
                 grave=True,
             )  # fmt: skip
+
+    def _tell_unstable(self) -> None:
+        """Warn of a state that a small disturbance leads away from, as a buckled one."""
+        if self._stabilization or self._solved is None or self._slips():
+            return
+        number = releasing_motions(self.problem, self._solved)
+        if number:
+            self.solution.warn(
+                "unstable equilibrium", self.state.time, float(number),
+                f"{number} independent motion{'s' if number > 1 else ''} away from this state "
+                "release energy: it is an equilibrium, but not a stable one, and a small "
+                "disturbance leads elsewhere, as in buckling or tipping; to find where, begin with "
+                "a small displacement= in that direction, or disturb the loads",
+            )  # fmt: skip
+
+    def _slips(self) -> bool:
+        """Whether nodes slip with friction, whose forces have no potential. Collective."""
+        both = zip(self.system.contacts, self.state.contacts, strict=True)
+        slip = any(p.friction and bool(((c.force > 0.0) & ~c.stick).any()) for p, c in both)
+        return anywhere(self.system.comm, slip)
 
     def _tell_part_of_loads(self) -> None:
         """Warn if the load steps were asked to end before all of the constant loads act."""

@@ -13,7 +13,7 @@ what a field split makes of the matrix whose elements' tangents are those of `au
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,23 +52,29 @@ class AugmentedMatrix:
     Args:
         problem: Equations of the step; its layout must not change.
         bodies: PETSc matrices of its bodies that are awake.
+        around: Stiffness that closed contacts of a body get [N/m], at each of its coordinates; None:
+            that of their surroundings.
 
     Attributes:
         matrix: Of the same layout as the step's own.
         mixed: Whether there are bodies with constraints of their own, for which a multigrid is not.
     """
 
-    def __init__(self, problem: StepProblem, bodies: Sequence[Any]) -> None:
+    def __init__(
+        self,
+        problem: StepProblem,
+        bodies: Sequence[Any],
+        around: Callable[[Any], FloatArray] | None = None,
+    ) -> None:
         laid, awake = problem.laid, [problem.system.bodies[k] for k in problem.awake]
         blocks = [b._replace(pattern=np.ones_like(b.pattern)) for b in laid.blocks]
         self.matrix = StepMatrix(laid.layout, bodies, blocks, split=True, blocked=True, kind="aij")
-        around = problem.x.duplicate()
-        around.set(0.0)
+        stiffness, place = around or problem.stabilization.stiffness, problem.x.duplicate()
+        place.set(0.0)
         for k, body in zip(problem.awake, awake, strict=True):
-            stiffness = problem.factor * problem.stabilization.stiffness(body)
-            around.array_w[problem.of_body(k)] = stiffness
-        self._stiffness = laid.at_elements(around, problem.elements) if laid.blocks else []
-        around.destroy()
+            place.array_w[problem.of_body(k)] = problem.factor * stiffness(body)
+        self._stiffness = laid.at_elements(place, problem.elements) if laid.blocks else []
+        place.destroy()
         self._comm = problem.system.comm
         continua = np.repeat([not body.joints for body in awake], [b.num_owned for b in awake])
         self._continua = np.flatnonzero(continua)
