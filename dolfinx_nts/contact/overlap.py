@@ -17,6 +17,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
+from dolfinx_nts.contact.inner_edge import InnerEdges, in_inner_edge
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.overhang import inside_rim
 from dolfinx_nts.contact.surfaces import Surface
@@ -58,6 +59,7 @@ class OverlapWatch:
     def __init__(self, system: Any) -> None:
         self._comm, self._bodies = system.comm, system.bodies
         self._surfaces: dict[int, Surface] = {}
+        self._edges: dict[int, InnerEdges] = {}
 
         def start() -> tuple[FloatArray, ...]:
             at_start: tuple[FloatArray, ...] = system.initial_state().u
@@ -97,7 +99,7 @@ class OverlapWatch:
             u: Owned displacements of all bodies [m]; kept until the next look, not to be changed.
             time: At which they are so [s].
             forces: Of each contact of the system the normal forces of its share [N]; may be left
-                out, and then contact that ends inside a rim is not told.
+                out, and then contact inside a rim or in an inner edge is not told.
             last: Look again wherever anything has moved.
         """
         now = [pair.where(u, time) for pair in self._pairs]
@@ -108,7 +110,7 @@ class OverlapWatch:
                 findings += self._pairs[k].passed(before.where, now[k], way, before.pause.through)
             found, pause = self._pairs[k].look(now[k])
             findings += found
-            findings += self._inside_rims(self._pairs[k], u, forces)
+            findings += self._of_contacts(self._pairs[k], u, forces)
             self._looked[k] = _Looked(now[k], pause)
         worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
@@ -117,19 +119,29 @@ class OverlapWatch:
                 worst[key] = f
         return list(worst.values())
 
-    def _inside_rims(
+    def _of_contacts(
         self,
         pair: BodyPair | ObstacleContact,
         u: Sequence[FloatArray],
         forces: Sequence[FloatArray],
     ) -> Iterator[Finding]:
-        """Contacts of a pair that end inside the rim of a master; as of `look`. Collective."""
+        """What is told of contacts by their forces; as of `look`. Collective.
+
+        That one ends inside the rim of a master, and that nodes lie in inner edges of one.
+        """
         if isinstance(pair, ObstacleContact) or not forces:
             return  # obstacles have no rim
-        for (contact, bodies), force in zip(self._contacts, forces, strict=True):
+        for k, ((contact, bodies), force) in enumerate(zip(self._contacts, forces, strict=True)):
             # The surface of a contact of a body with itself may end where the body does not.
             if contact in pair.contacts and len(set(bodies)) == 2:
-                found = inside_rim(contact, [u[k] for k in bodies], force)
+                moved = [u[b] for b in bodies]
+                if k not in self._edges:
+                    y = contact.positions(moved)[1]
+                    self._edges[k] = InnerEdges(contact.master.facets, y)
+                found = inside_rim(contact, moved, force)
+                if found:
+                    yield found
+                found = in_inner_edge(self._edges[k], contact, moved, force)
                 if found:
                     yield found
 

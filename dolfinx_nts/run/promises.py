@@ -115,7 +115,10 @@ class Promises:
                 f"{massless / self._largest:.2g} of the largest energy; use a smaller dt",
                 grave=True,
             )  # fmt: skip
-        remedy = "use a finer or smoother master, or a smaller, constant dt"
+        remedy = (
+            "use a finer or smoother master, or a smaller, constant dt; where faces of the master "
+            "meet at an inner edge, declare a contact for each"
+        )
         if gain > _GAIN * abs(row["energy"]) + self._rounding:
             where = balance.expelled(problem, step)
             text = (

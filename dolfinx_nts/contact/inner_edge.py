@@ -1,0 +1,148 @@
+"""Slave nodes in an inner edge of a master, which a contact holds out of one of its two faces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.crossings import Finding
+from dolfinx_nts.contact.search import closest_facets
+from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.parallel import gather_rows
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+#: Facets meet at an edge where the cosine of the angle between their normals is below this; in a
+#: bore of facets a node that slides is behind the next one for a step, which is known.
+_SHARP = 0.7
+#: Depth behind one of the two facets that is told, in sizes of the smaller one: in stiff bodies a
+#: little of it takes all of a force, and gaps are solved to rounding.
+_DEEP = 1e-6
+#: A node in the edge is not farther from it than this many depths.
+_NEAR = 2.0
+#: No facet is nearer to it than this part of the depth.
+_ALONE = 0.5
+
+
+class Behind(NamedTuple):
+    """The node that lies deepest.
+
+    Attributes:
+        node: Point of the slave.
+        facet: Facet of the master that it lies behind.
+        depth: [m].
+        size: The same in sizes of the smaller of the two facets [-].
+    """
+
+    node: int
+    facet: int
+    depth: float
+    size: float
+
+
+class InnerEdges:
+    """Edges of a master's surface at which it turns towards the side of the slave.
+
+    Args:
+        facets: Facets of the surface, shape (m, nc).
+        y: Its nodes [m], from which these edges are chosen once.
+    """
+
+    def __init__(self, facets: IntArray, y: FloatArray) -> None:
+        self._facets = facets
+        ends = np.stack([facets, np.roll(facets, -1, axis=1)], axis=2).reshape(-1, 2)
+        facet = np.repeat(np.arange(len(facets)), facets.shape[1])
+        order = np.lexsort((ends.max(axis=1), ends.min(axis=1)))
+        ends, facet = np.sort(ends[order], axis=1), facet[order]
+        same = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
+        two = np.stack([facet[same], facet[same + 1]], axis=1)
+        place, normal = self._planes(y, two)
+        rise = np.einsum("ni,ni->n", place[:, 1] - place[:, 0], normal[:, 0])
+        cosine = np.einsum("ni,ni->n", normal[:, 0], normal[:, 1])
+        inner = (rise > 0.0) & (cosine < _SHARP)
+        self._ends, self._two = ends[same[inner]], two[inner]
+
+    def __len__(self) -> int:
+        return len(self._two)
+
+    def behind(self, points: FloatArray, force: FloatArray, y: FloatArray) -> Behind | None:
+        """Return the node that carries at one facet and lies deepest behind the one beside it.
+
+        Args:
+            points: Those of the slave [m], shape (p, 3).
+            force: Their normal forces [N], shape (p,).
+            y: Nodes of the master now [m].
+        """
+        carry = np.flatnonzero(force > 0.0)
+        if not len(carry) or not len(self):
+            return None
+        ends, normals = y[self._ends], self._planes(y, self._two)[1]
+        corners = y[self._facets]
+        sizes = fc.size(corners)[self._two].min(axis=1)
+        low, high = points[carry].min(axis=0), points[carry].max(axis=0)
+        reach = sizes[:, None]
+        near = (ends.min(axis=1) - reach <= high) & (ends.max(axis=1) + reach >= low)
+        worst = None
+        for k in np.flatnonzero(near.all(axis=1)):
+            x, along = points[carry] - ends[k, 0], ends[k, 1] - ends[k, 0]
+            on = np.clip(x @ along / (along @ along), 0.0, 1.0)
+            away = np.linalg.norm(x - on[:, None] * along, axis=1)
+            depths = -(x @ normals[k].T)
+            depth = depths.max(axis=1)
+            size = float(sizes[k])
+            depth[(away > _NEAR * depth) | (depth > size)] = 0.0
+            deep = np.flatnonzero(depth > _DEEP * size)
+            # On the far side of a thin wall other facets are nearer.
+            alone = closest_facets(points[carry[deep]], corners, reach=_ALONE * depth[deep])
+            for n in deep[alone.facet < 0]:
+                if worst is None or depth[n] > worst.depth:
+                    facet, part = int(self._two[k, depths[n].argmax()]), float(depth[n]) / size
+                    worst = Behind(int(carry[n]), facet, float(depth[n]), part)
+        return worst
+
+    def _planes(self, y: FloatArray, two: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Middles and normals of pairs of facets, shape (n, 2, 3) each."""
+        corners = y[self._facets[two.ravel()]]
+        middle = np.full((len(corners), 2), 1 / 3 if corners.shape[1] == 3 else 0.0)
+        place, _, normal = fc.frame(corners, middle)
+        return place.reshape(-1, 2, 3), normal.reshape(-1, 2, 3)
+
+
+def in_inner_edge(
+    edges: InnerEdges, contact: Any, u: Sequence[FloatArray], force: FloatArray
+) -> Finding | None:
+    """As `InnerEdges.behind`, of a contact, with a sentence and a remedy. Collective.
+
+    Args:
+        edges: Those of the contact's master.
+        contact: A contact of two surfaces.
+        u: Owned displacements of its bodies [m].
+        force: Normal force of each slave node of this rank's share [N].
+    """
+    if not len(edges):
+        return None
+    slave, master = contact.slave, contact.master
+    of_points = np.zeros(len(slave.points))
+    of_points[slave.dealt] = gather_rows(slave.body.comm, force)
+    if not of_points.any():
+        return None
+    x, y = contact.positions(u)
+    found = edges.behind(x, of_points, y)
+    if found is None:
+        return None
+    one, two, node = slave.body.name, master.body.name, int(slave.original[found.node])
+    corners = sorted(int(n) for n in master.original[master.facets[found.facet]])
+    text = (
+        f"node {node} of {one!r} lies in an inner edge of {two!r}, {found.depth:.3g} m, or "
+        f"{found.size:.2g} of a facet, behind the facet of nodes {corners}: contact "
+        f"{contact.name!r} holds a node out of one facet at a time; declare a contact for each of "
+        f"the faces of {two!r} that meet there"
+    )
+    place = x[found.node] + contact.origin
+    return Finding(
+        "node in an inner edge", found.depth, found.size, place, (one, two), (node,), text
+    )
