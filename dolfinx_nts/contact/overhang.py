@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy.typing as npt
 from dolfinx_nts.contact.crossings import Finding
 from dolfinx_nts.contact.search import closest_facets
 from dolfinx_nts.kernels import facets as fc
-from dolfinx_nts.parallel import gather_rows
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -91,23 +89,20 @@ def overhang(
     return Overhang(mean, size, node) if size > _LEAST else None
 
 
-def inside_rim(contact: Any, u: Sequence[FloatArray], force: FloatArray) -> Finding | None:
-    """As `overhang`, of a contact, with a sentence and a remedy. Collective, alike on all ranks.
+def inside_rim(
+    contact: Any, positions: tuple[FloatArray, ...], force: FloatArray
+) -> Finding | None:
+    """As `overhang`, of a contact, with a sentence and a remedy.
 
     Args:
         contact: A contact of two surfaces.
-        u: Owned displacements of its bodies [m].
-        force: Normal force of each slave node of this rank's share [N].
+        positions: Of all points of both, as of `ContactPair.positions` [m].
+        force: Normal force of each point of the slave [N].
     """
-    slave, master = contact.slave, contact.master
+    (x, y), slave, master = positions, contact.slave, contact.master
     if not len(slave.facets):
         return None
-    of_points = np.zeros(len(slave.points))
-    of_points[slave.dealt] = gather_rows(slave.body.comm, force)
-    if not of_points.any():
-        return None
-    x, y = contact.positions(u)
-    found = overhang(x, slave.facets, of_points, y[master.facets])
+    found = overhang(x, slave.facets, force, y[master.facets])
     if found is None:
         return None
     one, two, node = slave.body.name, master.body.name, int(slave.original[found.node])

@@ -133,17 +133,18 @@ class OverlapWatch:
             return  # obstacles have no rim
         for k, ((contact, bodies), force) in enumerate(zip(self._contacts, forces, strict=True)):
             # The surface of a contact of a body with itself may end where the body does not.
-            if contact in pair.contacts and len(set(bodies)) == 2:
-                moved = [u[b] for b in bodies]
-                if k not in self._edges:
-                    y = contact.positions(moved)[1]
-                    self._edges[k] = InnerEdges(contact.master.facets, y)
-                found = inside_rim(contact, moved, force)
-                if found:
-                    yield found
-                found = in_inner_edge(self._edges[k], contact, moved, force)
-                if found:
-                    yield found
+            if contact not in pair.contacts or len(set(bodies)) < 2:
+                continue
+            everywhere = contact.slave.at_all(force)
+            if not everywhere.any():
+                continue
+            positions = contact.positions([u[b] for b in bodies])
+            if k not in self._edges:
+                self._edges[k] = InnerEdges(contact.master.facets, positions[1])
+            yield from filter(None, (
+                inside_rim(contact, positions, everywhere),
+                in_inner_edge(self._edges[k], contact, positions, everywhere),
+            ))  # fmt: skip
 
     def enclosed(self, u: Sequence[FloatArray], time: float) -> list[Finding]:
         """Obstacles inside bodies that a contact is to hold out of them. Collective.

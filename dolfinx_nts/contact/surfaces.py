@@ -346,16 +346,19 @@ class Surface:
         return found
 
     @cached_property
-    def dealt(self) -> IntArray:
+    def _dealt(self) -> IntArray:
         """Shares of all ranks one after another. Collective."""
         return gather_rows(self.body.comm, self.share)
 
+    def at_all(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values at all points from those at the points of `share`. Collective."""
+        table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
+        table[self._dealt] = gather_rows(self.body.comm, values)
+        return table
+
     def at_own(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values at the points of `rows` from those at the points of `share`. Collective."""
-        comm = self.body.comm
-        table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
-        table[self.dealt] = gather_rows(comm, values)
-        return self.owned(table)
+        return self.owned(self.at_all(values))
 
     def owned(self, table: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values at the points of `rows` from those at all points. Collective."""

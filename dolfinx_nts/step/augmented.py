@@ -52,7 +52,7 @@ class AugmentedMatrix:
     Args:
         problem: Equations of the step; its layout must not change.
         bodies: PETSc matrices of its bodies that are awake.
-        around: Stiffness that closed contacts of a body get [N/m], at each of its coordinates; None:
+        around: Stiffness that closed contacts of a body get at each of its coordinates [N/m]; None:
             that of their surroundings.
 
     Attributes:

@@ -42,7 +42,8 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
         problem, tangents,
         lambda body: _STIFF * stabilization.stiffness(body, (body,)),
     )  # fmt: skip
-    augmented.assemble([part.tangent for part in step.parts], fresh=True)
+    coupled = step.parts if problem.laid.blocks else []
+    augmented.assemble([part.tangent for part in coupled], fresh=True)
     matrix = augmented.matrix.corner.convert("aij", PETSc.Mat())
     augmented.destroy()
     transpose = matrix.transpose(PETSc.Mat())
