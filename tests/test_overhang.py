@@ -94,12 +94,47 @@ def forces_elsewhere(points):
             *face(3, tilt=-0.5, about=1.82), last_row(face(3)[0])[0],
             id="far above the rim",
         ),
+        # A ball near the rim: its facet rises by a tenth of the way to there.
+        pytest.param(*face(3, tilt=-0.1, about=1.82), last_row(face(3)[0])[0], id="round"),
         # 20 facets: 0.01 of 0.6 m.
         pytest.param(*face(20, start=1.69), last_row(face(20, start=1.69)[0])[0], id="fine mesh"),
     ],
 )  # fmt: skip
 def test_nothing_is_told(points, facets, force):
     assert overhang(points, facets, force, TABLE) is None
+
+
+def test_what_another_contact_holds_does_not_tip():
+    """A brick of one cell with its ends on two others; nodes between its ends reach beyond."""
+    points, facets = face(1)
+    force, last = last_row(points)
+    held = points[:, 0] > last
+    assert overhang(points, facets, force, TABLE) is not None
+    assert overhang(points, facets, force, TABLE, held) is None
+    points, facets = face(2, start=1.7, width=0.8)
+    force = (points[:, 0] < 1.71) * 1.0
+    held = points[:, 0] > 2.4
+    assert overhang(points, facets, force, TABLE, held).distance == pytest.approx(0.3, rel=1e-9)
+
+
+@pytest.mark.mpi
+def test_bricks_on_two_bricks():
+    """A bond with 2 cm between the bricks: the upper one, of one cell, rests on its ends."""
+    fixed = dict(motion=(0, 0, 0), rotation=(0, 0, 0))
+    below = [
+        nts.RigidBody(
+            box([x, 0, 0], [x + 1, 0.5, 0.3], 1), density=1e3, name=f"brick {k}", **fixed
+        )
+        for k, x in enumerate((0.0, 1.02))
+    ]  # fmt: skip
+    upper = nts.RigidBody(box([0.51, 0, 0.3], [1.51, 0.5, 0.6], 1), density=1e3, name="upper")
+    face_of = at(2, 0.3)
+    pairs = [nts.ContactPair(upper.surface(face_of), b.surface(face_of)) for b in below]
+    system = nts.System([upper, *below], contacts=pairs, gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.1)
+    weight = 9.81 * upper.mass
+    assert run.contact_forces[-1, :, 2] == pytest.approx([weight / 2, weight / 2], rel=1e-9)
+    assert run.status == "completed" and not run.warnings
 
 
 def slide(n, exchange=False, cells=(5, 3, 1)):

@@ -13,6 +13,7 @@ from dolfinx_nts.kernels import facets as fc
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
 
 #: All but this part of a contact's force must act at the rim: a body that tips stands on one edge.
 _ELSEWHERE = 0.01
@@ -20,8 +21,9 @@ _ELSEWHERE = 0.01
 #: than above it.
 _BESIDE = 0.05
 #: The rim touches a facet that it is no farther above or below than this part of the distance from
-#: the node that carries.
-_FLAT = 0.2
+#: the node that carries, unless the facet rises from the master by more than the second part, as
+#: that of a ball does.
+_FLAT, _RISES = 0.2, 0.05
 #: Distance from the rim, in widths of the slave's surface, that is told, and that is grave.
 _LEAST, _GRAVE = 0.05, 0.3
 
@@ -41,7 +43,11 @@ class Overhang(NamedTuple):
 
 
 def overhang(
-    x: FloatArray, facets: IntArray, force: FloatArray, corners: FloatArray
+    x: FloatArray,
+    facets: IntArray,
+    force: FloatArray,
+    corners: FloatArray,
+    held: BoolArray | None = None,
 ) -> Overhang | None:
     """Return how far inside the rim of a master contact ends, if all of its force acts there.
 
@@ -54,6 +60,8 @@ def overhang(
         facets: Its facets, shape (m, nc).
         force: Normal force of each point [N], >= 0, shape (p,).
         corners: Corners of the master's facets [m], shape (n, nc, 3).
+        held: Points that carry in another contact, which hold what reaches over the rim, shape
+            (p,); None: there are none.
     """
     total, on = float(force.sum()), (force > 0.0)[facets]
     part = on.any(axis=1) & ~on.all(axis=1)
@@ -71,13 +79,18 @@ def overhang(
     above = np.einsum("mki,mi->mk", way, normal)
     beside = np.linalg.norm(way - above[..., None] * normal[:, None], axis=2)
     beyond = (beside > _BESIDE * fc.size(corner)[:, None]) & (beside > np.abs(above))
+    if held is not None:
+        beyond &= ~held[facets]
     # From each corner to the nearest of the places at the rim below corners beyond it.
     arm = foot[:, None] - corner[:, :, None]
     way = np.where(beyond[:, None], np.linalg.norm(arm, axis=3), np.inf)
     chosen = way.argmin(axis=2)[..., None]
     height = np.abs(np.einsum("mkli,mi->mkl", arm, normal))
-    nearest, height = (np.take_along_axis(a, chosen, axis=2)[..., 0] for a in (way, height))
-    nearest[~(height <= _FLAT * nearest)] = np.inf
+    nearest, height, rises = (
+        np.take_along_axis(a, chosen, axis=2)[..., 0]
+        for a in (way, height, _rises(corner, on, corners))
+    )
+    nearest[~(height <= _FLAT * nearest) | rises] = np.inf
     inside = np.full(len(x), np.inf)
     np.minimum.at(inside, facets[on], nearest[on])
     rim = np.flatnonzero((force > 0.0) & np.isfinite(inside))
@@ -89,8 +102,31 @@ def overhang(
     return Overhang(mean, size, node) if size > _LEAST else None
 
 
+def _rises(corner: FloatArray, on: BoolArray, master: FloatArray) -> BoolArray:
+    """Whether facets rise from the master on the way from each corner that carries to the others.
+
+    Args:
+        corner: Corners of the facets [m], shape (m, nc, 3).
+        on: Which of them carry, shape (m, nc).
+        master: Corners of the master's facets [m].
+
+    Returns:
+        Shape (m, nc, nc), first the corner that carries.
+    """
+    at = closest_facets(corner[on], master, reach=np.inf)
+    normal = np.zeros_like(corner)
+    normal[on] = fc.frame(master[at.facet], at.xi)[2]
+    edge = corner[:, None] - corner[:, :, None]
+    rise: FloatArray = np.einsum("mkli,mki->mkl", edge, normal)
+    steep: BoolArray = rise > _RISES * np.linalg.norm(edge, axis=3)
+    return steep
+
+
 def inside_rim(
-    contact: Any, positions: tuple[FloatArray, ...], force: FloatArray
+    contact: Any,
+    positions: tuple[FloatArray, ...],
+    force: FloatArray,
+    held: BoolArray | None = None,
 ) -> Finding | None:
     """As `overhang`, of a contact, with a sentence and a remedy.
 
@@ -98,11 +134,12 @@ def inside_rim(
         contact: A contact of two surfaces.
         positions: Of all points of both, as of `ContactPair.positions` [m].
         force: Normal force of each point of the slave [N].
+        held: As of `overhang`.
     """
     (x, y), slave, master = positions, contact.slave, contact.master
     if not len(slave.facets):
         return None
-    found = overhang(x, slave.facets, force, y[master.facets])
+    found = overhang(x, slave.facets, force, y[master.facets], held)
     if found is None:
         return None
     one, two, node = slave.body.name, master.body.name, int(slave.original[found.node])

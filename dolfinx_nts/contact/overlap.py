@@ -131,20 +131,36 @@ class OverlapWatch:
         """
         if isinstance(pair, ObstacleContact) or not forces:
             return  # obstacles have no rim
-        for k, ((contact, bodies), force) in enumerate(zip(self._contacts, forces, strict=True)):
+        everywhere = [
+            contact.slave.at_all(force)
+            for (contact, _), force in zip(self._contacts, forces, strict=True)
+        ]
+        for k, (contact, bodies) in enumerate(self._contacts):
             # The surface of a contact of a body with itself may end where the body does not.
-            if contact not in pair.contacts or len(set(bodies)) < 2:
-                continue
-            everywhere = contact.slave.at_all(force)
-            if not everywhere.any():
+            if contact not in pair.contacts or len(set(bodies)) < 2 or not everywhere[k].any():
                 continue
             positions = contact.positions([u[b] for b in bodies])
             if k not in self._edges:
                 self._edges[k] = InnerEdges(contact.master.facets, positions[1])
+            held = self._held_otherwise(k, everywhere)
             yield from filter(None, (
-                inside_rim(contact, positions, everywhere),
-                in_inner_edge(self._edges[k], contact, positions, everywhere),
+                inside_rim(contact, positions, everywhere[k], held),
+                in_inner_edge(self._edges[k], contact, positions, everywhere[k]),
             ))  # fmt: skip
+
+    def _held_otherwise(self, k: int, forces: Sequence[FloatArray]) -> BoolArray:
+        """Which points of a contact's slave carry in another contact, shape (p,).
+
+        Args:
+            k: Number of the contact.
+            forces: Normal forces of all points of each contact's slave [N].
+        """
+        slave = self._contacts[k][0].slave
+        held = np.zeros(len(slave.points), dtype=bool)
+        for n, ((contact, _), force) in enumerate(zip(self._contacts, forces, strict=True)):
+            if n != k and contact.slave.body is slave.body:
+                held |= np.isin(slave.original, contact.slave.original[force > 0.0])
+        return held
 
     def enclosed(self, u: Sequence[FloatArray], time: float) -> list[Finding]:
         """Obstacles inside bodies that a contact is to hold out of them. Collective.
