@@ -587,6 +587,10 @@ def test_smoothing():
 
 
 # ---- contacts and systems
+def test_motion_of_a_name():
+    raises(TypeError, r"^body='left': pass a body, e.g. run", lambda: nts.motion_of("left"))
+
+
 def test_slave_is_master():
     body = continuum()
     surface, other = body.surface(top), body.surface(lambda x: x[0] < 1e-9)

@@ -52,8 +52,11 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
         v: Owned velocities [m/s], shape (num_owned,); default: likewise.
 
     Raises:
+        TypeError: `body` is none.
         ValueError: The body was destroyed.
     """
+    if not isinstance(body, Body):
+        raise TypeError(f"body={body!r}: pass a body, e.g. run.system.bodies[0]")
     body.check_alive()
     known = body.last_accepted()
     u, v = _owned(body, "u", u, known[0]), _owned(body, "v", v, known[1])
