@@ -69,6 +69,7 @@ class StepProblem:
         self.rtol, self.condense = rtol, condense
         self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
         self._asleep: dict[int, BodyTerms] = {}
+        self._evaluated: dict[int, BodyTerms] = {}
         self.awake: tuple[int, ...] = ()
         self._numbers: tuple[Any, ...] | None = None
         self.couplings = Couplings(system)
@@ -108,6 +109,7 @@ class StepProblem:
             moments: Where the forces on each body are taken; None: as the integrator's step has it.
         """
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
+        self._evaluated = {}
         self.loads.begin(state, dt, moments)
         at_rest = self._fly()
         lengths, way = self.lengths, [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
@@ -292,16 +294,33 @@ class StepProblem:
             self._closed,
         )  # fmt: skip
         force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
-        bodies = dict(self._asleep)
+        bodies, unmoved = dict(self._asleep), self._unmoved(values)
         for k in self.awake:
             body, u0, here = self.system.bodies[k], self.state.u[k], laid.of_body(k)
             u1 = values[here]
-            internal = self.factor * body.internal(u1)
-            external = self.factor * body.external(u1, self.loads.gravity)
+            if k in unmoved:
+                internal, external = self._evaluated[k].internal, self._evaluated[k].external
+            else:
+                internal = self.factor * body.internal(u1)
+                external = self.factor * body.external(u1, self.loads.gravity)
             du, coupling = u1 - u0, force[here]
             residual = self._inertial(body, du) - self.flight[k] + internal - external + coupling
             bodies[k] = BodyTerms(u1, du, internal, external, coupling, residual)
+        self._evaluated = bodies
         return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
+
+    def _unmoved(self, values: FloatArray) -> set[int]:
+        """Bodies that are where the last iterate had them, whose forces are known. Collective.
+
+        Most often bodies at rest before something hits them.
+        """
+        moved = [
+            k not in self._evaluated
+            or not np.array_equal(values[self.laid.of_body(k)], self._evaluated[k].u1)
+            for k in self.awake
+        ]
+        anywhere = global_max(self.system.comm, np.array(moved, dtype=np.float64))
+        return {k for k, moves in zip(self.awake, anywhere, strict=True) if not moves}
 
     def _closed(self, batch: ContactElements) -> float:
         """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
