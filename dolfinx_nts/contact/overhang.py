@@ -146,8 +146,8 @@ def inside_rim(
     text = (
         f"facets of {one!r} reach over the rim of {two!r}, and all of contact {contact.name!r} "
         f"acts at their nodes before it, most at node {node}, {found.distance:.3g} m inside the "
-        f"rim, or {found.size:.2g} of the surface's width: {one!r} tips about these nodes, not "
-        f"about the rim; use a finer mesh of {one!r} there, or take {two!r} as the slave"
+        f"rim, or {found.size:.2g} of the surface's width: what tips there does so about these "
+        f"nodes, not about the rim; use a finer mesh of {one!r} there, or take {two!r} as the slave"
     )
     place, grave = x[found.node] + contact.origin, found.size > _GRAVE
     return Finding(
