@@ -11,7 +11,8 @@ The file is described in `dolfinx_nts.output.state_file`; of its `notes` the run
 - `contacts`: names of the contacts of these;
 - `loads`: of each body the loads and supports that are constant, to tell a restart with others;
 - `last`: start and length of the last step [s], or null;
-- `promised`: largest energy and rounding that the ledger is held against [J];
+- `promised`: largest energies and rounding that the ledger is held against, and kinetic energy at
+  the start of bodies whose motion is prescribed [J];
 - `bounded`: whether nodes that infinite friction holds may slip;
 - `measured`: of each body, diagonals of its matrix and factors, from which rounding is judged;
 - `pace`: what `Adapt` remembers, see `PaceMemory`, but its accelerations, which are

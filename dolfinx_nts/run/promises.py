@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.step import balance
 from dolfinx_nts.step.accuracy import EXACT
@@ -46,16 +47,19 @@ class Promises:
         self._remedy += integrator.ledger_remedy
         self._open = f"use EnergyMomentum(){integrator.ledger_remedy}"
         self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if self._closes else _OPEN
-        self._largest, self._rounding = 0.0, 0.0
+        self._largest, self._whole, self._rounding = 0.0, 0.0, 0.0
+        # Of bodies whose motion is prescribed: which they are, and their kinetic energy at first.
+        self._driven: list[int] | None = None
+        self._first = 0.0
 
     @property
-    def memory(self) -> tuple[float, float]:
-        """Largest energy and rounding so far [J], for a run that goes on."""
-        return self._largest, self._rounding
+    def memory(self) -> tuple[float, float, float, float]:
+        """Largest energies, rounding and energy of driven bodies [J], for a run that goes on."""
+        return self._largest, self._whole, self._rounding, self._first
 
     def resume(self, memory: Sequence[float]) -> None:
         """Go on from another run's memory."""
-        self._largest, self._rounding = memory
+        self._largest, self._whole, self._rounding, self._first = memory
 
     def hold(self, problem: StepProblem, step: Evaluation, impulses: float) -> None:
         """Warn if the last row's ledger misses too much, or contact brought energy. Collective.
@@ -65,10 +69,8 @@ class Promises:
             step: Their solution.
             impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
         """
-        names = ("kinetic", "potential", "external_work", "friction_dissipation")
         before, row = self._solution.rows[-2:]
-        sizes = (abs(one[name]) for one in (before, row) for name in names)
-        self._largest = max(self._largest, *sizes)
+        self._measure(problem, before, row)
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         problem.system.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
         moved = np.sqrt(squares)
@@ -78,9 +80,10 @@ class Promises:
         self._rounding += _ROUNDING * _EPS * impulses / problem.dt * problem.rounded_length
         self._tell_gain(problem, step, before, row)
         missing = abs(row["ledger_residual"])
-        if missing <= self._promise * self._largest + self._rounding:
+        promise = max(self._promise * self._largest, _LEAST * self._whole)
+        if missing <= promise + self._rounding:
             return
-        part = missing / self._largest if self._largest else np.inf
+        part = self._part(missing)
         if self._closes:
             text = (
                 f"the ledger misses {missing:.3g} J, {part:.2g} of the largest energy, where this "
@@ -100,6 +103,36 @@ class Promises:
         doubtful = not part <= (_DOUBTFUL if self._closes else _OPEN)
         self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
 
+    def _measure(
+        self, problem: StepProblem, before: Mapping[str, Any], row: Mapping[str, Any]
+    ) -> None:
+        """Note the largest energies. Collective.
+
+        What bodies have whose motion is prescribed counts only for rounding: a heavy plate that
+        drives past would hide what a body on it gains.
+        """
+        names = ("kinetic", "potential", "external_work", "friction_dissipation")
+        sizes = [abs(one[name]) for one in (before, row) for name in names]
+        self._whole = max(self._whole, *sizes)
+        bodies, comm = problem.system.bodies, problem.system.comm
+        if self._driven is None and problem.integrator.inertia:
+            free = [float(len(body.fixed) < body.num_owned) for body in bodies]
+            self._driven = np.flatnonzero(global_max(comm, np.array(free)) == 0.0).tolist()
+        if self._driven:
+            v = problem.state.v
+            local = sum(0.5 * float(v[k] @ bodies[k].inertia(v[k])) for k in self._driven)
+            driven = float(comm.allreduce(local))
+            # The first row is that of the start, unless the run goes on.
+            self._first = self._first if len(self._solution.rows) > 2 else driven
+            work = abs(before["external_work"] - driven + self._first)
+            sizes = [before["kinetic"] - driven, work]
+            sizes += [abs(one[name]) for one in (before, row) for name in names[1::2]]
+        self._largest = max(self._largest, *sizes)
+
+    def _part(self, energy: float) -> float:
+        """An energy over the largest one."""
+        return energy / self._largest if self._largest else np.inf
+
     def _tell_gain(
         self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
         row: Mapping[str, Any],
@@ -112,7 +145,7 @@ class Promises:
             self._solution.warn(
                 "energy from massless nodes", row["time"], massless,
                 f"nodes without mass that leave within steps have brought {massless:.3g} J, "
-                f"{massless / self._largest:.2g} of the largest energy; use a smaller dt",
+                f"{self._part(massless):.2g} of the largest energy; use a smaller dt",
                 grave=True,
             )  # fmt: skip
         remedy = (
@@ -128,7 +161,7 @@ class Promises:
         elif gain > 0.0 and total > _GAIN * self._largest + self._rounding:
             gain, text = total, (
                 f"nodes that start steps behind their facets have brought {total:.3g} J in all, "
-                f"{total / self._largest:.2g} of the largest energy; {remedy}"
+                f"{self._part(total):.2g} of the largest energy; {remedy}"
             )
         else:
             # What a coefficient of restitution takes is asked for.
@@ -137,7 +170,7 @@ class Promises:
                 self._solution.warn(
                     "energy lost to contact", row["time"], -total,
                     f"gaps that close in mid step have taken {-total:.3g} J, "
-                    f"{-total / self._largest:.2g} of the largest energy: how bodies rebound may "
+                    f"{self._part(-total):.2g} of the largest energy: how bodies rebound may "
                     "depend on it; compare with a smaller dt and a finer mesh, or pass "
                     "adapt=Adapt(...)",
                 )  # fmt: skip
