@@ -365,3 +365,23 @@ def test_writers_see_the_motion_of_supports_from_the_start(mpi_tmp_path):
         first = next(csv.DictReader(file))
     assert list(first)[1].startswith("kinetic")
     assert float(list(first.values())[1]) == run.balance["kinetic"][0] > 0
+
+
+@pytest.mark.mpi
+def test_a_longer_run_takes_no_longer_steps():
+    """A cube that vibrates while it flies far is followed as closely however far it is to fly."""
+
+    def stretched(x):
+        return np.array([5.0 + 0.5 * (x[0] - 0.5), 0.0 * x[0], 0.0 * x[0]])
+
+    times = []
+    for t_end in (1.0, 3.0):
+        mesh = create_box(COMM, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)
+        cube = nts.Continuum(mesh, nts.NeoHookean(1e5, 0.3), density=1e3, velocity=stretched)
+        run = nts.simulate(
+            nts.System([cube]), nts.EnergyMomentum(), dt=0.1, t_end=t_end,
+            adapt=nts.Adapt(tolerance=1e-4), progress=False,
+        )  # fmt: skip
+        times.append(run.balance["time"])
+    early, late = (t[t < 0.8] for t in times)
+    assert len(early) > 20 and early == pytest.approx(late, rel=1e-9)

@@ -18,6 +18,7 @@ from mpi4py import MPI
 
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.state import State
+from dolfinx_nts.step.lengths import Lengths
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import known_options
@@ -41,11 +42,12 @@ class Adapt:
 
     Attributes:
         tolerance: Largest error of a step, > 0: of the motion (root of its square, weighted by
-            mass) relative to what the run's largest such speed covers until t_end; and of the
-            energy that nodes lose by closing their gaps in mid step, relative to the largest
-            kinetic energy. A step in which two surfaces that were apart touch and would lose more
-            is shortened to end where the first gap closes, by the velocities at its start; gaps
-            that close while other nodes of the pair carry are not met.
+            mass) relative to what the run's largest such speed covers until t_end, at most half the
+            diagonal of the box around all bodies in the reference; and of the energy that nodes
+            lose by closing their gaps in mid step, relative to the largest kinetic energy. A step
+            in which two surfaces that were apart touch and would lose more is shortened to end
+            where the first gap closes, by the velocities at its start; gaps that close while other
+            nodes of the pair carry are not met.
         shortest: Smallest step, and smallest time to a gap's closing, over `dt`, in (0, 1].
 
     Raises:
@@ -122,7 +124,7 @@ class Pace:
         self._tolerance, self._span = adapt.tolerance, span
         self._longest, self.shortest = dt, adapt.shortest * dt
         self.dt = self.shortest
-        self._top = _norms(system, state.v)[0]
+        self._top, self._size = _norms(system, state.v)[0], _size(system)
         self._before: tuple[float, tuple[FloatArray, ...]] | None = None
         self._error, self._meets, self.exceeds = 0.0, False, False
 
@@ -219,7 +221,7 @@ class Pace:
         for body, e in zip(bodies, missed, strict=True):
             e[body.fixed] = 0.0
         speed, error = _norms(problem.system, v1, missed)
-        limit = self._tolerance * self._span * max(self._top, speed)
+        limit = self._tolerance * min(self._span * max(self._top, speed), self._size)
         return speed, error / limit if error > 0.0 else error
 
     def _expels(self, problem: StepProblem, step: Evaluation) -> bool:
@@ -228,6 +230,17 @@ class Pace:
             gain += float(np.maximum(c.gains(part, problem.factor), 0.0).sum())
         total = float(problem.system.comm.allreduce(gain))
         return total > self._tolerance * 0.5 * self._top**2
+
+
+def _size(system: System) -> float:
+    """Of the bodies that move, in the norm of their mass; infinite of points alone. Collective."""
+    mass = 0.0
+    for body in system.bodies:
+        free = np.ones(body.num_owned, dtype=bool)
+        free[body.fixed] = False
+        mass += float(body.nodal_mass[free].sum()) / 3.0
+    radius = Lengths(system).radius
+    return math.sqrt(system.comm.allreduce(mass)) * radius if radius else math.inf
 
 
 def _norms(system: System, *fields: Any) -> list[float]:
