@@ -145,7 +145,8 @@ def test_level_0_knows_neither_mpi_nor_petsc(module):
 
 #: What makes PETSc matrices.
 MATRICES = {
-    "step.assembly", "step.schur", "step.mass_solves", "step.model_problem", "dolfinx_compat",
+    "step.assembly", "step.schur", "step.mass_solves", "step.model_problem", "step.instability",
+    "dolfinx_compat",
 }  # fmt: skip
 
 

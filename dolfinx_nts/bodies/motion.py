@@ -55,7 +55,7 @@ def motion_of(body: Body, u: FloatArray | None = None, v: FloatArray | None = No
         TypeError: `body` is none.
         ValueError: The body was destroyed.
     """
-    if not isinstance(body, Body):
+    if not hasattr(body, "nodal_mass"):
         raise TypeError(f"body={body!r}: pass a body, e.g. run.system.bodies[0]")
     body.check_alive()
     known = body.last_accepted()
