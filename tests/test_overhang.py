@@ -104,6 +104,18 @@ def test_nothing_is_told(points, facets, force):
     assert overhang(points, facets, force, TABLE) is None
 
 
+@pytest.mark.parametrize("rows, told", [((0.4, 0.6), False), ((0.4,), True)])
+def test_what_stands_between_two_rims_does_not_tip(rows, told):
+    """On a wall along x of 0.3 m, with rows of nodes 0.05 m inside its rims."""
+    points, facets = face(3, start=1.0)
+    wall = TABLE * [1, 0.3, 1] + [0, 0.35, 0]
+    force = np.isclose(points[:, 1, None], rows).any(axis=1) * 1.0
+    found = overhang(points, facets, force, wall)
+    assert (found is not None) == told
+    if told:
+        assert found.distance == pytest.approx(0.05, rel=1e-9)
+
+
 def test_what_another_contact_holds_does_not_tip():
     """A brick of one cell with its ends on two others; nodes between its ends reach beyond."""
     points, facets = face(1)

@@ -24,6 +24,8 @@ _BESIDE = 0.05
 #: the node that carries, unless the facet rises from the master by more than the second part, as
 #: that of a ball does.
 _FLAT, _RISES = 0.2, 0.05
+#: It tips to one side: the mean way to the rim is this part of its length, or more.
+_ONE_SIDE = 0.5
 #: Distance from the rim, in widths of the slave's surface, that is told, and that is grave.
 _LEAST, _GRAVE = 0.05, 0.3
 
@@ -91,10 +93,17 @@ def overhang(
         for a in (way, height, _rises(corner, on, corners))
     )
     nearest[~(height <= _FLAT * nearest) | rises] = np.inf
-    inside = np.full(len(x), np.inf)
-    np.minimum.at(inside, facets[on], nearest[on])
+    way = np.take_along_axis(arm, chosen[..., None], axis=2)[:, :, 0]
+    # The nearest last, as of several facets of a node it counts.
+    order = np.argsort(-nearest[on])
+    node = facets[on][order]
+    inside, to_rim = np.full(len(x), np.inf), np.zeros_like(x)
+    inside[node], to_rim[node] = nearest[on][order], way[on][order]
     rim = np.flatnonzero((force > 0.0) & np.isfinite(inside))
     if float(force[rim].sum()) < (1.0 - _ELSEWHERE) * total:
+        return None
+    aside = float(np.linalg.norm(force[rim] @ to_rim[rim]))
+    if aside < _ONE_SIDE * float(force[rim] @ inside[rim]):
         return None
     mean = float(np.average(inside[rim], weights=force[rim]))
     size = mean / float(np.ptp(x, axis=0).max())
