@@ -53,6 +53,42 @@ def test_a_pendulum_stands_or_hangs(up):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("other", ["steel", "boulder"])
+def test_a_pendulum_beside_what_is_stiff_or_heavy(other):
+    """What stands elsewhere in the scene does not hide that it falls."""
+    arm = nts.RigidBody(
+        box([-0.05, -0.05, 0], [0.05, 0.05, 1], 1), density=1e3, name="arm"
+    )
+    hinge = nts.Revolute(arm, None, point=(0, 0, 0), axis=(0, 1, 0))
+    if other == "steel":
+        steel = nts.NeoHookean(young=2e11, poisson=0.3)
+        foot, mesh = nts.Dirichlet(at(2, 0.0)), box([2, 0, 0], [3, 1, 1], 1)
+        body = nts.Continuum(mesh, steel, density=7.8e3, bcs=[foot], name=other)
+    else:
+        mesh = box([2, 0, 0], [4, 2, 2], 1)
+        body = nts.RigidBody(mesh, density=3e3, motion=(0, 0, 0), rotation=(0, 0, 0), name=other)
+    run = nts.equilibrium(nts.System([arm, body], joints=[hinge], gravity=(0, 0, -9.81)))
+    assert told(run) == 1
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("metre", [1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("joint", [nts.Prismatic, nts.Cylindrical, nts.Planar])
+def test_a_slider_may_stand_anywhere(joint, metre):
+    """Its weight acts beside the point of the joint; along the axis nothing resists or drives."""
+    options = dict(axis=(0, 0, 1)) if joint is nts.Planar else dict(axis=(1, 0, 0))
+    # A cylindrical joint lets it turn, to hang below the axis.
+    low, high = [0, -0.1, -0.2], [0.2, 0.1, 0]
+    mesh = box(*(metre * np.array(end) for end in (low, high)), 1)
+    slider = nts.RigidBody(mesh, density=1e3 / metre**3, name="slider")
+    held = joint(slider, None, point=(0, 0, 0), **options)
+    run = nts.equilibrium(
+        nts.System([slider], joints=[held], gravity=(0, 0, -9.81 * metre))
+    )
+    assert "unstable equilibrium" not in run.warnings
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("rigid", [True, False])
 def test_a_block_that_stands_is_stable(rigid):
     """Contact and friction hold it, though nothing of its own does."""
