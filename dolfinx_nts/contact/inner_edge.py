@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from dolfinx_nts.contact.crossings import Finding
 from dolfinx_nts.contact.search import closest_facets
@@ -81,26 +82,25 @@ class InnerEdges:
         ends, normals = y[self._ends], self._planes(y, self._two)[1]
         corners = y[self._facets]
         sizes = fc.size(corners)[self._two].min(axis=1)
-        low, high = points[carry].min(axis=0), points[carry].max(axis=0)
-        reach = sizes[:, None]
-        near = (ends.min(axis=1) - reach <= high) & (ends.max(axis=1) + reach >= low)
-        worst = None
-        for k in np.flatnonzero(near.all(axis=1)):
-            x, along = points[carry] - ends[k, 0], ends[k, 1] - ends[k, 0]
-            on = np.clip(x @ along / (along @ along), 0.0, 1.0)
-            away = np.linalg.norm(x - on[:, None] * along, axis=1)
-            depths = -(x @ normals[k].T)
-            depth = depths.max(axis=1)
-            size = float(sizes[k])
-            depth[(away > _NEAR * depth) | (depth > size)] = 0.0
-            deep = np.flatnonzero(depth > _DEEP * size)
-            # On the far side of a thin wall other facets are nearer.
-            alone = closest_facets(points[carry[deep]], corners, reach=_ALONE * depth[deep])
-            for n in deep[alone.facet < 0]:
-                if worst is None or depth[n] > worst.depth:
-                    facet, part = int(self._two[k, depths[n].argmax()]), float(depth[n]) / size
-                    worst = Behind(int(carry[n]), facet, float(depth[n]), part)
-        return worst
+        # Farther away none lies in the edge, see below.
+        reach = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) + _NEAR * sizes
+        at = cKDTree(points[carry]).query_ball_point(ends.mean(axis=1), reach)
+        edge = np.repeat(np.arange(len(at)), [len(near) for near in at])
+        node = carry[np.concatenate(at).astype(np.int64)]
+        x, along = points[node] - ends[edge, 0], (ends[:, 1] - ends[:, 0])[edge]
+        on = np.einsum("ni,ni->n", x, along) / np.einsum("ni,ni->n", along, along)
+        away = np.linalg.norm(x - np.clip(on, 0.0, 1.0)[:, None] * along, axis=1)
+        depths, size = -np.einsum("ni,nki->nk", x, normals[edge]), sizes[edge]
+        depth = depths.max(axis=1)
+        deep = np.flatnonzero((away <= _NEAR * depth) & (depth <= size) & (depth > _DEEP * size))
+        # On the far side of a thin wall other facets are nearer.
+        others = closest_facets(points[node[deep]], corners, reach=_ALONE * depth[deep])
+        alone = deep[others.facet < 0]
+        if not len(alone):
+            return None
+        n = alone[depth[alone].argmax()]
+        facet = int(self._two[edge[n], depths[n].argmax()])
+        return Behind(int(node[n]), facet, float(depth[n]), float(depth[n] / size[n]))
 
     def _planes(self, y: FloatArray, two: IntArray) -> tuple[FloatArray, FloatArray]:
         """Middles and normals of pairs of facets, shape (n, 2, 3) each."""
