@@ -104,13 +104,18 @@ class OverlapWatch:
         """
         now = [pair.where(u, time) for pair in self._pairs]
         findings: list[Finding] = []
-        for k, way in self._due(now, last):
-            before = self._looked.get(k)
+        due = self._due(now, last)
+        # Obstacles have no rim and no inner edge.
+        between = [k for k, _ in due if isinstance(self._pairs[k], BodyPair)]
+        everywhere = self._everywhere(forces) if between else []
+        for k, way in due:
+            before, pair = self._looked.get(k), self._pairs[k]
             if before and way > before.pause.clear + before.pause.through:
-                findings += self._pairs[k].passed(before.where, now[k], way, before.pause.through)
-            found, pause = self._pairs[k].look(now[k])
+                findings += pair.passed(before.where, now[k], way, before.pause.through)
+            found, pause = pair.look(now[k])
             findings += found
-            findings += self._of_contacts(self._pairs[k], u, forces)
+            if everywhere and isinstance(pair, BodyPair):
+                findings += self._of_contacts(pair, u, everywhere)
             self._looked[k] = _Looked(now[k], pause)
         worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
@@ -119,22 +124,25 @@ class OverlapWatch:
                 worst[key] = f
         return list(worst.values())
 
+    def _everywhere(self, forces: Sequence[FloatArray]) -> list[FloatArray]:
+        """Forces of all points of each contact's slave, none if there are none. Collective."""
+        if not forces:
+            return []
+        both = zip(self._contacts, forces, strict=True)
+        return [contact.slave.at_all(force) for (contact, _), force in both]
+
     def _of_contacts(
-        self,
-        pair: BodyPair | ObstacleContact,
-        u: Sequence[FloatArray],
-        forces: Sequence[FloatArray],
+        self, pair: BodyPair, u: Sequence[FloatArray], everywhere: Sequence[FloatArray]
     ) -> Iterator[Finding]:
-        """What is told of contacts by their forces; as of `look`. Collective.
+        """What is told of contacts by their forces. Collective.
 
         That one ends inside the rim of a master, and that nodes lie in inner edges of one.
+
+        Args:
+            pair: The bodies between which they are.
+            u: As of `look`.
+            everywhere: Normal forces of all points of each contact's slave [N].
         """
-        if isinstance(pair, ObstacleContact) or not forces:
-            return  # obstacles have no rim
-        everywhere = [
-            contact.slave.at_all(force)
-            for (contact, _), force in zip(self._contacts, forces, strict=True)
-        ]
         for k, (contact, bodies) in enumerate(self._contacts):
             # The surface of a contact of a body with itself may end where the body does not.
             if contact not in pair.contacts or len(set(bodies)) < 2 or not everywhere[k].any():
