@@ -73,12 +73,13 @@ def test_a_pendulum_beside_what_is_stiff_or_heavy(other):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("metre", [1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("far", [0.0, 3.0])
 @pytest.mark.parametrize("joint", [nts.Prismatic, nts.Cylindrical, nts.Planar])
-def test_a_slider_may_stand_anywhere(joint, metre):
+def test_a_slider_may_stand_anywhere(joint, far, metre):
     """Its weight acts beside the point of the joint; along the axis nothing resists or drives."""
     options = dict(axis=(0, 0, 1)) if joint is nts.Planar else dict(axis=(1, 0, 0))
     # A cylindrical joint lets it turn, to hang below the axis.
-    low, high = [0, -0.1, -0.2], [0.2, 0.1, 0]
+    low, high = [far, -0.1, -0.2 - far], [far + 0.2, 0.1, -far]
     mesh = box(*(metre * np.array(end) for end in (low, high)), 1)
     slider = nts.RigidBody(mesh, density=1e3 / metre**3, name="slider")
     held = joint(slider, None, point=(0, 0, 0), **options)

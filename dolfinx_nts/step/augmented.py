@@ -93,6 +93,24 @@ class AugmentedMatrix:
             self.matrix.corner.setNearNullSpace(modes)
             modes.destroy()
 
+    def turning(self, tangents: Sequence[FloatArray]) -> FloatArray:
+        """Row sums of what elements add to the bodies' own coordinates. Collective.
+
+        It is the stiffness that forces have because they turn with the bodies, in sizes.
+
+        Args:
+            tangents: As of `assemble`, which is to follow.
+        """
+        sums = [np.zeros_like(a) for a in tangents]
+        for out, a, around in zip(sums, tangents, self._stiffness, strict=True):
+            k = np.arange(around.shape[1])
+            out[:, k, k] = np.abs(a[:, : len(k), : len(k)]).sum(axis=2)
+        self.matrix.assemble(sums, fresh=True)
+        diagonal = self.matrix.corner.getDiagonal()
+        found: FloatArray = np.abs(diagonal.array_r)
+        diagonal.destroy()
+        return found
+
     def split_bodies(self, snes: Any, operator: Any) -> None:
         """Tell continua, for a multigrid, from other bodies. Collective, before the first solve.
 

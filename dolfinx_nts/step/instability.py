@@ -24,10 +24,12 @@ _SKEW = 1e-3
 #: Stiffness against a motion, relative to that of its coordinates, that counts as none: a body may
 #: be free to move along a surface.
 _NONE = 1e-8
-#: The same of rigid bodies, relative to that of all their places or directors. They have none but
-#: that of contacts and joints, as stiff as other bodies of the scene, or as the heaviest, need it.
-#: In 1e7 weights over the size, forces that a joint turns as a body slides count as 1e-14 of it.
-_NONE_OF_RIGID = 1e-12
+#: The same of rigid bodies, relative to what forces that turn with the bodies give them. Where such
+#: forces change as a body slides, springs in place of joints leave less than nothing of its
+#: resistance: the square of that over their stiffness.
+_NONE_OF_RIGID = 1e-3
+#: Rounding of a stiffness, relative to the largest of the body.
+_ROUNDING = 1e-13
 
 
 def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
@@ -52,13 +54,17 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
         lambda body: _STIFF * stabilization.stiffness(body, (body,)),
     )  # fmt: skip
     coupled = step.parts if problem.laid.blocks else []
-    augmented.assemble([part.tangent for part in coupled], fresh=True)
+    elements = [part.tangent for part in coupled]
+    turning = augmented.turning(elements)
+    augmented.assemble(elements, fresh=True)
     matrix = augmented.matrix.corner.convert("aij", PETSc.Mat())
     augmented.destroy()
     transpose = matrix.transpose(PETSc.Mat())
     matrix.axpy(1.0, transpose)
     transpose.destroy()
-    negative = _negative_pivots(matrix, [problem.system.bodies[k] for k in problem.awake])
+    negative = _negative_pivots(
+        matrix, [problem.system.bodies[k] for k in problem.awake], turning
+    )
     matrix.destroy()
     return negative
 
@@ -72,22 +78,29 @@ def _is_symmetric(matrix: Any) -> bool:
     return small
 
 
-def _no_stiffness(body: Any, size: FloatArray) -> FloatArray:
-    """What counts as none at each coordinate of a body, of these stiffnesses, (num_owned,)."""
+def _no_stiffness(body: Any, size: FloatArray, turning: FloatArray) -> FloatArray:
+    """What counts as none at each coordinate of a body, shape (num_owned,).
+
+    Args:
+        body: The body.
+        size: Its stiffness.
+        turning: What turning forces give it, see `AugmentedMatrix.turning`.
+    """
     if not body.rigid:
         return _NONE * size
     found, places = np.zeros_like(size), np.repeat(body.places, 3)
     for kind in (places, ~places):
-        found[kind] = _NONE_OF_RIGID * size[kind].max(initial=0.0)
+        found[kind] = _NONE_OF_RIGID * turning[kind].max(initial=0.0)
+        found[kind] += _ROUNDING * size[kind].max(initial=0.0)
     return found
 
 
-def _negative_pivots(matrix: Any, bodies: Sequence[Any]) -> int:
+def _negative_pivots(matrix: Any, bodies: Sequence[Any], turning: FloatArray) -> int:
     """Of a symmetric matrix, whose diagonal is raised by what counts as none. Collective."""
     diagonal = matrix.getDiagonal()
     ends = np.cumsum([body.num_owned for body in bodies])[:-1]
-    parts = np.split(np.abs(diagonal.array_r), ends)
-    none = [_no_stiffness(body, size) for body, size in zip(bodies, parts, strict=True)]
+    parts = (np.split(each, ends) for each in (np.abs(diagonal.array_r), turning))
+    none = [_no_stiffness(body, *both) for body, *both in zip(bodies, *parts, strict=True)]
     diagonal.array_w[:] += np.concatenate(none)
     matrix.setDiagonal(diagonal)
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
