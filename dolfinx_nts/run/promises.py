@@ -70,7 +70,7 @@ class Promises:
             impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
         """
         before, row = self._solution.rows[-2:]
-        self._measure(problem, before, row)
+        self._measure(problem, step, before, row)
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         problem.system.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
         moved = np.sqrt(squares)
@@ -104,8 +104,9 @@ class Promises:
         self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
 
     def _measure(
-        self, problem: StepProblem, before: Mapping[str, Any], row: Mapping[str, Any]
-    ) -> None:
+        self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
+        row: Mapping[str, Any],
+    ) -> None:  # fmt: skip
         """Note the largest energies. Collective.
 
         What bodies have whose motion is prescribed counts only for rounding: a heavy plate that
@@ -119,14 +120,20 @@ class Promises:
             free = [float(len(body.fixed) < body.num_owned) for body in bodies]
             self._driven = np.flatnonzero(global_max(comm, np.array(free)) == 0.0).tolist()
         if self._driven:
-            v = problem.state.v
-            local = sum(0.5 * float(v[k] @ bodies[k].inertia(v[k])) for k in self._driven)
-            driven = float(comm.allreduce(local))
+            local = np.zeros(2)
+            for k in self._driven:
+                v, acceleration = problem.state.v[k], problem.state.acceleration(k)
+                after = problem.integrator.advance(
+                    step.bodies[k].du, v, acceleration, problem.dt
+                )[0]
+                local += [0.5 * float(w @ bodies[k].inertia(w)) for w in (v, after)]
+            driven = comm.allreduce(local).tolist()
             # The first row is that of the start, unless the run goes on.
-            self._first = self._first if len(self._solution.rows) > 2 else driven
-            work = abs(before["external_work"] - driven + self._first)
-            sizes = [before["kinetic"] - driven, work]
-            sizes += [abs(one[name]) for one in (before, row) for name in names[1::2]]
+            self._first = self._first if len(self._solution.rows) > 2 else driven[0]
+            sizes = [abs(one[name]) for one in (before, row) for name in names[1::2]]
+            for one, own in zip((before, row), driven, strict=True):
+                work = abs(one["external_work"] - own + self._first)
+                sizes += [one["kinetic"] - own, work]
         self._largest = max(self._largest, *sizes)
 
     def _part(self, energy: float) -> float:
