@@ -222,6 +222,35 @@ def test_a_stiffness_that_changes_between_load_steps_is_named():
     assert warning.count == 1 and warning.first == 0.5 and not warning.grave
 
 
+class Driven(PointMass):
+    """A mass that moves along x as prescribed."""
+
+    def __init__(self, mass, speed):
+        super().__init__(COMM, mass, (0.0, 0.0, 0.0), (speed, 0.0, 0.0), name="driven")
+        self.fixed = np.arange(self.num_owned)
+
+    def prescribed(self, time):
+        return time * self.initial_velocity
+
+
+@pytest.mark.mpi
+def test_a_gain_in_one_step_is_measured_without_driven_bodies(monkeypatch):
+    """0.1 J of 1 J, beside a mass of 2e6 kg at 1 m/s."""
+    monkeypatch.setattr("dolfinx_nts.step.balance.expelled", lambda *_: "by one node")
+    told = []
+    solution = SimpleNamespace(warn=lambda kind, *rest, **_: told.append((kind, *rest)))
+    stepper = nts.Stepper(nts.System([Sprung(1.0), Driven(2e6, 1.0)]), nts.EnergyMomentum())
+    stepper.problem.begin(stepper.state, 0.05)
+    step = stepper.solver.solve()
+    row = dict(stepper.solution.rows[-1], energy=1e6 + 1.0, kinetic=1e6 + 1.0)
+    solution.rows = [row, row | {"time": 0.05, "contact_defect": -0.1}]
+    Promises(solution, nts.EnergyMomentum(), 1e-12).hold(stepper.problem, step, 0.0)
+    stepper.close()
+    ((kind, _, size, text),) = told
+    assert kind == "energy from behind facets" and size == 0.1
+    assert text.startswith("nodes that start behind their facets bring 0.1 J")
+
+
 def impact_on_a_heavy_plate(along):
     """A cube of 2 kJ hits a plate of 144 t; both drive along the plate at a speed [m/s]."""
     plate = nts.RigidBody(

@@ -70,7 +70,7 @@ class Promises:
             impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
         """
         before, row = self._solution.rows[-2:]
-        self._measure(problem, step, before, row)
+        energy = self._measure(problem, step, before, row)
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         problem.system.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
         moved = np.sqrt(squares)
@@ -78,7 +78,7 @@ class Promises:
         # Forces do some work even where nothing moves, as gaps are solved to 8 eps of positions:
         # the 2,450 N at each corner of a box at rest act over 1.7e-15 m.
         self._rounding += _ROUNDING * _EPS * impulses / problem.dt * problem.rounded_length
-        self._tell_gain(problem, step, before, row)
+        self._tell_gain(problem, step, before, row, energy)
         missing = abs(row["ledger_residual"])
         promise = max(self._promise * self._largest, _LEAST * self._whole)
         if missing <= promise + self._rounding:
@@ -106,15 +106,15 @@ class Promises:
     def _measure(
         self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
         row: Mapping[str, Any],
-    ) -> None:  # fmt: skip
-        """Note the largest energies. Collective.
+    ) -> float:  # fmt: skip
+        """Note the largest energies; return that at the end of the step [J]. Collective.
 
         What bodies have whose motion is prescribed counts only for rounding: a heavy plate that
         drives past would hide what a body on it gains.
         """
         names = ("kinetic", "potential", "external_work", "friction_dissipation")
         sizes = [abs(one[name]) for one in (before, row) for name in names]
-        self._whole = max(self._whole, *sizes)
+        self._whole, driven = max(self._whole, *sizes), [0.0, 0.0]
         bodies, comm = problem.system.bodies, problem.system.comm
         if self._driven is None and problem.integrator.inertia:
             free = [float(len(body.fixed) < body.num_owned) for body in bodies]
@@ -135,6 +135,7 @@ class Promises:
                 work = abs(one["external_work"] - own + self._first)
                 sizes += [one["kinetic"] - own, work]
         self._largest = max(self._largest, *sizes)
+        return abs(float(row["energy"]) - driven[1])
 
     def _part(self, energy: float) -> float:
         """An energy over the largest one."""
@@ -142,7 +143,7 @@ class Promises:
 
     def _tell_gain(
         self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
-        row: Mapping[str, Any],
+        row: Mapping[str, Any], energy: float,
     ) -> None:  # fmt: skip
         """Warn if contact has brought energy, in this step or in all. Collective."""
         total = row["impact_restored"] - row["contact_defect"]
@@ -159,7 +160,7 @@ class Promises:
             "use a finer or smoother master, or a smaller, constant dt; where faces of the master "
             "meet at an inner edge, declare a contact for each"
         )
-        if gain > _GAIN * abs(row["energy"]) + self._rounding:
+        if gain > _GAIN * energy + self._rounding:
             where = balance.expelled(problem, step)
             text = (
                 f"nodes that start behind their facets bring {gain:.3g} J to "
