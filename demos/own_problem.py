@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.output import Fields
 from dolfinx_nts.output.pictures import picture
 
@@ -55,7 +56,7 @@ class Block(nts.Body):
         dx = ufl.dx(metadata={"quadrature_degree": 2})
         work = ufl.derivative(energy(ufl.Identity(3) + ufl.grad(self.u)) * dx, self.u, w)
         slope = ufl.derivative(work, self.u, du)
-        self._force, self._stiffness = compat.compile_forms([work, slope])
+        self._force, self._stiffness = compile_forms([work, slope])
         self._vector, self._matrix = (
             compat.create_vector(self.space), compat.create_matrix(self._stiffness)
         )  # fmt: skip
@@ -72,7 +73,7 @@ class Block(nts.Body):
 
     def force(self):
         """Internal forces [N]."""
-        compat.assemble_vector(self._vector, self._force)
+        assemble_vector(self._vector, self._force)
         return self._vector.array_r.copy()
 
     def stiffness(self):

@@ -7,8 +7,10 @@ import importlib
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import cffi
 import dolfinx
 import dolfinx.fem.petsc as fem_petsc
 import numpy as np
@@ -171,18 +173,22 @@ def without_floats() -> Iterator[None]:
 
 
 @contextmanager
-def _told_compiler(what: str) -> Iterator[None]:
+def _told_compiler(what: str) -> Iterator[list[Path]]:
     """Tell in one line that something is compiled, which is not in FFCx's cache, and nothing else.
 
     0.5.2 sends the C compiler's progress to the root logger, whose level it raises itself. Of
     spaces, too: their elements are compiled. Errors are still raised and printed.
+
+    Yields:
+        The C files that FFCx takes or makes, one after the other.
     """
     before, look = logging.root.manager.disable, ffcx_jit.get_cached_module
-    told = False
+    told, sources = False, []
 
     def looked(*arguments: Any) -> Any:
         nonlocal told
         found = look(*arguments)
+        sources.append(Path(arguments[2], f"{arguments[0]}.c"))
         if found[0] is None and not told:
             logger.info("compiling %s, which is kept in %s", what, arguments[2])
             logging.disable(logging.INFO)
@@ -191,7 +197,7 @@ def _told_compiler(what: str) -> Iterator[None]:
 
     ffcx_jit.get_cached_module = looked
     try:
-        yield
+        yield sources
     finally:
         ffcx_jit.get_cached_module = look
         logging.disable(before)
@@ -296,34 +302,68 @@ C_FLAGS = ["-O2", "-g0", "-fno-math-errno", "-fno-trapping-math"]
 _PATIENCE = 600
 
 
+def _jit_options() -> tuple[dict[str, Any], dict[str, Any]]:
+    """DOLFINx's options of the compiler, as they are and as they are by default."""
+    named = "PARAMETERS" if _OLD else "OPTIONS"
+    defaults = getattr(jit, f"DOLFINX_DEFAULT_JIT_{named}")
+    chosen = getattr(jit, f"get_{named.lower()}")()
+    return chosen, {name: default[0] for name, default in defaults.items()}
+
+
 def jit_options() -> dict[str, Any]:
     """What differs from DOLFINx's defaults when forms are compiled, but for what a user chose.
 
     A file `dolfinx_jit_options.json` (0.5.2: `dolfinx_jit_parameters.json`) in the working folder
     or in `~/.config/dolfinx` is the user's choice.
     """
-    named = "PARAMETERS" if _OLD else "OPTIONS"
-    defaults = getattr(jit, f"DOLFINX_DEFAULT_JIT_{named}")
-    chosen = getattr(jit, f"get_{named.lower()}")()
+    chosen, defaults = _jit_options()
     ours = {"cffi_extra_compile_args": C_FLAGS, "timeout": _PATIENCE}
-    return {name: value for name, value in ours.items() if chosen[name] == defaults[name][0]}
+    return {name: value for name, value in ours.items() if chosen[name] == defaults[name]}
 
 
-def compile_forms(forms: Sequence[Any]) -> list[Any]:
-    """Compile forms; signatures first because 0.5.2's depend on what was compiled before."""
-    forms = [canonical(f) for f in forms]
-    for f in forms:
-        if _OLD:
-            # Compiling a form sets this on its mesh, and so would change the next one's signature.
-            for domain in f.ufl_domains():
-                domain.ufl_coordinate_element()._sub_element._variant = "equispaced"
-        f.signature()
+def chosen_flags() -> list[str]:
+    """The C compiler's flags that a user chose in that file."""
+    name = "cffi_extra_compile_args"
+    chosen, defaults = (options[name] for options in _jit_options())
+    return [] if chosen == defaults else list(chosen)
+
+
+def compile_form(form: Any) -> tuple[Any, Path]:
+    """A compiled form, and FFCx's C code of it."""
+    form = canonical(form)
+    if _OLD:
+        # Compiling a form sets this on its mesh, and so would change the next one's signature.
+        for domain in form.ufl_domains():
+            domain.ufl_coordinate_element()._sub_element._variant = "equispaced"
     options = jit_options()
     given: dict[str, Any] = {"jit_options": options}
     if _OLD:
         given = {"jit_params": options, "form_compiler_params": {}}
-    with _told_compiler("forms of a material or mesh that is new here"):
-        return [fem.form(f, **given) for f in forms]
+    with _told_compiler("forms of a material or mesh that is new here") as sources:
+        return fem.form(form, **given), sources[-1]
+
+
+def packed(form: Any) -> tuple[FloatArray | None, FloatArray]:
+    """Coefficients of the cells of a compiled form over cells, (cells, n), and constants, (m,)."""
+    form = getattr(form, "_cpp_object", form)
+    found = list(cpp.fem.pack_coefficients(form).values())
+    return found[0] if found and found[0].size else None, cpp.fem.pack_constants(form)
+
+
+def cell_kernel(form: Any) -> Any:
+    """FFCx's kernel of a compiled form's first integral, of six arrays and what it does not need.
+
+    They are entries, coefficients, constants and coordinates, see `ufcx_tabulate_tensor_float64`.
+    """
+    made = form.ufcx_form
+    first = made.form_integrals[0] if hasattr(made, "form_integrals") else made.integrals(0)[0]
+    address = int(cffi.FFI().cast("uintptr_t", first.tabulate_tensor_float64))
+    return ctypes.CFUNCTYPE(None, *(ctypes.c_void_p,) * 7)(address)
+
+
+def turns_dofs(space: Any) -> bool:
+    """Whether entries of a cell depend on how its neighbours are numbered."""
+    return bool(space.element.needs_dof_transformations)
 
 
 def create_vector(space: Any) -> Any:
@@ -337,12 +377,11 @@ def create_vector(space: Any) -> Any:
     return b
 
 
-def assemble_vector(b: Any, form: Any) -> None:
-    """Assemble into a ghosted vector, ghosts added to their owners."""
-    with b.localForm() as loc:
-        loc.set(0.0)
-    fem_petsc.assemble_vector(b, form)
-    b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+def add_vector(values: FloatArray, form: Any) -> None:
+    """Add a compiled linear form to this rank's values, ghosts included."""
+    form = getattr(form, "_cpp_object", form)
+    packed = cpp.fem.pack_constants(form), cpp.fem.pack_coefficients(form)
+    cpp.fem.assemble_vector(values, form, *packed)
 
 
 def create_matrix(form: Any) -> Any:

@@ -18,6 +18,7 @@ from rotations import rotation
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.kernels import discrete_gradient as dg
 from dolfinx_nts.kernels.strain_energy import strain_energy
 
@@ -74,7 +75,7 @@ class Point:
         dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 0})
         w = ufl.TestFunction(space)
         work = ufl.inner(stress(energy, self.e0, self.e1), ufl.grad(w)) * dx
-        self.work, self.energy = compat.compile_forms([work, energy(self.e1) * dx])
+        self.work, self.energy = compile_forms([work, energy(self.e1) * dx])
         self.nodes = unit_nodes(space.tabulate_dof_coordinates())
         self.vector = compat.create_vector(space)
 
@@ -83,7 +84,7 @@ class Point:
 
     def stress_between(self, e0, e1):
         self.e0.value[:], self.e1.value[:] = e0, e1
-        compat.assemble_vector(self.vector, self.work)
+        assemble_vector(self.vector, self.work)
         # grad N of the node at e_k is e_k, the volume is 1/6.
         return 6.0 * self.vector.array_r.reshape(-1, 3)[self.nodes].T
 
@@ -92,7 +93,7 @@ class Point:
 
     def stored_at(self, e):
         self.e1.value[:] = e
-        return 6.0 * fem.assemble_scalar(self.energy)
+        return 6.0 * self.energy.value()
 
 
 _POINTS = {}

@@ -18,6 +18,7 @@ import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.contact_search import ContactSearch
+from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.study import economy, tradeoff
 
 COMM = MPI.COMM_WORLD
@@ -296,7 +297,7 @@ def mass_form(body):
     import ufl
 
     v, w = ufl.TrialFunction(body.space), ufl.TestFunction(body.space)
-    return compat.compile_forms([body._rho * ufl.inner(v, w) * body._dx])[0]
+    return compile_forms([body._rho * ufl.inner(v, w) * body._dx])[0]
 
 
 def test_loads_are_assembled_when_they_change(monkeypatch):

@@ -21,7 +21,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 #: Floors from below: files, and folders that stand for all of theirs.
 LEVELS = [
-    {"parallel", "validation", "dolfinx_compat", "kernels"},
+    {"parallel", "validation", "dolfinx_compat", "forms", "kernels"},
     {"integrators"},
     {
         "bodies", "constraints", "contact", "coupling", "elements", "evaluation", "joints",

@@ -12,13 +12,13 @@ import ufl
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import dolfinx_compat as compat, forms
 
 mesh = create_box(MPI.COMM_SELF, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.tetrahedron)
 space = compat.vector_space(mesh, 1)
 compat.scalar_space(mesh, "DG", 0), compat.tensor_space(mesh, "DG", 0)
 w = ufl.TestFunction(space)
-compat.compile_forms([{form}])
+forms.compile_forms([{form}])
 """
 
 

@@ -11,6 +11,7 @@ from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.parameters import Parameter, is_number
+from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.validation import floats
 
 FloatArray = npt.NDArray[np.float64]
@@ -79,7 +80,7 @@ def inertia_of(space: Any, density: Parameter) -> Inertia:
     rho = fem.Constant(mesh, float(density)) if is_number(density) else density
     v, w = ufl.TrialFunction(space), ufl.TestFunction(space)
     dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
-    (form,) = compat.compile_forms([rho * ufl.inner(v, w) * dx])
+    (form,) = compile_forms([rho * ufl.inner(v, w) * dx])
     matrix = compat.create_matrix(form)
     compat.assemble_matrix(matrix, form, (), 0.0)
     owned = 3 * space.dofmap.index_map.size_local

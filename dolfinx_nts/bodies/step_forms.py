@@ -12,6 +12,7 @@ from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.evaluation import Moment
+from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.static import EQUILIBRIUM
 
@@ -127,7 +128,7 @@ class StepForms:
     def assemble(self, form: Any) -> FloatArray:
         """Owned entries of a compiled linear form."""
         self._check_alive()
-        compat.assemble_vector(self._vector, form)
+        assemble_vector(self._vector, form)
         return self._vector.array_r.copy()
 
     def with_ghosts(self, u: FloatArray) -> FloatArray:
@@ -161,7 +162,7 @@ class StepForms:
             tangent = self._factors[1] * ufl.derivative(virtual, self._u1, du)
             if rule.inertia:
                 tangent += self._factors[0] * self._mass(du, w)
-            forms = compat.compile_forms([work, tangent] + ([] if extra is None else [extra]))
+            forms = compile_forms([work, tangent] + ([] if extra is None else [extra]))
             self._forms[rule] = forms[0], forms[1], forms[2] if extra is not None else None
         return self._forms[rule]
 

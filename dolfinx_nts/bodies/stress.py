@@ -8,6 +8,7 @@ import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.kernels.strain_energy import green_strain
 
 
@@ -73,11 +74,11 @@ def _cell_means(body: Any, value: Any, name: str) -> Any:
     if value.ufl_shape:
         one = ufl.as_tensor([[1.0] * 3] * 3)
     dx = ufl.Measure("dx", body.mesh, metadata={"quadrature_degree": 2 * body.degree})
-    forms = compat.compile_forms([ufl.inner(value, q) * dx, ufl.inner(one, q) * dx])
+    forms = compile_forms([ufl.inner(value, q) * dx, ufl.inner(one, q) * dx])
     result, vector = fem.Function(space, name=name), compat.create_vector(space)
     sums = []
     for form in forms:
-        compat.assemble_vector(vector, form)
+        assemble_vector(vector, form)
         sums.append(vector.array_r.copy())
     vector.destroy()
     result.x.array[: len(sums[0])] = sums[0] / sums[1]

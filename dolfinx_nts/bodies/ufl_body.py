@@ -31,6 +31,7 @@ from dolfinx_nts.bodies.step_forms import ExtraForm, StepForms, fill
 from dolfinx_nts.bodies.user_forms import checked_form
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.evaluation import Moment
+from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.parallel import gather_on_root, raise_together
@@ -275,7 +276,7 @@ class UflBody(Body):
         self._taken = self.parameters()
         if self._extra_form is not None:
             self._check_extra_form(self._extra_form, w)
-        of_mass, *compiled, self._energy_form = compat.compile_forms([mass, *loads, energy])
+        of_mass, *compiled, self._energy_form = compile_forms([mass, *loads, energy])
         self._load = np.zeros(self.num_owned)
         self._mass = MassMatrix(of_mass)
         self._take_mass()
@@ -367,7 +368,7 @@ class UflBody(Body):
         """Strain energy on this rank [J]."""
         kept = self.u.x.array.copy()
         fill(self.u, u)
-        value = float(fem.assemble_scalar(self._energy_form))
+        value = self._energy_form.value()
         self.u.x.array[:] = kept
         return value
 

@@ -10,6 +10,7 @@ import platform
 import shlex
 import subprocess
 import tempfile
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,8 @@ class Together(ctypes.Structure):
     _fields_ = [("force", _REAL), ("normal", _REAL), ("tangential", _REAL)]  # noqa: RUF012
 
 
+#: Arguments of the loop in `cell_batches.c`.
+ASSEMBLE = (_LONG, *(_ARRAY,) * 6)
 _FACET, _LIMITS = ctypes.POINTER(Facet), ctypes.POINTER(Limits)
 #: Arguments of the kernels.
 _KERNELS = {
@@ -76,31 +79,43 @@ _KERNELS = {
 }
 
 
-def _compile(target: Path) -> None:
-    """Make the library; whoever else does so at the same time replaces it by the same."""
-    compiler = shlex.split(os.environ.get("CC", "cc"))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-        made = Path(folder, target.name)
-        files = [*map(str, _SOURCES[1:]), "-o", str(made)]
-        command = [*compiler, *_FLAGS, "-shared", "-fPIC", *files, "-lm"]
-        subprocess.run(command, check=True, capture_output=True)
-        made.replace(target)
+def key(*parts: str) -> str:
+    """What a library is made of, in 16 characters."""
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def made(name: str, command: Callable[[Path], list[str]]) -> Any:
+    """A library in the folder of the forms that DOLFINx compiles, made where it is not there.
+
+    Whoever else makes it at the same time replaces it by the same.
+
+    Args:
+        name: Its file's, with the `key` of all that it is made of.
+        command: An empty folder -> the compiler's flags and files.
+
+    Raises:
+        OSError: It can be neither made nor loaded.
+        subprocess.CalledProcessError: The compiler has refused it.
+    """
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    target = Path(cache, "fenics", f"dolfinx_nts_{platform.machine()}_{name}.so")
+    if not target.exists():
+        compiler = shlex.split(os.environ.get("CC", "cc"))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+            new = Path(folder, target.name)
+            given = [*command(Path(folder)), "-shared", "-fPIC", "-o", str(new), "-lm"]
+            subprocess.run([*compiler, *given], check=True, capture_output=True)
+            new.replace(target)
+    return ctypes.CDLL(str(target))
 
 
 @lru_cache
 def load() -> Any:
     """The library, or None where it can be neither found nor made."""
-    key = hashlib.sha256(" ".join(_FLAGS).encode())
-    for source in _SOURCES:
-        key.update(source.read_bytes())
-    # Beside the forms that DOLFINx compiles.
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    target = Path(cache, "fenics", f"dolfinx_nts_{platform.machine()}_{key.hexdigest()[:16]}.so")
+    of = key(" ".join(_FLAGS), *(source.read_text() for source in _SOURCES))
     try:
-        if not target.exists():
-            _compile(target)
-        library = ctypes.CDLL(str(target))
+        library = made(of, lambda _: [*_FLAGS, *map(str, _SOURCES[1:])])
     except (OSError, subprocess.CalledProcessError) as error:
         logger.warning("Contact kernels are not compiled (%s): contact takes longer", error)
         return None

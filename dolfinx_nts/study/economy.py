@@ -201,7 +201,8 @@ class PlainBody:
         work = ufl.inner(stress, ufl.grad(w)) * dx
         inertia = rho * ufl.inner(du, w) * dx
         tangent = factor * ufl.derivative(work, self._u1, du) + inertia
-        self._work, self._tangent, mass = compat.compile_forms([work, tangent, inertia])
+        forms = [compat.compile_form(form)[0] for form in (work, tangent, inertia)]
+        self._work, self._tangent, mass = forms
         self._mass, self._a = compat.create_matrix(mass), compat.create_matrix(self._tangent)
         compat.assemble_matrix(self._mass, mass, (), 0.0)
         self._force = compat.create_vector(space)
@@ -237,7 +238,10 @@ class PlainBody:
 
     def _residual(self, _snes: Any, x: Any, f: Any) -> None:
         self._fill(x)
-        compat.assemble_vector(self._force, self._work)
+        with self._force.localForm() as here:
+            here.set(0.0)
+            compat.add_vector(here.array_w, self._work)
+        self._force.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         self._change.waxpy(-1.0, self._first, x)
         self._mass.mult(self._change, f)
         f.axpy(0.5 * self._dt**2, self._force)

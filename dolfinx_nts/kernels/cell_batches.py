@@ -1,0 +1,194 @@
+"""What FFCx has written for one cell, run on several cells at once.
+
+A form of a body is some hundred operations in each quadrature point of a cell, one after the other.
+A processor does each of them on four or eight numbers in the time that it takes for one. So the C
+code of FFCx is compiled once more, with a number of each of as many cells in place of each number
+(cross-element vectorization: Sun, Mitchell, Kulkarni, Kloeckner, Ham and Kelly 2020). Operations
+and their order stay, and so do results but for rounding.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import subprocess
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.kernels import library
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+_LOOP = Path(__file__).with_name("cell_batches.c")
+#: The processor's own instructions. A fused product and sum rounds once where C rounds twice.
+_FLAGS = ["-std=gnu11", "-O2", "-ftree-vectorize", "-march=native", "-g0"]
+_FLAGS += ["-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
+#: Cells on which a new kernel is compared with FFCx's, no multiple of what runs at once.
+_COMPARED = 11
+#: Part of the largest entry by which they may differ: rounding where the code cancels digits.
+_AGREE = 1e-8
+
+
+class Shape(NamedTuple):
+    """How many numbers a kernel has of one cell.
+
+    Attributes:
+        coordinates: Coordinates of the cell's nodes.
+        coefficients: Of all Functions.
+        entries: What it adds to.
+        block: Entries of each of its nodes.
+    """
+
+    coordinates: int
+    coefficients: int
+    entries: int
+    block: int
+
+
+def _body(code: str) -> str:
+    """The body of the only kernel in FFCx's C code, with `Real` variables for `cell_batches.c`.
+
+    Raises:
+        ValueError: There is another number of kernels.
+    """
+    (found,) = re.finditer(r"\bvoid tabulate_tensor_\w+\([^)]*\)\s*\{", code)
+    begin = end = found.end()
+    depth = 1
+    while depth:
+        depth += {"{": 1, "}": -1}.get(code[end], 0)
+        end += 1
+    parts = re.split(r"(static const double [^;]*;)", code[begin : end - 1])
+    # Every other part is a table, which all cells share.
+    parts[::2] = [_for_lanes(part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def _for_lanes(code: str) -> str:
+    """Statements with `Real` in place of double."""
+    code = _with_select(code)
+    code = re.sub(r"\b(?:const )?double (\w+) = ([^;]*);", r"Real \1 = EACH(\2);", code)
+    code = re.sub(r"\b(?:const )?double (\w+)\[", r"Real \1[", code)
+    return re.sub(r"^(\s*\w+\[[^=;]*\]) = ([^;]*);", r"\1 = EACH(\2);", code, flags=re.MULTILINE)
+
+
+def _with_select(code: str) -> str:
+    """Conditional expressions, which FFCx encloses in parentheses, as calls of SELECT."""
+    while (mark := code.find("?")) >= 0:
+        begin, end = _bracket(code, mark, -1), _bracket(code, mark, 1)
+        colon = next(k for k in range(mark, end) if code[k] == ":" and _bracket(code, k, 1) == end)
+        condition, yes, no = code[begin + 1 : mark], code[mark + 1 : colon], code[colon + 1 : end]
+        for of_numbers, of_masks in (("&&", "&"), ("||", "|"), ("!(", "~(")):
+            condition = condition.replace(of_numbers, of_masks)
+        code = f"{code[:begin]}SELECT({condition}, {yes}, {no}){code[end + 1 :]}"
+    return code
+
+
+def _bracket(code: str, start: int, step: int) -> int:
+    """Where the parentheses around a place close (step 1) or open (step -1)."""
+    depth, k = 1, start
+    while depth:
+        k += step
+        depth += step * {"(": 1, ")": -1}.get(code[k], 0)
+    return k
+
+
+def load(source: Path, shape: Shape, flags: list[str]) -> Any:
+    """The loop over cells with a kernel of FFCx in a library, or None where it cannot be made.
+
+    Args:
+        source: FFCx's C code of a form.
+        shape: Sizes of the kernel.
+        flags: More of the compiler's flags, which count more than ours.
+    """
+    sizes = [f"-D{name.upper()}={value}" for name, value in shape._asdict().items()]
+    given = [*_FLAGS, *flags, *sizes]
+
+    def command(folder: Path) -> list[str]:
+        kernel = folder / "kernel.c"
+        kernel.write_text(_body(code))
+        return [*given, f'-DKERNEL="{kernel}"', str(_LOOP)]
+
+    try:
+        code = source.read_text()
+        key = library.key(code, _LOOP.read_text(), Path(__file__).read_text(), *given, _processor())
+        loop = library.made(f"cells_{key}", command).assemble
+    except (OSError, ValueError, subprocess.CalledProcessError) as error:
+        logger.debug("%s is evaluated cell by cell: %s", source, error)
+        return None
+    loop.argtypes = library.ASSEMBLE
+    return loop
+
+
+@lru_cache
+def _processor() -> str:
+    """What the machine's processor can do, as a folder may be shared by different ones."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return ""
+    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
+
+
+class CellBatches:
+    """Sums a form over cells, several at once.
+
+    Args:
+        loop: As of `load`.
+        nodes: Numbers of each cell's nodes, shape (cells, nodes).
+        x: Their coordinates [m], shape (n, 3).
+        dofs: Blocks of the cells in what they are added to, shape (cells, blocks).
+    """
+
+    def __init__(self, loop: Any, nodes: IntArray, x: FloatArray, dofs: IntArray) -> None:
+        self._loop, self._x = loop, x
+        self._nodes, self._dofs = (np.ascontiguousarray(a, dtype=np.int32) for a in (nodes, dofs))
+
+    def add(self, coefficients: FloatArray | None, constants: FloatArray, out: FloatArray) -> None:
+        """Add the form.
+
+        Args:
+            coefficients: Of each cell as DOLFINx packs them, shape (cells, coefficients).
+            constants: As DOLFINx packs them, shape (constants,).
+            out: What it is added to, shape (blocks times their size,).
+        """
+        given = self._x, self._dofs, coefficients, constants, out
+        library.run(self._loop, len(self._nodes), self._nodes, *given)
+
+
+def agrees(
+    loop: Any,
+    kernel: Any,
+    shape: Shape,
+    x: FloatArray,
+    coefficients: FloatArray,
+    constants: FloatArray,
+) -> bool:
+    """Whether a kernel does what FFCx's does, on warped cells with arbitrary displacements.
+
+    Args:
+        loop: As of `load`.
+        kernel: FFCx's.
+        shape: Sizes of both.
+        x: Coordinates of one cell's nodes [m], shape (nodes, 3).
+        coefficients: Of this cell, shape (coefficients,).
+        constants: Of the form.
+    """
+    rng = np.random.default_rng(0)
+    size = 0.05 * np.ptp(x, axis=0).max()
+    places = x + size * rng.uniform(-1.0, 1.0, (_COMPARED, *x.shape))
+    w = coefficients + size * rng.uniform(-1.0, 1.0, (_COMPARED, shape.coefficients))
+    found, expected = np.zeros((2, _COMPARED, shape.entries))
+    for one, of_cell, place in zip(expected, w, places, strict=True):
+        library.run(kernel, one, of_cell, constants, place, None, None, None)
+    nodes = np.arange(_COMPARED * len(x)).reshape(_COMPARED, -1)
+    dofs = np.arange(found.size // shape.block).reshape(_COMPARED, -1)
+    CellBatches(loop, nodes, places.reshape(-1, 3), dofs).add(w, constants, found.reshape(-1))
+    limit = _AGREE * np.abs(expected[np.isfinite(expected)]).max(initial=0.0)
+    return np.allclose(found, expected, rtol=0.0, atol=limit, equal_nan=True)

@@ -1,0 +1,220 @@
+"""Forms that are evaluated for several cells at once, against DOLFINx, which takes one by one."""
+
+import logging
+import math
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType, create_box, create_rectangle, meshtags
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import forms
+from dolfinx_nts.bodies.step_forms import fill
+from dolfinx_nts.kernels import cell_batches, library
+
+COMM = MPI.COMM_WORLD
+KINDS = {"hexahedra": CellType.hexahedron, "tetrahedra": CellType.tetrahedron}
+MATERIALS = {
+    "neo-Hookean": nts.NeoHookean(young=1e6, poisson=0.3),
+    "Mooney-Rivlin": nts.MooneyRivlin(a=2e5, b=1e5, c=1e6),
+    "Saint-Venant": nts.StVenantKirchhoff(young=1e6, poisson=0.3),
+    "Fung": lambda c: 1e5 * (ufl.exp(0.3 * (ufl.tr(c) - 3)) - ufl.ln(ufl.det(c))),
+    "powers": lambda c: 1e5 * (ufl.tr(c) ** 1.7 + ufl.tr(c) ** 6 + ufl.det(c) ** -0.5),
+    "conditions": lambda c: 1e5 * ufl.conditional(
+        ufl.And(ufl.gt(c[0, 0], 1.0), ufl.Not(ufl.gt(c[1, 1], 1.0))),
+        ufl.tr(c) ** 2,
+        ufl.conditional(ufl.lt(c[2, 2], 1.0), ufl.sqrt(ufl.det(c)), abs(c[0, 1])),
+    ),
+    "trigonometry": lambda c: 1e5 * (ufl.cos(c[0, 1]) + ufl.sin(c[1, 2]) * ufl.tanh(c[0, 0]) + ufl.atan(c[2, 2])),
+}  # fmt: skip
+
+
+def box(kind, n=3):
+    ends = [np.zeros(3), np.array([1.0, 0.8, 1.2])]
+    mesh = create_box(COMM, ends, [n, 2, 2], kind)
+    mesh.geometry.x[:] += 0.02 * np.sin(9.0 * mesh.geometry.x[:, [1, 2, 0]])
+    return mesh
+
+
+def moved(space, seed=0):
+    """Displacement of some hundredths [m] that is smooth, and so the same on all ranks."""
+    x = space.tabulate_dof_coordinates()
+    return 0.03 * np.sin((3.0 + seed) * x[:, [1, 2, 0]] + seed + np.arange(3)).ravel()
+
+
+def without_batches(form):
+    """The same form as DOLFINx evaluates it."""
+    other = object.__new__(forms.CellForm)
+    other.compiled, other._batches = form.compiled, None
+    return other
+
+
+def entries(form, space):
+    """A linear form with all contributions of other ranks."""
+    vector = compat.create_vector(space)
+    forms.assemble_vector(vector, form)
+    found = vector.array_r.copy()
+    vector.destroy()
+    return found
+
+
+def same(form, space):
+    assert form._batches is not None
+    found, expected = (entries(f, space) for f in (form, without_batches(form)))
+    size = COMM.allreduce(np.abs(expected).max(initial=0.0), op=MPI.MAX)
+    assert size > 0.0
+    assert COMM.allreduce(np.abs(found - expected).max(initial=0.0), op=MPI.MAX) < 1e-13 * size
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("rule", ["energy-momentum", "midpoint"])
+@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.fast("hexahedra-neo-Hookean-energy-momentum", "tetrahedra-powers-midpoint",
+                  "hexahedra-conditions-midpoint")  # fmt: skip
+@pytest.mark.fast_on_ranks("hexahedra-neo-Hookean-energy-momentum")
+def test_forces_and_energy_are_those_of_dolfinx(kind, material, rule):
+    integrator = {"energy-momentum": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}[rule]
+    body = nts.Continuum(box(KINDS[kind]), MATERIALS[material], density=1e3)
+    work = body._forms._compiled(integrator)[0]
+    for function, seed in ((body._forms._u0, 1), (body._forms._u1, 2), (body.u, 3)):
+        fill(function, moved(body.space, seed)[: body.num_owned])
+    same(work, body.space)
+    energy, assembled = body._energy_form, fem.assemble_scalar(body._energy_form.compiled)
+    assert energy._batches is not None
+    assert energy.value() == pytest.approx(assembled, rel=1e-13)
+
+
+@pytest.mark.parametrize("degree", [2, 3])
+def test_of_higher_degree(degree):
+    space = compat.vector_space(box(CellType.tetrahedron, 2), degree)
+    u, w = fem.Function(space), ufl.TestFunction(space)
+    fill(u, moved(space)[: 3 * space.dofmap.index_map.size_local])
+    energy = 0.5 * ufl.inner(ufl.grad(u), ufl.grad(u)) * (1.0 + ufl.inner(u, u)) * ufl.dx
+    (work,) = forms.compile_forms([ufl.derivative(energy, u, w)])
+    same(work, space)
+
+
+def test_of_a_membrane():
+    mesh = create_rectangle(COMM, [np.zeros(2), np.ones(2)], [5, 3], CellType.quadrilateral)
+    space = compat.vector_space(mesh, 1)
+    u, w = fem.Function(space), ufl.TestFunction(space)
+    fill(u, moved(space)[: 3 * space.dofmap.index_map.size_local])
+    (work,) = forms.compile_forms([(1.0 + ufl.inner(u, u)) * ufl.inner(u, w) * ufl.dx])
+    same(work, space)
+
+
+@pytest.mark.mpi
+def test_with_fields_of_parameters():
+    """Cells with moduli of their own, and a Constant in the exponent."""
+    mesh = box(CellType.hexahedron)
+    stiffness, exponent = fem.Function(compat.scalar_space(mesh, "DG", 0)), fem.Constant(mesh, 1.3)
+    stiffness.interpolate(lambda x: 1e5 * (1.0 + x[0]))
+    body = nts.Continuum(mesh, lambda c: stiffness * ufl.tr(c) ** exponent, density=1e3)
+    work = body._forms._compiled(nts.Midpoint())[0]
+    fill(body._forms._u1, moved(body.space)[: body.num_owned])
+    same(work, body.space)
+    exponent.value = 2.1
+    stiffness.x.array[:] *= 2.0
+    same(work, body.space)
+
+
+def test_parts_and_facets_are_left_to_dolfinx():
+    mesh = box(CellType.hexahedron)
+    space = compat.vector_space(mesh, 1)
+    w = ufl.TestFunction(space)
+    tags = meshtags(mesh, 3, np.arange(3, dtype=np.int32), np.ones(3, dtype=np.int32))
+    dx = ufl.Measure("dx", mesh, subdomain_data=tags)
+    volume = ufl.as_vector([1.0, 2.0, 3.0])
+    for measure in (dx(1), ufl.ds(mesh), ufl.dx(mesh) + ufl.ds(mesh)):
+        parts = [ufl.inner(volume, w) * m for m in getattr(measure, "ufl_operands", [measure])]
+        (form,) = forms.compile_forms([sum(parts[1:], parts[0])])
+        assert form._batches is None
+        assert np.isfinite(entries(form, space)).all()
+
+
+#: x -> [x, x, ...] for `log` alone: a kernel that writes the logarithms of its coefficients.
+LOGARITHM = """
+void tabulate_tensor_integral_log(double* restrict A, const double* restrict w, const double* c)
+{
+  for (int i = 0; i < 4; ++i)
+    A[i] += log(w[i]);
+}
+"""
+
+
+def logarithms(x, tmp_path):
+    """What the kernels' logarithm makes of numbers."""
+    source = tmp_path / "log.c"
+    source.write_text(LOGARITHM)
+    x = np.asarray(x, dtype=np.float64).reshape(-1, 4)
+    loop = cell_batches.load(source, cell_batches.Shape(3, 4, 4, 1), [])
+    nodes, dofs = np.zeros((len(x), 1)), np.arange(x.size).reshape(x.shape)
+    out = np.zeros(x.size)
+    cell_batches.CellBatches(loop, nodes, np.zeros((1, 3)), dofs).add(x, np.zeros(0), out)
+    return out
+
+
+def test_the_logarithm_is_that_of_the_library(tmp_path):
+    rng = np.random.default_rng(0)
+    near_one = 1.0 + np.concatenate([[0.0, 2.0**-52, -(2.0**-53)], rng.normal(size=397) * 1e-3])
+    wide = np.exp(rng.uniform(-745.0, 709.0, 4000))
+    x = np.concatenate([near_one, wide, [5e-324, 1e-310, 2.3e-308, 1.7e308]])
+    exact = [math.log(value) for value in x]
+    found = logarithms(x, tmp_path)
+    assert (np.abs(found - exact) <= np.spacing(np.abs(exact))).all()
+    assert found[0] == 0.0
+    odd = logarithms([0.0, -1.0, np.inf, np.nan, -0.0, -np.inf, 1.0, 2.0], tmp_path)
+    np.testing.assert_array_equal(
+        odd, [-np.inf, np.nan, np.inf, np.nan, -np.inf, np.nan, 0.0, math.log(2.0)]
+    )
+
+
+def test_a_wrong_kernel_is_refused(monkeypatch, caplog):
+    """One whose lanes got something else than FFCx's is found out before it is used."""
+    mesh = box(CellType.hexahedron)
+    space = compat.vector_space(mesh, 1)
+    u, w = fem.Function(space), ufl.TestFunction(space)
+    work = ufl.inner(ufl.grad(u), ufl.grad(w)) * (1.25 + ufl.inner(u, u)) * ufl.dx
+    good = cell_batches._for_lanes
+    monkeypatch.setattr(cell_batches, "_for_lanes", lambda c: good(c).replace("1.25", "1.26"))
+    monkeypatch.setattr(library, "key", lambda *_: "wrong")
+    with caplog.at_level(logging.WARNING):
+        (form,) = forms.compile_forms([work])
+    assert form._batches is None
+    assert "differs for several cells at once" in caplog.text
+
+
+@pytest.mark.parametrize("compiler", ["/no/compiler", "false"])
+def test_without_a_compiler_dolfinx_takes_them(compiler, monkeypatch):
+    mesh = box(CellType.hexahedron)
+    u = fem.Function(compat.vector_space(mesh, 1))
+    form = (2.5 + ufl.inner(u, u)) * ufl.dx
+    compat.compile_form(form)  # which needs one
+    monkeypatch.setenv("CC", compiler)
+    monkeypatch.setattr(library, "key", lambda *_: "none")
+    (functional,) = forms.compile_forms([form])
+    assert functional._batches is None
+    assert COMM.allreduce(functional.value()) == pytest.approx(2.5 * 0.96, rel=0.2)
+
+
+def test_flags_of_a_user_come_last(monkeypatch):
+    """So that they count: see `compat.chosen_flags`."""
+    given = []
+
+    def made(_name, command):
+        given.extend(command(cell_batches.Path("/nowhere")))
+        raise OSError("only asked for its flags")
+
+    monkeypatch.setattr(compat, "chosen_flags", lambda: ["-O3", "-march=x86-64"])
+    monkeypatch.setattr(library, "made", made)
+    monkeypatch.setattr(cell_batches.Path, "write_text", lambda *_: None)
+    mesh = box(CellType.hexahedron)
+    forms.compile_forms([ufl.inner(*[fem.Function(compat.vector_space(mesh, 1))] * 2) * ufl.dx])
+    ours, theirs = given.index("-march=native"), given.index("-march=x86-64")
+    assert ours < given.index("-O3") < theirs
+
