@@ -343,11 +343,21 @@ def compile_form(form: Any) -> tuple[Any, Path]:
         return fem.form(form, **given), sources[-1]
 
 
-def packed(form: Any) -> tuple[FloatArray | None, FloatArray]:
-    """Coefficients of the cells of a compiled form over cells, (cells, n), and constants, (m,)."""
-    form = getattr(form, "_cpp_object", form)
-    found = list(cpp.fem.pack_coefficients(form).values())
-    return found[0] if found and found[0].size else None, cpp.fem.pack_constants(form)
+def constants(form: Any) -> FloatArray:
+    """Values of a compiled form's Constants, shape (n,)."""
+    values: FloatArray = cpp.fem.pack_constants(getattr(form, "_cpp_object", form))
+    return values
+
+
+def functions(form: Any, compiled: Any) -> list[Any]:
+    """The Functions of a form in the order in which its kernel takes them.
+
+    Args:
+        form: In UFL.
+        compiled: By DOLFINx.
+    """
+    given, made = form.coefficients(), compiled.ufcx_form
+    return [given[made.original_coefficient_position[k]] for k in range(made.num_coefficients)]
 
 
 def cell_kernel(form: Any) -> Any:

@@ -123,12 +123,19 @@ INLINE void kernel(Real *restrict A, const Real *restrict w, const double *restr
 #include KERNEL
 }
 
+/* Values of a Function, of which dofs [cells][blocks] are those of the cells; each has `size` numbers. */
+typedef struct {
+    const double *values;
+    const int32_t *dofs;
+    int blocks, size;
+} Field;
+
 /* Adds what the cells contribute to `out`.
 
    nodes [cells][COORDINATES / 3] and dofs [cells][ENTRIES / BLOCK]: numbers of nodes with coordinates x [3] and of
-   blocks of `out`; w [cells][COEFFICIENTS]; c: constants. */
-void assemble(long cells, const int32_t *nodes, const double *x, const int32_t *dofs, const double *w, const double *c,
-              double *out)
+   blocks of `out`; fields: of the form, with COEFFICIENTS numbers in a cell; c: constants. */
+void assemble(long cells, const int32_t *nodes, const double *x, const int32_t *dofs, int fields, const Field *field,
+              const double *c, double *out)
 {
     enum { NODES = COORDINATES / 3, BLOCKS = ENTRIES / BLOCK };
     for (long first = 0; first < cells; first += LANES) {
@@ -140,8 +147,13 @@ void assemble(long cells, const int32_t *nodes, const double *x, const int32_t *
             for (int i = 0; i < NODES; i++)
                 for (int k = 0; k < 3; k++)
                     coordinate_dofs[3 * i + k][lane] = x[3 * nodes[cell * NODES + i] + k];
-            for (int i = 0; i < COEFFICIENTS; i++)
-                coefficients[i][lane] = w[cell * COEFFICIENTS + i];
+            Real *next = coefficients;
+            for (int f = 0; f < fields; f++) {
+                const int blocks = field[f].blocks, size = field[f].size;
+                for (int i = 0; i < blocks; i++)
+                    for (int k = 0; k < size; k++)
+                        (*next++)[lane] = field[f].values[size * field[f].dofs[cell * blocks + i] + k];
+            }
         }
         kernel(A, coefficients, c, coordinate_dofs);
         for (int lane = 0; lane < here; lane++)

@@ -12,7 +12,8 @@ from __future__ import annotations
 import logging
 import re
 import subprocess
-from functools import lru_cache
+from collections.abc import Sequence
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -136,6 +137,20 @@ def _processor() -> str:
     return next((line for line in lines if line.startswith(("flags", "Features"))), "")
 
 
+class Field(NamedTuple):
+    """A Function in a form.
+
+    Attributes:
+        values: Its values, which the form takes as they are at each evaluation, shape (n,).
+        dofs: Blocks of the cells, shape (cells, blocks).
+        size: Values of a block.
+    """
+
+    values: FloatArray
+    dofs: IntArray
+    size: int
+
+
 class CellBatches:
     """Sums a form over cells, several at once.
 
@@ -144,22 +159,30 @@ class CellBatches:
         nodes: Numbers of each cell's nodes, shape (cells, nodes).
         x: Their coordinates [m], shape (n, 3).
         dofs: Blocks of the cells in what they are added to, shape (cells, blocks).
+        fields: Of the form.
     """
 
-    def __init__(self, loop: Any, nodes: IntArray, x: FloatArray, dofs: IntArray) -> None:
-        self._loop, self._x = loop, x
-        self._nodes, self._dofs = (np.ascontiguousarray(a, dtype=np.int32) for a in (nodes, dofs))
+    def __init__(
+        self, loop: Any, nodes: IntArray, x: FloatArray, dofs: IntArray, fields: Sequence[Field]
+    ) -> None:
+        whole = [np.ascontiguousarray(a, np.int32) for a in (nodes, dofs, *(f.dofs for f in fields))]
+        given = [
+            library.Field(f.values.ctypes.data, of_cells.ctypes.data, of_cells.shape[1], f.size)
+            for f, of_cells in zip(fields, whole[2:], strict=True)
+        ]
+        table = (library.Field * len(given))(*given)
+        self._held = whole, x, list(fields), table
+        places = whole[0].ctypes.data, x.ctypes.data, whole[1].ctypes.data
+        self._run = partial(loop, len(nodes), *places, len(given), table)
 
-    def add(self, coefficients: FloatArray | None, constants: FloatArray, out: FloatArray) -> None:
+    def add(self, constants: FloatArray, out: FloatArray) -> None:
         """Add the form.
 
         Args:
-            coefficients: Of each cell as DOLFINx packs them, shape (cells, coefficients).
             constants: As DOLFINx packs them, shape (constants,).
-            out: What it is added to, shape (blocks times their size,).
+            out: What it is added to, contiguous, shape (blocks times their size,).
         """
-        given = self._x, self._dofs, coefficients, constants, out
-        library.run(self._loop, len(self._nodes), self._nodes, *given)
+        library.run(self._run, constants, out)
 
 
 def agrees(
@@ -189,6 +212,9 @@ def agrees(
         library.run(kernel, one, of_cell, constants, place, None, None, None)
     nodes = np.arange(_COMPARED * len(x)).reshape(_COMPARED, -1)
     dofs = np.arange(found.size // shape.block).reshape(_COMPARED, -1)
-    CellBatches(loop, nodes, places.reshape(-1, 3), dofs).add(w, constants, found.reshape(-1))
+    of_cells = np.arange(_COMPARED * shape.coefficients).reshape(_COMPARED, -1)
+    field = Field(w.ravel(), of_cells, 1)
+    batches = CellBatches(loop, nodes, places.reshape(-1, 3), dofs, [field])
+    batches.add(constants, found.reshape(-1))
     limit = _AGREE * np.abs(expected[np.isfinite(expected)]).max(initial=0.0)
     return np.allclose(found, expected, rtol=0.0, atol=limit, equal_nan=True)

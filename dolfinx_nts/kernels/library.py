@@ -54,6 +54,15 @@ class Law(ctypes.Structure):
     ]
 
 
+class Field(ctypes.Structure):
+    """A Function in a form; see `cell_batches.c`."""
+
+    _fields_ = [  # noqa: RUF012
+        *(("values", _ARRAY), ("dofs", _ARRAY)),
+        *(("blocks", _INT), ("size", _INT)),
+    ]
+
+
 class Together(ctypes.Structure):
     """What pairs have in common; see `contact_law.c`."""
 
@@ -61,7 +70,7 @@ class Together(ctypes.Structure):
 
 
 #: Arguments of the loop in `cell_batches.c`.
-ASSEMBLE = (_LONG, *(_ARRAY,) * 6)
+ASSEMBLE = (_LONG, *(_ARRAY,) * 3, _INT, *(_ARRAY,) * 3)
 _FACET, _LIMITS = ctypes.POINTER(Facet), ctypes.POINTER(Limits)
 #: Arguments of the kernels.
 _KERNELS = {
