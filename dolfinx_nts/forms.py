@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +20,7 @@ from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, agrees, 
 logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 def compile_forms(forms: Sequence[Any]) -> list[Any]:
@@ -27,46 +30,38 @@ def compile_forms(forms: Sequence[Any]) -> list[Any]:
         A `CellForm` of each that has at most one argument, and DOLFINx's form of any other.
     """
     compiled = []
-    for form in forms:
-        made, source = compat.compile_form(form)
-        compiled.append(made if len(form.arguments()) > 1 else CellForm(form, made, source))
+    # The C compiler works beside FFCx, which is busy with the next form.
+    with ThreadPoolExecutor(1) as beside:
+        for form in forms:
+            made, source = compat.compile_form(form)
+            if len(form.arguments()) <= 1:
+                cells = _cells(form, made)
+                loop = cells and beside.submit(load, source, cells.shape, compat.chosen_flags())
+                made = CellForm(made, source, cells, loop)
+            compiled.append(made)
     return compiled
 
 
-class CellForm:
-    """A compiled functional or linear form.
+class _Cells(NamedTuple):
+    """What a form over all cells of a mesh is evaluated with; arrays as of `CellBatches`."""
 
-    Integrals over all cells of a mesh are evaluated for several cells at once; those over parts of
-    it or over facets are DOLFINx's.
+    shape: Shape
+    nodes: IntArray
+    x: FloatArray
+    dofs: IntArray
+    fields: list[Field]
 
-    Args:
-        form: In UFL.
-        compiled: By DOLFINx.
-        source: FFCx's C code of it.
+    def arguments_of_first(self) -> tuple[FloatArray, FloatArray]:
+        """Coordinates of the first cell and its values of all Functions."""
+        of_cell = [f.values.reshape(-1, f.size)[f.dofs[0]].ravel() for f in self.fields]
+        return self.x[self.nodes[0]], np.concatenate(of_cell)
+
+
+def _cells(form: Any, compiled: Any) -> _Cells | None:
+    """What a form is evaluated with for several cells at once; None where DOLFINx does better.
+
+    It does over facets and parts of a mesh, and without Functions a form is hardly evaluated again.
     """
-
-    def __init__(self, form: Any, compiled: Any, source: Path) -> None:
-        self._compiled = compiled
-        self._batches = _batches(form, compiled, source)
-
-    def add(self, values: FloatArray) -> None:
-        """Add the linear form to this rank's values, ghosts included."""
-        if self._batches is None:
-            compat.add_vector(values, self._compiled)
-        else:
-            self._batches.add(compat.constants(self._compiled), values)
-
-    def value(self) -> float:
-        """The functional on this rank."""
-        if self._batches is None:
-            return float(fem.assemble_scalar(self._compiled))
-        total = np.zeros(1)
-        self.add(total)
-        return float(total[0])
-
-
-def _batches(form: Any, compiled: Any, source: Path) -> CellBatches | None:
-    """What sums a form over the cells; None where nothing but DOLFINx can."""
     msh = compiled.mesh
     cells = msh.topology.index_map(msh.topology.dim).size_local
     over_cells = all(
@@ -75,8 +70,8 @@ def _batches(form: Any, compiled: Any, source: Path) -> CellBatches | None:
     )
     functions = compat.functions(form, compiled)
     spaces = [argument.ufl_function_space() for argument in form.arguments()]
-    of_all = [*spaces, *(f.function_space for f in functions)]
-    if not cells or not over_cells or any(compat.turns_dofs(space) for space in of_all):
+    turned = any(compat.turns_dofs(s) for s in (*spaces, *(f.function_space for f in functions)))
+    if not cells or not functions or not over_cells or turned:
         return None
     nodes = compat.geometry_dofmap(msh)[:cells]
     # A functional adds all cells to one entry.
@@ -89,16 +84,50 @@ def _batches(form: Any, compiled: Any, source: Path) -> CellBatches | None:
     ]
     width = sum(field.dofs.shape[1] * field.size for field in fields)
     shape = Shape(3 * nodes.shape[1], width, block * dofs.shape[1], block)
-    loop = load(source, shape, compat.chosen_flags())
-    if loop is None:
-        return None
-    x, constants = msh.geometry.x, compat.constants(compiled)
-    of_cell = [f.values.reshape(-1, f.size)[f.dofs[0]].ravel() for f in fields]
-    first = np.concatenate([np.empty(0), *of_cell])
-    if not agrees(loop, compat.cell_kernel(compiled), shape, x[nodes[0]], first, constants):
-        logger.warning("%s differs for several cells at once; it is taken cell by cell", source)
-        return None
-    return CellBatches(loop, nodes, x, dofs, fields)
+    return _Cells(shape, nodes, msh.geometry.x, dofs, fields)
+
+
+class CellForm:
+    """A compiled functional or linear form, evaluated for several cells at once where that can be.
+
+    Args:
+        compiled: By DOLFINx.
+        source: FFCx's C code of it.
+        cells: What it is evaluated with; None: DOLFINx evaluates it.
+        loop: Future of what `load` returns.
+    """
+
+    def __init__(self, compiled: Any, source: Path, cells: _Cells | None, loop: Any) -> None:
+        self._compiled, self._source, self._cells, self._loop = compiled, source, cells, loop
+
+    @cached_property
+    def batches(self) -> CellBatches | None:
+        """What sums it over the cells; None where DOLFINx does."""
+        loop = self._cells and self._loop.result()
+        if self._cells is None or loop is None:
+            return None
+        x, first = self._cells.arguments_of_first()
+        kernel, constants = compat.cell_kernel(self._compiled), compat.constants(self._compiled)
+        if not agrees(loop, kernel, self._cells.shape, x, first, constants):
+            text = "%s differs for several cells at once; it is taken cell by cell"
+            logger.warning(text, self._source)
+            return None
+        return CellBatches(loop, *self._cells[1:])
+
+    def add(self, values: FloatArray) -> None:
+        """Add the linear form to this rank's values, ghosts included."""
+        if self.batches is None:
+            compat.add_vector(values, self._compiled)
+        else:
+            self.batches.add(compat.constants(self._compiled), values)
+
+    def value(self) -> float:
+        """The functional on this rank."""
+        if self.batches is None:
+            return float(fem.assemble_scalar(self._compiled))
+        total = np.zeros(1)
+        self.add(total)
+        return float(total[0])
 
 
 def assemble_vector(b: Any, form: CellForm) -> None:

@@ -276,7 +276,7 @@ class UflBody(Body):
         self._taken = self.parameters()
         if self._extra_form is not None:
             self._check_extra_form(self._extra_form, w)
-        of_mass, *compiled, self._energy_form = compile_forms([mass, *loads, energy])
+        self._energy_form, of_mass, *compiled = compile_forms([energy, mass, *loads])
         self._load = np.zeros(self.num_owned)
         self._mass = MassMatrix(of_mass)
         self._take_mass()
