@@ -292,6 +292,26 @@ def test_what_iterations_leave_does_not_add_up(system, steps, contact):
 
 
 @pytest.mark.mpi
+def test_lasting_contact_begins_closed():
+    """Free flight would open it in every other step, by a bounce that does not come."""
+    block = nts.Continuum(box((0, 0, 0), (1, 1, 1), 2), RUBBER, density=1e3, velocity=(0, 0, -2.0))
+    pair = nts.ContactPair(block.surface(at(2, 0.0)), nts.Plane((0, 0, 0), (0, 0, 1)))
+    stepper = nts.Stepper(nts.System([block], contacts=[pair]), nts.EnergyMomentum())
+    problem, flies, carry = stepper.problem, 0, 0
+    for _ in range(8):
+        stepper.advance(2e-3)
+        problem.begin(stepper.state, 2e-3)
+        (first,) = problem.evaluate(problem.x).parts
+        nodes = problem.elements[0].candidates.node
+        carried = stepper.state.contacts[0].force[nodes] > 0.0
+        assert first.active[carried].all()
+        flies += int((first.gap[carried] > 1e-3).sum())
+        carry += int(carried.sum())
+    assert COMM.allreduce(carry) >= 9 and COMM.allreduce(flies) > 0
+    stepper.close()
+
+
+@pytest.mark.mpi
 @pytest.mark.fast_on_ranks()
 def test_the_linear_solver_goes_as_far_as_kept_matrices_allow():
     """Those of a strain of 1e-6 are wrong by as much: two iterations gain twelve digits."""

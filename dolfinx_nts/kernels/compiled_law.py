@@ -30,6 +30,7 @@ class Law(NamedTuple):
         coefficient: Of friction [-].
         pull: Pull over friction up to which a node that sticks is let slip before it is let go.
         uneven: Largest ratio of normal forces by which friction is divided.
+        opening: Part of `yielding` by which a gap that is open counts against a force.
         tangential_scale: Algorithmic scale of the return map, shape (n,).
         unmoved: Projector on what of lambda_T acts on prescribed coordinates only, shape
             (n, 2, 2); None: nothing is prescribed.
@@ -48,6 +49,7 @@ class Law(NamedTuple):
     coefficient: float = 0.0
     pull: float = 0.0
     uneven: float = 1.0
+    opening: float = 1.0
     tangential_scale: FloatArray | None = None
     unmoved: FloatArray | None = None
 

@@ -14,7 +14,7 @@
 typedef struct {
     const double *scale, *yielding, *none, *before;
     int size, row, friction, endless, strong, redundant;
-    double coefficient, pull, uneven;
+    double coefficient, pull, uneven, opening;
     const double *tangential_scale, *unmoved;
 } Law;
 
@@ -195,7 +195,7 @@ void laws(const Law *law, const Together *together, long n, const double *gap, c
             if (law->pull > 0.0)
                 none -= pull_of(law, &slip, c, last + constraints - 2, unmoved);
         }
-        active[i] = -last[0] - law->yielding[i] * gap[i] > none;
+        active[i] = -last[0] - law->yielding[i] * (gap[i] > 0.0 ? law->opening : 1.0) * gap[i] > none;
         stick[i] = 0;
         distance[i] = active[i] && law->friction ? distance_of(&slip) : 0.0;
         if (active[i]) {

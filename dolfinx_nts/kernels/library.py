@@ -49,7 +49,7 @@ class Law(ctypes.Structure):
     _fields_ = [  # noqa: RUF012
         *((name, _ARRAY) for name in ("scale", "yielding", "none", "before")),
         *((name, _INT) for name in ("size", "row", "friction", "endless", "strong", "redundant")),
-        *((name, _REAL) for name in ("coefficient", "pull", "uneven")),
+        *((name, _REAL) for name in ("coefficient", "pull", "uneven", "opening")),
         *((name, _ARRAY) for name in ("tangential_scale", "unmoved")),
     ]
 

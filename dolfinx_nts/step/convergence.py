@@ -45,6 +45,27 @@ def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
     return found[k], bodies[k].name
 
 
+def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
+    """Whether the residual does more work in the step than a part of the forces' work. Collective.
+
+    It is what the step misses in the ledger.
+
+    Args:
+        problem: Equations of the step.
+        e: Iterate.
+        share: The part, of the largest work of one kind of forces on one body.
+    """
+    local = np.zeros((len(e.bodies), 6))
+    for k in problem.awake:
+        t = e.bodies[k]
+        left = free(problem.system.bodies[k], t.residual)
+        parts = (left, problem.flight[k], t.internal, t.external, t.coupling, t.du)
+        local[k] = [float(p @ t.du) for p in parts]
+    work = global_sum(problem.system.comm, local)
+    rounding = problem.rounding.forces @ np.sqrt(work[:, 5])
+    return abs(work[:, 0].sum()) > share * np.abs(work[:, 1:5]).max() + rounding
+
+
 def _over_limits(
     problem: StepProblem, e: Evaluation, forces: Mapping[int, FloatArray], rounding: FloatArray
 ) -> list[float]:

@@ -17,7 +17,7 @@ from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.step.accuracy import EXACT, Newton
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.augmented import AugmentedMatrix
-from dolfinx_nts.step.convergence import ratios
+from dolfinx_nts.step.convergence import leaves_work, ratios
 from dolfinx_nts.step.diagnosis import diagnosis
 from dolfinx_nts.step.iterates import Iterates
 from dolfinx_nts.step.kept import KeptTangents
@@ -45,6 +45,8 @@ _NEAR = 1e4
 _INSIDE_OUT = 8
 #: Where residuals add up over steps, one above this part of its tolerance gets one more iteration.
 _SURE = 0.05
+#: The part of the tolerance by which work may be left where it has either sign.
+_EITHER_SIGN = 0.02
 
 
 class StepSolver:
@@ -354,12 +356,14 @@ class StepSolver:
         """Whether what an iteration leaves adds up over steps; every rank must call it.
 
         Kept matrices leave the same part of a smooth motion in each step, whose work has one sign;
-        where contact acts, the parts differ, and only what is to be exact is to have none of them.
+        where contact acts, the parts differ, and only what is much in one step counts.
         """
-        if not self._presets.keeps or self.newton.rtol <= EXACT:
-            return self._presets.keeps
+        problem, rtol = self.problem, self.newton.rtol
         acts = any(bool(part.status.any()) for part in e.parts)
-        return not anywhere(self.problem.system.comm, acts)
+        if self._presets.keeps and (rtol <= EXACT or not anywhere(problem.system.comm, acts)):
+            return True
+        # Where nothing has inertia there is no ledger.
+        return problem.integrator.inertia and leaves_work(problem, e, _EITHER_SIGN * rtol)
 
     # ---- failure
     def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:
