@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, agrees, load
 
 logger = logging.getLogger(__name__)
@@ -30,16 +30,24 @@ def compile_forms(forms: Sequence[Any]) -> list[Any]:
         A `CellForm` of each that has at most one argument, and DOLFINx's form of any other.
     """
     compiled = []
-    # The C compiler works beside FFCx, which is busy with the next form.
-    with ThreadPoolExecutor(1) as beside:
-        for form in forms:
-            made, source = compat.compile_form(form)
-            if len(form.arguments()) <= 1:
-                cells = _cells(form, made)
-                loop = cells and beside.submit(load, source, cells.shape, compat.chosen_flags())
-                made = CellForm(made, source, cells, loop)
-            compiled.append(made)
+    for form in forms:
+        made, source = compat.compile_form(form)
+        if len(form.arguments()) <= 1:
+            cells = _cells(form, made)
+            # The C compiler works beside FFCx, which is busy with the next form.
+            loop = cells and library.beside.submit(_load, source, cells.shape)
+            made = CellForm(made, source, cells, loop)
+        compiled.append(made)
     return compiled
+
+
+def _load(source: Path, shape: Shape) -> Any:
+    """As `load`, from a file."""
+    try:
+        return load(source.read_text(), shape, compat.chosen_flags())
+    except OSError as error:
+        logger.debug("%s is taken cell by cell: %s", source, error)
+        return None
 
 
 class _Cells(NamedTuple):

@@ -13,6 +13,7 @@ from mpi4py import MPI
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import forms
+from dolfinx_nts.bodies.inversion import Determinants
 from dolfinx_nts.bodies.step_forms import fill
 from dolfinx_nts.kernels import cell_batches, library
 
@@ -29,7 +30,9 @@ MATERIALS = {
         ufl.tr(c) ** 2,
         ufl.conditional(ufl.lt(c[2, 2], 1.0), ufl.sqrt(ufl.det(c)), abs(c[0, 1])),
     ),
-    "trigonometry": lambda c: 1e5 * (ufl.cos(c[0, 1]) + ufl.sin(c[1, 2]) * ufl.tanh(c[0, 0]) + ufl.atan(c[2, 2])),
+    "trigonometry": lambda c: 1e5 * (
+        ufl.cos(c[0, 1]) + ufl.sin(c[1, 2]) * ufl.tanh(c[0, 0]) + ufl.atan(c[2, 2])
+    ),
 }  # fmt: skip
 
 
@@ -145,12 +148,10 @@ void tabulate_tensor_integral_log(double* restrict A, const double* restrict w, 
 """
 
 
-def logarithms(x, tmp_path):
+def logarithms(x):
     """What the kernels' logarithm makes of numbers."""
-    source = tmp_path / "log.c"
-    source.write_text(LOGARITHM)
     x = np.asarray(x, dtype=np.float64).reshape(-1, 4)
-    loop = cell_batches.load(source, cell_batches.Shape(3, 4, 4, 1), [])
+    loop = cell_batches.load(LOGARITHM, cell_batches.Shape(3, 4, 4, 1))
     nodes, dofs = np.zeros((len(x), 1)), np.arange(x.size).reshape(x.shape)
     out, field = np.zeros(x.size), cell_batches.Field(x.ravel(), dofs, 1)
     batches = cell_batches.CellBatches(loop, nodes, np.zeros((1, 3)), dofs, [field])
@@ -158,16 +159,16 @@ def logarithms(x, tmp_path):
     return out
 
 
-def test_the_logarithm_is_that_of_the_library(tmp_path):
+def test_the_logarithm_is_that_of_the_library():
     rng = np.random.default_rng(0)
     near_one = 1.0 + np.concatenate([[0.0, 2.0**-52, -(2.0**-53)], rng.normal(size=397) * 1e-3])
     wide = np.exp(rng.uniform(-745.0, 709.0, 4000))
     x = np.concatenate([near_one, wide, [5e-324, 1e-310, 2.3e-308, 1.7e308]])
     exact = [math.log(value) for value in x]
-    found = logarithms(x, tmp_path)
+    found = logarithms(x)
     assert (np.abs(found - exact) <= np.spacing(np.abs(exact))).all()
     assert found[0] == 0.0
-    odd = logarithms([0.0, -1.0, np.inf, np.nan, -0.0, -np.inf, 1.0, 2.0], tmp_path)
+    odd = logarithms([0.0, -1.0, np.inf, np.nan, -0.0, -np.inf, 1.0, 2.0])
     np.testing.assert_array_equal(
         odd, [-np.inf, np.nan, np.inf, np.nan, -np.inf, np.nan, 0.0, math.log(2.0)]
     )
@@ -202,6 +203,18 @@ def test_without_a_compiler_dolfinx_takes_them(compiler, monkeypatch, tmp_path):
     assert COMM.allreduce(functional.value()) == pytest.approx(2.5 * 0.96, rel=0.2)
 
 
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_determinants_are_those_of_numpy(kind, degree, monkeypatch):
+    space = compat.vector_space(box(KINDS[kind]), degree)
+    here, there = (Determinants(space, degree, 2 * degree) for _ in range(2))
+    assert here._batches is not None
+    monkeypatch.setattr(Determinants, "_batches", None)
+    for seed in (1, 2):
+        u = moved(space, seed)
+        assert here.smallest(u)[0] == pytest.approx(there.smallest(u)[0], rel=1e-13)
+
+
 def test_flags_of_a_user_come_last(monkeypatch):
     """So that they count: see `compat.chosen_flags`."""
     given = []
@@ -213,8 +226,9 @@ def test_flags_of_a_user_come_last(monkeypatch):
     monkeypatch.setattr(compat, "chosen_flags", lambda: ["-O3", "-march=x86-64"])
     monkeypatch.setattr(library, "made", made)
     monkeypatch.setattr(cell_batches.Path, "write_text", lambda *_: None)
-    mesh = box(CellType.hexahedron)
-    forms.compile_forms([ufl.inner(*[fem.Function(compat.vector_space(mesh, 1))] * 2) * ufl.dx])
+    u = fem.Function(compat.vector_space(box(CellType.hexahedron), 1))
+    (functional,) = forms.compile_forms([ufl.inner(u, u) * ufl.dx])
+    assert functional.batches is None
     ours, theirs = given.index("-march=native"), given.index("-march=x86-64")
     assert ours < given.index("-O3") < theirs
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import basix
@@ -11,12 +12,40 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.points import of_nodes
+from dolfinx_nts.kernels import library
+from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, load
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Cells that are evaluated at once, few enough for their derivatives to stay in the cache.
 _CELLS = 1024
+
+
+#: det(dx/dxi) at the points of a cell, from its nodes' positions, as FFCx would write it.
+_KERNEL = """
+void tabulate_tensor_det(double* restrict A, const double* restrict w)
+{{
+  static const double table[3][{points}][{nodes}] = {table};
+  for (int p = 0; p < {points}; ++p)
+  {{
+    double x[3][3];
+    for (int k = 0; k < 3; ++k)
+    {{
+      for (int d = 0; d < 3; ++d)
+      {{
+        double sum = 0.0;
+        for (int i = 0; i < {nodes}; ++i)
+          sum += w[3 * i + k] * table[d][p][i];
+        x[k][d] = sum;
+      }}
+    }}
+    double minors = x[0][0] * (x[1][1] * x[2][2] - x[1][2] * x[2][1]);
+    minors += x[0][1] * (x[1][2] * x[2][0] - x[1][0] * x[2][2]);
+    minors += x[0][2] * (x[1][0] * x[2][1] - x[1][1] * x[2][0]);
+    A[p] += minors;
+  }}
+}}
+"""
 
 
 class Determinants:
@@ -38,34 +67,51 @@ class Determinants:
         points = points[:1] if constant else np.concatenate([basix.geometry(kind), points])
         variant = basix.LagrangeVariant.gll_warped
         element = basix.create_element(basix.ElementFamily.P, kind, degree, variant)
-        gradients = element.tabulate(1, points)[1:, :, :, 0]
-        self._table = np.ascontiguousarray(gradients.reshape(-1, gradients.shape[2]))
+        #: Derivatives of the shape functions, shape (3, points, nodes).
+        self._table = np.ascontiguousarray(element.tabulate(1, points)[1:, :, :, 0])
         nodes = space.tabulate_dof_coordinates()
         # About a node of their own: differences of far positions would lose digits.
         self._origin = nodes[:1].sum(axis=0)
         self._reference = (nodes - self._origin).ravel()
-        cells = compat.cell_dofs(space)[: space.mesh.topology.index_map(3).size_local]
-        self._parts = []
-        for first in range(0, len(cells), _CELLS):
-            of_cell = of_nodes(cells[first : first + _CELLS].T)
-            numbers = of_cell.swapaxes(1, 2).reshape(len(of_cell), -1)
-            self._parts.append((numbers, 1.0 / self._det(self._reference, numbers)))
+        self._cells = compat.cell_dofs(space)[: space.mesh.topology.index_map(3).size_local]
+        _, count, of_cell = self._table.shape
+        table = str(self._table.tolist()).translate(str.maketrans("[]", "{}"))
+        code = _KERNEL.format(points=count, nodes=of_cell, table=table)
+        shape = Shape(3, 3 * of_cell, count, count)
+        self._loop = library.beside.submit(load, code, shape, compat.chosen_flags())
 
-    def _det(self, x: FloatArray, numbers: npt.NDArray[Any]) -> FloatArray:
-        """det(dx/dxi) [m^3], shape (points, cells)."""
-        rows = (self._table @ x.take(numbers)).reshape(3, -1, 3, numbers.shape[1] // 3)
-        (a, b, c), (d, e, f), (g, h, i) = rows.transpose(0, 2, 1, 3)
-        # In place: as long as the work is, new arrays take longer.
-        det, minor, product = e * i, f * g, f * h
-        det -= product
-        det *= a
-        minor -= np.multiply(d, i, out=product)
-        minor *= b
-        det += minor
-        np.multiply(d, h, out=minor)
-        minor -= np.multiply(e, g, out=product)
-        minor *= c
-        det += minor
+    @cached_property
+    def _batches(self) -> CellBatches | None:
+        """What takes several cells at once; None where it is not compiled."""
+        loop, number = self._loop.result(), np.arange(len(self._cells))[:, None]
+        if loop is None:
+            return None
+        self._x = np.empty_like(self._reference)
+        x = Field(self._x, self._cells, 3)
+        return CellBatches(loop, np.zeros_like(number), np.zeros((1, 3)), number, [x])
+
+    @cached_property
+    def _inverse(self) -> FloatArray:
+        """One over det(dX/dxi) [1/m^3], shape (cells, points)."""
+        found: FloatArray = 1.0 / self._dets(self._reference)
+        return found
+
+    def _dets(self, x: FloatArray) -> FloatArray:
+        """det(dx/dxi) of nodes' positions x [m^3], shape (cells, points)."""
+        out = np.zeros((len(self._cells), self._table.shape[1]))
+        if self._batches is None:
+            for first in range(0, len(out), _CELLS):
+                here = slice(first, first + _CELLS)
+                out[here] = self._of_cells(x.reshape(-1, 3)[self._cells[here]])
+        else:
+            self._x[:] = x
+            self._batches.add(np.empty(0), out.reshape(-1))
+        return out
+
+    def _of_cells(self, x: FloatArray) -> FloatArray:
+        """The same of cells with their nodes' positions, (n, nodes, 3) -> (n, points)."""
+        a, b, c = np.einsum("dpi,nik->dnpk", self._table, x)
+        det: FloatArray = (a * np.cross(b, c)).sum(axis=-1)
         return det
 
     @np.errstate(over="ignore", invalid="ignore")  # an iterate may run off
@@ -78,16 +124,13 @@ class Determinants:
         Returns:
             A det that is not finite is -inf; without cells it is inf.
         """
-        x, least, nodes = self._reference + u, np.inf, None
-        for numbers, inverse in self._parts:
-            det = self._det(x, numbers)
-            det *= inverse
-            i = int(det.argmin())  # the first NaN, if there is one
-            if not det.flat[i] >= least:
-                least, nodes = float(det.flat[i]), numbers[:, i % det.shape[1] :: det.shape[1]]
-        if nodes is None:
+        if not len(self._cells):
             return np.inf, np.full(3, np.nan)
-        middle = self._origin + self._reference[nodes].mean(axis=0)
+        det = self._dets(self._reference + u)
+        det *= self._inverse
+        i = int(det.argmin())  # the first NaN, if there is one
+        least, nodes = float(det.flat[i]), self._cells[i // det.shape[1]]
+        middle = self._origin + self._reference.reshape(-1, 3)[nodes].mean(axis=0)
         return least if np.isfinite(least) else -np.inf, middle
 
 

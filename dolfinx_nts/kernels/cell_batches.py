@@ -100,11 +100,11 @@ def _bracket(code: str, start: int, step: int) -> int:
     return k
 
 
-def load(source: Path, shape: Shape, flags: list[str]) -> Any:
-    """The loop over cells with a kernel of FFCx in a library, or None where it cannot be made.
+def load(code: str, shape: Shape, flags: Sequence[str] = ()) -> Any:
+    """The loop over cells with a kernel in a library, or None where it cannot be made.
 
     Args:
-        source: FFCx's C code of a form.
+        code: C code with one kernel as FFCx writes it.
         shape: Sizes of the kernel.
         flags: More of the compiler's flags, which count more than ours.
     """
@@ -117,11 +117,10 @@ def load(source: Path, shape: Shape, flags: list[str]) -> Any:
         return [*given, f'-DKERNEL="{kernel}"', str(_LOOP)]
 
     try:
-        code = source.read_text()
         key = library.key(code, _LOOP.read_text(), Path(__file__).read_text(), *given, _processor())
         loop = library.made(f"cells_{key}", command).assemble
     except (OSError, ValueError, subprocess.CalledProcessError) as error:
-        logger.debug("%s is evaluated cell by cell: %s", source, error)
+        logger.debug("a kernel is not compiled for several cells at once: %s", error)
         return None
     loop.argtypes = library.ASSEMBLE
     return loop
@@ -165,7 +164,8 @@ class CellBatches:
     def __init__(
         self, loop: Any, nodes: IntArray, x: FloatArray, dofs: IntArray, fields: Sequence[Field]
     ) -> None:
-        whole = [np.ascontiguousarray(a, np.int32) for a in (nodes, dofs, *(f.dofs for f in fields))]
+        numbers = nodes, dofs, *(f.dofs for f in fields)
+        whole = [np.ascontiguousarray(a, dtype=np.int32) for a in numbers]
         given = [
             library.Field(f.values.ctypes.data, of_cells.ctypes.data, of_cells.shape[1], f.size)
             for f, of_cells in zip(fields, whole[2:], strict=True)

@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -86,6 +87,10 @@ _KERNELS = {
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
     "wrenches": (_INT, _LONG, *(_ARRAY,) * 5),
 }
+
+
+#: Compiles beside what else there is to do, one after the other.
+beside = ThreadPoolExecutor(1)
 
 
 def key(*parts: str) -> str:
