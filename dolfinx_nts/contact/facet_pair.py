@@ -143,7 +143,7 @@ class FacetPair(ContactPair, master=Surface):
         beside = (found.gap < -_OUTSIDE * found.length) & ~known[found.node]
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
-        stays[np.setdiff1d(node, lost)] = known[np.setdiff1d(node, lost)]
+        stays[node], stays[lost] = known[node], False
         hidden, deepest = found.part(beside), (0.0, -1)
         if len(hidden.node):
             depth = -hidden.gap / hidden.length
