@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import importlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -329,19 +329,19 @@ def chosen_flags() -> list[str]:
     return [] if chosen == defaults else list(chosen)
 
 
-def compile_form(form: Any) -> tuple[Any, Path]:
-    """A compiled form, and FFCx's C code of it."""
-    form = canonical(form)
-    if _OLD:
-        # Compiling a form sets this on its mesh, and so would change the next one's signature.
-        for domain in form.ufl_domains():
-            domain.ufl_coordinate_element()._sub_element._variant = "equispaced"
+def compile_forms(forms: Iterable[Any]) -> Iterator[tuple[Any, Path]]:
+    """Compiled forms one by one, each with FFCx's C code of it."""
     options = jit_options()
     given: dict[str, Any] = {"jit_options": options}
     if _OLD:
         given = {"jit_params": options, "form_compiler_params": {}}
     with _told_compiler("forms of a material or mesh that is new here") as sources:
-        return fem.form(form, **given), sources[-1]
+        for form in map(canonical, forms):
+            if _OLD:
+                # Compiling a form sets this on its mesh, and so would change the next signature.
+                for domain in form.ufl_domains():
+                    domain.ufl_coordinate_element()._sub_element._variant = "equispaced"
+            yield fem.form(form, **given), sources[-1]
 
 
 def constants(form: Any) -> FloatArray:
@@ -358,7 +358,8 @@ def functions(form: Any, compiled: Any) -> list[Any]:
         compiled: By DOLFINx.
     """
     given, made = form.coefficients(), compiled.ufcx_form
-    return [given[made.original_coefficient_position[k]] for k in range(made.num_coefficients)]
+    place = made.original_coefficient_position if _OLD else made.original_coefficient_positions
+    return [given[place[k]] for k in range(made.num_coefficients)]
 
 
 def cell_kernel(form: Any) -> Any:
@@ -372,9 +373,20 @@ def cell_kernel(form: Any) -> Any:
     return ctypes.CFUNCTYPE(None, *(ctypes.c_void_p,) * 7)(address)
 
 
-def turns_dofs(space: Any) -> bool:
-    """Whether entries of a cell depend on how its neighbours are numbered."""
-    return bool(space.element.needs_dof_transformations)
+def plain_dofs(space: Any, cells: int) -> IntArray | None:
+    """Blocks of dofs of the first cells as a kernel takes them, (cells, blocks).
+
+    None where the dofs of a cell are turned by how its neighbours are numbered, or where their list
+    is not what its layout says, as of a part of a mixed space.
+    """
+    if space.element.needs_dof_transformations:
+        return None
+    dofs = space.dofmap.list
+    if _OLD:
+        if len(dofs.array) != dofs.num_nodes * space.dofmap.dof_layout.num_dofs:
+            return None
+        dofs = _table(dofs, space.dofmap.dof_layout)
+    return np.asarray(dofs[:cells])
 
 
 def create_vector(space: Any) -> Any:
@@ -393,6 +405,11 @@ def add_vector(values: FloatArray, form: Any) -> None:
     form = getattr(form, "_cpp_object", form)
     packed = cpp.fem.pack_constants(form), cpp.fem.pack_coefficients(form)
     cpp.fem.assemble_vector(values, form, *packed)
+
+
+def sum_ghosts(b: Any) -> None:
+    """Add values at ghosts of a PETSc vector to their owners."""
+    b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
 
 def create_matrix(form: Any) -> Any:

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.kernels import library
@@ -29,25 +28,11 @@ def compile_forms(forms: Sequence[Any]) -> list[Any]:
     Returns:
         A `CellForm` of each that has at most one argument, and DOLFINx's form of any other.
     """
-    compiled = []
-    for form in forms:
-        made, source = compat.compile_form(form)
-        if len(form.arguments()) <= 1:
-            cells = _cells(form, made)
-            # The C compiler works beside FFCx, which is busy with the next form.
-            loop = cells and library.beside.submit(_load, source, cells.shape)
-            made = CellForm(made, source, cells, loop)
-        compiled.append(made)
-    return compiled
-
-
-def _load(source: Path, shape: Shape) -> Any:
-    """As `load`, from a file."""
-    try:
-        return load(source.read_text(), shape, compat.chosen_flags())
-    except OSError as error:
-        logger.debug("%s is taken cell by cell: %s", source, error)
-        return None
+    both = zip(forms, compat.compile_forms(forms), strict=True)
+    return [
+        made if len(form.arguments()) > 1 else CellForm(made, source, _cells(form, made))
+        for form, (made, source) in both
+    ]
 
 
 class _Cells(NamedTuple):
@@ -59,37 +44,35 @@ class _Cells(NamedTuple):
     dofs: IntArray
     fields: list[Field]
 
-    def arguments_of_first(self) -> tuple[FloatArray, FloatArray]:
-        """Coordinates of the first cell and its values of all Functions."""
-        of_cell = [f.values.reshape(-1, f.size)[f.dofs[0]].ravel() for f in self.fields]
-        return self.x[self.nodes[0]], np.concatenate(of_cell)
-
 
 def _cells(form: Any, compiled: Any) -> _Cells | None:
     """What a form is evaluated with for several cells at once; None where DOLFINx does better.
 
     It does over facets and parts of a mesh, and without Functions a form is hardly evaluated again.
     """
-    msh = compiled.mesh
-    cells = msh.topology.index_map(msh.topology.dim).size_local
     over_cells = all(
         part.integral_type() == "cell" and part.subdomain_id() in ("everywhere", "otherwise")
         for part in form.integrals()
     )
     functions = compat.functions(form, compiled)
     spaces = [argument.ufl_function_space() for argument in form.arguments()]
-    turned = any(compat.turns_dofs(s) for s in (*spaces, *(f.function_space for f in functions)))
-    if not cells or not functions or not over_cells or turned:
+    of_all = [*(f.function_space for f in functions), *spaces]
+    elsewhere = any(space.ufl_domain() != form.ufl_domain() for space in of_all)
+    if not functions or not over_cells or elsewhere:
         return None
-    nodes = compat.geometry_dofmap(msh)[:cells]
-    # A functional adds all cells to one entry.
-    dofs, block = np.zeros((cells, 1), dtype=np.int32), 1
-    if spaces:
-        dofs, block = compat.cell_dofs(spaces[0])[:cells], spaces[0].dofmap.bs
-    fields = [
-        Field(f.x.array, compat.cell_dofs(f.function_space)[:cells], f.function_space.dofmap.bs)
-        for f in functions
-    ]
+    msh = of_all[0].mesh
+    cells = msh.topology.index_map(msh.topology.dim).size_local
+    all_dofs = [compat.plain_dofs(space, cells) for space in of_all]
+    blocks = [space.dofmap.bs for space in of_all]
+    if not spaces:
+        # A functional adds all cells to one entry.
+        all_dofs.append(np.zeros((cells, 1), dtype=np.int32))
+        blocks.append(1)
+    known = [dofs for dofs in all_dofs if dofs is not None]
+    if not cells or len(known) < len(all_dofs):
+        return None
+    fields = [Field(f.x.array, *of) for f, *of in zip(functions, known, blocks, strict=False)]
+    nodes, dofs, block = compat.geometry_dofmap(msh)[:cells], known[-1], blocks[-1]
     width = sum(field.dofs.shape[1] * field.size for field in fields)
     shape = Shape(3 * nodes.shape[1], width, block * dofs.shape[1], block)
     return _Cells(shape, nodes, msh.geometry.x, dofs, fields)
@@ -102,21 +85,23 @@ class CellForm:
         compiled: By DOLFINx.
         source: FFCx's C code of it.
         cells: What it is evaluated with; None: DOLFINx evaluates it.
-        loop: Future of what `load` returns.
     """
 
-    def __init__(self, compiled: Any, source: Path, cells: _Cells | None, loop: Any) -> None:
-        self._compiled, self._source, self._cells, self._loop = compiled, source, cells, loop
+    def __init__(self, compiled: Any, source: Path, cells: _Cells | None) -> None:
+        self._compiled, self._source, self._cells = compiled, source, cells
+        if cells is not None:
+            # The C compiler works beside FFCx, which is busy with the next form.
+            self._loop = library.Beside(_load, source, cells.shape, compat.chosen_flags())
+            of_cell = [f.values.reshape(-1, f.size)[f.dofs[0]].ravel() for f in cells.fields]
+            self._first = np.concatenate(of_cell), compat.constants(compiled)
 
     @cached_property
     def batches(self) -> CellBatches | None:
         """What sums it over the cells; None where DOLFINx does."""
-        loop = self._cells and self._loop.result()
-        if self._cells is None or loop is None:
+        if self._cells is None or (loop := self._loop.result()) is None:
             return None
-        x, first = self._cells.arguments_of_first()
-        kernel, constants = compat.cell_kernel(self._compiled), compat.constants(self._compiled)
-        if not agrees(loop, kernel, self._cells.shape, x, first, constants):
+        shape, nodes, x, *_ = self._cells
+        if not agrees(loop, compat.cell_kernel(self._compiled), shape, x[nodes[0]], *self._first):
             text = "%s differs for several cells at once; it is taken cell by cell"
             logger.warning(text, self._source)
             return None
@@ -138,9 +123,18 @@ class CellForm:
         return float(total[0])
 
 
+def _load(source: Path, shape: Shape, flags: Sequence[str]) -> Any:
+    """As `load`, from a file."""
+    try:
+        return load(source.read_text(), shape, flags)
+    except OSError as error:
+        logger.info("%s is taken cell by cell: %s", source, error)
+        return None
+
+
 def assemble_vector(b: Any, form: CellForm) -> None:
     """Assemble a linear form into a ghosted PETSc vector, ghosts added to their owners."""
     with b.localForm() as here:
         here.set(0.0)
         form.add(here.array_w)
-    b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+    compat.sum_ghosts(b)

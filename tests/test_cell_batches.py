@@ -9,6 +9,7 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, create_box, create_rectangle, meshtags
 from mpi4py import MPI
+from processes import in_fresh_python
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -51,7 +52,7 @@ def moved(space, seed=0):
 
 def without_batches(form):
     """The same form as DOLFINx evaluates it."""
-    return forms.CellForm(form._compiled, form._source, None, None)
+    return forms.CellForm(form._compiled, form._source, None)
 
 
 def entries(form, space):
@@ -107,6 +108,82 @@ def test_of_a_membrane():
     fill(u, moved(space)[: 3 * space.dofmap.index_map.size_local])
     (work,) = forms.compile_forms([(1.0 + ufl.inner(u, u)) * ufl.inner(u, w) * ufl.dx])
     same(work, space)
+
+
+@pytest.mark.parametrize("combined", ["and", "or", "not", "unequal", "alone"])
+def test_conditions_on_constants_hold_when_they_change(combined):
+    """What is true of a Constant is one number for all cells, what is true of a field is not."""
+    mesh = box(CellType.hexahedron)
+    on, space = fem.Constant(mesh, 0.0), compat.vector_space(mesh, 1)
+    u = fem.Function(space)
+    fill(u, moved(space)[: 3 * space.dofmap.index_map.size_local])
+    late, large = ufl.gt(on, 0.5), ufl.gt(u[0], 0.0)
+    condition = {
+        "and": ufl.And(late, large),
+        "or": ufl.Or(late, large),
+        "not": ufl.And(ufl.Not(late), large),
+        "unequal": ufl.And(ufl.ne(on, 0.0), large),
+        "alone": late,
+    }[combined]
+    (form,) = forms.compile_forms([ufl.conditional(condition, 2.0, 1.0) * u[1] ** 2 * ufl.dx])
+    assert form.batches is not None
+    for value in (0.0, 1.0):
+        on.value = value
+        expected = fem.assemble_scalar(form._compiled)
+        assert form.value() == pytest.approx(expected, rel=1e-13)
+
+
+def test_largest_and_smallest_values():
+    mesh = box(CellType.hexahedron)
+    u = fem.Function(compat.vector_space(mesh, 1))
+    fill(u, moved(u.function_space)[: 3 * u.function_space.dofmap.index_map.size_local])
+    angle = getattr(ufl, "atan2", None) or ufl.atan_2
+    value = ufl.max_value(u[0], 0.01) + ufl.min_value(u[1], u[2]) + angle(u[0], 2.0 + u[1])
+    value += ufl.sign(u[2])
+    (form,) = forms.compile_forms([value * ufl.dx])
+    assert form.batches is not None
+    assert form.value() == pytest.approx(fem.assemble_scalar(form._compiled), rel=1e-13)
+
+
+def test_a_part_of_a_mixed_function_is_left_to_dolfinx():
+    mesh = box(CellType.tetrahedron)
+    if compat.VERSION < (0, 8):
+        cell = mesh.ufl_cell()
+        both = ufl.VectorElement("Lagrange", cell, 2) * ufl.FiniteElement("Lagrange", cell, 1)
+        space = fem.FunctionSpace(mesh, both)
+    else:
+        from basix.ufl import element, mixed_element
+
+        vector, scalar = element("P", "tetrahedron", 2, shape=(3,)), element("P", "tetrahedron", 1)
+        space = fem.functionspace(mesh, mixed_element([vector, scalar]))
+    both = fem.Function(space)
+    both.x.array[:] = np.sin(np.arange(len(both.x.array)))
+    part = both.sub(0)
+    (form,) = forms.compile_forms([ufl.inner(part, part) * ufl.dx])
+    assert form.value() == pytest.approx(fem.assemble_scalar(form._compiled), rel=1e-13)
+
+
+def test_what_a_fork_interrupts_is_made_again():
+    """`multiprocessing` forks on Linux; a child has its parent's objects, not its threads."""
+    code = """
+import os
+from dolfinx_nts.kernels import library
+import threading
+gate = threading.Event()
+here = os.getpid()
+def slow():
+    if os.getpid() == here:
+        gate.wait(60)
+    return os.getpid()
+beside = library.Beside(slow)
+child = os.fork()
+if child == 0:
+    os._exit(0 if beside.result() == os.getpid() else 1)
+_, status = os.waitpid(child, 0)
+gate.set()
+print(os.waitstatus_to_exitcode(status), beside.result() == here)
+"""
+    assert in_fresh_python(code).split() == ["0", "True"]
 
 
 @pytest.mark.mpi
@@ -182,7 +259,7 @@ def test_a_wrong_kernel_is_refused(monkeypatch, caplog, tmp_path):
     work = ufl.inner(ufl.grad(u), ufl.grad(w)) * (1.25 + ufl.inner(u, u)) * ufl.dx
     good = cell_batches._for_lanes
     monkeypatch.setattr(cell_batches, "_for_lanes", lambda c: good(c).replace("1.25", "1.26"))
-    compat.compile_form(work)
+    forms.compile_forms([work])
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # now of our libraries alone
     with caplog.at_level(logging.WARNING):
         (form,) = forms.compile_forms([work])
@@ -195,7 +272,7 @@ def test_without_a_compiler_dolfinx_takes_them(compiler, monkeypatch, tmp_path):
     mesh = box(CellType.hexahedron)
     u = fem.Function(compat.vector_space(mesh, 1))
     form = (2.5 + ufl.inner(u, u)) * ufl.dx
-    compat.compile_form(form)  # which needs one
+    forms.compile_forms([form])  # by FFCx, which needs one
     monkeypatch.setenv("CC", compiler)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (functional,) = forms.compile_forms([form])

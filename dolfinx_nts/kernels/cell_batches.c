@@ -16,7 +16,7 @@
 #endif
 
 typedef double Real __attribute__((vector_size(8 * LANES)));
-typedef long long Mask __attribute__((vector_size(8 * LANES)));
+typedef int64_t Mask __attribute__((vector_size(8 * LANES)));
 
 #define INLINE static inline __attribute__((always_inline))
 #define ZERO ((Real){0})
@@ -51,6 +51,23 @@ LANEWISE(acos)
 LANEWISE(atan)
 LANEWISE(erf)
 
+#define LANEWISE_OF_TWO(name)               \
+    INLINE Real each_##name(Real x, Real y) \
+    {                                       \
+        double a[LANES], b[LANES];          \
+        memcpy(a, &x, sizeof a);            \
+        memcpy(b, &y, sizeof b);            \
+        for (int i = 0; i < LANES; i++)     \
+            a[i] = name(a[i], b[i]);        \
+        memcpy(&x, a, sizeof a);            \
+        return x;                           \
+    }
+
+LANEWISE_OF_TWO(fmin)
+LANEWISE_OF_TWO(fmax)
+LANEWISE_OF_TWO(atan2)
+LANEWISE_OF_TWO(pow)
+
 INLINE Real each_fabs(Real x) { return (Real)((Mask)x & INT64_MAX); }
 
 /* The logarithm as in FDLIBM (Sun Microsystems 1993), whose error is below one unit in the last place:
@@ -59,7 +76,7 @@ INLINE Real each_log(Real x)
 {
     const Mask tiny = x < 0x1p-1022;
     const Mask bits = (Mask)choose(tiny, x * 0x1p54, x);
-    const Mask power = (bits - 0x3fe6a09e667f3bcdLL) >> 52; /* of two, with 1 + f from sqrt(1/2) to sqrt(2) */
+    const Mask power = (bits - INT64_C(0x3fe6a09e667f3bcd)) >> 52; /* of two, with 1 + f from sqrt(1/2) to sqrt(2) */
     const Real k = __builtin_convertvector(power, Real) - choose(tiny, EACH(54.0), ZERO);
     const Real f = (Real)(bits - (power << 52)) - 1.0;
     const Real half = 0.5 * f * f, s = f / (2.0 + f), z = s * s, w = z * z;
@@ -72,22 +89,11 @@ INLINE Real each_log(Real x)
     return choose((x > 0.0) & (x < INFINITY), y, outside);
 }
 
-INLINE Real power_of_reals(Real x, Real y)
-{
-    double a[LANES], b[LANES];
-    memcpy(a, &x, sizeof a);
-    memcpy(b, &y, sizeof b);
-    for (int i = 0; i < LANES; i++)
-        a[i] = pow(a[i], b[i]);
-    memcpy(&x, a, sizeof a);
-    return x;
-}
-
 INLINE Real power_of_whole(Real x, int n)
 {
     const int times = n < 0 ? -n : n;
     if (times == 0 || times > 4)
-        return power_of_reals(x, EACH((double)n));
+        return each_pow(x, EACH((double)n));
     Real y = x;
     for (int i = 1; i < times; i++)
         y *= x;
@@ -98,7 +104,7 @@ INLINE Real power_of_real(Real x, double y)
 {
     if (y == 0.5)
         return each_sqrt(x);
-    return y == (int)y ? power_of_whole(x, (int)y) : power_of_reals(x, EACH(y));
+    return y == (int)y ? power_of_whole(x, (int)y) : each_pow(x, EACH(y));
 }
 
 #define sqrt(x) each_sqrt(EACH(x))
@@ -113,9 +119,12 @@ INLINE Real power_of_real(Real x, double y)
 #define acos(x) each_acos(EACH(x))
 #define atan(x) each_atan(EACH(x))
 #define erf(x) each_erf(EACH(x))
+#define fmin(x, y) each_fmin(EACH(x), EACH(y))
+#define fmax(x, y) each_fmax(EACH(x), EACH(y))
+#define atan2(x, y) each_atan2(EACH(x), EACH(y))
 #define fabs(x) each_fabs(EACH(x))
 #define log(x) each_log(EACH(x))
-#define pow(x, y) _Generic((y), int : power_of_whole, double : power_of_real, default : power_of_reals)(EACH(x), y)
+#define pow(x, y) _Generic((y), int : power_of_whole, double : power_of_real, default : each_pow)(EACH(x), y)
 
 INLINE void kernel(Real *restrict A, const Real *restrict w, const double *restrict c,
                    const Real *restrict coordinate_dofs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import hashlib
 import logging
 import os
@@ -10,10 +11,11 @@ import platform
 import shlex
 import subprocess
 import tempfile
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache, partial
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -55,7 +57,7 @@ class Law(ctypes.Structure):
     ]
 
 
-class Field(ctypes.Structure):
+class FieldTable(ctypes.Structure):
     """A Function in a form; see `cell_batches.c`."""
 
     _fields_ = [  # noqa: RUF012
@@ -89,8 +91,44 @@ _KERNELS = {
 }
 
 
-#: Compiles beside what else there is to do, one after the other.
-beside = ThreadPoolExecutor(1)
+class Beside:
+    """A call in a thread beside what else there is to do; in a forked process it is made again.
+
+    Args:
+        function: What is called.
+        arguments: Its arguments.
+    """
+
+    def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
+        self._call, self._process = partial(function, *arguments), os.getpid()
+        self._found: list[Any] = []
+        self._thread = Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self._found = [self._call()]
+
+    def result(self) -> Any:
+        """What the function returns, once it does."""
+        if os.getpid() == self._process:
+            self._thread.join()
+        if not self._found:
+            self._run()
+        return self._found[0]
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Let one thread of one process at a time work in a folder."""
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX)
+        yield
+    finally:
+        # A process that was forked meanwhile has the folder open, too.
+        fcntl.flock(opened, fcntl.LOCK_UN)
+        os.close(opened)
+
 
 
 def key(*parts: str) -> str:
@@ -101,7 +139,7 @@ def key(*parts: str) -> str:
 def made(name: str, command: Callable[[Path], list[str]]) -> Any:
     """A library in the folder of the forms that DOLFINx compiles, made where it is not there.
 
-    Whoever else makes it at the same time replaces it by the same.
+    Ranks and processes that share the folder wait for the one that makes it.
 
     Args:
         name: Its file's, with the `key` of all that it is made of.
@@ -114,14 +152,20 @@ def made(name: str, command: Callable[[Path], list[str]]) -> Any:
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     target = Path(cache, "fenics", f"dolfinx_nts_{platform.machine()}_{name}.so")
     if not target.exists():
-        compiler = shlex.split(os.environ.get("CC", "cc"))
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-            new = Path(folder, target.name)
-            given = [*command(Path(folder)), "-shared", "-fPIC", "-o", str(new), "-lm"]
-            subprocess.run([*compiler, *given], check=True, capture_output=True)
-            new.replace(target)
+        with _alone(target.parent):
+            if not target.exists():
+                _make(target, command)
     return ctypes.CDLL(str(target))
+
+
+def _make(target: Path, command: Callable[[Path], list[str]]) -> None:
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+        new = Path(folder, target.name)
+        given = [*command(Path(folder)), "-shared", "-fPIC", "-o", str(new), "-lm"]
+        subprocess.run([*compiler, *given], check=True, capture_output=True, text=True)
+        new.replace(target)
 
 
 @lru_cache

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.state import State
 from dolfinx_nts.step.impact import Impact
@@ -82,6 +84,10 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
         if body.has_massless:
             # What has no momentum has no velocity of its own either.
             v[k][body.massless] = step.bodies[k].du[body.massless] / dt
+        # What is known of a body holds while its arrays are the same objects.
+        for now, before in ((u, old.u), (v, old.v)):
+            if np.array_equal(now[k], before[k]):
+                now[k] = before[k]
     both = problem.couplings.each(step)
     contacts, *joints = (coupling.history(parts) for coupling, parts in both)
     return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))

@@ -48,7 +48,7 @@ def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
 def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
     """Whether the residual does more work in the step than a part of the forces' work. Collective.
 
-    It is what the step misses in the ledger.
+    It is the bodies' part of what the step misses in the ledger.
 
     Args:
         problem: Equations of the step.

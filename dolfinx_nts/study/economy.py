@@ -30,6 +30,7 @@ from petsc4py import PETSc
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.forms import CellForm, assemble_vector
 from dolfinx_nts.kernels.strain_energy import strain_energy
 from dolfinx_nts.output import writers as output
 from dolfinx_nts.step.linear_solver import SolverOptions
@@ -201,8 +202,10 @@ class PlainBody:
         work = ufl.inner(stress, ufl.grad(w)) * dx
         inertia = rho * ufl.inner(du, w) * dx
         tangent = factor * ufl.derivative(work, self._u1, du) + inertia
-        forms = [compat.compile_form(form)[0] for form in (work, tangent, inertia)]
-        self._work, self._tangent, mass = forms
+        forms = list(compat.compile_forms([work, tangent, inertia]))
+        # As a plain loop has it: DOLFINx evaluates it.
+        self._work = CellForm(*forms[0], None)
+        self._tangent, mass = (form for form, _ in forms[1:])
         self._mass, self._a = compat.create_matrix(mass), compat.create_matrix(self._tangent)
         compat.assemble_matrix(self._mass, mass, (), 0.0)
         self._force = compat.create_vector(space)
@@ -238,10 +241,7 @@ class PlainBody:
 
     def _residual(self, _snes: Any, x: Any, f: Any) -> None:
         self._fill(x)
-        with self._force.localForm() as here:
-            here.set(0.0)
-            compat.add_vector(here.array_w, self._work)
-        self._force.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        assemble_vector(self._force, self._work)
         self._change.waxpy(-1.0, self._first, x)
         self._mass.mult(self._change, f)
         f.axpy(0.5 * self._dt**2, self._force)
