@@ -12,7 +12,7 @@ import shlex
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Thread
@@ -119,14 +119,16 @@ class Beside:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Let one thread of one process at a time work in a folder."""
+    """Let one thread of one process at a time work in a folder, if its file system has locks."""
     opened = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(opened, fcntl.LOCK_EX)
+        with suppress(OSError):
+            fcntl.flock(opened, fcntl.LOCK_EX)
         yield
     finally:
         # A process that was forked meanwhile has the folder open, too.
-        fcntl.flock(opened, fcntl.LOCK_UN)
+        with suppress(OSError):
+            fcntl.flock(opened, fcntl.LOCK_UN)
         os.close(opened)
 
 
