@@ -329,6 +329,11 @@ def chosen_flags() -> list[str]:
     return [] if chosen == defaults else list(chosen)
 
 
+def cache_folder() -> Path:
+    """Where DOLFINx keeps what it compiles."""
+    return Path(_jit_options()[0]["cache_dir"])
+
+
 def compile_forms(forms: Iterable[Any]) -> Iterator[tuple[Any, Path]]:
     """Compiled forms one by one, each with FFCx's C code of it."""
     options = jit_options()

@@ -14,7 +14,7 @@ from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.kernels import library
-from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, agrees, load
+from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, difference, load
 
 logger = logging.getLogger(__name__)
 
@@ -98,12 +98,18 @@ class CellForm:
     @cached_property
     def batches(self) -> CellBatches | None:
         """What sums it over the cells; None where DOLFINx does."""
-        if self._cells is None or (loop := self._loop.result()) is None:
+        if self._cells is None:
             return None
         shape, nodes, x, *_ = self._cells
-        if not agrees(loop, compat.cell_kernel(self._compiled), shape, x[nodes[0]], *self._first):
-            text = "%s differs for several cells at once; it is taken cell by cell"
-            logger.warning(text, self._source)
+        kernel, level = compat.cell_kernel(self._compiled), logging.WARNING
+        try:
+            loop = self._loop.result()
+            why = difference(loop, kernel, shape, x[nodes[0]], *self._first)
+        except library.NotMadeError as error:
+            why, level = str(error), logging.INFO
+        if why:
+            text = "the kernel of %s for several cells at once is not used, but that for one: %s"
+            logger.log(level, text, self._source, why)
             return None
         return CellBatches(loop, *self._cells[1:])
 
@@ -124,12 +130,12 @@ class CellForm:
 
 
 def _load(source: Path, shape: Shape, flags: Sequence[str]) -> Any:
-    """As `load`, from a file."""
+    """As `load`, from a file and beside it."""
     try:
-        return load(source.read_text(), shape, flags)
+        code = source.read_text()
     except OSError as error:
-        logger.info("%s is taken cell by cell: %s", source, error)
-        return None
+        raise library.NotMadeError(str(error)) from error
+    return load(code, shape, source.parent, flags)
 
 
 def assemble_vector(b: Any, form: CellForm) -> None:

@@ -862,3 +862,34 @@ def test_a_load_step_that_fails_after_others_keeps_what_is_solved():
     run = nts.equilibrium(nts.System([upper, lower], contacts=[pair]), load_steps=2)
     assert not run.status.startswith("completed") and len(run.rows) >= 2
     assert run.rows[1]["time"] <= 0.5
+
+
+def gent(limit):
+    """Rubber that is not defined beyond a limit of I_1 - 3 - 2 ln J."""
+
+    def energy(c):
+        j = ufl.sqrt(ufl.det(c))
+        return -1e5 * ufl.ln(1 - (ufl.tr(c) - 3 - 2 * ufl.ln(j)) / limit) + 1e5 * (j - 1) ** 2
+
+    return energy
+
+
+@pytest.mark.mpi
+def test_an_energy_that_is_not_defined_is_told():
+    """Forces may come out finite where the energy does not."""
+    pulled = nts.Dirichlet(at(0, 1.0), lambda t: (2 * t, 0, 0))
+    body = nts.Continuum(box(), gent(0.5), density=1e3, bcs=[nts.Dirichlet(at(0, 0.0)), pulled])
+    run = nts.equilibrium(nts.System([body]), load_steps=3)
+    assert "the energy is not finite" in str(run.warnings)
+    assert run.status != "completed"
+
+
+@pytest.mark.mpi
+def test_forces_that_are_not_finite_are_told():
+    """And motions that nothing resists are not sought in them."""
+    body = nts.Continuum(
+        box(), lambda c: 1e5 * ufl.sqrt(ufl.tr(c) - 3.2), density=1e3,
+        bcs=[nts.Dirichlet(at(0, 0.0))],
+    )  # fmt: skip
+    run = nts.equilibrium(nts.System([body], gravity=(0, 0, -9.81)), load_steps=2)
+    assert "the internal forces of 'body' are not finite" in run.status

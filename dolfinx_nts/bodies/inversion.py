@@ -79,13 +79,18 @@ class Determinants:
         table = str(self._table.tolist()).translate(str.maketrans("[]", "{}"))
         code = _KERNEL.format(points=count, nodes=of_cell, table=table)
         shape = Shape(3, 3 * of_cell, count, count)
-        self._loop = library.Beside(load, code, shape, compat.chosen_flags())
+        self._loop = library.Beside(
+            load, code, shape, compat.cache_folder(), compat.chosen_flags()
+        )
 
     @cached_property
     def _batches(self) -> CellBatches | None:
         """What takes several cells at once; None where it is not compiled."""
-        loop, number = self._loop.result(), np.arange(len(self._cells))[:, None]
-        if loop is None:
+        number = np.arange(len(self._cells))[:, None]
+        try:
+            loop = self._loop.result()
+        except library.NotMadeError as error:
+            logger.info("the kernel of det F is not used, but NumPy: %s", error)
             return None
         self._x = np.empty_like(self._reference)
         x = Field(self._x, self._cells, 3)

@@ -91,8 +91,14 @@ _KERNELS = {
 }
 
 
+class NotMadeError(Exception):
+    """A library cannot be made; says why in a line."""
+
+
 class Beside:
     """A call in a thread beside what else there is to do; in a forked process it is made again.
+
+    What it raises is raised by `result`.
 
     Args:
         function: What is called.
@@ -106,7 +112,10 @@ class Beside:
         self._thread.start()
 
     def _run(self) -> None:
-        self._found = [self._call()]
+        try:
+            self._found = [self._call(), None]
+        except Exception as error:  # any: it is raised where it is asked for
+            self._found = [None, error]
 
     def result(self) -> Any:
         """What the function returns, once it does."""
@@ -114,7 +123,10 @@ class Beside:
             self._thread.join()
         if not self._found:
             self._run()
-        return self._found[0]
+        value, error = self._found
+        if error is not None:
+            raise error
+        return value
 
 
 @contextmanager
@@ -138,27 +150,42 @@ def key(*parts: str) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-def made(name: str, command: Callable[[Path], list[str]]) -> Any:
-    """A library in the folder of the forms that DOLFINx compiles, made where it is not there.
+def made(
+    name: str, command: Callable[[Path], list[str]], folder: Path | None = None
+) -> Any:
+    """A library, made where it is not there.
 
     Ranks and processes that share the folder wait for the one that makes it.
 
     Args:
         name: Its file's, with the `key` of all that it is made of.
         command: An empty folder -> the compiler's flags and files.
+        folder: Where it is kept; None: where DOLFINx keeps what it compiles, unless it is told
+            another folder.
 
     Raises:
-        OSError: It can be neither made nor loaded.
-        subprocess.CalledProcessError: The compiler has refused it.
+        NotMadeError: It can be neither made nor loaded.
     """
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    target = Path(cache, "fenics", f"dolfinx_nts_{platform.machine()}_{name}.so")
-    if not target.exists():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with _alone(target.parent):
-            if not target.exists():
-                _make(target, command)
-    return ctypes.CDLL(str(target))
+    if folder is None:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "fenics")
+    try:
+        target = folder.expanduser().resolve() / f"dolfinx_nts_{platform.machine()}_{name}.so"
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with _alone(target.parent):
+                if not target.exists():
+                    _make(target, command)
+        try:
+            return ctypes.CDLL(str(target))
+        except OSError:  # what a full disk has left is of no use
+            _make(target, command)
+            return ctypes.CDLL(str(target))
+    except subprocess.CalledProcessError as error:
+        lines = (line.partition("error: ")[2] for line in error.stderr.splitlines())
+        why = next(filter(None, lines), f"{error.cmd[0]} ends with status {error.returncode}")
+        raise NotMadeError(why) from error
+    except (OSError, RuntimeError) as error:  # pathlib's, without a home
+        raise NotMadeError(str(error)) from error
 
 
 def _make(target: Path, command: Callable[[Path], list[str]]) -> None:
@@ -176,7 +203,7 @@ def load() -> Any:
     of = key(" ".join(_FLAGS), *(source.read_text() for source in _SOURCES))
     try:
         library = made(of, lambda _: [*_FLAGS, *map(str, _SOURCES[1:])])
-    except (OSError, subprocess.CalledProcessError) as error:
+    except NotMadeError as error:
         logger.warning("Contact kernels are not compiled (%s): contact takes longer", error)
         return None
     for name, arguments in _KERNELS.items():

@@ -13,6 +13,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.run.promises import NOT_FINITE
 from dolfinx_nts.run.same import same_run
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Solution
@@ -169,12 +170,14 @@ class _LoadStepper(Stepper):
         pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
         pressed += self.system.comm.allreduce(loads)
         rounding = _ROUNDING * self.problem.rounded_length * pressed
-        if missing > _OPEN * size + rounding:
-            self.solution.warn(
-                "ledger", time, missing,
+        if not missing <= _OPEN * size + rounding:
+            text = (
                 f"work and stored energy differ by {missing:.3g} J of {size:.3g} J: "
-                f"{self._remedy_of_ledger()}",
-            )  # fmt: skip
+                f"{self._remedy_of_ledger()}"
+            )
+            endless = not np.isfinite(missing)
+            text = NOT_FINITE if endless else text
+            self.solution.warn("ledger", time, missing, text, grave=endless)
         self._accept(state)
         tell_inversion(self.solution, self.problem, step, state)
         tell_couplings(self.solution, self.problem, step, state)

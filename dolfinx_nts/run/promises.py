@@ -30,6 +30,11 @@ _LOSS = 0.1
 _EPS = float(np.finfo(float).eps)
 #: Rounding of a step's energy over that of its forces times its motion.
 _ROUNDING = 10.0
+#: What a run says of an energy without a value.
+NOT_FINITE = (
+    "the energy is not finite: that of a material, a form or a spring may not be defined for its "
+    "deformation"
+)
 
 
 class Promises:
@@ -96,10 +101,7 @@ class Promises:
                 f"{self._open}"
             )
         if not np.isfinite(missing):
-            text = (
-                "the energy is not finite: that of a material, a form or a spring may not be "
-                "defined for its deformation"
-            )
+            text = NOT_FINITE
         doubtful = not part <= (_DOUBTFUL if self._closes else _OPEN)
         self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
 

@@ -59,6 +59,10 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
         for j, (m, y) in enumerate(modes):
             sizes[1, i, j] = x @ y if k == m else 0.0
     comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.SUM)
+    if not np.isfinite(sizes).all():  # what is not defined there is told by who solves the step
+        for vector in (direction, result, diagonal):
+            vector.destroy()
+        return None
     resistance, forces = np.sqrt(sizes.diagonal(axis1=1, axis2=2))
     alone = np.flatnonzero(resistance <= _NONE * forces)
     if alone.size:  # eigenvectors would mix the motions that are free as rounding has it
