@@ -893,3 +893,13 @@ def test_forces_that_are_not_finite_are_told():
     )  # fmt: skip
     run = nts.equilibrium(nts.System([body], gravity=(0, 0, -9.81)), load_steps=2)
     assert "the internal forces of 'body' are not finite" in run.status
+
+
+@pytest.mark.mpi
+def test_virtual_work_that_is_not_finite_is_told():
+    body = nts.Continuum(
+        box(), RUBBER, density=1e3, bcs=[nts.Dirichlet(at(0, 0.0))],
+        extra_form=lambda u, v, w, t: ufl.sqrt(u[0] - 1.0) * w[0] * ufl.dx,
+    )  # fmt: skip
+    run = nts.equilibrium(nts.System([body]), load_steps=1)
+    assert "the external forces of 'body' are not finite: check its loads" in run.status

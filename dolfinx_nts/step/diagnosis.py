@@ -45,16 +45,21 @@ def diagnosis(
         for name in best
     }
     top = [best[name] for name in sorted(best, key=lambda name: -trouble[name])[:4]]
-    endless = [
-        body.name
-        for body, terms in bodies
-        if not problem.system.comm.allreduce(np.isfinite(terms.internal).all(), op=MPI.LAND)
-    ]
-    if endless:
-        why += (
-            f"; the internal forces of {', '.join(map(repr, endless))} are not finite: the energy "
-            "of its material or form may not be defined for this deformation"
-        )
+    kinds = {
+        "internal": "the energy of its material or form may not be defined for this deformation",
+        "external": "check its loads and its extra_form for NaN",
+    }
+    for kind, hint in kinds.items():
+        endless = [
+            body.name
+            for body, terms in bodies
+            if not problem.system.comm.allreduce(
+                bool(np.isfinite(getattr(terms, kind)).all()), op=MPI.LAND
+            )
+        ]
+        if endless:
+            names = ", ".join(map(repr, endless))
+            why += f"; the {kind} forces of {names} are not finite: {hint}"
     top += _held_twice(problem, e)
     finite = ratio[worst] < np.inf
     size = f"at {ratio[worst]:.3g} times its tolerance" if finite else "is not finite"
