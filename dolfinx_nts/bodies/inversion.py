@@ -157,15 +157,16 @@ def smallest_dets(
     Args:
         system: Its bodies.
         u: Displacements of each body [m].
-        known: Of each body's number what was found last and where, brought up to date.
+        known: Of each body's number what was found last, which holds while its array is the same
+            object; brought up to date.
 
     Returns:
         Shape (bodies,).
     """
     local, known = np.empty(len(system.bodies)), {} if known is None else known
     for k, (body, values) in enumerate(zip(system.bodies, u, strict=True)):
-        if k not in known or not np.array_equal(known[k][0], values):
-            known[k] = values.copy(), body.smallest_det(values)[0]
+        if k not in known or known[k][0] is not values:
+            known[k] = values, body.smallest_det(values)[0]
         local[k] = known[k][1]
     system.comm.Allreduce(MPI.IN_PLACE, local, op=MPI.MIN)
     return local

@@ -7,13 +7,17 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.step.impact import Impact
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.validation import StepFailedError
+
+FloatArray = npt.NDArray[np.float64]
 
 #: Searches for contact, each along the motion that came of the one before.
 _SEARCHES = 4
@@ -66,7 +70,7 @@ def solved(problem: StepProblem, solver: StepSolver) -> Evaluation:
 
 
 def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
-    """State at t_{n+1}.
+    """State at t_{n+1}. Collective.
 
     Args:
         problem: Equations of the step.
@@ -84,10 +88,23 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
         if body.has_massless:
             # What has no momentum has no velocity of its own either.
             v[k][body.massless] = step.bodies[k].du[body.massless] / dt
-        # What is known of a body holds while its arrays are the same objects.
-        for now, before in ((u, old.u), (v, old.v)):
-            if np.array_equal(now[k], before[k]):
-                now[k] = before[k]
+    _keep_unchanged(problem, u, v)
     both = problem.couplings.each(step)
     contacts, *joints = (coupling.history(parts) for coupling, parts in both)
     return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))
+
+
+def _keep_unchanged(problem: StepProblem, u: list[FloatArray], v: list[FloatArray]) -> None:
+    """Take bodies' arrays at t_n where all ranks find them unchanged. Collective.
+
+    What is known of a body holds while its arrays are the same objects, on all ranks alike.
+    """
+    both = (u, problem.state.u), (v, problem.state.v)
+    moved = [
+        [float(not np.array_equal(now[k], before[k])) for k in range(len(u))]
+        for now, before in both
+    ]
+    anywhere = global_max(problem.system.comm, np.array(moved))
+    for (now, before), moves in zip(both, anywhere, strict=True):
+        for k in np.flatnonzero(moves == 0.0):
+            now[k] = before[k]
