@@ -130,15 +130,15 @@ class Beside:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Let one thread of one process at a time work in a folder, if its file system has locks."""
-    opened = os.open(folder, os.O_RDONLY)
+def _alone(target: Path) -> Iterator[None]:
+    """Let one thread of one process at a time make a file, if its file system has locks."""
+    opened = os.open(target.with_suffix(".lock"), os.O_CREAT | os.O_RDWR)
     try:
         with suppress(OSError):
             fcntl.flock(opened, fcntl.LOCK_EX)
         yield
     finally:
-        # A process that was forked meanwhile has the folder open, too.
+        # A process that was forked meanwhile has it open, too.
         with suppress(OSError):
             fcntl.flock(opened, fcntl.LOCK_UN)
         os.close(opened)
@@ -172,7 +172,7 @@ def made(
         target = folder.expanduser().resolve() / f"dolfinx_nts_{platform.machine()}_{name}.so"
         if not target.exists():
             target.parent.mkdir(parents=True, exist_ok=True)
-            with _alone(target.parent):
+            with _alone(target):
                 if not target.exists():
                     _make(target, command)
         try:
