@@ -144,15 +144,12 @@ def _alone(target: Path) -> Iterator[None]:
         os.close(opened)
 
 
-
 def key(*parts: str) -> str:
     """What a library is made of, in 16 characters."""
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-def made(
-    name: str, command: Callable[[Path], list[str]], folder: Path | None = None
-) -> Any:
+def made(name: str, command: Callable[[Path], list[str]], folder: Path | None = None) -> Any:
     """A library, made where it is not there.
 
     Ranks and processes that share the folder wait for the one that makes it.
