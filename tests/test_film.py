@@ -43,7 +43,8 @@ def test_frames_of_a_run(mpi_tmp_path):
     assert len(frames) == 4
     assert len({frame.shape for frame in frames}) == 1
     assert any((a != b).any() for a, b in zip(frames, frames[1:], strict=False))
-    touches = np.abs(run.contact_forces[::2]).max(axis=(1, 2)) > 0
+    forces = np.abs(run.contact_forces[::2]).max(axis=(1, 2))
+    touches = forces > 0.02 * forces.max()  # others are not drawn; 1e-28 N may be left by rounding
     assert touches.any() and not touches.all()
     assert [reds(frame) > 0 for frame in frames] == touches.tolist()
     _, without = film(mpi_tmp_path / "without.gif", every=2, forces=False)
