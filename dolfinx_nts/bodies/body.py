@@ -160,7 +160,7 @@ class Body:
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of the sum of the places' momenta [kg m/s], shape (3,)."""
-        total: FloatArray = momentum.reshape(-1, 3)[self.places].sum(axis=0)
+        total: FloatArray = self.places @ momentum.reshape(-1, 3)
         return total
 
     def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:

@@ -139,6 +139,8 @@ class StepForms:
     def with_ghosts(self, u: FloatArray) -> FloatArray:
         """Values at all nodes of this rank. Collective."""
         self._check_alive()
+        if self._alone:
+            return u
         self._vector.array_w[:] = u
         self._vector.ghostUpdate()
         with self._vector.localForm() as here:

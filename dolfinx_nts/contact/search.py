@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.kernels.vectors import range_of
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
@@ -293,10 +294,9 @@ def apart(points: FloatArray, corners: FloatArray, reach: float) -> bool:
         corners: Facet corners [m], shape (m, nc, 3).
         reach: Largest distance of interest [m].
     """
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    first, last = points.min(axis=0), points.max(axis=0)
-    outside = float(np.maximum(0.0, np.maximum(low - last, first - high)).max())
-    magnitude = max(float(np.abs(a).max()) for a in (low, high, first, last))
+    one, two = range_of(points), range_of(corners)
+    outside = max(0.0, -float((one + two[::-1]).min()))
+    magnitude = max(float(np.abs(a).max()) for a in (one, two))
     return outside > reach + ROUNDING * (magnitude + outside)
 
 

@@ -120,8 +120,9 @@ def size(corners: FloatArray) -> FloatArray:
     Args:
         corners: Facet corners [m], shape (n, nc, 3).
     """
-    edges = np.roll(corners, -1, axis=1) - corners
-    return np.linalg.norm(edges, axis=2).mean(axis=1)
+    edges = corners[:, np.arange(1 - corners.shape[1], 1)] - corners  # next corner, last to first
+    lengths: FloatArray = np.sqrt(np.einsum("nki,nki->nk", edges, edges))
+    return lengths.sum(axis=1) / corners.shape[1]
 
 
 def edge_excess(xi: FloatArray, nc: int) -> FloatArray:

@@ -23,9 +23,11 @@ def range_of(moved: FloatArray, around: FloatArray | float = 0.0) -> FloatArray:
         moved: The vectors, shape (3 n,) or (n, 3); of none it is -inf.
         around: What each component may be larger or smaller by, shape (n, 3).
     """
-    moved = moved.reshape(-1, 3)
+    # Components one after the other are compared ten times as fast.
+    moved = np.ascontiguousarray(moved.reshape(-1, 3).T)
+    around = np.transpose(around)
     ends = (around + moved, around - moved)
-    return np.array([end.max(axis=0, initial=-np.inf) for end in ends])
+    return np.array([end.max(axis=1, initial=-np.inf) for end in ends])
 
 
 def solve_2x2(
