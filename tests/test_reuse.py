@@ -383,7 +383,7 @@ def test_forces_of_a_body_at_rest_are_evaluated_once_a_step():
         internal, count = right.internal, []
         right.internal = lambda u1, i=internal, n=count: n.append(1) or i(u1)
         if not remember:
-            stepper.problem._unmoved = lambda values: set()
+            stepper.problem.moved = lambda values, known, p=stepper.problem: list(p.awake)
         for _ in range(4):
             stepper.advance(1e-3)
         calls.append(len(count))

@@ -10,7 +10,7 @@ pure: nothing here changes a State, and history changes only when a step is acce
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
@@ -69,7 +69,9 @@ class StepProblem:
         self.rtol, self.condense = rtol, condense
         self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
         self._asleep: dict[int, BodyTerms] = {}
-        self._evaluated: dict[int, BodyTerms] = {}
+        self._evaluated: dict[int, tuple[FloatArray, ...]] = {}
+        # What batches contribute that have no element on any rank: nothing, at every iterate.
+        self._of_none: tuple[Any, ...] | None = None
         self.awake: tuple[int, ...] = ()
         self._numbers: tuple[Any, ...] | None = None
         self.couplings = Couplings(system)
@@ -200,6 +202,7 @@ class StepProblem:
             self.unknowns = Unknowns(system.comm, sizes, elements, of)
             self.version += 1
             self._numbers = numbers
+        self._of_none = None
         self.guess(flight=True)
 
     @property
@@ -284,7 +287,31 @@ class StepProblem:
         Args:
             x: PETSc vector of the unknowns.
         """
-        values, laid, elements = x.array_r.copy(), self.laid, self.elements
+        values, laid = x.array_r.copy(), self.laid
+        if laid.blocks or self._of_none is None:
+            parts = self._of_elements(x, values)
+            self._of_none = None if laid.blocks else parts
+        else:
+            parts = self._of_none
+        force = laid.forces(self.elements, parts) if laid.blocks else np.zeros(len(values))
+        # Most often bodies at rest before something hits them stay where the last iterate had them.
+        for k in self.moved(values, {k: terms[0] for k, terms in self._evaluated.items()}):
+            self._evaluated[k] = self._without_elements(k, values[laid.of_body(k)])
+        bodies = dict(self._asleep)
+        for k in self.awake:
+            u1, du, internal, external, total = self._evaluated[k]
+            coupling = force[laid.of_body(k)]
+            bodies[k] = BodyTerms(u1, du, internal, external, coupling, total + coupling)
+        return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
+
+    def _of_elements(self, x: Any, values: FloatArray) -> tuple[Any, ...]:
+        """What each batch of elements contributes at an iterate. Collective.
+
+        Args:
+            x: PETSc vector of the unknowns.
+            values: This rank's part of it.
+        """
+        laid, elements = self.laid, self.elements
         positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
         own = laid.own_values(values, elements)
         parts = evaluate_together(self.system.comm, elements, positions, own)
@@ -293,34 +320,33 @@ class StepProblem:
             contacts.elements, contacts.bodies, parts[:touching], positions[:touching],
             self._closed,
         )  # fmt: skip
-        force = laid.forces(elements, parts) if laid.blocks else np.zeros(len(values))
-        bodies, unmoved = dict(self._asleep), self._unmoved(values)
-        for k in self.awake:
-            body, u0, here = self.system.bodies[k], self.state.u[k], laid.of_body(k)
-            u1 = values[here]
-            if k in unmoved:
-                internal, external = self._evaluated[k].internal, self._evaluated[k].external
-            else:
-                internal = self.factor * body.internal(u1)
-                external = self.factor * body.external(u1, self.loads.gravity)
-            du, coupling = u1 - u0, force[here]
-            residual = self._inertial(body, du) - self.flight[k] + internal - external + coupling
-            bodies[k] = BodyTerms(u1, du, internal, external, coupling, residual)
-        self._evaluated = bodies
-        return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
+        return parts
 
-    def _unmoved(self, values: FloatArray) -> set[int]:
-        """Bodies that are where the last iterate had them, whose forces are known. Collective.
+    def _without_elements(self, k: int, u1: FloatArray) -> tuple[FloatArray, ...]:
+        """`BodyTerms` of a body at a displacement, but for those of elements. Collective.
 
-        Most often bodies at rest before something hits them.
+        Returns:
+            u1, du, internal and external forces, and the equation without elements.
         """
-        moved = [
-            k not in self._evaluated
-            or not np.array_equal(values[self.laid.of_body(k)], self._evaluated[k].u1)
+        body, du = self.system.bodies[k], u1 - self.state.u[k]
+        internal = self.factor * body.internal(u1)
+        external = self.factor * body.external(u1, self.loads.gravity)
+        total = self._inertial(body, du) - self.flight[k] + internal - external
+        return u1, du, internal, external, total
+
+    def moved(self, values: FloatArray, known: Mapping[int, FloatArray]) -> list[int]:
+        """Bodies that are awake and are elsewhere than known. Collective.
+
+        Args:
+            values: This rank's unknowns.
+            known: Displacements [m] by the body's number; a body without one is elsewhere.
+        """
+        here = [
+            k not in known or not np.array_equal(values[self.laid.of_body(k)], known[k])
             for k in self.awake
         ]
-        anywhere = global_max(self.system.comm, np.array(moved, dtype=np.float64))
-        return {k for k, moves in zip(self.awake, anywhere, strict=True) if not moves}
+        anywhere = global_max(self.system.comm, np.array(here, dtype=np.float64))
+        return [k for k, moves in zip(self.awake, anywhere.tolist(), strict=True) if moves]
 
     def _closed(self, batch: ContactElements) -> float:
         """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""

@@ -142,6 +142,8 @@ class Unknowns:
 
         Forces that cancel each other count in full.
         """
+        if not self.blocks:
+            return np.zeros(bodies)
         squares: FloatArray = np.square(_coordinate_rows(elements, parts))
         found: Any = np.bincount(self._body_of_row, squares, minlength=bodies)
         return found

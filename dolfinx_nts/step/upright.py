@@ -93,8 +93,8 @@ class Upright:
         return forbidden(self._problem.system, self.smallest(x))
 
     def _displacements(self, x: FloatArray) -> list[FloatArray]:
-        """Displacement of each body at an iterate [m]; bodies asleep stay where they are."""
+        """Displacement of each body at an iterate [m]; the array of t_n if it stays. Collective."""
         u = list(self._problem.state.u)
-        for k in self._problem.awake:
+        for k in self._problem.moved(x, dict(enumerate(u))):
             u[k] = x[self._problem.of_body(k)]
         return u
