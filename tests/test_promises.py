@@ -58,7 +58,7 @@ def test_energy_that_contact_brings_in_small_parts_is_told():
         solution.rows = [
             row | {"time": float(i), "contact_defect": -0.005 * i} for i in (k - 1, k)
         ]
-        promises.hold(stepper.problem, step, 0.0)
+        promises.hold(stepper.problem, step, *solution.rows, 0.0)
     stepper.close()
     assert [(kind, time) for kind, time, *_ in told] == [
         ("energy from behind facets", float(k)) for k in range(3, 11)
@@ -244,7 +244,8 @@ def test_a_gain_in_one_step_is_measured_without_driven_bodies(monkeypatch):
     step = stepper.solver.solve()
     row = dict(stepper.solution.rows[-1], energy=1e6 + 1.0, kinetic=1e6 + 1.0)
     solution.rows = [row, row | {"time": 0.05, "contact_defect": -0.1}]
-    Promises(solution, nts.EnergyMomentum(), 1e-12).hold(stepper.problem, step, 0.0)
+    promises = Promises(solution, nts.EnergyMomentum(), 1e-12)
+    promises.hold(stepper.problem, step, *solution.rows, 0.0)
     stepper.close()
     ((kind, _, size, text),) = told
     assert kind == "energy from behind facets" and size == 0.1

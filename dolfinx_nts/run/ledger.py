@@ -31,6 +31,8 @@ class Ledger:
         self._promises, self._kept = promises, kept
         self._known: dict[str, balance.Measured] = {}
         self._material_change = 0.0
+        # The table and its length when its last row was last known, and that row.
+        self._last: tuple[Any, int, Mapping[str, Any]] | None = None
         # Of the state at t_n with materials that have changed since its row was written.
         self._restated: dict[str, Any] | None = None
 
@@ -84,13 +86,20 @@ class Ledger:
         """What `measure` finds at t_n, which the table has but for changes of materials."""
         if not self._kept:
             return balance.momenta(self._system, state)
-        return self._restated or self._solution.rows[-1]
+        return self._restated or self._last_row()
 
     def measure(self, state: State) -> Mapping[str, Any]:
         """Momenta of a state, and energies if they are kept. Collective."""
         if not self._kept:
             return balance.momenta(self._system, state)
         return balance.measure(self._system, state, self._known)
+
+    def _last_row(self) -> Mapping[str, Any]:
+        """The table's last row, read only where it is another one than `enter` wrote."""
+        rows = self._solution.rows
+        if self._last is None or self._last[0] is not rows or self._last[1] != len(rows):
+            self._last = rows, len(rows), rows[-1]
+        return self._last[2]
 
     def enter(self, problem: StepProblem, trial: Trial) -> None:
         """Write the row of a step that is accepted, and hold it to its promises. Collective.
@@ -100,20 +109,23 @@ class Ledger:
             trial: Its solution.
         """
         step, impact, rows = trial.step, trial.impact, self._solution.rows
+        before = self._last_row()
         known = {"time": trial.state.time, "newton_iterations": step.iterations}
         if self._kept:
             terms = balance.step_terms(problem, step) | known
             terms["impact_restored"] = 0.0 if impact is None else impact.energy
             terms["material_change"] = self.take_change()
-            row = balance.next_row(rows[0], rows[-1], dict(trial.measured), terms)
+            row = balance.next_row(rows.column("energy")[0], before, trial.measured, terms)
         else:
             row = balance.unknown_row(self._system) | known
         forces = resultants.of_step(problem, step)
         if impact is not None:
             for name, impulse in zip(resultants.CONTACTS, impact.impulses, strict=True):
                 forces[name] = forces[name] + impulse / problem.dt
-        rows.append(row | forces)
+        row |= forces
+        rows.append(row)
+        self._last = rows, len(rows), row
         if self._kept:
-            self._promises.hold(problem, step, trial.impulses)
+            self._promises.hold(problem, step, before, row, trial.impulses)
             found = balance.switches(problem, step, trial.state.time)
             self._solution.switches.extend(found)

@@ -66,15 +66,19 @@ class Promises:
         """Go on from another run's memory."""
         self._largest, self._whole, self._rounding, self._first = memory
 
-    def hold(self, problem: StepProblem, step: Evaluation, impulses: float) -> None:
-        """Warn if the last row's ledger misses too much, or contact brought energy. Collective.
+    def hold(
+        self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
+        row: Mapping[str, Any], impulses: float,
+    ) -> None:  # fmt: skip
+        """Warn if a step's ledger misses too much, or contact brought energy. Collective.
 
         Args:
             problem: Equations of the step.
             step: Their solution.
+            before: Row of the balance table before it.
+            row: Row of the step.
             impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
         """
-        before, row = self._solution.rows[-2:]
         energy = self._measure(problem, step, before, row)
         squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
         problem.system.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
@@ -281,12 +281,12 @@ def unknown_row(system: System) -> dict[str, Any]:
 
 
 def next_row(
-    first: dict[str, Any], last: dict[str, Any], measured: dict[str, Any], terms: dict[str, float]
+    first: float, last: Mapping[str, Any], measured: Mapping[str, Any], terms: Mapping[str, float]
 ) -> dict[str, Any]:
     """Row of an accepted step; work, dissipation, defect and ledger residual are cumulative.
 
     Args:
-        first: Row the ledger is opened with.
+        first: Energy that the ledger is opened with [J].
         last: Row before the step.
         measured: `measure` of the new state.
         terms: `step_terms` of the step.
@@ -298,7 +298,7 @@ def next_row(
     row["energy"] = row["kinetic"] + row["potential"]
     row["ledger_residual"] = (
         row["energy"]
-        - first["energy"]
+        - first
         - row["external_work"]
         - row["impact_restored"]
         - row["material_change"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -71,7 +72,8 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     parts += [_of_joint(problem, step, k, *each) for k, each in held]
     total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-    split = np.split(total, np.cumsum([len(part) for part in parts])[:-1])
+    stops = accumulate(map(len, parts))
+    split = [total[stop - len(part) : stop] for part, stop in zip(parts, stops, strict=True)]
     names = [*map(reactions_of, bodies), CONTACT_FORCES, CONTACT_MOMENTS]
     found = {name: value / problem.factor for name, value in zip(names, split, strict=False)}
     for joint, (force, moment, places, count) in zip(joints, split[len(names) :], strict=True):
