@@ -121,6 +121,8 @@ class ContactElements(ContactLaws):
 
     def part(self, chosen: BoolArray) -> ContactElements:
         """Return some of the pairs, chosen by a mask of shape (n,)."""
+        if chosen.all():
+            return self
         found = self.candidates.part(chosen)
         return replace(
             self,

@@ -70,6 +70,7 @@ class ContactSearch:
         self.beside = [(0.0, -1)] * len(contacts)
         self._cover = [0.0] * len(contacts)
         self._known: dict[int, tuple[list[FloatArray], ContactElements]] = {}
+        self._placed: dict[int, Sequence[FloatArray]] = {}
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
 
@@ -96,7 +97,7 @@ class ContactSearch:
         search: bool,
     ) -> None:
         """Make the elements of a step, as of `Coupling`. Collective."""
-        self._step, self._old = step, history
+        self._step, self._old, self._placed = step, history, {}
         time = step.state.time
         self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
         if again is None:
@@ -125,6 +126,13 @@ class ContactSearch:
         on = global_max(self._comm, local) > 0.0
         return set().union(*itertools.compress(self.bodies, on))
 
+    def _positions(self, k: int) -> Sequence[FloatArray]:
+        """Positions of all points of a contact at t_n [m], see `ContactPair`. Collective."""
+        if k not in self._placed:
+            u = [self._step.state.u[b] for b in self.bodies[k]]
+            self._placed[k] = self._pairs[k].positions(u)
+        return self._placed[k]
+
     def _reach(self, k: int, motion: FloatArray) -> float:
         """Bound on the motion of slaves relative to the master [m]."""
         reach = np.sqrt(3.0) * float(sum(motion[b] for b in self.bodies[k]))
@@ -135,15 +143,15 @@ class ContactSearch:
         u = [self._step.state.u[b] for b in self.bodies[k]]
         known, reach = self._known.pop(k, None), self._reach(k, self._step.motion)
         if reach > 0.0:
-            return self._find(k, u, reach)
+            return self._find(k, reach)
         if known is None or any(a is not b for a, b in zip(known[0], u, strict=True)):
-            known = u, self._find(k, u, reach)
+            known = u, self._find(k, reach)
         self._known[k] = known
         return known[1]
 
-    def _find(self, k: int, u: list[FloatArray], reach: float) -> ContactElements:
+    def _find(self, k: int, reach: float) -> ContactElements:
         pair, path, bodies, step = self._pairs[k], self._paths[k], self.bodies[k], self._step
-        positions = pair.positions(u)
+        positions = self._positions(k)
         found, self._followed[k], self._cover[k], self.beside[k] = pair.find(
             positions,
             self._old[k].facet,
@@ -250,13 +258,12 @@ class ContactSearch:
     def _passed(self, k: int, e: Evaluation, part: Contribution, reach: float) -> bool:
         """Return whether nodes have come through facets unseen, which are noted. Collective."""
         pair, bodies, path = self._pairs[k], self.bodies[k], self._paths[k]
-        positions = pair.positions([self._step.state.u[b] for b in bodies])
         held = np.full(len(pair.slave.share), -1)
         c, active = self.elements[k].candidates, part.active
         held[c.node[active]] = c.facet[active]
         motions = [e.bodies[b].du for b in bodies]
         try:
-            hit = pair.missed(positions, motions, path, reach, held)
+            hit = pair.missed(self._positions(k), motions, path, reach, held)
         except UserFunctionError:
             raise
         except StepFailedError as failure:

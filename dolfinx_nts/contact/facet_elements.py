@@ -35,6 +35,8 @@ class FacetElements(ContactElements):
 
     def part(self, chosen: BoolArray) -> FacetElements:
         """Return some of the pairs, chosen by a mask of shape (n,)."""
+        if chosen.all():
+            return self
         return replace(
             self,
             candidates=self.candidates.part(chosen),

@@ -321,13 +321,13 @@ class StepSolver:
             return reasons.DIVERGED_FNORM_NAN
         unchanged = self.iterates.settled
         stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
-        # An active set that still changes stalls by itself, not by rounding.
-        known = self.problem.rounding.is_known(self.problem.awake)
-        near = worst < _NEAR or (unchanged and not known)
-        if stalls and near and not self._measured:
-            self.problem.measure_rounding(last)
-            self._measured = True
-            worst = self._worst(last)
+        if stalls and not self._measured:
+            # An active set that still changes stalls by itself, not by rounding.
+            known = self.problem.rounding.is_known(self.problem.awake)
+            if worst < _NEAR or (unchanged and not known):
+                self.problem.measure_rounding(last)
+                self._measured = True
+                worst = self._worst(last)
         self._solved |= iteration > 0
         self._tangents.due |= unchanged and worst > max(1.0, _SLOW * self._before)
         if iteration > 0 and unchanged:

@@ -44,7 +44,7 @@ class Rounding:
         self._bodies, self._tangent, self._springs = bodies, tangent, springs
         self._diagonal, self._of_factor = np.zeros((2, len(bodies)))
         self._between = np.zeros(len(bodies))
-        self.length = self._extent = self._moved = np.zeros(len(bodies))
+        self.length = self._extent = self._moved = self._beside = np.zeros(len(bodies))
         self._factor = 1.0
 
     def begin(
@@ -59,6 +59,8 @@ class Rounding:
             extent: Largest coordinate [m], shape (bodies,).
         """
         self._factor, self.length, self._moved, self._extent = factor, length, moved, extent
+        both = zip(self._bodies, extent, strict=True)
+        self._beside = np.array([e if body.rounded is None else body.rounded for body, e in both])
         # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
         old = self._of_factor
         self._diagonal[(factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * factor)] = 0.0
@@ -102,10 +104,8 @@ class Rounding:
 
     def at(self, length: FloatArray) -> FloatArray:
         """`forces` at displacements of these lengths [m], shape (bodies,)."""
-        bodies = zip(self._bodies, self._extent, strict=True)
-        beside = np.array([e if body.rounded is None else body.rounded for body, e in bodies])
         between = _ENDS * self._between * (length + self._extent)
-        rounding: FloatArray = _EPS * (self._diagonal * (length + beside) + between)
+        rounding: FloatArray = _EPS * (self._diagonal * (length + self._beside) + between)
         return rounding
 
     def of(self, bodies: Sequence[int]) -> float:
