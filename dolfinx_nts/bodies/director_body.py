@@ -192,13 +192,17 @@ class DirectorBody(Body):
         """Nodal vectors of an element."""
         return self._nodes.shape[1] * self._width // 3
 
+    @cached_property
+    def _rows(self) -> IntArray:
+        """Number on this rank of each coordinate, element after element."""
+        rows: IntArray = (self._width * self._nodes[:, :, None] + np.arange(self._width)).ravel()
+        return rows
+
     def _gather(self, values: FloatArray) -> FloatArray:
         """Sums at this rank's coordinates of what elements contribute, (n, 3 k). Collective."""
-        width = self._width
         with self._shared.localForm() as local:
-            sums = np.zeros((local.getLocalSize() // width, width))
-            np.add.at(sums, self._nodes, values.reshape(*self._nodes.shape, width))
-            local.array_w[:] = sums.ravel()
+            size = local.getLocalSize()
+            local.array_w[:] = np.bincount(self._rows, values.ravel(), minlength=size)
         self._shared.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         owned: FloatArray = self._shared.array_r.copy()
         return owned
