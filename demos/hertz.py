@@ -173,13 +173,18 @@ def scene(comm, problem, *, held=(), loads=(), whole=False, friction=0.0):
     return nts.System([upper, lower], contacts=[pair])
 
 
-def press(comm, problem, **options):
-    """Return the equilibrium under an even pressure on the flat face; options of `equilibrium`."""
+def pressed(comm, problem):
+    """Return both bodies under an even pressure on the flat face."""
     r, n = problem.radius, problem.cells
     rim = np.sin(np.diff(np.arctan(np.arange(n + 1) / n)))  # the face of a sphere is a polygon
     area = 4 * r**2 * rim.sum() if problem.spheres else 2 * r
     load = nts.Traction(plane(problem, 2, r), (0.0, 0.0, -problem.force / area))
-    return nts.equilibrium(scene(comm, problem, loads=[load]), load_steps=2, **options)
+    return scene(comm, problem, loads=[load])
+
+
+def press(comm, problem, **options):
+    """Return their equilibrium; options of `equilibrium`."""
+    return nts.equilibrium(pressed(comm, problem), load_steps=2, **options)
 
 
 def pressing_force(problem, run, *, parts):
