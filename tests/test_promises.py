@@ -143,11 +143,14 @@ def test_a_closed_ledger_says_nothing(integrator, accuracy):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Newmark()])
-def test_an_energy_that_is_no_number_is_grave(integrator):
-    run = nts.simulate(nts.System([Sprung(np.nan)]), integrator, dt=0.05, t_end=0.2)
+@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Newmark(), nts.Midpoint()])
+@pytest.mark.parametrize("energy", [np.nan, np.inf])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_an_energy_that_is_no_number_is_grave(integrator, energy):
+    run = nts.simulate(nts.System([Sprung(energy)]), integrator, dt=0.05, t_end=0.2)
     assert run.status != "completed" and run.warnings["ledger"].grave
     assert "the energy is not finite" in run.warnings["ledger"].text
+    assert type(run.warnings["ledger"].worst) is float
 
 
 def vibrating(stiffness):

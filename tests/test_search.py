@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from rotations import random_rotation
 
-from dolfinx_nts.contact.search import ROUNDING, closest_facets
+from dolfinx_nts.contact.search import ROUNDING, apart, closest_facets
 from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.kernels.vectors import range_of
 
 
 @pytest.fixture(autouse=True, params=["all pairs", "trees"])
@@ -241,3 +242,27 @@ def test_bad_input_is_named():
         closest_facets(points, corners, reach=1.0, current=np.full(3, 4))
     with pytest.raises(ValueError, match="corners must have shape"):
         closest_facets(points, corners[0], reach=1.0)
+
+
+def test_boxes_are_apart_by_their_largest_gap():
+    """Along one axis, in either order; a reach of that gap, up to rounding, is not enough."""
+    facet = np.array([[[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]])
+    for axis in range(3):
+        for way in (-1.0, 1.0):
+            points = np.full((2, 3), 0.5 * (np.arange(3) < 2))
+            points[:, axis] += way * (3.0 + 0.5 * (axis < 2))
+            gap = 3.0
+            assert apart(points, facet, gap - 1e-9) and not apart(points, facet, gap)
+    assert not apart(facet[0], facet, 0.0)
+
+
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_range_of_vectors(n):
+    rng = np.random.default_rng(n)
+    moved, around = rng.normal(size=(n, 3)), rng.random((n, 3))
+    for width in (0.0, around):
+        high, low = (
+            [max((side[:, i]).tolist(), default=-np.inf) for i in range(3)]
+            for side in (moved + width, -moved + width)
+        )
+        assert range_of(moved.ravel(), width).tolist() == [high, low]

@@ -137,7 +137,7 @@ class StepForms:
         return self._vector.array_r.copy()
 
     def with_ghosts(self, u: FloatArray) -> FloatArray:
-        """Values at all nodes of this rank. Collective."""
+        """Values at all nodes of this rank, on one rank u itself. Collective."""
         self._check_alive()
         if self._alone:
             return u

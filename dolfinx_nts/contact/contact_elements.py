@@ -120,7 +120,7 @@ class ContactElements(ContactLaws):
         return 1.0
 
     def part(self, chosen: BoolArray) -> ContactElements:
-        """Return some of the pairs, chosen by a mask of shape (n,)."""
+        """Return the pairs chosen by a mask of shape (n,), itself if that chooses all."""
         if chosen.all():
             return self
         found = self.candidates.part(chosen)

@@ -261,9 +261,9 @@ class ContactSearch:
         held = np.full(len(pair.slave.share), -1)
         c, active = self.elements[k].candidates, part.active
         held[c.node[active]] = c.facet[active]
-        motions = [e.bodies[b].du for b in bodies]
+        motions, positions = [e.bodies[b].du for b in bodies], self._positions(k)
         try:
-            hit = pair.missed(self._positions(k), motions, path, reach, held)
+            hit = pair.missed(positions, motions, path, reach, held)
         except UserFunctionError:
             raise
         except StepFailedError as failure:

@@ -34,7 +34,7 @@ class FacetElements(ContactElements):
     master_scale: FloatArray
 
     def part(self, chosen: BoolArray) -> FacetElements:
-        """Return some of the pairs, chosen by a mask of shape (n,)."""
+        """Return the pairs chosen by a mask of shape (n,), itself if that chooses all."""
         if chosen.all():
             return self
         return replace(

@@ -120,7 +120,7 @@ def size(corners: FloatArray) -> FloatArray:
     Args:
         corners: Facet corners [m], shape (n, nc, 3).
     """
-    edges = corners[:, np.arange(1 - corners.shape[1], 1)] - corners  # next corner, last to first
+    edges = np.concatenate([corners[:, 1:], corners[:, :1]], axis=1) - corners
     lengths: FloatArray = np.sqrt(np.einsum("nki,nki->nk", edges, edges))
     return lengths.sum(axis=1) / corners.shape[1]
 

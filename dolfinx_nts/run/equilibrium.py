@@ -158,7 +158,7 @@ class _LoadStepper(Stepper):
         terms |= {"time": time, "newton_iterations": iterations}
         terms |= {"contact_defect": 0.0, "material_change": self._ledger.take_change()}
         rows, measured = self.solution.rows, balance.measure(self.system, state)
-        row = balance.next_row(rows.column("energy")[0], before, measured, terms)
+        row = balance.next_row(float(rows.column("energy")[0]), before, measured, terms)
         rows.append(row | forces_now)
         self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
         # A drive that lifts a weight does the work that the weight takes.

@@ -95,7 +95,7 @@ class Ledger:
         return balance.measure(self._system, state, self._known)
 
     def _last_row(self) -> Mapping[str, Any]:
-        """The table's last row, read only where it is another one than `enter` wrote."""
+        """The table's last row, read from the table only if `enter` did not write it."""
         rows = self._solution.rows
         if self._last is None or self._last[0] is not rows or self._last[1] != len(rows):
             self._last = rows, len(rows), rows[-1]
@@ -115,7 +115,8 @@ class Ledger:
             terms = balance.step_terms(problem, step) | known
             terms["impact_restored"] = 0.0 if impact is None else impact.energy
             terms["material_change"] = self.take_change()
-            row = balance.next_row(rows.column("energy")[0], before, trial.measured, terms)
+            first = float(rows.column("energy")[0])
+            row = balance.next_row(first, before, trial.measured, terms)
         else:
             row = balance.unknown_row(self._system) | known
         forces = resultants.of_step(problem, step)

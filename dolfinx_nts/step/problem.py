@@ -289,13 +289,13 @@ class StepProblem:
         """
         values, laid = x.array_r.copy(), self.laid
         if laid.blocks or self._of_none is None:
-            parts = self._of_elements(x, values)
+            parts = self._parts_of_elements(x, values)
             self._of_none = None if laid.blocks else parts
         else:
             parts = self._of_none
         force = laid.forces(self.elements, parts) if laid.blocks else np.zeros(len(values))
         # Most often bodies at rest before something hits them stay where the last iterate had them.
-        for k in self.moved(values, {k: terms[0] for k, terms in self._evaluated.items()}):
+        for k in self.elsewhere(values, {k: terms[0] for k, terms in self._evaluated.items()}):
             self._evaluated[k] = self._without_elements(k, values[laid.of_body(k)])
         bodies = dict(self._asleep)
         for k in self.awake:
@@ -304,7 +304,7 @@ class StepProblem:
             bodies[k] = BodyTerms(u1, du, internal, external, coupling, total + coupling)
         return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
 
-    def _of_elements(self, x: Any, values: FloatArray) -> tuple[Any, ...]:
+    def _parts_of_elements(self, x: Any, values: FloatArray) -> tuple[Any, ...]:
         """What each batch of elements contributes at an iterate. Collective.
 
         Args:
@@ -334,12 +334,12 @@ class StepProblem:
         total = self._inertial(body, du) - self.flight[k] + internal - external
         return u1, du, internal, external, total
 
-    def moved(self, values: FloatArray, known: Mapping[int, FloatArray]) -> list[int]:
-        """Bodies that are awake and are elsewhere than known. Collective.
+    def elsewhere(self, values: FloatArray, known: Mapping[int, FloatArray]) -> list[int]:
+        """Bodies that are awake and not where they are known to have been. Collective.
 
         Args:
             values: This rank's unknowns.
-            known: Displacements [m] by the body's number; a body without one is elsewhere.
+            known: Displacements there [m] by the body's number; a body without one is elsewhere.
         """
         here = [
             k not in known or not np.array_equal(values[self.laid.of_body(k)], known[k])

@@ -95,6 +95,6 @@ class Upright:
     def _displacements(self, x: FloatArray) -> list[FloatArray]:
         """Displacement of each body at an iterate [m]; the array of t_n if it stays. Collective."""
         u = list(self._problem.state.u)
-        for k in self._problem.moved(x, dict(enumerate(u))):
+        for k in self._problem.elsewhere(x, dict(enumerate(u))):
             u[k] = x[self._problem.of_body(k)]
         return u
