@@ -11,6 +11,7 @@ from point_mass import MASS, PointMass, PointSurface, Sledge
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
+from dolfinx_nts.contact.pair import Motion
 from dolfinx_nts.contact.surfaces import locate_facets
 
 COMM = MPI.COMM_WORLD
@@ -150,6 +151,27 @@ def test_along_edges_and_over_corners(integrator, facets, start, velocity):
     """Two to six facets are equally near all the time, or again and again."""
     h = follow(scene((*start, 0.0), (*velocity, 0.0), plate(facets)), integrator, 40)
     assert_slides_straight(h, (*velocity, 0.0), 1e-12)
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-16, -1e-16, 1e-13, -1e-13])
+def test_rounding_does_not_choose_the_facet_at_an_edge(off):
+    """A mass that stays at its facet on an edge goes over to the next one in whose way it is."""
+    _, master = plate("squares")
+    mass = PointMass(COMM, MASS, (0.25 + off, 0.1, 0.0), (0.0, 0.0, 0.0))
+    pair = nts.ContactPair(PointSurface(mass, mass.reference), master)
+
+    def facet(start, way, current):
+        positions = pair.positions([np.array(start) - mass.reference, 0.0 * master.body.reference])
+        paths = [np.array([way, 0.0, 0.0]), 0.0 * master.body.reference]
+        found = pair.find(
+            positions, np.array([current]), np.zeros((2, 3)), Motion(0.1, paths, np.array([-1]))
+        )
+        return found.candidates.facet.tolist()
+
+    (left,), (right,) = (facet((x, 0.1, 0.0), 0.0, -1) for x in (0.2, 0.3))
+    assert left != right
+    assert facet(mass.reference, 0.05, left) == [right]
+    assert facet(mass.reference, -0.05, left) == [left]
 
 
 @pytest.mark.parametrize("place", [(0.1, 0.1), (0.25, 0.1), (0.25, 0.25)])

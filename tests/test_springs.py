@@ -662,6 +662,23 @@ def test_statics_of_a_stiff_spring_needs_no_cut(stiffness, way):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("stiffness", [1e4, 1e9])
+def test_a_body_at_rest_on_an_unstretched_spring_stays_there(stiffness):
+    """The spring's force is the rounding of its length, which nothing else in the scene exceeds."""
+    low = np.array([3.0, 0.0, 0.0])
+    mesh = create_box(
+        COMM, [low, low + 0.5], [2, 2, 2], CellType.hexahedron, ghost_mode=GhostMode.shared_facet
+    )
+    body = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3)
+    ends = [(3.5, 0.25, 0.25), (5.0, 0.25, 0.25)]
+    spring = nts.Spring(body, None, points=ends, stiffness=stiffness)
+    system = nts.System([body], joints=[spring])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=4e-3, t_end=0.1)
+    assert run.status == "completed" and run.retries == 0
+    assert np.abs(body.u.x.array).max() <= 4 * np.spacing(5.0)
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("stiffness", [5e-3, 5e3])
 def test_stabilization_of_springs_is_that_of_the_springs(stiffness):
     """No gravity and no flexible body: in any unit the same number of relaxations."""

@@ -360,7 +360,9 @@ class FacetPair(ContactPair, master=Surface):
         edge = after.argmax(axis=1)
         pairs = np.arange(len(edge))
         joined = self._joined[c.facet, edge]
-        over = (before.max(axis=1) <= 0.0) & (after[pairs, edge] > search.PREFERENCE)
+        # On an edge rounding must not decide: a node that stays at its facet there is within it.
+        within = before.max(axis=1) <= search.PREFERENCE
+        over = within & (after[pairs, edge] > search.PREFERENCE)
         change = np.flatnonzero(over & (joined >= 0))
         return change, joined[change] // nc
 

@@ -323,8 +323,7 @@ class StepSolver:
         stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
         if stalls and not self._measured:
             # An active set that still changes stalls by itself, not by rounding.
-            known = self.problem.rounding.is_known(self.problem.awake)
-            if worst < _NEAR or (unchanged and not known):
+            if worst < _NEAR or (unchanged and not self.problem.rounding_is_known):
                 self.problem.measure_rounding(last)
                 self._measured = True
                 worst = self._worst(last)

@@ -380,6 +380,12 @@ class StepProblem:
             held.destroy()
         return a
 
+    @property
+    def rounding_is_known(self) -> bool:
+        """Whether the rounding of all forces has been measured, of springs in this step."""
+        springs = any(not any(batch.widths.values()) for batch in self.elements)
+        return self.rounding.is_known(self.awake, springs=springs)
+
     def measure_rounding(self, e: Evaluation) -> None:
         """Measure the rounding of the forces anew, at an iterate's motion. Collective.
 

@@ -43,7 +43,7 @@ class Rounding:
     ) -> None:
         self._bodies, self._tangent, self._springs = bodies, tangent, springs
         self._diagonal, self._of_factor = np.zeros((2, len(bodies)))
-        self._between = np.zeros(len(bodies))
+        self._between, self._springs_known = np.zeros(len(bodies)), False
         self.length = self._extent = self._moved = self._beside = np.zeros(len(bodies))
         self._factor = 1.0
 
@@ -64,7 +64,7 @@ class Rounding:
         # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
         old = self._of_factor
         self._diagonal[(factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * factor)] = 0.0
-        self._between[:] = 0.0
+        self._between[:], self._springs_known = 0.0, False
 
     @property
     def measured(self) -> list[list[float]]:
@@ -75,9 +75,15 @@ class Rounding:
     def measured(self, known: Sequence[Sequence[float]]) -> None:
         self._diagonal[:], self._of_factor[:] = known
 
-    def is_known(self, bodies: Iterable[int]) -> bool:
-        """Whether the rounding of the forces on all these bodies has been measured."""
-        return bool((self._diagonal[list(bodies)] > 0.0).all())
+    def is_known(self, bodies: Iterable[int], *, springs: bool) -> bool:
+        """Whether the rounding of the forces on all these bodies has been measured.
+
+        Args:
+            bodies: Their numbers.
+            springs: Whether forces act between bodies, whose rounding is measured in each step.
+        """
+        known = bool((self._diagonal[list(bodies)] > 0.0).all())
+        return known and (self._springs_known or not springs)
 
     def measure(self, bodies: Iterable[int]) -> None:
         """Measure it anew, for bodies that have stiffened. Collective.
@@ -95,7 +101,7 @@ class Rounding:
 
     def measure_springs(self) -> None:
         """Measure that of forces between bodies in this step. Collective."""
-        self._between = self._springs()
+        self._between, self._springs_known = self._springs(), True
 
     @property
     def forces(self) -> FloatArray:
