@@ -212,7 +212,8 @@ class System:
         missing = [b.name for b in self.bodies if b.name not in index]
         if missing:
             raise ValueError(
-                f"start: has bodies {list(index)}, not {missing}; name the bodies of both alike"
+                f"start: has bodies {list(index)}, not {missing}; give both scenes the same bodies "
+                "by the same names (what comes in later waits in the first, too, e.g. held by bcs)"
             )
         u = tuple(state.u[index[b.name]].copy() for b in self.bodies)
         for body, now in zip(self.bodies, u, strict=True):

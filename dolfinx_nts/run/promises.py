@@ -185,8 +185,8 @@ class Promises:
                     "energy lost to contact", row["time"], -total,
                     f"gaps that close in mid step have taken {-total:.3g} J, "
                     f"{self._part(-total):.2g} of the largest energy: how bodies rebound may "
-                    "depend on it; compare with a smaller dt and a finer mesh, or pass "
-                    "adapt=Adapt(...)",
+                    "depend on it; compare with a smaller dt (with Adapt a smaller tolerance) "
+                    "and a finer mesh",
                 )  # fmt: skip
             return
         self._solution.warn("energy from behind facets", row["time"], gain, text, grave=True)
