@@ -340,7 +340,10 @@ def test_nodes_between_two_that_do_not_yield_are_named(by, integrator):
     [(0.0, 0, "contact and none"), (0.3, 0, "contact and none"), (0.3, 1, "stick and slip")],
 )
 def test_nodes_that_flip_are_named_with_their_states(friction, row, states, integrator):
-    """Seven flips of a step are said to be some, eight to be a cycle, with what may end it."""
+    """Seven flips in a step are said to be some, eight to be a cycle, of whatever kinds they are.
+
+    What may end the cycle is said, too.
+    """
     stepper = nts.Stepper(scene(velocity=(0.0, 0.0, -1.0), friction=friction), integrator)
     stepper.start(2e-3)
     stepper.problem.begin(stepper.state, 2e-3)
@@ -356,6 +359,9 @@ def test_nodes_that_flip_are_named_with_their_states(friction, row, states, inte
             beyond = np.full_like(step.parts[0].residual, np.inf)
             with np.errstate(over="raise"):
                 assert contact.describe(step.parts[0]._replace(residual=beyond), flips)[0] == np.inf
+    if contact.num_elements:
+        flips[:] = 4
+        assert "settles in neither" in contact.describe(step.parts[0], flips)[1]
     stepper.close()
 
 

@@ -441,7 +441,7 @@ class ContactElements(ContactLaws):
         text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
         if slide:
             text += f" and {slide} between stick and slip"
-        if max(touch, slide) >= _CYCLE:
+        if touch + slide >= _CYCLE:
             states = "stick and slip" if slide > touch else "contact and none"
             remedy = "try another dt"
             if not self._free[i, 0].any():
