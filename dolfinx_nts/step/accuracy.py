@@ -45,8 +45,8 @@ class Newton:
         reuse: Keep the bodies' matrices, and what the linear solver made of them, over iterations
             and steps for as long as Newton contracts well; contact is always linearised anew. None:
             while "krylov" is in use in dynamics of 600 coordinates or more, not counting those of
-            rigid bodies, beams and shells. There matrices take most of the time; MUMPS would
-            factorise about twice as often.
+            rigid bodies and beams, nor of shells below 2,000. There matrices take most of the time;
+            MUMPS would factorise about twice as often.
 
     Raises:
         TypeError: An argument is of another type.
@@ -87,22 +87,30 @@ class Newton:
         """
         if self.reuse is not None:
             return self.reuse
-        size = system.comm.allreduce(sum(b.num_owned for b in system.bodies if not b.joints))
-        return inertia and bool(size >= _LARGE)
+        return inertia and _sizes(system, inertia)[0] >= _LARGE
 
     def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
         if self.linear_solver != "auto":
             return self.linear_solver
-        continua = [b for b in system.bodies if not b.joints]
-        loose = [b for b in system.bodies if b.joints and not b.bound]
-        local = [sum(b.num_owned for b in bodies) for bodies in (continua, loose)]
-        size, other = (int(n) for n in system.comm.allreduce(np.array(local)))
-        # Multigrid knows nothing of constraints; incomplete factors take a few well.
-        if inertia and other >= _MANY:
-            size += other
-        couples, mixed = bool(system.contacts or system.joints), len(continua) < len(system.bodies)
+        size, mixed = _sizes(system, inertia)
+        couples = bool(system.contacts or system.joints)
         return choose(size, couples, inertia, given, mixed)
+
+
+def _sizes(system: System, inertia: bool) -> tuple[int, bool]:
+    """Coordinates of bodies that an iterative solver is for, and whether there are others.
+
+    Collective.
+    """
+    continua = [b for b in system.bodies if not b.joints]
+    loose = [b for b in system.bodies if b.joints and not b.bound]
+    local = [sum(b.num_owned for b in bodies) for bodies in (continua, loose)]
+    size, other = (int(n) for n in system.comm.allreduce(np.array(local)))
+    # Multigrid knows nothing of constraints; incomplete factors take a few well.
+    if inertia and other >= _MANY:
+        size += other
+    return size, len(continua) < len(system.bodies)
 
 
 #: What `simulate(accuracy=...)` stands for; what each costs and loses is measured by `tradeoff`.
