@@ -146,6 +146,7 @@ def test_a_closed_ledger_says_nothing(integrator, accuracy):
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Newmark(), nts.Midpoint()])
 @pytest.mark.parametrize("energy", [np.nan, np.inf])
 @pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.fast_on_ranks("nan-integrator0")
 def test_an_energy_that_is_no_number_is_grave(integrator, energy):
     run = nts.simulate(nts.System([Sprung(energy)]), integrator, dt=0.05, t_end=0.2)
     assert run.status != "completed" and run.warnings["ledger"].grave

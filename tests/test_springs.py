@@ -663,6 +663,7 @@ def test_statics_of_a_stiff_spring_needs_no_cut(stiffness, way):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("stiffness", [1e4, 1e9])
+@pytest.mark.fast_on_ranks("1000000000.0")
 def test_a_body_at_rest_on_an_unstretched_spring_stays_there(stiffness):
     """The spring's force is the rounding of its length, which nothing else in the scene exceeds."""
     low = np.array([3.0, 0.0, 0.0])
