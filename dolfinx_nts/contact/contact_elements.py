@@ -121,16 +121,16 @@ class ContactElements(ContactLaws):
 
     def part(self, chosen: BoolArray) -> ContactElements:
         """Return the pairs chosen by a mask of shape (n,), itself if that chooses all."""
-        if chosen.all():
-            return self
-        found = self.candidates.part(chosen)
-        return replace(
-            self,
-            candidates=found,
-            x0=self.x0[chosen],
-            scale=self.scale[chosen],
-            before=self._before_of(chosen),
-        )
+        return self if chosen.all() else replace(self, **self._of_pairs(chosen))
+
+    def _of_pairs(self, chosen: BoolArray) -> dict[str, Any]:
+        """What some of the pairs are made of, by attribute."""
+        return {
+            "candidates": self.candidates.part(chosen),
+            "x0": self.x0[chosen],
+            "scale": self.scale[chosen],
+            "before": self._before_of(chosen),
+        }
 
     @cached_property
     def _nodes(self) -> list[Points]:

@@ -6,7 +6,7 @@ and six multipliers). Friction adds two (lambda_T).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -33,18 +33,9 @@ class FacetElements(ContactElements):
 
     master_scale: FloatArray
 
-    def part(self, chosen: BoolArray) -> FacetElements:
-        """Return the pairs chosen by a mask of shape (n,), itself if that chooses all."""
-        if chosen.all():
-            return self
-        return replace(
-            self,
-            candidates=self.candidates.part(chosen),
-            x0=self.x0[chosen],
-            scale=self.scale[chosen],
-            before=self._before_of(chosen),
-            master_scale=self.master_scale[chosen],
-        )
+    def _of_pairs(self, chosen: BoolArray) -> dict[str, Any]:
+        """What some of the pairs are made of, by attribute."""
+        return super()._of_pairs(chosen) | {"master_scale": self.master_scale[chosen]}
 
     @property
     def num_control(self) -> int:
