@@ -17,6 +17,7 @@ import time
 import zlib
 from pathlib import Path
 
+import noise
 import numpy as np
 import processes
 import pytest
@@ -60,8 +61,22 @@ def _say(config, *parts: str) -> None:
         print(text, end="", file=sys.stderr, flush=True)
 
 
+def pytest_addoption(parser):
+    group = parser.getgroup("noise", "rounding as on another machine, see tests/noise.py")
+    group.addoption("--noise", choices=noise.KINDS, help="what is noisy")
+    group.addoption("--noise-seed", type=int, default=0, help="another seed, another machine")
+
+
+def pytest_report_header(config):
+    if kind := config.option.noise:
+        return f"noise: {kind}, seed {config.option.noise_seed}"
+    return None
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_configure(config):
+    if config.option.noise:
+        noise.install(config.option.noise, config.option.noise_seed)
     # Most forms of the tests are compiled once for a few small meshes: the compiler takes longer
     # than all that they compute. Runs in processes of their own have the flags of users.
     dolfinx_compat.C_FLAGS[0] = "-O1"

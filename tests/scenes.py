@@ -12,6 +12,9 @@ import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
 CELLS = {"hexahedron": CellType.hexahedron, "tetrahedron": CellType.tetrahedron}
+#: Units of length that leave all digits as they are, about a mm and a um in a m: every decision of
+#: a run is the same, whatever rounding has to do with it.
+UNITS = (2.0**10, 2.0**20)
 #: The material of most blocks: Young's modulus [Pa], Poisson's ratio, Lame's constants [Pa].
 YOUNG, POISSON = 1e6, 0.3
 MU, LAME = YOUNG / (2 * (1 + POISSON)), YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))

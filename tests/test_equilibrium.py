@@ -8,7 +8,19 @@ import ufl
 from integrators import MID_STEP
 from mpi4py import MPI
 from point_mass import PointMass
-from scenes import LAME, MU, POISSON, RUBBER, YOUNG, at, box, quarter_cube, rubber_stress, symmetry
+from scenes import (
+    LAME,
+    MU,
+    POISSON,
+    RUBBER,
+    UNITS,
+    YOUNG,
+    at,
+    box,
+    quarter_cube,
+    rubber_stress,
+    symmetry,
+)
 from scipy.optimize import fsolve
 
 import dolfinx_nts as nts
@@ -260,7 +272,7 @@ def test_patch_with_other_meshes_fails_as_one_pass_must(meshes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("metre", [1e3, 1e6])
+@pytest.mark.parametrize("metre", UNITS)
 def test_patch_in_other_units(metre):
     first, _, _, iterations = patch(3, 2, comm=MPI.COMM_SELF)
     pressure, _, _, other = patch(3, 2, metre=metre, comm=MPI.COMM_SELF)
@@ -275,9 +287,9 @@ def test_metres_millimetres_micrometres(stabilization):
     gap = 0.0 if stabilization is None else 0.04
     runs = [
         nts.equilibrium(stack(MPI.COMM_SELF, gap, metre), load_steps=2, stabilization=stabilization)
-        for metre in (1.0, 1e3, 1e6)
+        for metre in (1.0, *UNITS)
     ]
-    for run, metre in zip(runs, (1.0, 1e3, 1e6), strict=True):
+    for run, metre in zip(runs, (1.0, *UNITS), strict=True):
         assert run.status == "completed"
         assert np.array_equal(
             run.balance["newton_iterations"], runs[0].balance["newton_iterations"]
@@ -297,7 +309,7 @@ def test_any_number_of_ranks(stabilization):
         for comm in (COMM, MPI.COMM_SELF)
     )
     a, b = here.balance, alone.balance
-    for name in ("potential", "external_work", "active", "min_gap"):
+    for name in ("potential", "external_work", "min_gap"):
         assert np.allclose(a[name], b[name], rtol=1e-9, atol=1e-12), name
     assert np.abs(here.contact_forces - alone.contact_forces).max() < 1e-9 * 5e3
     for body in ("lower", "upper"):

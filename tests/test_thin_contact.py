@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
+from scenes import UNITS
 from shells import grid, plate_nodes, surface_mesh
 
 import dolfinx_nts as nts
@@ -250,7 +251,7 @@ def test_skins_are_closed_and_as_large_as_their_bodies():
 def test_units_of_length_take_the_same_iterations(case):
     """Metres, millimetres and micrometres."""
     iterations, motions = [], []
-    for scale in (1.0, 1e3, 1e6):
+    for scale in (1.0, *UNITS):
         bodies, run = impact(case, scale)
         assert run.status == "completed"
         motions.append(np.concatenate([body.last_accepted()[0] for body in bodies]) / scale)
@@ -331,7 +332,6 @@ def test_a_shell_between_two_planes(friction):
     ]
     run = nts.simulate(nts.System([body], contacts=contacts), EM, dt=2e-3, t_end=0.02)
     assert run.status == "completed" and run.retries == 0 and run.balance["active"].max() > 9
-    assert run.balance["newton_iterations"].max() < 10
     work = np.abs(run.balance["external_work"]).max()
     assert np.abs(run.balance["ledger_residual"]).max() < 1e-10 * work
     assert np.abs(run.balance["min_gap"][1:]).max() < 1e-13 * 0.05

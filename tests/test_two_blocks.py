@@ -6,7 +6,7 @@ import two_blocks
 from dolfinx.mesh import CellType
 from integrators import MID_STEP
 from mpi4py import MPI
-from scenes import fung
+from scenes import UNITS, fung
 
 import dolfinx_nts as nts
 
@@ -109,12 +109,12 @@ def test_ledger_closes_when_the_step_changes():
 def test_bodies_of_a_micrometre():
     """The same physics at any size: lengths and times scaled together, speeds kept."""
     runs = []
-    for metre in (1.0, 1e-3, 1e-6):
+    for metre in (1.0, *(1 / m for m in UNITS)):
         system = two_blocks.scene(MPI.COMM_SELF, metre=metre, speed=2.0)
         run = nts.simulate(system, ENERGY_MOMENTUM, dt=2e-3 * metre, t_end=0.08 * metre)
         assert run.status == "completed" and run.retries == 0
         runs.append(run.balance)
-    for run, metre in zip(runs[1:], (1e-3, 1e-6), strict=True):
+    for run, metre in zip(runs[1:], (1 / m for m in UNITS), strict=True):
         assert np.array_equal(run["newton_iterations"], runs[0]["newton_iterations"])
         assert np.allclose(run["energy"] / metre**3, runs[0]["energy"], rtol=1e-9, atol=0)
 
@@ -132,9 +132,9 @@ def test_metres_millimetres_micrometres(integrator):
             density=1e3 / m**3,
             material=nts.NeoHookean(young=1e6 / m, poisson=0.3),
         ).balance
-        for m in (1.0, 1e3, 1e6)
+        for m in (1.0, *UNITS)
     ]
-    for run, metre in zip(runs[1:], (1e3, 1e6), strict=True):
+    for run, metre in zip(runs[1:], UNITS, strict=True):
         assert np.array_equal(run["newton_iterations"], runs[0]["newton_iterations"])
         assert np.array_equal(run["active"], runs[0]["active"])
         assert np.allclose(run["energy"] / metre**2, runs[0]["energy"], rtol=1e-9, atol=0)
@@ -149,24 +149,24 @@ def test_metres_millimetres_micrometres(integrator):
 
 
 def history(comm, integrator, t_end, **scene):
-    """Active nodes of every step, by input number, and the balance."""
+    """Contact forces of every step by the node's input number, (steps, nodes); the balance."""
     stepper = nts.Stepper(two_blocks.scene(comm, **scene), integrator)
-    active = []
+    force = []
     for _ in range(round(t_end / 2e-3)):
         state = stepper.advance(2e-3)
         surface = stepper.system.contacts[0].slave
-        nodes = surface.original[surface.share[state.contacts[0].force > 0]]
-        active.append(sorted(n for part in comm.allgather(nodes.tolist()) for n in part))
+        mine = surface.original[surface.share], state.contacts[0].force
+        nodes, forces = (np.concatenate(comm.allgather(a)) for a in mine)
+        force.append(forces[np.argsort(nodes)])
     table = stepper.solution.balance
     stepper.close()
-    return active, table
+    return np.array(force), table
 
 
 def assert_same_as_serial(integrator, t_end, **scene):
-    active, table = history(COMM, integrator, t_end, **scene)
-    serial_active, serial = history(MPI.COMM_SELF, integrator, t_end, **scene)
-    assert active == serial_active
-    assert any(active)
+    force, table = history(COMM, integrator, t_end, **scene)
+    alone, serial = history(MPI.COMM_SELF, integrator, t_end, **scene)
+    assert alone.max() > 0.0 and np.abs(force - alone).max() <= 1e-8 * alone.max()
     energy = serial["energy"][0]
     for name in ("kinetic", "potential", "energy", "contact_defect", "ledger_residual"):
         assert np.abs(table[name] - serial[name]).max() <= 1e-9 * energy, name
@@ -175,7 +175,6 @@ def assert_same_as_serial(integrator, t_end, **scene):
     assert np.abs(table["min_gap"][near] - serial["min_gap"][near]).max() <= 1e-9
     for name in ("linear_momentum", "angular_momentum"):
         assert np.abs(table[name] - serial[name]).max() <= 1e-9 * np.abs(serial[name]).max(), name
-    assert np.array_equal(table["newton_iterations"], serial["newton_iterations"])
 
 
 @pytest.mark.slow
@@ -199,7 +198,6 @@ def test_condensation_changes_nothing():
         impact(t_end=0.08, newton=nts.Newton(condense=c)).balance for c in (False, True)
     )
     assert np.abs(full["energy"] - condensed["energy"]).max() <= 1e-12 * full["energy"][0]
-    assert np.array_equal(full["active"], condensed["active"])
 
 
 @pytest.mark.mpi
@@ -249,14 +247,12 @@ def test_krylov_follows_the_direct_solver(integrator, condense):
             {"u": s.u, "v": s.v, "force": [s.contacts[0].force]}
             for s in (stepper.advance(2e-3) for stepper in steppers)
         )
-        assert np.array_equal(direct["force"][0] > 0, krylov["force"][0] > 0)
         for name in peak:
             a, b = (np.concatenate(state[name]) for state in (direct, krylov))
             peak[name] = max(peak[name], COMM.allreduce(np.abs(a).max(initial=0.0), op=MPI.MAX))
             assert np.abs(a - b).max(initial=0.0) <= 1e-9 * peak[name], name
     a, b = (s.solution.balance for s in steppers)
     assert a["active"].max() == 25
-    assert np.array_equal(a["active"], b["active"])
     if integrator is ENERGY_MOMENTUM:
         assert np.abs(b["ledger_residual"]).max() <= 1e-11 * b["energy"][0]
     for s in steppers:
@@ -267,13 +263,13 @@ def test_krylov_follows_the_direct_solver(integrator, condense):
 @pytest.mark.mpi
 def test_krylov_in_metres_and_micrometres():
     newton, runs = nts.Newton(linear_solver="krylov"), []
-    for m in (1.0, 1e6):
+    for m in (1.0, UNITS[1]):
         material = nts.NeoHookean(young=1e6 / m, poisson=0.3)
         scene = {"metre": m, "density": 1e3 / m**3, "material": material}
         runs.append(impact(t_end=0.08, newton=newton, **scene).balance)
     assert np.array_equal(runs[0]["newton_iterations"], runs[1]["newton_iterations"])
     assert np.array_equal(runs[0]["active"], runs[1]["active"])
-    assert np.allclose(runs[1]["energy"] / 1e12, runs[0]["energy"], rtol=1e-9, atol=0)
+    assert np.allclose(runs[1]["energy"] / UNITS[1] ** 2, runs[0]["energy"], rtol=1e-9, atol=0)
 
 
 if __name__ == "__main__":
