@@ -192,10 +192,11 @@ def figures(run, tilts, dominoes, friction):
     heads = np.abs(run.contact_forces[:, dominoes:]).max(axis=2) > 0.0
     met = heads.any(axis=0)
     times = np.where(met, t[heads.argmax(axis=0)], np.inf)
-    toes = sum(force[1:, 0, 0] for name, force in run.reactions.items() if name.startswith("toe"))
-    floor = run.contact_forces[1:, :dominoes, 0].sum(axis=1)
+    toes = [force[1:, 0, 0] for name, force in run.reactions.items() if name.startswith("toe")]
+    touch = run.contact_forces[1:, :, 0].T
     momentum = b["linear_momentum"][:, 0]
-    missing = np.diff(momentum) - np.diff(t) * (toes + floor)
+    missing = np.diff(momentum) - np.diff(t) * (sum(toes) + touch[:dominoes].sum(axis=0))
+    impulses = np.diff(t) * np.abs([*toes, *touch]).sum(axis=0)
     return {
         "fallen": int((tilts.rows[-1] > FALLEN).sum()),
         "impacts": times,
@@ -207,7 +208,7 @@ def figures(run, tilts, dominoes, friction):
         "contact_defect": float(b["contact_defect"][-1] / size),
         "ledger": float(np.abs(b["ledger_residual"]).max() / size),
         "given": float(momentum[0] / np.abs(momentum).max()),
-        "momentum": float(np.abs(missing).max() / np.abs(momentum).max()),
+        "momentum": float(np.abs(missing).max() / impulses.max()),
         "newton_iterations": float(b["newton_iterations"][1:].mean()),
         "retries": run.retries,
         "status": run.status,

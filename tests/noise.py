@@ -27,8 +27,8 @@ def _uniform(seed, values):
     return np.random.default_rng([seed, key]).uniform(-1.0, 1.0, values.shape)
 
 
-def install(kind: str, seed: int) -> None:
-    """Make all steps of this process noisy."""
+def install(kind: str, seed: int, change=setattr) -> None:
+    """Make all steps of this process noisy, by `change(class, method, function)`."""
     residual, without_elements = StepProblem.residual, StepProblem._without_elements
 
     def noisy_residual(self, e):
@@ -42,6 +42,6 @@ def install(kind: str, seed: int) -> None:
         return u1, du, internal + noise, external, total + noise
 
     if kind in ("residual", "both"):
-        StepProblem.residual = noisy_residual
+        change(StepProblem, "residual", noisy_residual)
     if kind in ("forces", "both"):
-        StepProblem._without_elements = noisy_forces
+        change(StepProblem, "_without_elements", noisy_forces)

@@ -3,13 +3,14 @@
 import functools
 import math
 
+import noise
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import COLUMNS, difference
 from mpi4py import MPI
-from scenes import CELLS, UNITS, rubbing_blocks
+from scenes import CELLS, UNITS, box, rubbing_blocks
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact import coulomb
@@ -340,3 +341,23 @@ def test_without_friction_nothing_tangential_is_allocated():
     counts = [c.num_constraints for c in stepper.problem.elements]
     assert counts == [1] and stepper.problem.elements[0].num_tangential == 0
     stepper.close()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_rests_at_its_bound_sticks(seed, monkeypatch):
+    """Its corners slipped in equilibrium; rounding must not tell which of them slip at rest."""
+    mesh = box(high=(1.0, 1.0, 0.5), cells=(3, 3, 2))
+    block = nts.Continuum(mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, name="block")
+    floor = nts.Plane((0, 0, 0), (0, 0, 1), name="floor")
+    pair = nts.ContactPair(block.surface(lambda x: x[2] < 1e-9), floor, friction=0.3)
+    steep = np.arctan(0.28)
+    system = nts.System(
+        [block], contacts=[pair], gravity=(9.81 * np.sin(steep), 0.0, -9.81 * np.cos(steep))
+    )
+    settled = nts.equilibrium(system, load_steps=1, newton=nts.Newton(rtol=1e-14))
+    assert settled.status.startswith("completed") and settled.balance["slip"][-1] >= 4
+    noise.install("both", seed, monkeypatch.setattr)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=1.01, start=settled)
+    assert run.status.startswith("completed")
+    assert run.balance["kinetic"].max() < 1e-18 * 500 * 9.81
+    assert (run.balance["stick"][1:] == run.balance["active"][1:]).all()

@@ -289,6 +289,17 @@ class ContactElements(ContactLaws):
             found[f"{self.name} (d, f)"] = over(augmented, limit)
         return found
 
+    def sticks(self, part: Contribution) -> BoolArray:
+        """Which pairs have stuck in a solved step, shape (n,).
+
+        Rounding alone tells on which side of Coulomb's bound a node is that rests at it, so a slip
+        counts from the rounding of places on.
+        """
+        if not self.num_tangential:
+            return part.stick
+        still: BoolArray = part.active & (part.distance <= self.rounding)
+        return part.stick | still
+
     def ledger(self, part: Contribution, factor: float) -> dict[str, float]:
         """Works and counts of an accepted step on this rank.
 
@@ -309,7 +320,8 @@ class ContactElements(ContactLaws):
         dissipation, counts = 0.0, (0.0, 0.0)
         if self.num_tangential:
             dissipation = float((part.multiplier[:, -2:] * part.slip)[slipping].sum())
-            counts = float(part.stick.sum()), float(slipping.sum())
+            sticking = self.sticks(part)
+            counts = float(sticking.sum()), float((part.active & ~sticking).sum())
         defect = -float(part.multiplier[:, 0] @ self.candidates.gap)
         # Where it is closed, the gap is the solver's tolerance.
         left = float((part.multiplier[:, 0] * part.gap)[gone].sum())
@@ -408,7 +420,7 @@ class ContactElements(ContactLaws):
         new = ContactHistory.of_start(len(old.force))
         node = self.candidates.node
         new.facet[node], new.gap[node] = self.candidates.facet, part.gap
-        new.stick[node] = part.stick
+        new.stick[node] = self.sticks(part)
         new.force[node] = -np.where(part.active, part.end[:, 0], 0.0) / factor
         new.tangential[node] = self._tangential_at_end(part, old.tangential[node], factor)
         new.slip[:] = old.slip
