@@ -12,6 +12,7 @@ from petsc4py import PETSc
 from scenes import RUBBER, everywhere
 
 import dolfinx_nts as nts
+from dolfinx_nts.step import iterates
 
 COMM = MPI.COMM_WORLD
 ROUND_OFF = 1e-12
@@ -380,6 +381,38 @@ def test_a_failure_advises_only_where_its_text_does(told):
     failure = solver._failure(step, PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT, 9)
     assert failure.advises == told == ("settles in neither; try another dt" in str(failure))
     stepper.close()
+
+
+@rubbing
+def test_contacts_that_change_one_at_a_time_end_in_the_same_step(friction, monkeypatch):
+    """What a second attempt does where the whole active set goes to and fro."""
+    ends, imposed = [], []
+    for alone in (False, True):
+        stepper = nts.Stepper(
+            scene("across", velocity=(0.3, 0.0, -1.0), friction=friction), nts.EnergyMomentum()
+        )
+        solver, contacts = stepper.solver, stepper.problem.couplings.contacts
+        if alone:
+            restart, impose = solver.iterates.restart, contacts.impose
+
+            def pivoting(solver=solver, restart=restart):
+                restart()
+                solver.iterates.forget_last()
+
+            def counted(active, impose=impose):
+                imposed.append(active is not None)
+                impose(active)
+
+            monkeypatch.setattr(iterates, "_PATIENCE", 0)
+            monkeypatch.setattr(solver.iterates, "restart", pivoting)
+            monkeypatch.setattr(contacts, "impose", counted)
+        for _ in range(8):
+            state = stepper.advance(2e-3)
+        assert stepper.solution.balance["active"].max() > 1
+        ends.append(np.concatenate(state.u))
+        stepper.close()
+    assert any(imposed)
+    assert np.abs(ends[0] - ends[1]).max(initial=0.0) < ROUND_OFF
 
 
 class Breaks:

@@ -85,6 +85,8 @@ class ContactLaws:
         force_rounding: Contact force [kg m] that counts as none.
         bounded: Whether infinite friction has a bound.
         lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
+        imposed: Which pairs are active, whatever their forces and gaps say, shape (n,); None: those
+            that the law says.
         before: h^2/2 lambda_N and lambda_T at t_n of massless nodes [kg m], NaN of the others,
             shape (n, 3); None: there are none.
     """
@@ -100,6 +102,7 @@ class ContactLaws:
     force_rounding: float = 0.0
     bounded: bool = False
     lets_slip: bool = False
+    imposed: BoolArray | None = None
     before: FloatArray | None = None
 
     @property
@@ -254,9 +257,9 @@ class ContactLaws:
     def _law(self) -> tuple[Any, list[Any]]:
         """What the compiled kernel is to know of the pairs in this step."""
         row = self._num_places + self.num_augmented
-        none, size = self._yielding * self.gap_rounding, row + self.num_constraints
+        size = row + self.num_constraints
         law = compiled_law.Law(
-            self.scale, self._yielding, none, self.before, size, row, opening=_OPENING
+            self.scale, self._yielding, self._no_force, self.before, size, row, opening=_OPENING
         )
         if self.num_tangential:
             coulomb = self.coulomb
@@ -385,6 +388,13 @@ class ContactLaws:
         """Whether a small pull on a node that sticks lets it slip."""
         return self.lets_slip or self.coulomb.endless
 
+    @property
+    def _no_force(self) -> FloatArray:
+        """Contact force that counts as none before friction has a say [kg m], shape (n,)."""
+        if self.imposed is not None:
+            return np.where(self.imposed, -np.inf, np.inf)
+        return self._yielding * self.gap_rounding
+
     def _none(self, slip: Slip | None, multiplier: FloatArray) -> FloatArray:
         """Contact force that counts as none [kg m], shape (n,).
 
@@ -393,7 +403,7 @@ class ContactLaws:
         the last step. If no step comes of that (`lets_slip`), a small pull on a node that sticks
         lets it slip. A solved step never ends in such a state, so this adds no solution.
         """
-        none = self._yielding * self.gap_rounding
+        none = self._no_force
         if slip is None or not self._may_pull:
             return none
         return none - self.coulomb.pull(slip, multiplier)

@@ -392,6 +392,16 @@ class ContactSearch:
         """Solve this step with nodes that slip rather than leave, see `ContactElements`."""
         self.elements = [replace(c, lets_slip=True) for c in self.elements]
 
+    def impose(self, active: Sequence[BoolArray] | None) -> None:
+        """Hold candidates active or inactive; None: as the laws say.
+
+        Args:
+            active: Of each of `elements`, shape (n,).
+        """
+        given = [None] * len(self.elements) if active is None else active
+        both = zip(self.elements, given, strict=True)
+        self.elements = [replace(c, imposed=on) for c, on in both]
+
     def give_way(self) -> bool:
         """Let infinite friction have a bound."""
         endless = any(np.isinf(pair.friction) for pair in self._pairs)

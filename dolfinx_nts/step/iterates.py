@@ -8,10 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.evaluation import Evaluation
-from dolfinx_nts.parallel import everywhere
+from dolfinx_nts.parallel import everywhere, global_max, global_sum
 from dolfinx_nts.step.problem import StepProblem
 
 IntArray = npt.NDArray[np.signedinteger[Any]]
+
+#: Iterations in a row without fewer changes of the active set before one changes at a time.
+_PATIENCE = 4
 
 
 class Iterates:
@@ -23,6 +26,7 @@ class Iterates:
     Attributes:
         last: Evaluation of the last iterate.
         flips: Of each batch of elements how often each has changed its status.
+        imposed: Whether the last iterate was evaluated with contacts that its laws would change.
     """
 
     def __init__(self, problem: StepProblem) -> None:
@@ -33,11 +37,17 @@ class Iterates:
         """Forget all iterates, as a step begins."""
         self.last: Evaluation | None = None
         self.flips: list[IntArray] = []
-        self._settled = True
+        self.imposed, self._settled, self._pivots = False, True, False
 
     def forget_last(self) -> None:
-        """Forget the last iterate, as another attempt at the same step begins."""
-        self.last = None
+        """Forget the last iterate, as another attempt at the same step begins.
+
+        In that one contacts change one at a time where changing all at once leads nowhere. On a
+        linear problem without friction this ends (block pivoting with single pivots, Judice and
+        Pires 1994), where the plain active set may cycle.
+        """
+        self.last, self.imposed, self._pivots = None, False, True
+        self._fewest, self._patience = np.inf, _PATIENCE
 
     def at(self, x: Any) -> Evaluation:
         """Evaluation at an iterate, reused while SNES asks for the same one. Collective.
@@ -53,7 +63,7 @@ class Iterates:
         # A diverging iterate may overflow; the convergence test sees it.
         with np.errstate(over="ignore", invalid="ignore"):
             new = self._problem.evaluate(x)
-        self._settled = True
+        self._settled, self.imposed = True, False
         if last is None:
             self.flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
         else:
@@ -62,8 +72,40 @@ class Iterates:
                     changes = a.status != b.status
                     self.flips[k] += changes
                     self._settled &= not changes.any()
+            if self._pivots:
+                new = self._pivoted(last, new, x)
         self.last = new
         return new
+
+    def _pivoted(self, last: Evaluation, new: Evaluation, x: Any) -> Evaluation:
+        """The new iterate, with one change of the last one's active set if all do not settle.
+
+        Collective.
+        """
+        contacts, comm = self._problem.couplings.contacts, self._problem.system.comm
+        before, after = (
+            [part.active for part in e.parts[: len(contacts.elements)]] for e in (last, new)
+        )
+        changes = [a != b for a, b in zip(before, after, strict=True)]
+        count = float(global_sum(comm, np.array([float(c.sum()) for c in changes])).sum())
+        if count < self._fewest:
+            self._fewest, self._patience = count, _PATIENCE
+        if count <= 1.0 or self._patience > 0:
+            self._patience -= 1
+            return new
+        # The last one of the last batch and rank: an order that is the same in every iteration.
+        own = [k * comm.size + comm.rank for k, c in enumerate(changes) if c.any()]
+        k, rank = divmod(int(global_max(comm, np.array([max(own, default=-1.0)]))[0]), comm.size)
+        if rank == comm.rank:
+            only = np.flatnonzero(changes[k])[-1]
+            before[k] = before[k].copy()
+            before[k][only] = after[k][only]
+        contacts.impose(before)
+        with np.errstate(over="ignore", invalid="ignore"):
+            held = self._problem.evaluate(x)
+        contacts.impose(None)
+        self.imposed = True
+        return held
 
     @property
     def settled(self) -> bool:

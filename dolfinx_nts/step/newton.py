@@ -310,7 +310,9 @@ class StepSolver:
 
     def _worst(self, e: Evaluation) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            return max(ratios(self.problem, e).values())
+            worst = max(ratios(self.problem, e).values())
+        # What contacts satisfy that are held as they are not is no solution.
+        return max(worst, 2.0) if e is self.iterates.last and self.iterates.imposed else worst
 
     def _converged(self, _snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
         last = self.iterates.last
