@@ -85,6 +85,7 @@ def forces_elsewhere(points):
         pytest.param(*face(3), forces_elsewhere(face(3)[0]), id="other nodes carry"),
         pytest.param(*face(3, start=1.0), last_row(face(3, start=1.0)[0])[0], id="all over it"),
         pytest.param(*face(3), np.zeros(16), id="no force"),
+        pytest.param(*face(3), -1e-20 * last_row(face(3)[0])[0], id="rounding of no force"),
         # With the edge x = 1 down: the nodes that carry nothing hang above the table.
         pytest.param(
             *face(3, start=1.0, tilt=-0.5, about=1.0), (face(3)[0][:, 0] < 1.63) * 1.0,

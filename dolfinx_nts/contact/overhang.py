@@ -68,8 +68,8 @@ def overhang(
     total, on = float(force.sum()), (force > 0.0)[facets]
     part = on.any(axis=1) & ~on.all(axis=1)
     facets, on = facets[part], on[part]
-    # Most often some carry amid others that do.
-    if not total or float(force[np.unique(facets)].sum()) < (1.0 - _ELSEWHERE) * total:
+    # A touch without force may have rounding in it, of any sign; most often some carry amid others.
+    if not total > 0.0 or float(force[np.unique(facets)].sum()) < (1.0 - _ELSEWHERE) * total:
         return None
     corner = x[facets]
     at = closest_facets(corner[~on], corners, reach=np.inf)
