@@ -150,7 +150,7 @@ class Coupling(Protocol):
     def touched(self) -> set[int]:
         """Numbers of the bodies that elements move, the same on all ranks. Collective."""
 
-    def wake(self, u1: Sequence[FloatArray]) -> bool:
+    def wake(self, e: Evaluation, parts: Sequence[Any]) -> bool:
         """Return whether a solved step asks for more elements, which are made. Collective."""
 
     def misses(self, e: Evaluation, parts: Sequence[Any], motion: FloatArray) -> bool:

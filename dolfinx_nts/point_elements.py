@@ -204,7 +204,7 @@ class EveryStep:
         """All bodies."""
         return set(self.bodies[0])
 
-    def wake(self, u1: Sequence[FloatArray]) -> bool:
+    def wake(self, e: Evaluation, parts: Sequence[Any]) -> bool:
         """Nothing sleeps."""
         return False
 

@@ -97,6 +97,8 @@ class ContactSearch:
         search: bool,
     ) -> None:
         """Make the elements of a step, as of `Coupling`. Collective."""
+        # Their forces are the first guess: of t_n, or of the solution that is gone on from.
+        self._carried = history if again is None else self.history(again.parts)
         self._step, self._old, self._placed = step, history, {}
         time = step.state.time
         self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
@@ -221,14 +223,11 @@ class ContactSearch:
         return awake
 
     # ---- a solution
-    def wake(self, u1: Sequence[FloatArray]) -> bool:
-        """Give unknowns to idle candidates whose gaps a solution closes, if any. Collective.
-
-        Args:
-            u1: Displacement of each body at t_{n+1} [m].
-        """
+    def wake(self, e: Evaluation, parts: Sequence[Contribution]) -> bool:
+        """Give unknowns to idle candidates whose gaps a solution closes, if any. Collective."""
         if not self._watching:
             return False
+        u1 = [terms.u1 for terms in e.bodies]
         self.idle_gaps = [self._gap(k, c, u1) for k, c in enumerate(self.idle)]
         closed = [
             ~(gap >= -c.gap_rounding) for c, gap in zip(self.idle, self.idle_gaps, strict=True)
@@ -237,6 +236,7 @@ class ContactSearch:
             return False
         for awake, late in zip(self._with_unknowns, closed, strict=True):
             awake[np.flatnonzero(~awake)[late]] = True
+        self._carried = self.history(parts)
         self._choose()
         return True
 
@@ -282,7 +282,7 @@ class ContactSearch:
     def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
         """Return what each contact remembers of an accepted step."""
         histories = []
-        for k, (c, part) in enumerate(zip(self.elements, parts, strict=True)):
+        for k, (c, part) in enumerate(zip(self.elements, parts, strict=False)):
             new = c.history(part, self._step.factor, self._old[k])
             idle = self.idle[k].candidates
             new.facet[idle.node], new.gap[idle.node] = idle.facet, self.idle_gaps[k]
@@ -359,13 +359,14 @@ class ContactSearch:
         """Multipliers of the contact forces of the last step, shape (n, constraints).
 
         In statics nodes that touch at t_n start as active: without inertia a body may have nothing
-        but its contacts to hold it.
+        but its contacts to hold it. Where a solution of this step has missed contacts, they are its
+        forces.
         """
         c, multipliers = self.elements[k], self.carried(k)
         if c.pair.redundant:
             # Else rounding adds up over steps in forces that sticking nodes exert on each other.
             multipliers[:, 1:] = 0.0
-        if not self._step.integrator.inertia:
+        if not self._step.integrator.inertia and self._carried is self._old:
             near = _TOUCHING * c.candidates.length
             touching = (self._old[k].force[c.candidates.node] > 0.0) | (c.candidates.gap <= near)
             augmented = np.empty((c.num_elements, 0))
@@ -376,7 +377,7 @@ class ContactSearch:
 
     def carried(self, k: int) -> FloatArray:
         """Multipliers of the contact forces of the last step as they were, (n, constraints)."""
-        c, old = self.elements[k], self._old[k]
+        c, old = self.elements[k], self._carried[k]
         node = c.candidates.node
         forces = c.multipliers(old.force[node], old.tangential[node])
         multipliers: FloatArray = self._step.factor * forces / c.scale[:, None]

@@ -128,9 +128,9 @@ class Couplings:
             if k in bodies:
                 coupling.rouse()
 
-    def wake(self, u1: Sequence[FloatArray]) -> bool:
+    def wake(self, e: Evaluation) -> bool:
         """Whether a solved step asks for more elements, which are made. Collective."""
-        return any([coupling.wake(u1) for coupling in self._all])
+        return any([coupling.wake(e, parts) for coupling, parts in [*self.each(e)]])
 
     def misses(self, e: Evaluation, motion: FloatArray) -> bool:
         """Whether a solved step may have passed by something, see `Coupling.misses`. Collective."""

@@ -128,7 +128,7 @@ class StepProblem:
         )  # fmt: skip
         self.couplings.begin(step, again, search)
         self._asleep = self._find_asleep(at_rest & (lengths.motion == 0.0)) if sleep else {}
-        self._lay_out()
+        self._lay_out(again)
 
     def _fly(self) -> BoolArray:
         """Set `first`, `flight` and `lengths`, the step without forces. Collective.
@@ -168,11 +168,10 @@ class StepProblem:
         Args:
             e: Solution of the step without them.
         """
-        u1 = [terms.u1 for terms in e.bodies]
-        if not self.couplings.wake(u1):
+        if not self.couplings.wake(e):
             return False
         self._rouse(self._asleep.keys() & self.couplings.touched())
-        self._lay_out()
+        self._lay_out(e)
         return True
 
     def misses(self, e: Evaluation) -> bool:
@@ -185,8 +184,12 @@ class StepProblem:
         """
         return self.couplings.misses(e, self.lengths.motion_of(e))
 
-    def _lay_out(self) -> None:
-        """Layout of the unknowns, kept while no rank's elements change, and a first guess."""
+    def _lay_out(self, again: Evaluation | None) -> None:
+        """Layout of the unknowns, kept while no rank's elements change, and a first guess.
+
+        Args:
+            again: Solution of this step with fewer elements, which the next one goes on from.
+        """
         system = self.system
         if len(self._asleep) == len(system.bodies):
             # SNES needs an unknown; at rest it takes no iteration.
@@ -203,7 +206,7 @@ class StepProblem:
             self.version += 1
             self._numbers = numbers
         self._of_none = None
-        self.guess(flight=True)
+        self.guess(flight=True, again=again)
 
     @property
     def x(self) -> Any:
@@ -252,7 +255,9 @@ class StepProblem:
             return force
         return self.stabilization.of(body) * du
 
-    def guess(self, *, flight: bool, carried: bool = False) -> None:
+    def guess(
+        self, *, flight: bool, carried: bool = False, again: Evaluation | None = None
+    ) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 
         Args:
@@ -261,6 +266,8 @@ class StepProblem:
                 and no forces. Prescribed coordinates are at t_{n+1}.
             carried: Take the contact forces of the last step unchanged, whatever `flight` is, even
                 where they are a poor guess.
+            again: Solution of this step with fewer elements: its motion and contact forces are
+                taken in place of these.
         """
         laid, elements = self.laid, self.elements
         with self.x as x:
@@ -268,6 +275,8 @@ class StepProblem:
             for k in self.awake:
                 fixed, u1 = self.system.bodies[k].fixed, self.first[k]
                 start = u1 if flight else self.state.u[k].copy()
+                if again is not None:
+                    start = again.bodies[k].u1.copy()
                 start[fixed] = u1[fixed]
                 x[laid.of_body(k)] = start
         if "constraints" in laid.own and (flight or carried or not self.integrator.inertia):
