@@ -15,6 +15,7 @@ from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent, resultants
 from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.step.supports import rates_at
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import UserFunctionError, is_finite
 
@@ -227,9 +228,6 @@ def carried_forces(system: System, start: Solution | None) -> dict[str, FloatArr
 def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: bool) -> State:
     """The state with the rates of prescribed motion as velocities there. Collective.
 
-    As v_1 = 2 (u_1 - u_0)/h - v_0, another start would make their velocities alternate for ever.
-    The rate is a one-sided difference of second order, as accurate as the integrators.
-
     Args:
         system: The scene.
         state: At the start.
@@ -239,9 +237,7 @@ def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: b
     """
     v = [v.copy() for v in state.v]
     for body, values in zip(system.bodies, v, strict=True):
-        p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
-        # Written in this way, the rate of what does not move is 0, not rounding.
-        rate = (4.0 * (p1 - p0) - (p2 - p0)) / dt
+        rate = rates_at(body, state.time, -dt, twice=False).velocity
         old = values[body.fixed]
         sizes = [np.abs(a).max(initial=0.0) for a in (rate - old, rate, old)]
         off, *size = global_max(system.comm, np.array(sizes)).tolist()

@@ -16,6 +16,7 @@ from dolfinx_nts.state import State
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.mass_solves import Saddle, solve_mass
 from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.step.supports import rates_at
 from dolfinx_nts.step.unknowns import Unknowns
 
 FloatArray = npt.NDArray[np.float64]
@@ -54,7 +55,7 @@ def accelerations(problem: StepProblem, state: State, dt: float) -> tuple[FloatA
     Args:
         problem: Equations of the run.
         state: At the start; its own accelerations play no part.
-        dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+        dt: First step [s]; in which prescribed coordinates are asked for their motion.
     """
     forces, held = zip(*accelerating_forces(problem, state, dt), strict=True)
     solved = _solve(problem, replace(state, a=held), forces, 1, dt)
@@ -69,7 +70,7 @@ def accelerating_forces(
     Args:
         problem: Equations of the run.
         state: The state; its own accelerations play no part.
-        dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+        dt: First step [s]; in which prescribed coordinates are asked for their motion.
 
     Returns:
         Of each body the forces [N], less the inertia of its prescribed coordinates, and
@@ -85,9 +86,8 @@ def accelerating_forces(
     out = []
     for body, u, force in zip(problem.system.bodies, state.u, contact, strict=True):
         right = body.external(u, gravity) - body.internal(u) - force
-        p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
         a = np.zeros_like(u)
-        a[body.fixed] = 4.0 * (p0 - 2.0 * p1 + p2) / dt**2
+        a[body.fixed] = rates_at(body, state.time, -dt).acceleration
         right -= body.inertia(a)
         right[body.fixed] = 0.0
         out.append((right, a))
