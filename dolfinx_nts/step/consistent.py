@@ -26,7 +26,7 @@ _TIMES = 8
 
 
 def violation(
-    problem: StepProblem, state: State, dt: float, *, rates: bool
+    problem: StepProblem, state: State, dt: float, *, rates: bool, part: float = 0.0
 ) -> tuple[float, str] | None:
     """The worst violation of a constraint at a start, and its joint's name. Collective.
 
@@ -35,16 +35,19 @@ def violation(
         state: At the start.
         dt: First step [s].
         rates: That of velocities; else of positions.
+        part: Of the speed of a joint's bodies that it may be, beside its rounding.
 
     Returns:
         [m/s] or [m], or None where all constraints hold.
     """
-    worst, name = 0.0, ""
-    for joint, coupling in zip(problem.system.joints, problem.couplings.joints, strict=True):
+    worst, name, system = 0.0, "", problem.system
+    every = zip(system.joints, system.joint_bodies, problem.couplings.joints, strict=True)
+    for joint, of, coupling in every:
+        speed = max(float(np.abs(state.v[k]).max(initial=0.0)) for k in of)
         for found in filter(None, coupling.kinematics(state, dt)):
-            local = np.array([found.size[int(rates)], found.limit[int(rates)]])
-            off, limit = global_max(problem.system.comm, local).tolist()
-            if off > limit and off > worst:
+            local = np.array([found.size[int(rates)], found.limit[int(rates)], speed])
+            off, limit, speed = global_max(system.comm, local).tolist()
+            if off > max(limit, part * speed) and off > worst:
                 worst, name = off, joint.name
     return (worst, name) if name else None
 
