@@ -2,10 +2,15 @@
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from rotations import rotation
 from scenes import at, box, everywhere
+from shells import plate
 
 import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
+
+COMM = MPI.COMM_WORLD
 
 YOUNG, SIDE = 1e6, 0.1
 #: Buckling load of a slender column of height 1 m, clamped below (Euler) [N]: pi^2 E I / (2 L)^2.
@@ -104,6 +109,21 @@ def test_a_block_that_stands_is_stable(rigid):
     assert told(run) == 0
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize("young", [1e5, 1e8])
+def test_what_nothing_resists_is_no_instability(young):
+    """A block may slide and turn on a smooth floor; a coarse solution leaves it out of balance."""
+    block = nts.Continuum(
+        box([0, 0, 0], [0.2, 0.2, 0.4], (2, 2, 4)), nts.NeoHookean(young=young, poisson=0.3),
+        density=1e3, name="block",
+    )  # fmt: skip
+    pair = nts.ContactPair(block.surface(at(2, 0.0)), nts.Plane((0, 0, 0), (0, 0, 1)))
+    run = nts.equilibrium(
+        nts.System([block], contacts=[pair], gravity=(0, 0, -9.81)), newton=nts.Newton(rtol=1e-6)
+    )
+    assert "free motion" in run.warnings and "unstable equilibrium" not in run.warnings
+
+
 def test_a_block_on_its_edge_is_not():
     """Held by contact at two nodes, straight under its centre: it may tip to either side."""
     mesh = box([0, 0, 0], [0.2, 0.2, 0.2], 1)
@@ -113,3 +133,100 @@ def test_a_block_on_its_edge_is_not():
     pair = nts.ContactPair(block.surface(everywhere), floor, friction=0.5)
     run = nts.equilibrium(nts.System([block], contacts=[pair], gravity=(0, 0, -9.81)))
     assert told(run) == 1
+
+
+# ---- slender bodies, whose bending is soft beside their stretch by any factor
+STEEL = 2.1e11
+
+
+def end(x):
+    return x[0] > 1.0 - 1e-9
+
+
+def foot(x):
+    return x[0] < 1e-9
+
+
+def beam(sides, force, n=16):
+    """A steel beam of 1 m along x, clamped at x = 0, under a dead force at its end [N]."""
+    mine = slice(None if COMM.rank == 0 else 0)
+    cells = np.column_stack([np.arange(n), np.arange(1, n + 1)])[mine]
+    x = (np.linspace(0.0, 1.0, n + 1)[:, None] * [1.0, 0.0, 0.0])[mine]
+    mesh = compat.create_mesh(COMM, cells, x, "interval")
+    section = nts.Rectangle(*sides).section(young=STEEL, poisson=0.3, density=7800.0)
+    body = nts.Beam(
+        mesh, section, direction=(0, 1, 0), bcs=[nts.Clamp(foot)],
+        forces=[nts.PointForce(end, force)],
+    )  # fmt: skip
+    return nts.equilibrium(nts.System([body]), load_steps=4)
+
+
+def euler(side, width=None, young=STEEL):
+    """Buckling load of a column of 1 m that is clamped at one end [N]; side the thinner one."""
+    return np.pi**2 / 4.0 * young * (width or side) * side**3 / 12.0
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("slender", [10, 20, 75, 120, 250, 400, 1000])
+@pytest.mark.fast("20", "1000")
+@pytest.mark.fast_on_ranks("1000")
+def test_a_beam_buckles_however_slender(slender):
+    """Past 9 times Euler's load in the second mode, too, both about two axes."""
+    side = 1.0 / slender
+    for part, expected in ((0.98, 0), (1.02, 2), (1.1, 2), (2.0, 2), (10.0, 4)):
+        # At L/h = 10 stretch and shear shift 10 times the load, not the number of modes.
+        run = beam((side, side), (-part * euler(side), 0, 0))
+        assert told(run) == expected, part
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("slender", [10, 100, 1000])
+@pytest.mark.fast("1000")
+@pytest.mark.fast_on_ranks()
+def test_a_strip_of_shells_buckles_however_slender(slender):
+    """Across its thickness; without Poisson's ratio a strip is a beam."""
+    thick, width, n = 1.0 / slender, 0.5, 24
+    for part, expected in ((0.98, 0), (1.02, 1), (10.0, 2)):
+        load = -part * euler(thick, width) / 2.0
+        strip = nts.Shell(
+            plate(n, 1, 1.0, width), young=STEEL, poisson=0.0, thickness=thick, density=7800.0,
+            bcs=[nts.Clamp(foot)], name="strip",
+            forces=[nts.PointForce(corner(y), (load, 0, 0)) for y in (0.0, width)],
+        )  # fmt: skip
+        run = nts.equilibrium(nts.System([strip]), load_steps=2)
+        assert told(run) == expected, part
+
+
+def corner(y):
+    return lambda x: end(x) & (np.abs(x[1] - y) < 1e-9)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("slender", [10, 100, 1000])
+@pytest.mark.fast("1000")
+@pytest.mark.fast_on_ranks()
+def test_a_solid_buckles_however_slender(slender):
+    """Of degree 2, which does not lock."""
+    side = 1.0 / slender
+    for part, expected in ((0.97, 0), (1.02, 2)):
+        push = nts.Traction(at(0, 1.0), (-part * euler(side) / side**2, 0, 0))
+        body = nts.Continuum(
+            box([0, 0, 0], [1, side, side], (20, 1, 1)), nts.NeoHookean(STEEL, 0.0), degree=2,
+            density=7800.0, bcs=[nts.Dirichlet(at(0, 0.0))], traction=[push], name="column",
+        )  # fmt: skip
+        assert told(nts.equilibrium(nts.System([body]), load_steps=2)) == expected, part
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("high", [0.02, 0.1])
+@pytest.mark.fast_on_ranks("0.02")
+def test_a_cantilever_strip_buckles_sideways(high):
+    """Prandtl (1899): 4.013 sqrt(EI GJ)/L^2, bending about the stiff axis left out: 0.5 %."""
+    thin, shear = high / 12.0, STEEL / 2.6
+    inertia = high * thin**3 / 12.0
+    torsion = nts.Rectangle(thin, high).section(young=STEEL, poisson=0.3, density=1.0).GJ
+    assert torsion == pytest.approx(4.0 * shear * inertia, rel=0.06)  # (1 - 0.63/12)
+    prandtl = 4.013 * np.sqrt(STEEL * inertia * torsion)
+    for part, expected in ((0.97, 0), (1.03, 1)):
+        run = beam((thin, high), (0, 0, -part * prandtl), n=32)
+        assert told(run) == expected, part

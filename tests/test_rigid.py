@@ -286,25 +286,6 @@ def test_prescribed_motion_does_external_work():
     assert run.reactions["rigid"][-1, 0, 0] == pytest.approx(2.0, rel=1e-8)
 
 
-def test_prescribed_turning_starts_as_the_midpoint_rule_keeps_it():
-    """Its first speed depends on dt: with the exact one speeds would alternate for ever.
-
-    v_1 = 2 (u_1 - u_0)/h - v_0 keeps w tan(w h/2)/(w h/2) alone, which is w (1 + (w h)^2/12). What
-    starts otherwise alternates by twice as much as it is off; here that is of third order.
-    """
-    w, h = 2.0, 0.05
-    body = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), rotation=lambda t: (0, 0, w * t))
-    stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum())
-    speeds = []
-    for _ in range(6):
-        stepper.advance(h)
-        speeds.append(body.angular_velocity[2])
-    stepper.close()
-    assert np.ptp(speeds) < (w * h) ** 3 / 10 * w
-    assert np.mean(speeds) == pytest.approx(np.tan(0.5 * w * h) / (0.5 * h), rel=(w * h) ** 4)
-    assert np.mean(speeds) / w - 1.0 == pytest.approx((w * h) ** 2 / 12.0, rel=0.01)
-
-
 def iterations_in(unit):
     """Of a free body with lengths in this unit, which flies as it must."""
     body = nts.RigidBody.from_inertia(

@@ -22,10 +22,10 @@ class Newmark(WithAccelerations):
 
     With gamma = 1/2 it is of second order, and the trapezoidal rule with beta = 1/4, which keeps
     J + h^2/4 sum v x M a in place of the angular momentum J. Linear problems are stable for
-    2 beta >= gamma >= 1/2; supports may move for beta >= 1/4 only. A larger gamma damps, and is of
-    first order. So is friction, whose force at t_{n+1} opposes the slip of the whole step, and the
-    work of supports in the ledger, while that of loads is of the mean of both ends. Impacts bring
-    energy in, the more the smaller the step: the method is here to compare with.
+    2 beta >= gamma >= 1/2. A larger gamma damps, and is of first order. So is friction, whose force
+    at t_{n+1} opposes the slip of the whole step, and the work of supports in the ledger, while
+    that of loads is of the mean of both ends. Impacts bring energy in, the more the smaller the
+    step: the method is here to compare with.
 
     Attributes:
         beta: > 0, up to 1/2.

@@ -128,11 +128,9 @@ class Promises:
         if self._driven:
             local = np.zeros(2)
             for k in self._driven:
-                v, acceleration = problem.state.v[k], problem.state.acceleration(k)
-                after = problem.integrator.advance(
-                    step.bodies[k].du, v, acceleration, problem.dt
-                )[0]
-                local += [0.5 * float(w @ bodies[k].inertia(w)) for w in (v, after)]
+                after, _ = problem.supports.advance(k, step.bodies[k].du)
+                speeds = problem.state.v[k], after
+                local += [0.5 * float(v @ bodies[k].inertia(v)) for v in speeds]
             driven = comm.allreduce(local).tolist()
             # The first row is that of the start, unless the run goes on.
             self._first = self._first if len(self._solution.rows) > 2 else driven[0]

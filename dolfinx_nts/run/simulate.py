@@ -132,7 +132,8 @@ def simulate(
             "material_change" in the balance.
 
         project_start: Start with the nearest velocities, in the kinetic energy, that the joints
-            allow; else a start that violates a joint is refused with its name.
+            allow; else a start that violates a joint is refused with its name, but for what meshes
+            do to it, a thousandth of its bodies' speed, which is projected and told.
         ledger: Keep energies, momenta, works and counts in the balance; without it they are NaN
             after the start, and nothing watches over energy and momentum. It costs a few parts in a
             hundred of small scenes' steps.

@@ -15,11 +15,15 @@ from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent, resultants
 from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.step.supports import rates_at
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import UserFunctionError, is_finite
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Part of the speed of its bodies by which a joint may be violated at the start as meshes do it,
+#: whose centre of mass is off the axis of what they stand for.
+_OF_MESHES = 1e-3
 #: Part of the speed of supports by which a run that goes on may differ from their motion, as it
 #: does by the error of its steps.
 _JUMP = 0.1
@@ -227,9 +231,6 @@ def carried_forces(system: System, start: Solution | None) -> dict[str, FloatArr
 def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: bool) -> State:
     """The state with the rates of prescribed motion as velocities there. Collective.
 
-    As v_1 = 2 (u_1 - u_0)/h - v_0, another start would make their velocities alternate for ever.
-    The rate is a one-sided difference of second order, as accurate as the integrators.
-
     Args:
         system: The scene.
         state: At the start.
@@ -239,9 +240,7 @@ def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: b
     """
     v = [v.copy() for v in state.v]
     for body, values in zip(system.bodies, v, strict=True):
-        p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
-        # Written in this way, the rate of what does not move is 0, not rounding.
-        rate = (4.0 * (p1 - p0) - (p2 - p0)) / dt
+        rate = rates_at(body, state.time, -dt, twice=False).velocity
         old = values[body.fixed]
         sizes = [np.abs(a).max(initial=0.0) for a in (rate - old, rate, old)]
         off, *size = global_max(system.comm, np.array(sizes)).tolist()
@@ -252,7 +251,7 @@ def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: b
 
 def consistent_start(
     problem: StepProblem, state: State, dt: float, *, continues: bool, project: bool
-) -> State:
+) -> tuple[State, tuple[float, str] | None]:
     """A start that fits the joints. Collective.
 
     Args:
@@ -261,13 +260,17 @@ def consistent_start(
         dt: First step [s].
         continues: Whether another run with these joints ended there. Velocities at the end of a
             step need not fit: they only do in the mean of two steps.
-        project: Project velocities that do not fit.
+        project: Project velocities that do not fit, however far they are off.
+
+    Returns:
+        The start, and where velocities were projected unasked, how far they were off [m/s], and a
+        sentence on it.
 
     Raises:
         ValueError: It does not fit, and its velocities are not to be projected, or cannot be.
     """
     if not problem.system.joints:
-        return state
+        return state, None
     still = tuple(np.zeros_like(v) for v in state.v)
     problem.begin(replace(state, a=state.a or still), dt, sleep=False)
     found = consistent.violation(problem, state, dt, rates=False)
@@ -277,22 +280,27 @@ def consistent_start(
             "displacements and prescribed motion, and what the joint prescribes, begin where "
             "it holds"
         )
-    if continues:
-        return state
-    found = consistent.violation(problem, state, dt, rates=True)
-    if found is not None and not project:
+    found = None if continues else consistent.violation(problem, state, dt, rates=True)
+    if found is None:
+        return state, None
+    far = consistent.violation(problem, state, dt, rates=True, part=_OF_MESHES)
+    if far is not None and not project:
         raise ValueError(
-            f"velocity: at the start joint {found[1]!r} is violated at {found[0]:.3g} m/s; "
+            f"velocity: at the start joint {far[1]!r} is violated at {far[0]:.3g} m/s; "
             "change the bodies' velocities or the prescribed rates so that they fit, or pass "
             "project_start=True"
         )
-    if found is not None:
-        state = replace(state, v=consistent.projection(problem, state, dt))
-        found = consistent.violation(problem, state, dt, rates=True)
-    if found is not None:
+    state = replace(state, v=consistent.projection(problem, state, dt))
+    left = consistent.violation(problem, state, dt, rates=True)
+    if left is not None:
         raise ValueError(
-            f"project_start=True: no velocities fit joint {found[1]!r}, which stays violated "
-            f"at {found[0]:.3g} m/s; prescribed motion, or another joint, contradicts it: leave "
+            f"project_start=True: no velocities fit joint {left[1]!r}, which stays violated "
+            f"at {left[0]:.3g} m/s; prescribed motion, or another joint, contradicts it: leave "
             "one of them out"
         )
-    return state
+    text = (
+        f"joint {found[1]!r} was violated at {found[0]:.3g} m/s at the start, as a centre of mass "
+        "that a mesh puts beside an axis makes it; the run begins with the nearest velocities "
+        "that fit"
+    )
+    return state, None if project else (found[0], text)

@@ -347,7 +347,7 @@ class Stepper:
             return
         for retry in count():
             try:
-                state = self._fitting(dt)
+                state, moved = self._fitting(dt)
                 break
             except UserFunctionError:
                 raise
@@ -359,6 +359,8 @@ class Stepper:
                 logger.info("%s; starting with dt=%.3g", failure, dt)
         self._accept(state)
         self._started = True
+        if moved is not None:
+            self.solution.warn("start projected", state.time, *moved)
         doubt = incomplete(self._start)
         if doubt:
             self.solution.warn("start", state.time, 1.0, doubt, grave=True)
@@ -376,8 +378,11 @@ class Stepper:
         # Where bodies were before the first step, for one that carries them through each other.
         self.look()
 
-    def _fitting(self, dt: float) -> State:
+    def _fitting(self, dt: float) -> tuple[State, tuple[float, str] | None]:
         """The start with rates of prescribed motion and accelerations, which fits the joints.
+
+        Returns:
+            It, and what `consistent_start` has to tell of it.
 
         Raises:
             StepFailedError: A joint refuses a step of this length.
@@ -386,13 +391,13 @@ class Stepper:
         # What the first call sets is what the run begins with.
         self._materials.changed()
         state = with_prescribed_rates(self.system, self.state, dt, goes_on=self._goes_on)
-        state = consistent_start(
+        state, moved = consistent_start(
             self.problem, state, dt, continues=self._continues, project=self._project_start
         )
         if self.problem.integrator.accelerations and not state.a:
             carried = with_resting_forces(self.problem, state, dt, self.newton, self._given)
             state = replace(state, a=consistent.accelerations(self.problem, carried, dt))
-        return state
+        return state, moved
 
     @property
     def _continues(self) -> bool:

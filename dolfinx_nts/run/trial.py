@@ -80,8 +80,8 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
     old, dt = problem.state, problem.dt
     u, v, a = list(old.u), list(old.v), list(old.a)
     for k in problem.awake:
-        u[k], a0 = step.bodies[k].u1.copy(), old.acceleration(k)
-        v[k], a1 = problem.integrator.advance(step.bodies[k].du, old.v[k], a0, dt)
+        u[k] = step.bodies[k].u1.copy()
+        v[k], a1 = problem.supports.advance(k, step.bodies[k].du)
         if a1 is not None:
             a[k] = a1
         body = problem.system.bodies[k]

@@ -188,9 +188,9 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     losses = (name for joint in problem.system.joints for name in joint.losses)
     sums, smallest = dict.fromkeys((*WORKS, *COUNTS, *losses), 0.0), {"min_gap": np.inf}
     added = problem.loads.work_at_ends(step)
-    for body, terms, more in zip(problem.system.bodies, step.bodies, added, strict=True):
-        work = terms.external @ terms.du + terms.residual[body.fixed] @ terms.du[body.fixed] + more
-        sums["external_work"] += scale * float(work)
+    for k, (terms, more) in enumerate(zip(step.bodies, added, strict=True)):
+        work = scale * float(terms.external @ terms.du + more)
+        sums["external_work"] += work + problem.supports.work(k, terms, problem.factor)
     for elements, part in zip(problem.elements, step.parts, strict=True):
         for name, value in elements.ledger(part, problem.factor).items():
             sums[name] += value

@@ -16,6 +16,7 @@ from dolfinx_nts.state import State
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.mass_solves import Saddle, solve_mass
 from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.step.supports import rates_at
 from dolfinx_nts.step.unknowns import Unknowns
 
 FloatArray = npt.NDArray[np.float64]
@@ -25,7 +26,7 @@ _TIMES = 8
 
 
 def violation(
-    problem: StepProblem, state: State, dt: float, *, rates: bool
+    problem: StepProblem, state: State, dt: float, *, rates: bool, part: float = 0.0
 ) -> tuple[float, str] | None:
     """The worst violation of a constraint at a start, and its joint's name. Collective.
 
@@ -34,16 +35,19 @@ def violation(
         state: At the start.
         dt: First step [s].
         rates: That of velocities; else of positions.
+        part: Of the speed of a joint's bodies that it may be, beside its rounding.
 
     Returns:
         [m/s] or [m], or None where all constraints hold.
     """
-    worst, name = 0.0, ""
-    for joint, coupling in zip(problem.system.joints, problem.couplings.joints, strict=True):
+    worst, name, system = 0.0, "", problem.system
+    every = zip(system.joints, system.joint_bodies, problem.couplings.joints, strict=True)
+    for joint, of, coupling in every:
+        speed = max(float(np.abs(state.v[k]).max(initial=0.0)) for k in of)
         for found in filter(None, coupling.kinematics(state, dt)):
-            local = np.array([found.size[int(rates)], found.limit[int(rates)]])
-            off, limit = global_max(problem.system.comm, local).tolist()
-            if off > limit and off > worst:
+            local = np.array([found.size[int(rates)], found.limit[int(rates)], speed])
+            off, limit, speed = global_max(system.comm, local).tolist()
+            if off > max(limit, part * speed) and off > worst:
                 worst, name = off, joint.name
     return (worst, name) if name else None
 
@@ -54,7 +58,7 @@ def accelerations(problem: StepProblem, state: State, dt: float) -> tuple[FloatA
     Args:
         problem: Equations of the run.
         state: At the start; its own accelerations play no part.
-        dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+        dt: First step [s]; in which prescribed coordinates are asked for their motion.
     """
     forces, held = zip(*accelerating_forces(problem, state, dt), strict=True)
     solved = _solve(problem, replace(state, a=held), forces, 1, dt)
@@ -69,7 +73,7 @@ def accelerating_forces(
     Args:
         problem: Equations of the run.
         state: The state; its own accelerations play no part.
-        dt: First step [s]; prescribed coordinates accelerate as in the mean over it.
+        dt: First step [s]; in which prescribed coordinates are asked for their motion.
 
     Returns:
         Of each body the forces [N], less the inertia of its prescribed coordinates, and
@@ -85,9 +89,8 @@ def accelerating_forces(
     out = []
     for body, u, force in zip(problem.system.bodies, state.u, contact, strict=True):
         right = body.external(u, gravity) - body.internal(u) - force
-        p0, p1, p2 = (body.prescribed(state.time + s * dt) for s in (0.0, 0.5, 1.0))
         a = np.zeros_like(u)
-        a[body.fixed] = 4.0 * (p0 - 2.0 * p1 + p2) / dt**2
+        a[body.fixed] = rates_at(body, state.time, -dt).acceleration
         right -= body.inertia(a)
         right[body.fixed] = 0.0
         out.append((right, a))

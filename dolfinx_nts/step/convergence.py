@@ -97,8 +97,11 @@ def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     top = global_max(problem.system.comm, np.array(local))
     motion = max(top[0], float(problem.lengths.motion.max()))
     rounded = motion + float(problem.lengths.moved.max())
-    ratio: dict[str, float] = {}
-    for c, largest in zip(problem.elements, top[2:].reshape(-1, 4), strict=True):
+    sizes, ratio = top[2:].reshape(-1, 4), dict[str, float]()
+    # What rounding leaves open in a joint the linear solve passes on to all that its bodies link.
+    for of in problem.couplings.mechanisms:
+        sizes[of, 3] = sizes[of, 3].max(initial=0.0)
+    for c, largest in zip(problem.elements, sizes, strict=True):
         broken = np.inf if top[1] else 0.0
         # Several contacts of two bodies have one name.
         for name, value in c.ratios(largest, motion, rounded, problem.rtol).items():

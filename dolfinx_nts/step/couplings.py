@@ -42,6 +42,7 @@ class Couplings:
         # What holds a body together may leave a step with it.
         self._own = [(c, k) for c, (k, *_) in alone if c.rests]
         self._remembered: tuple[ContactHistory, ...] = ()
+        self._mechanisms = _linked(system.joint_bodies[: len(system.declared_joints)])
         _lend_less(system, self.joints)
 
     @property
@@ -65,6 +66,17 @@ class Couplings:
     def bodies(self) -> list[tuple[int, ...]]:
         """Numbers of the bodies of each batch."""
         return [of for coupling in self._all for of in coupling.bodies]
+
+    @property
+    def mechanisms(self) -> list[list[int]]:
+        """Positions among `elements` of those of joints, of each mechanism that bodies link."""
+        found: list[list[int]] = [[] for _ in range(max(self._mechanisms, default=-1) + 1)]
+        start = len(self.contacts.elements)
+        for mechanism, coupling in zip(self._mechanisms, self.joints, strict=False):
+            stop = start + len(coupling.elements)
+            found[mechanism] += range(start, stop)
+            start = stop
+        return found
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """All with their parts of an evaluation."""
@@ -149,6 +161,15 @@ class Couplings:
     def give_way(self) -> bool:
         """From the next step on, limit forces that had no limit; return whether there was one."""
         return any([coupling.give_way() for coupling in self._all])
+
+
+def _linked(of: Sequence[tuple[int, ...]]) -> list[int]:
+    """Number of the mechanism of each joint, whose bodies' numbers are given."""
+    held: list[set[int]] = []
+    for bodies in of:
+        linked = [other for other in held if other & set(bodies)]
+        held = [other for other in held if other not in linked] + [set(bodies).union(*linked)]
+    return [next(k for k, one in enumerate(held) if set(bodies) <= one) for bodies in of]
 
 
 def _lend_less(system: System, joints: Sequence[JointCoupling]) -> None:

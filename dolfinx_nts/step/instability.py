@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.evaluation import Evaluation, free
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.step.augmented import AugmentedMatrix
 from dolfinx_nts.step.problem import StepProblem
 
@@ -21,9 +21,13 @@ _MOST = 20_000
 _STIFF = 1e3
 #: Skew part of a body's matrix, relative to it, up to which its forces have a potential.
 _SKEW = 1e-3
-#: Stiffness against a motion, relative to that of its coordinates, that counts as none: a body may
-#: be free to move along a surface.
-_NONE = 1e-8
+#: Stiffness against a motion, relative to that of its coordinates, that counts as none, as a body
+#: may be free to move along a surface: rounding alone. Against bending a solid column of L/h = 1000
+#: has 1e-12 of it.
+_NONE = 1e-15
+#: How many times the forces that the solution leaves unbalanced, over the size of the body, which
+#: they turn: a free body turns against no more.
+_LEFT = 10.0
 #: The same of rigid bodies, relative to what forces that turn with the bodies give them. Where such
 #: forces change as a body slides, springs in place of joints leave less than nothing of its
 #: resistance: the square of that over their stiffness.
@@ -62,9 +66,8 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
     transpose = matrix.transpose(PETSc.Mat())
     matrix.axpy(1.0, transpose)
     transpose.destroy()
-    negative = _negative_pivots(
-        matrix, [problem.system.bodies[k] for k in problem.awake], turning
-    )
+    none = _no_stiffness(problem, step, matrix, turning)
+    negative = _negative_pivots(matrix, none)
     matrix.destroy()
     return negative
 
@@ -78,16 +81,47 @@ def _is_symmetric(matrix: Any) -> bool:
     return small
 
 
-def _no_stiffness(body: Any, size: FloatArray, turning: FloatArray) -> FloatArray:
-    """What counts as none at each coordinate of a body, shape (num_owned,).
+def _no_stiffness(
+    problem: StepProblem, step: Evaluation, matrix: Any, turning: FloatArray
+) -> FloatArray:
+    """What counts as none at each coordinate of all bodies, as `matrix` has them. Collective.
 
     Args:
-        body: The body.
-        size: Its stiffness.
-        turning: What turning forces give it, see `AugmentedMatrix.turning`.
+        problem: Equations of a load step.
+        step: Its solution.
+        matrix: Stiffness.
+        turning: What turning forces add to it, see `AugmentedMatrix.turning`.
     """
-    if not body.rigid:
-        return _NONE * size
+    bodies = [problem.system.bodies[k] for k in problem.awake]
+    left = _unbalanced(problem, step)
+    diagonal = matrix.getDiagonal()
+    ends = np.cumsum([body.num_owned for body in bodies])[:-1]
+    parts = (np.split(each, ends) for each in (np.abs(diagonal.array_r), turning))
+    found = [
+        _of_rigid(body, size, turns) if body.rigid else _NONE * size + unbalanced
+        for body, size, turns, unbalanced in zip(bodies, *parts, left, strict=True)
+    ]
+    diagonal.destroy()
+    return np.concatenate(found)
+
+
+def _unbalanced(problem: StepProblem, step: Evaluation) -> FloatArray:
+    """Forces that the solution leaves on each body awake over its size [N/m], `_LEFT` times."""
+    local = np.full((len(problem.awake), 7), -np.inf)
+    for row, k in zip(local, problem.awake, strict=True):
+        body = problem.system.bodies[k]
+        x = body.reference.reshape(-1, 3)[body.places]
+        row[0] = np.abs(free(body, step.bodies[k].residual)).max(initial=0.0)
+        row[1:4], row[4:] = (way.max(axis=0, initial=-np.inf) for way in (x, -x))
+    found = global_max(problem.system.comm, local)
+    sizes = 0.5 * np.linalg.norm(found[:, 1:4] + found[:, 4:], axis=1)
+    # A rigid body has a single place, and what counts as none there is told otherwise.
+    left: FloatArray = _LEFT * found[:, 0] / np.where(sizes > 0.0, sizes, np.inf)
+    return left
+
+
+def _of_rigid(body: Any, size: FloatArray, turning: FloatArray) -> FloatArray:
+    """The same of a rigid body, shape (num_owned,)."""
     found, places = np.zeros_like(size), np.repeat(body.places, 3)
     for kind in (places, ~places):
         found[kind] = _NONE_OF_RIGID * turning[kind].max(initial=0.0)
@@ -95,13 +129,10 @@ def _no_stiffness(body: Any, size: FloatArray, turning: FloatArray) -> FloatArra
     return found
 
 
-def _negative_pivots(matrix: Any, bodies: Sequence[Any], turning: FloatArray) -> int:
+def _negative_pivots(matrix: Any, none: FloatArray) -> int:
     """Of a symmetric matrix, whose diagonal is raised by what counts as none. Collective."""
     diagonal = matrix.getDiagonal()
-    ends = np.cumsum([body.num_owned for body in bodies])[:-1]
-    parts = (np.split(each, ends) for each in (np.abs(diagonal.array_r), turning))
-    none = [_no_stiffness(body, *both) for body, *both in zip(bodies, *parts, strict=True)]
-    diagonal.array_w[:] += np.concatenate(none)
+    diagonal.array_w[:] += none
     matrix.setDiagonal(diagonal)
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     pc = PETSc.PC().create(matrix.comm)

@@ -30,6 +30,7 @@ from dolfinx_nts.step.shared_weight import SharedWeight
 from dolfinx_nts.step.sleep import Sleepers
 from dolfinx_nts.step.stabilization import Stabilization
 from dolfinx_nts.step.stiffness_between import stiffness_between
+from dolfinx_nts.step.supports import Supports
 from dolfinx_nts.step.unknowns import Unknowns
 from dolfinx_nts.system import System
 
@@ -59,6 +60,7 @@ class StepProblem:
         stabilization: In statics, what holds each node at t_n.
         lengths: Lengths of the scene, and of the step after `begin`.
         loads: When the step takes which loads.
+        supports: Prescribed coordinates in the step.
         flight: M (u_1 - u_0) of each body in free flight [kg m], after `begin`; zero in statics.
     """
 
@@ -79,6 +81,7 @@ class StepProblem:
         self.unknowns: Unknowns | None = None
         self.version = 0
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
+        self.supports = Supports(system, integrator)
         lengths = self.lengths
         self.stabilization = Stabilization(
             system, lengths.radius or lengths.director, lengths.director or lengths.radius,
@@ -143,13 +146,16 @@ class StepProblem:
         self.first = [u + du for u, du in zip(state.u, ahead, strict=True)]
         for body, u1 in zip(bodies, self.first, strict=True):
             u1[body.fixed] = body.prescribed(state.time + dt)
+        self.supports.begin(state, self.first, dt)
         speed = self.lengths.begin(state, self.first, dt)
         # In statics v only predicts the first guess.
         moves = (speed > 0.0) & self.integrator.inertia
+        moving = self.supports.moving
         self.flight = [
-            self._inertial(b, du) if top else np.zeros_like(du)
-            for b, du, top in zip(bodies, ahead, moves, strict=True)
-        ]
+            self._inertial(b, self.supports.ahead(k, du, self.first[k]))
+            if moves[k] or k in moving else np.zeros_like(du)
+            for k, (b, du) in enumerate(zip(bodies, ahead, strict=True))
+        ]  # fmt: skip
         return speed == 0.0
 
     @property

@@ -89,13 +89,21 @@ class Rounding:
         """Measure it anew, for bodies that have stiffened. Collective.
 
         A director is rounded as its own length is, not as a position: the stiffness of thin bodies
-        against what turns it alone counts by that part.
+        against what turns it alone counts by that part. Positions are rounded in the forces on
+        directors, too, by no more than the mean stiffness of both, as it is definite.
         """
         for k in bodies:
             body, diagonal = self._bodies[k], self._tangent(k).getDiagonal()
             if body.oriented and not body.rigid:
-                of_nodes = np.where(body.places, 1.0, body.length / self._extent[k])
-                diagonal.array_w[:] *= np.repeat(of_nodes, 3)
+                each = diagonal.array_r.reshape(-1, 3)
+                # A node's place comes before its directors.
+                place = each[body.places].max(axis=1)[np.cumsum(body.places) - 1, None]
+                turns = ~body.places
+                each = each.copy()
+                each[turns] = body.length / self._extent[k] * each[turns] + np.sqrt(
+                    np.abs(each[turns] * place[turns])
+                )
+                diagonal.array_w[:] = each.ravel()
             self._diagonal[k], self._of_factor[k] = diagonal.norm(), self._factor
             diagonal.destroy()
 
