@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import importlib
 import logging
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,7 @@ from ffcx.codegeneration import jit as ffcx_jit
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.canonical import canonical
 
 logger = logging.getLogger(__name__)
@@ -177,10 +179,14 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
     """Tell in one line that something is compiled, which is not in FFCx's cache, and nothing else.
 
     0.5.2 sends the C compiler's progress to the root logger, whose level it raises itself. Of
-    spaces, too: their elements are compiled. Errors are still raised and printed.
+    spaces, too: their elements are compiled. Errors are still raised, and what a compiler says of
+    them is printed.
 
     Yields:
         The C files that FFCx takes or makes, one after the other.
+
+    Raises:
+        RuntimeError: The C compiler fails, or is not there.
     """
     before, look = logging.root.manager.disable, ffcx_jit.get_cached_module
     told, sources = False, []
@@ -198,6 +204,11 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
     ffcx_jit.get_cached_module = looked
     try:
         yield sources
+    except Exception as error:
+        # On rank 0 of several DOLFINx has put setuptools' error into one of its own.
+        if not re.search(r"\b(Compile|Link)Error: ", str(error)):
+            raise
+        raise RuntimeError(f"{what} cannot be compiled ({error}): {library.COMPILER}") from None
     finally:
         ffcx_jit.get_cached_module = look
         logging.disable(before)

@@ -16,6 +16,8 @@ import time
 from pathlib import Path
 from xml.etree import ElementTree
 
+from mpi4py import MPI
+
 import h5py
 import numpy as np
 import pytest
@@ -23,7 +25,6 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType
 from integrators import INTEGRATORS, MID_STEP
-from mpi4py import MPI
 from scenes import box
 
 import dolfinx_nts as nts

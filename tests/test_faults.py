@@ -11,9 +11,10 @@ import sys
 import textwrap
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from processes import environment_of_ranks
 from scenes import box, thrown_block
 

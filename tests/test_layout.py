@@ -21,7 +21,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 #: Floors from below: files, and folders that stand for all of theirs.
 LEVELS = [
-    {"parallel", "validation", "dolfinx_compat", "forms", "kernels"},
+    {"parallel", "validation", "mpi_first", "dolfinx_compat", "forms", "kernels"},
     {"integrators"},
     {
         "bodies", "constraints", "contact", "coupling", "elements", "evaluation", "joints",
@@ -188,7 +188,7 @@ def ours():
 
 
 def theirs():
-    return after("dolfinx", "dolfinx.fem.petsc")
+    return after("mpi4py.MPI", "dolfinx", "dolfinx.fem.petsc")
 
 
 def test_importing_is_cheap():

@@ -1,9 +1,10 @@
 """One mesh per body: from Gmsh files and models, and from tagged DOLFINx meshes."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx import mesh as dolfinx_mesh
-from mpi4py import MPI
 from scenes import RUBBER
 
 import dolfinx_nts as nts

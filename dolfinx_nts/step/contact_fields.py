@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from mpi4py import MPI
 
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
