@@ -37,10 +37,12 @@ FloatArray = npt.NDArray[np.float64]
 
 
 # ---- meshes
-def _partitioner() -> Any:
-    if VERSION < (0, 11):
-        return mesh.create_cell_partitioner(*(() if _OLD else (_SHARED,)))
-    return mesh.create_cell_partitioner(_SHARED, 2)
+def _ghosts() -> dict[str, Any]:
+    """What gives a mesh shared-facet ghosts, as an argument of the function that makes it."""
+    if not hasattr(mesh, "create_cell_partitioner"):  # after 0.11
+        return {"ghost_mode": _SHARED}
+    links = () if VERSION < (0, 11) else (2,)
+    return {"partitioner": mesh.create_cell_partitioner(_SHARED, *links)}
 
 
 def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Any:
@@ -53,15 +55,14 @@ def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: st
         cell_type: Of DOLFINx, e.g. "hexahedron", "tetrahedron", "quadrilateral", "interval".
     """
     cells, x = np.ascontiguousarray(cells, np.int64), np.ascontiguousarray(x, np.float64)
-    part = _partitioner()
     if _OLD:
         cell = ufl.Cell(cell_type, geometric_dimension=x.shape[1])
         domain = ufl.Mesh(ufl.VectorElement("Lagrange", cell, 1))
-        return mesh.create_mesh(comm, cells, x, domain, _SHARED, part)
+        return mesh.create_mesh(comm, cells, x, domain, _SHARED, mesh.create_cell_partitioner())
     basix_ufl = importlib.import_module("basix.ufl")
     e = basix_ufl.element("Lagrange", cell_type, 1, shape=(x.shape[1],))
     args = (x, e) if VERSION < (0, 10) else (e, x)
-    return mesh.create_mesh(comm, cells, *args, partitioner=part)
+    return mesh.create_mesh(comm, cells, *args, **_ghosts())
 
 
 def model_to_mesh(model: Any, comm: Any, rank: int = 0) -> tuple[Any, Any, Any]:
@@ -71,7 +72,7 @@ def model_to_mesh(model: Any, comm: Any, rank: int = 0) -> tuple[Any, Any, Any]:
         m, ct, ft = gmshio.model_to_mesh(model, comm, rank, 3)
         return m, ct, ft
     io = importlib.import_module("dolfinx.io.gmshio" if VERSION < (0, 10) else "dolfinx.io.gmsh")
-    m, ct, ft = tuple(io.model_to_mesh(model, comm, rank, 3, partitioner=_partitioner()))[:3]
+    m, ct, ft = tuple(io.model_to_mesh(model, comm, rank, 3, **_ghosts()))[:3]
     return m, ct, ft
 
 
@@ -88,6 +89,12 @@ def geometry_dofmap(msh: Any) -> IntArray:
         return _table(g.dofmap, g.cmap.create_dof_layout())
     nodes: IntArray = g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap
     return nodes
+
+
+def coordinate_map(msh: Any) -> Any:
+    """How the cells' points of reference are mapped to their geometry nodes."""
+    g = msh.geometry
+    return g.cmaps[0] if hasattr(g, "cmaps") else g.cmap
 
 
 def cell_dofs(space: Any) -> IntArray:

@@ -16,6 +16,13 @@ COMM = MPI.COMM_WORLD
 SOFT, HARD, PULL = 1e6, 4e6, 10.0
 
 
+def test_a_dolfinx_without_cell_partitioners_is_told_which_ghosts(monkeypatch):
+    """That of the main branch after 0.11; no release is there yet to run."""
+    monkeypatch.delattr(dolfinx_mesh, "create_cell_partitioner")
+    shared = dolfinx_mesh.GhostMode.shared_facet
+    assert compat._ghosts() == {"ghost_mode": shared}
+
+
 def line_of_blocks(gmsh, kind="hexahedron"):
     """Blocks x in [0, 1] and [1, 2] with a common interface; tags 7, 9; 4, 3, 5 at x = 0, 1, 2."""
     gmsh.initialize()

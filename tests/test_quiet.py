@@ -1,11 +1,10 @@
 """What compilers say is not for the user: a cold cache prints nothing, an error is still told."""
 
-import os
 import subprocess
 import sys
 
 import pytest
-from processes import in_fresh_python
+from processes import environment_of_processes, in_fresh_python
 
 SCRIPT = """
 from mpi4py import MPI
@@ -32,12 +31,9 @@ def run(form, cache, scene="", before=""):
         scene: Lines after it.
         before: Lines before it.
     """
-    mpi = ("OMPI_", "PMIX_", "PRTE_", "ORTE_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(mpi)}
-    environment |= {"XDG_CACHE_HOME": str(cache), "OMPI_ALLOW_RUN_AS_ROOT": "1"}
     return subprocess.run(
         [sys.executable, "-c", before + SCRIPT.replace("{form}", form) + scene],
-        env=environment | {"OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"},
+        env=environment_of_processes() | {"XDG_CACHE_HOME": str(cache)},
         cwd=cache,
         capture_output=True,
         text=True,
