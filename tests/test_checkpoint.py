@@ -420,6 +420,7 @@ def test_fields_do_not_go_on_with_part_of_them_or_with_those_of_another_run(mpi_
     with pytest.raises(FileNotFoundError, match="^folder=.*but no right.xdmf; put it back, or"):
         run(scene, start=start, output=[Fields(folder)])
     assert len(series(folder, "left")[0]) == 4
+    COMM.barrier()
     if COMM.rank == 0:
         (folder / "away.xdmf").rename(folder / "right.xdmf")
         (folder / "left.xdmf").write_text((folder / "left.xdmf").read_text()[:-20])

@@ -195,6 +195,7 @@ def theirs():
 def test_dolfinx_of_pypi_is_prepared_before_it_is_imported(tmp_path):
     """A package `dolfinx_solver` is imported where it is there, ahead of DOLFINx and PETSc."""
     seen = "import sys\nprint(*{'dolfinx', 'petsc4py'} & set(sys.modules), 'first')\n"
+    seen += "from mpi4py import MPI\n"
     (tmp_path / "dolfinx_solver.py").write_text(seen)
     found = in_fresh_python(f"import sys; sys.path[:0] = [{str(tmp_path)!r}]; import dolfinx_nts")
     assert found.split() == ["first"]
