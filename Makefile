@@ -1,6 +1,6 @@
 # Each target alone takes a fresh clone on a fresh Debian 12 (root or sudo) to a finished run.
 # PYTEST_ARGS="-k friction -x" goes to pytest; DEMO=name chooses a demo; see scripts/ for the rest.
-.PHONY: help setup test test-all lint demo docs dist test-debian13 test-sid clean distclean
+.PHONY: help setup test test-all lint demo docs dist test-debian13 test-wheels clean distclean
 SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 DEMO ?= two_blocks
@@ -16,7 +16,7 @@ help:
 	@echo 'make dist           sdist and wheel in dist/, checked by twine'
 	@echo 'make lint           ruff and mypy'
 	@echo 'make test-debian13  the fast tests on Debian 13 in a chroot (made once, some minutes)'
-	@echo 'make test-sid       the same on Debian sid'
+	@echo 'make test-wheels    the same with DOLFINx of PyPI, in .venv-wheels (PYTHON_WHEELS: which Python)'
 	@echo 'make clean          remove .venv, caches and out/; the chroots stay (make distclean)'
 
 setup:
@@ -43,11 +43,11 @@ lint: setup
 test-debian13:
 	@scripts/chroot.sh trixie
 
-test-sid:
-	@scripts/chroot.sh sid
+test-wheels:
+	@scripts/wheels.sh
 
 clean:
-	rm -rf .venv .venv-lint .pytest_cache .ruff_cache .mypy_cache build dist out *.egg-info docs/_build docs/made
+	rm -rf .venv .venv-lint .venv-wheels .pytest_cache .ruff_cache .mypy_cache build dist out *.egg-info docs/_build docs/made
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
 
 distclean: clean

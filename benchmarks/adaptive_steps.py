@@ -15,8 +15,9 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 from dolfinx_nts.study import scene_runs
 

@@ -13,8 +13,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from clock import Clock
 from mpi4py import MPI
+
+from clock import Clock
 from step_time import cubes
 
 import dolfinx_nts as nts

@@ -12,10 +12,11 @@ import argparse
 import time
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from clock import Clock
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.step.accuracy import ACCURACY

@@ -12,10 +12,11 @@ from __future__ import annotations
 import argparse
 import time
 
+from mpi4py import MPI
+
 import numpy as np
 from clock import Clock
 from memory import resident
-from mpi4py import MPI
 from step_time import PARTS, cubes
 
 import dolfinx_nts as nts

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import argparse
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

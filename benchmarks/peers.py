@@ -37,8 +37,9 @@ from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 from step_time import cubes
 
 import dolfinx_nts as nts

@@ -6,9 +6,10 @@ python benchmarks/rigid_cost.py [--cells 25]
 import argparse
 import time
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -6,9 +6,10 @@ A scene for `tradeoff`, which measures what each costs for the same error of the
         --vary hammer=rigid,continuum dt=4e-3,2e-3,1e-3 --reference hammer=continuum dt=2.5e-4
 """
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

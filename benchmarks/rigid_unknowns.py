@@ -24,6 +24,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from mpi4py import MPI  # noqa: F401 - before PETSc
+
 import numpy as np
 from petsc4py import PETSc
 from rigid_chain import chain

@@ -11,9 +11,10 @@ continuum of degree 2 and short steps:
 import sys
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh

@@ -23,9 +23,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -11,10 +11,11 @@ from __future__ import annotations
 import argparse
 import time
 
+from mpi4py import MPI
+
 import numpy as np
 from clock import Clock
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.bodies.continuum import Continuum

@@ -10,9 +10,10 @@ import sys
 import time
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh

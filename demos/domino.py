@@ -38,9 +38,10 @@ import argparse
 import time
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts

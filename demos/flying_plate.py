@@ -18,9 +18,10 @@ import argparse
 import time
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 from flying_beam import INTEGRATORS, NEWTON, figures, report
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh

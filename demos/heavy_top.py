@@ -27,8 +27,9 @@ import argparse
 import time
 from pathlib import Path
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts

@@ -34,8 +34,9 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh

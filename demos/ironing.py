@@ -32,9 +32,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields, Film

@@ -14,11 +14,12 @@ its own: contact force and number of nodes in contact.
 import argparse
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from petsc4py import PETSc
 from tqdm import tqdm
 

@@ -31,6 +31,8 @@ import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 from hertz import (
     PROBLEMS,
@@ -45,7 +47,6 @@ from hertz import (
     summary,
     write,
 )
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -20,8 +20,9 @@ import argparse
 import time
 from pathlib import Path
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 import dolfinx_nts as nts
 from dolfinx_nts.dolfinx_compat import create_mesh

@@ -25,9 +25,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV, Fields, Film

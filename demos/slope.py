@@ -23,8 +23,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 from sliding_block import GRAVITY, Motion, Options, command_line, compare, slide, system
 
 import dolfinx_nts as nts

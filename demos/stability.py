@@ -22,8 +22,9 @@ Generalised alpha completes; when the cube bounces, 17 % of the energy has come 
 import argparse
 from pathlib import Path
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import Fields, Film

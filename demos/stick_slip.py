@@ -21,9 +21,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import ufl
-from mpi4py import MPI
 from sliding_block import (
     DENSITY,
     GRAVITY,

@@ -34,8 +34,9 @@ import runpy
 import time
 from pathlib import Path
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 import dolfinx_nts as nts
 from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh

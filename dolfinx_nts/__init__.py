@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 
+from dolfinx_nts import mpi_first  # noqa: F401 - before anything of DOLFINx
 from dolfinx_nts.bodies.beam import Beam
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import importlib
 import logging
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,7 @@ from ffcx.codegeneration import jit as ffcx_jit
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.canonical import canonical
 
 logger = logging.getLogger(__name__)
@@ -35,10 +37,12 @@ FloatArray = npt.NDArray[np.float64]
 
 
 # ---- meshes
-def _partitioner() -> Any:
-    if VERSION < (0, 11):
-        return mesh.create_cell_partitioner(*(() if _OLD else (_SHARED,)))
-    return mesh.create_cell_partitioner(_SHARED, 2)
+def _ghosts() -> dict[str, Any]:
+    """What gives a mesh shared-facet ghosts, as an argument of the function that makes it."""
+    if not hasattr(mesh, "create_cell_partitioner"):  # after 0.11
+        return {"ghost_mode": _SHARED}
+    links = () if VERSION < (0, 11) else (2,)
+    return {"partitioner": mesh.create_cell_partitioner(_SHARED, *links)}
 
 
 def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Any:
@@ -51,15 +55,14 @@ def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: st
         cell_type: Of DOLFINx, e.g. "hexahedron", "tetrahedron", "quadrilateral", "interval".
     """
     cells, x = np.ascontiguousarray(cells, np.int64), np.ascontiguousarray(x, np.float64)
-    part = _partitioner()
     if _OLD:
         cell = ufl.Cell(cell_type, geometric_dimension=x.shape[1])
         domain = ufl.Mesh(ufl.VectorElement("Lagrange", cell, 1))
-        return mesh.create_mesh(comm, cells, x, domain, _SHARED, part)
+        return mesh.create_mesh(comm, cells, x, domain, _SHARED, mesh.create_cell_partitioner())
     basix_ufl = importlib.import_module("basix.ufl")
     e = basix_ufl.element("Lagrange", cell_type, 1, shape=(x.shape[1],))
     args = (x, e) if VERSION < (0, 10) else (e, x)
-    return mesh.create_mesh(comm, cells, *args, partitioner=part)
+    return mesh.create_mesh(comm, cells, *args, **_ghosts())
 
 
 def model_to_mesh(model: Any, comm: Any, rank: int = 0) -> tuple[Any, Any, Any]:
@@ -69,7 +72,7 @@ def model_to_mesh(model: Any, comm: Any, rank: int = 0) -> tuple[Any, Any, Any]:
         m, ct, ft = gmshio.model_to_mesh(model, comm, rank, 3)
         return m, ct, ft
     io = importlib.import_module("dolfinx.io.gmshio" if VERSION < (0, 10) else "dolfinx.io.gmsh")
-    m, ct, ft = tuple(io.model_to_mesh(model, comm, rank, 3, partitioner=_partitioner()))[:3]
+    m, ct, ft = tuple(io.model_to_mesh(model, comm, rank, 3, **_ghosts()))[:3]
     return m, ct, ft
 
 
@@ -86,6 +89,12 @@ def geometry_dofmap(msh: Any) -> IntArray:
         return _table(g.dofmap, g.cmap.create_dof_layout())
     nodes: IntArray = g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap
     return nodes
+
+
+def coordinate_map(msh: Any) -> Any:
+    """How the cells' points of reference are mapped to their geometry nodes."""
+    g = msh.geometry
+    return g.cmaps[0] if hasattr(g, "cmaps") else g.cmap
 
 
 def cell_dofs(space: Any) -> IntArray:
@@ -177,10 +186,14 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
     """Tell in one line that something is compiled, which is not in FFCx's cache, and nothing else.
 
     0.5.2 sends the C compiler's progress to the root logger, whose level it raises itself. Of
-    spaces, too: their elements are compiled. Errors are still raised and printed.
+    spaces, too: their elements are compiled. Errors are still raised, and what a compiler says of
+    them is printed.
 
     Yields:
         The C files that FFCx takes or makes, one after the other.
+
+    Raises:
+        RuntimeError: The C compiler fails, or is not there.
     """
     before, look = logging.root.manager.disable, ffcx_jit.get_cached_module
     told, sources = False, []
@@ -198,6 +211,11 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
     ffcx_jit.get_cached_module = looked
     try:
         yield sources
+    except Exception as error:
+        # On rank 0 of several DOLFINx has put setuptools' error into one of its own.
+        if not re.search(r"\b(Compile|Link)Error: ", str(error)):
+            raise
+        raise RuntimeError(f"{what} cannot be compiled ({error}): {library.COMPILER}") from None
     finally:
         ffcx_jit.get_cached_module = look
         logging.disable(before)

@@ -204,7 +204,7 @@ def _cells_of(mesh: Any, x: FloatArray) -> tuple[IntArray, IntArray, FloatArray]
     rounding = _ROUNDING * float(np.abs(x).max(initial=0.0))
     padding = float(_ON_CELL * sizes.max(initial=0.0) + rounding)
     near = compat.cells_near(mesh, x, padding)
-    dim, cmap = mesh.topology.dim, mesh.geometry.cmap
+    dim, cmap = mesh.topology.dim, compat.coordinate_map(mesh)
     simplex = nodes.shape[1] == dim + 1
     which, held, inside = [], [], []
     for i, cells in enumerate(near):

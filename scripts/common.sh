@@ -3,7 +3,7 @@
 # shellcheck shell=bash
 
 REPO=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
-PYTHON=$REPO/.venv/bin/python
+PYTHON=$REPO/${NTS_VENV:-.venv}/bin/python
 LINT_VENV=$REPO/.venv-lint
 
 say() { printf '==> %s\n' "$*"; }
@@ -55,6 +55,9 @@ clean_environment() {
   # Ranks that wait give way: tests share two cores with whatever else runs.
   export OMPI_MCA_mpi_yield_when_idle=1
   export PRTE_ALLOW_RUN_AS_ROOT=1 PRTE_ALLOW_RUN_AS_ROOT_CONFIRM=1 # newer OpenMPI
+  # Not as flags of mpirun, which MPICH's does not know.
+  export OMPI_MCA_hwloc_base_binding_policy=none OMPI_MCA_rmaps_base_oversubscribe=1
+  export PRTE_MCA_hwloc_default_binding_policy=none PRTE_MCA_rmaps_default_mapping_policy=:oversubscribe
   # One machine: shared memory will do, and containers often allow neither sockets nor ptrace.
   export OMPI_MCA_btl=^tcp OMPI_MCA_btl_vader_single_copy_mechanism=none
   export MPLBACKEND=Agg
@@ -62,8 +65,9 @@ clean_environment() {
 
 # mpi RANKS COMMAND...: a hanging run is ended after MPI_TIMEOUT seconds.
 mpi() {
-  local ranks=$1
+  local ranks=$1 mpirun
   shift
-  timeout --kill-after=20 "${MPI_TIMEOUT:-3600}" \
-    mpirun -n "$ranks" --bind-to none --oversubscribe "$@" </dev/null
+  mpirun=$(dirname "$PYTHON")/mpirun # MPICH's, where it is in the venv
+  [ -x "$mpirun" ] || mpirun=mpirun
+  timeout --kill-after=20 "${MPI_TIMEOUT:-3600}" "$mpirun" -n "$ranks" "$@" </dev/null
 }

@@ -20,6 +20,6 @@ rm -rf "$REPO/.venv"
 # --no-deps --no-index: nothing comes from a registry, so nothing can replace Debian's numpy.
 "$PYTHON" -m pip --isolated install --quiet --disable-pip-version-check --root-user-action=ignore \
   --no-deps --no-index --no-build-isolation --editable "$REPO"
-"$PYTHON" -c 'import dolfinx, dolfinx_nts' ||
+"$PYTHON" -c 'import dolfinx_nts' ||
   die "dolfinx or dolfinx_nts cannot be imported in .venv (see above)"
 printf '%s' "$wanted" >"$stamp"

@@ -17,11 +17,12 @@ import time
 import zlib
 from pathlib import Path
 
+from mpi4py import MPI
+
 import noise
 import numpy as np
 import processes
 import pytest
-from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat
 

@@ -4,10 +4,11 @@ It has three coordinates, a constant mass matrix and no potential. It shows all 
 `ContactPair` ask of a body and of a surface.
 """
 
+from mpi4py import MPI
+
 import dolfinx
 import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from petsc4py import PETSc
 from rotations import rotation
 

@@ -6,26 +6,43 @@ import sys
 from pathlib import Path
 
 DEMOS = Path(__file__).resolve().parents[1] / "demos"
+#: How the variables begin by which OpenMPI and MPICH tell a process that it is a rank.
+TELLS_RANKS = ("OMPI_COMM", "OMPI_UNIVERSE", "OMPI_APP", "PMI", "PRTE_", "ORTE_", "HYDI_")
+TELLS_RANKS += ("MPI_LOCAL", "OMPI_MCA_ess", "OMPI_MCA_orte", "OMPI_MCA_pmix")
+#: Of ranks that share cores, also as root: OpenMPI of 4 and since 5.
+SHARED = {
+    "OMPI_ALLOW_RUN_AS_ROOT": "1",
+    "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+    "OMPI_MCA_hwloc_base_binding_policy": "none",
+    "OMPI_MCA_mpi_yield_when_idle": "1",
+    "OMPI_MCA_rmaps_base_oversubscribe": "1",
+    "PRTE_ALLOW_RUN_AS_ROOT": "1",
+    "PRTE_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+    "PRTE_MCA_hwloc_default_binding_policy": "none",
+    "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
+}
+
+
+def environment_of_processes():
+    """Return this process' variables without those of its own MPI, which would mislead others."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(TELLS_RANKS)}
+    return environment | SHARED | {"OMP_NUM_THREADS": "1"}
 
 
 def in_fresh_python(code):
     """Return what code prints in a new interpreter that does not believe to be a rank."""
-    mpi = ("OMPI_", "PMIX_", "PRTE_", "ORTE_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(mpi)}
     done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, cwd="/", text=True, capture_output=True
-    )
+        [sys.executable, "-c", code], env=environment_of_processes(), cwd="/", text=True,
+        capture_output=True,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def environment_of_ranks():
-    """Return this process' variables without those of its own MPI, which would mislead others."""
-    own = ("OMPI_COMM", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PRTE_", "ORTE_")
-    own += ("OMPI_MCA_ess", "OMPI_MCA_orte", "OMPI_MCA_pmix")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(own)}
-    environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    return environment | {"OMP_NUM_THREADS": "1", "OMPI_MCA_mpi_yield_when_idle": "1"}
+def mpirun(ranks):
+    """Return the command that runs Python on ranks, by mpirun of the same environment."""
+    beside = Path(sys.executable).with_name("mpirun")
+    return [str(beside) if beside.exists() else "mpirun", "-n", str(ranks), sys.executable]
 
 
 def on_ranks(ranks: int, *arguments: str, well: bool = True) -> str:
@@ -37,11 +54,9 @@ def on_ranks(ranks: int, *arguments: str, well: bool = True) -> str:
         well: Whether it must succeed; else it must fail, and what it says on stderr is returned,
             too.
     """
-    environment = environment_of_ranks() | {"PYTHONPATH": str(DEMOS)}
-    command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), sys.executable]
     done = subprocess.run(
-        [*command, *arguments],
-        env=environment,
+        [*mpirun(ranks), *arguments],
+        env=environment_of_processes() | {"PYTHONPATH": str(DEMOS)},
         capture_output=True,
         text=True,
         timeout=900,

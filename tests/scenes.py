@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from rotations import rotation
 
 import dolfinx_nts as nts

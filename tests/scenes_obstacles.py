@@ -1,8 +1,9 @@
 """A point mass beside rigid planes, spheres and cylinders, which several test modules run."""
 
+from mpi4py import MPI
+
 import numpy as np
 from integrators import CONTACT_RULES
-from mpi4py import MPI
 from point_mass import MASS, STEP, PointMass, PointSurface, turn
 from scenes import RUBBER, box
 

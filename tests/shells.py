@@ -1,7 +1,8 @@
 """Meshes of shells."""
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 from dolfinx_nts import dolfinx_compat as compat
 

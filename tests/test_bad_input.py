@@ -8,6 +8,8 @@ import re
 from functools import partial
 from types import SimpleNamespace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
@@ -19,7 +21,6 @@ from dolfinx.mesh import (
     locate_entities_boundary,
     meshtags,
 )
-from mpi4py import MPI
 from scenes import CELLS, RUBBER, bottom, box, top
 
 import dolfinx_nts as nts

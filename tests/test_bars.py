@@ -1,9 +1,10 @@
 """Two bars that hit each other, against an independent linear code in one dimension."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from measures import drift
-from mpi4py import MPI
 from scenes import box
 
 import dolfinx_nts as nts

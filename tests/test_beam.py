@@ -2,11 +2,12 @@
 
 import logging
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from integrators import INTEGRATORS
-from mpi4py import MPI
 from scenes import UNITS
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation

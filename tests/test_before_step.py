@@ -1,11 +1,12 @@
 """The hook before each step: loads and materials that it changes, and when it is called."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from integrators import MID_STEP
-from mpi4py import MPI
 from scenes import box, everywhere
 
 import dolfinx_nts as nts

@@ -3,12 +3,13 @@
 import logging
 import math
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, create_box, create_rectangle, meshtags
-from mpi4py import MPI
 from processes import in_fresh_python
 
 import dolfinx_nts as nts

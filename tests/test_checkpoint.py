@@ -16,6 +16,8 @@ import time
 from pathlib import Path
 from xml.etree import ElementTree
 
+from mpi4py import MPI
+
 import h5py
 import numpy as np
 import pytest
@@ -23,7 +25,6 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType
 from integrators import INTEGRATORS, MID_STEP
-from mpi4py import MPI
 from scenes import box
 
 import dolfinx_nts as nts
@@ -419,6 +420,7 @@ def test_fields_do_not_go_on_with_part_of_them_or_with_those_of_another_run(mpi_
     with pytest.raises(FileNotFoundError, match="^folder=.*but no right.xdmf; put it back, or"):
         run(scene, start=start, output=[Fields(folder)])
     assert len(series(folder, "left")[0]) == 4
+    COMM.barrier()
     if COMM.rank == 0:
         (folder / "away.xdmf").rename(folder / "right.xdmf")
         (folder / "left.xdmf").write_text((folder / "left.xdmf").read_text()[:-20])

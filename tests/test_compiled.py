@@ -5,11 +5,12 @@ import types
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from facet_kinds import CENTRE, FLAT, KINDS
 from measures import relative
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact import contact_elements

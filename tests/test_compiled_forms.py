@@ -1,12 +1,13 @@
 """What is compiled: forms once, whatever their parameters and what was made before them."""
 
+from mpi4py import MPI
+
 import cffi
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 from processes import in_fresh_python
 
 import dolfinx_nts as nts

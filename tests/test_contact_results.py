@@ -1,8 +1,9 @@
 """Moments of contacts, and what they do at nodes as DOLFINx Functions."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scenes import box
 
 import dolfinx_nts as nts

@@ -1,10 +1,11 @@
 """Contact beside equations of a user's own."""
 
+from mpi4py import MPI
+
 import numpy as np
 import own_problem
 import pytest
 import ufl
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -1,8 +1,9 @@
 """Conditions that prescribe different values of one coordinate are refused, equal ones not."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scenes import RUBBER, at, box
 
 import dolfinx_nts as nts

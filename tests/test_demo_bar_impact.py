@@ -1,9 +1,10 @@
 """The elastic bar on a rigid wall: exact solution, closed forms, and an independent linear code."""
 
+from mpi4py import MPI
+
 import bar_impact as demo
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

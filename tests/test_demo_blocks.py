@@ -1,11 +1,12 @@
 """The blocks of three demos go as Coulomb says, on each floor, and leave pictures and fields."""
 
+from mpi4py import MPI
+
 import pytest
 import sliding_block
 import slope
 import stick_slip
 from measures import assert_as_coulomb_says
-from mpi4py import MPI
 
 COMM = MPI.COMM_WORLD
 SMALL = (2, 2, 1)

@@ -1,9 +1,10 @@
 """The flying L-block: energy and momenta after the loads have gone."""
 
+from mpi4py import MPI
+
 import flying_l_block as demo
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 
 @pytest.mark.mpi

@@ -1,9 +1,10 @@
 """The heavy-top demo: steady precession, nodding, and a cone of tetrahedra that does the same."""
 
+from mpi4py import MPI
+
 import heavy_top as demo
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -1,9 +1,10 @@
 """A block slides to rest: benchmark B4, and what its steps leave out."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import sliding_block as demo
-from mpi4py import MPI
 
 COMM = MPI.COMM_WORLD
 SMALL = (2, 2, 1)

@@ -1,12 +1,13 @@
 """Demos of beams and shells, beside theory and what their ledgers say."""
 
+from mpi4py import MPI
+
 import drum_stick
 import flying_beam
 import flying_plate
 import leaf_spring
 import pytest
 import snap_fit
-from mpi4py import MPI
 
 
 def check(demo, dt, t_end, drift):

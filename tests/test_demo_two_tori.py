@@ -4,9 +4,10 @@ import re
 import runpy
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat

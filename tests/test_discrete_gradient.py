@@ -6,6 +6,8 @@ virtual work of a constant stress into the stress itself. W is compared with 50-
 
 from decimal import Decimal, localcontext
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
@@ -13,7 +15,6 @@ from dolfinx import fem
 from dolfinx.mesh import CellType, create_unit_cube
 from integrators import GRADIENTS, MID_STEP
 from measures import STENCIL
-from mpi4py import MPI
 from rotations import rotation
 
 import dolfinx_nts as nts

@@ -3,13 +3,14 @@
 import csv
 import dataclasses
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
 from measures import difference
-from mpi4py import MPI
 from petsc4py import PETSc
 from processes import in_fresh_python
 from scenes import rubbing_blocks
@@ -320,11 +321,11 @@ def test_loads_are_assembled_when_they_change(monkeypatch):
 
 RUN = """
 import sys
+from mpi4py import MPI
 import dolfinx, dolfinx.fem.petsc
 before = set(sys.modules)
 import dolfinx_nts as nts
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 nts.dolfinx_compat.C_FLAGS[0] = "-O1"  # as the tests, which have compiled these forms
 mesh = create_box(MPI.COMM_WORLD, [[0, 0, 0], [1, 1, 1]], [1] * 3, CellType.hexahedron)
 cube = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3, velocity=(0, 0, -1), name="cube")

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from integrators import MID_STEP
-from mpi4py import MPI
 from point_mass import PointMass
 from scenes import (
     LAME,

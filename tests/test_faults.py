@@ -11,10 +11,11 @@ import sys
 import textwrap
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
-from processes import environment_of_ranks
+from processes import environment_of_processes, mpirun
 from scenes import box, thrown_block
 
 import dolfinx_nts as nts
@@ -68,16 +69,14 @@ def on_a_small_disk(tmp_path, ranks, *what):
     script, disk = tmp_path / "script.py", tmp_path / "disk"
     disk.mkdir()
     script.write_text(ON_A_SMALL_DISK.format(tests=TESTS))
-    command = [sys.executable, str(script), str(disk), *what]
-    if ranks > 1:
-        command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *command]
+    command = [*(mpirun(ranks) if ranks > 1 else [sys.executable]), str(script), str(disk), *what]
     inside = f"mount -t tmpfs -o size=300k tmpfs {disk} && exec \"$@\""
     space = ["unshare", "--mount", "--propagation", "private", "sh", "-c"]
     if subprocess.run([*space, inside, "sh", "true"], capture_output=True, check=False).returncode:
         pytest.skip("mounting is not allowed here")
     done = subprocess.run(
         [*space, inside, "sh", *command], capture_output=True, text=True, timeout=300, check=False,
-        env=environment_of_ranks(),
+        env=environment_of_processes(),
     )  # fmt: skip
     assert done.returncode == ("fields" in what), done.stdout + done.stderr
     return json.loads(done.stdout.splitlines()[-1])

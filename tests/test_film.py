@@ -1,8 +1,9 @@
 """Films of runs: their frames, and that forces are in them."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scenes import meeting_blocks
 
 import dolfinx_nts as nts

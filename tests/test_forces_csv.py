@@ -2,9 +2,10 @@
 
 import csv
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import ForcesCSV

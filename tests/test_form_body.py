@@ -1,12 +1,13 @@
 """Bodies of a user's own forms: as a continuum, on meshes of other dimensions, and wrong ones."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx.mesh import create_unit_square
 from integrators import GRADIENTS, INTEGRATORS, MID_STEP
 from measures import drift
-from mpi4py import MPI
 from scenes import box, green, saint_venant
 
 import dolfinx_nts as nts

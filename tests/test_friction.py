@@ -3,13 +3,14 @@
 import functools
 import math
 
+from mpi4py import MPI
+
 import noise
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import COLUMNS, difference
-from mpi4py import MPI
 from scenes import CELLS, UNITS, box, rubbing_blocks
 
 import dolfinx_nts as nts

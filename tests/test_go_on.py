@@ -1,10 +1,11 @@
 """A run that goes on from another one, and the forces of supports and contacts in dynamics."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import INTEGRATORS, MID_STEP
-from mpi4py import MPI
 from scenes import rubbing_blocks
 
 import dolfinx_nts as nts

@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
 from measures import OPEN, ledger_or_word
-from mpi4py import MPI
 from point_mass import STEP, PointMass, mass_on_wall
 from scenes import fung
 

@@ -1,10 +1,11 @@
 """Friction where some slip is prescribed, as in plane strain: what lambda_T is there."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 from scenes import RUBBER
 
 import dolfinx_nts as nts

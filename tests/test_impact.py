@@ -1,11 +1,12 @@
 """Impacts that give their energy back: `simulate(impact="restored", restitution=...)`."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from measures import drift
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

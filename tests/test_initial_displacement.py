@@ -1,8 +1,9 @@
 """Bodies that start displaced: what they store, how they swing, and where contact looks."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scenes import bottom, box, everywhere, top
 
 import dolfinx_nts as nts

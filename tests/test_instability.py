@@ -1,8 +1,9 @@
 """Equilibria that are not stable are told, and only these."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from rotations import rotation
 from scenes import at, box, everywhere
 from shells import plate

@@ -1,12 +1,13 @@
 """Cells inside out: det F in closed form, steps refused, cut back, or allowed and told."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from measures import OPEN, PROMISED, ledger_or_word
-from mpi4py import MPI
 from point_mass import PointMass
 from scenes import RUBBER, green, saint_venant
 

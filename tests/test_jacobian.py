@@ -3,12 +3,13 @@
 import itertools
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType
 from integrators import GRADIENTS, MID_STEP
 from measures import STENCIL, block_errors, dense
-from mpi4py import MPI
 from scenes import box, rotated_state, smooth_motion
 
 import dolfinx_nts as nts

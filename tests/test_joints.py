@@ -2,11 +2,12 @@
 
 import itertools
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 from scenes import UNITS
 from scipy.integrate import solve_ivp
 

@@ -2,11 +2,12 @@
 
 from typing import NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
 from integrators import CONTACT_RULES, MID_STEP
-from mpi4py import MPI
 from point_mass import MASS, PointMass, PointSurface, Sledge
 from scipy.integrate import solve_ivp
 

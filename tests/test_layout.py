@@ -9,6 +9,7 @@ import re
 import tomllib
 from pathlib import Path
 
+import pages
 import pytest
 from integrators import INTEGRATORS
 from processes import in_fresh_python
@@ -21,7 +22,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 #: Floors from below: files, and folders that stand for all of theirs.
 LEVELS = [
-    {"parallel", "validation", "dolfinx_compat", "forms", "kernels"},
+    {"parallel", "validation", "mpi_first", "dolfinx_compat", "forms", "kernels"},
     {"integrators"},
     {
         "bodies", "constraints", "contact", "coupling", "elements", "evaluation", "joints",
@@ -188,7 +189,34 @@ def ours():
 
 
 def theirs():
-    return after("dolfinx", "dolfinx.fem.petsc")
+    return after("mpi4py.MPI", "dolfinx", "dolfinx.fem.petsc")
+
+
+def test_dolfinx_of_pypi_is_prepared_before_it_is_imported(tmp_path):
+    """A package `dolfinx_solver` is imported where it is there, ahead of DOLFINx and PETSc."""
+    seen = "import sys\nprint(*{'dolfinx', 'petsc4py'} & set(sys.modules), 'first')\n"
+    seen += "from mpi4py import MPI\n"
+    (tmp_path / "dolfinx_solver.py").write_text(seen)
+    found = in_fresh_python(f"import sys; sys.path[:0] = [{str(tmp_path)!r}]; import dolfinx_nts")
+    assert found.split() == ["first"]
+
+
+def scripts():
+    """What a user may run, by a name: demos, benchmarks, and blocks of pages that are whole."""
+    for folder in ("demos", "benchmarks", "meshes"):
+        yield from ((str(p.name), p.read_text()) for p in (ROOT / folder).glob("*.py"))
+    yield from ((block.name, block.code) for block in pages.blocks() if block.whole)
+
+
+@pytest.mark.parametrize("name, code", scripts())
+def test_mpi_is_imported_before_dolfinx(name, code):
+    """DOLFINx of PyPI finds its MPI only then."""
+    nodes = [n for n in ast.parse(code).body if isinstance(n, ast.Import | ast.ImportFrom)]
+    names = [getattr(node, "module", None) or node.names[0].name for node in nodes]
+    packages = [name.split(".")[0] for name in names]
+    of_mpi = [packages.index(p) for p in ("mpi4py", "dolfinx_nts") if p in packages]
+    later = [packages.index(p) for p in ("dolfinx", "petsc4py") if p in packages]
+    assert not later or (of_mpi and min(of_mpi) < min(later)), packages
 
 
 def test_importing_is_cheap():

@@ -1,10 +1,11 @@
 """The choice of the linear solver, and the way back when it was wrong."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from measures import difference
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import dolfinx_nts as nts

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import bar_impact
 import numpy as np
 import pytest
@@ -9,7 +11,6 @@ import two_blocks
 from dolfinx.mesh import CellType
 from integrators import MID_STEP
 from measures import STENCIL, block_errors, dense, drift
-from mpi4py import MPI
 from scenes import RUBBER, UNITS, box, rotated_state
 
 import dolfinx_nts as nts

@@ -7,11 +7,12 @@ import sys
 import textwrap
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import dolfinx_nts as nts

@@ -1,9 +1,10 @@
 """One mesh per body: from Gmsh files and models, and from tagged DOLFINx meshes."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx import mesh as dolfinx_mesh
-from mpi4py import MPI
 from scenes import RUBBER
 
 import dolfinx_nts as nts
@@ -13,6 +14,13 @@ from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
 COMM = MPI.COMM_WORLD
 #: Young's moduli and a traction [Pa].
 SOFT, HARD, PULL = 1e6, 4e6, 10.0
+
+
+def test_a_dolfinx_without_cell_partitioners_is_told_which_ghosts(monkeypatch):
+    """That of the main branch after 0.11; no release is there yet to run."""
+    monkeypatch.delattr(dolfinx_mesh, "create_cell_partitioner")
+    shared = dolfinx_mesh.GhostMode.shared_facet
+    assert compat._ghosts() == {"ghost_mode": shared}
 
 
 def line_of_blocks(gmsh, kind="hexahedron"):

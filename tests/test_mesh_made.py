@@ -1,11 +1,12 @@
 """Meshes made of others: their volumes, energies of plane strain, and the same on any ranks."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, create_rectangle
-from mpi4py import MPI
 from scenes import at, box
 
 import dolfinx_nts as nts

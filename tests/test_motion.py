@@ -1,9 +1,10 @@
 """How a body moves as a whole, against closed forms of rigid motions."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from point_mass import PointMass, turn
 
 import dolfinx_nts as nts

@@ -1,9 +1,10 @@
 """Equilibrium by an algebraic multigrid of the augmented Lagrangian, against MUMPS."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.step.augmented import augmented

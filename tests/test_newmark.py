@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import ACCELERATED
-from mpi4py import MPI
 from point_mass import MASS, STEP, PointMass
 from scenes import at, box, flying_block, sliding_block
 

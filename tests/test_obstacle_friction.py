@@ -1,11 +1,12 @@
 """Coulomb friction on rigid planes, spheres and cylinders: closed forms, and a meshed plate."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import STENCIL
-from mpi4py import MPI
 from point_mass import MASS, STEP, turn
 from scenes import UNITS
 from scenes_obstacles import (

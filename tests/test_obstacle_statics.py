@@ -2,10 +2,11 @@
 
 import math
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from scenes import YOUNG, at, quarter_cube, rubber_stress
 
 import dolfinx_nts as nts

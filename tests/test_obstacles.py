@@ -2,12 +2,13 @@
 
 import re
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import STENCIL, differences
-from mpi4py import MPI
 from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, wall
 from scenes import UNITS
 from scenes_obstacles import (

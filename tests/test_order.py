@@ -1,9 +1,10 @@
 """All integrators are of second order, in free flight and while contact persists."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from integrators import GRADIENTS, INTEGRATORS
-from mpi4py import MPI
 from scenes import flying_block, sliding_block
 
 import dolfinx_nts as nts

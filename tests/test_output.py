@@ -3,10 +3,11 @@
 import re
 from types import SimpleNamespace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType
-from mpi4py import MPI
 from scenes import CELLS, RUBBER, box, meeting_blocks, thrown_block
 from xdmf import read_xdmf
 

@@ -4,12 +4,13 @@ import copy
 import itertools
 import logging
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 from rotations import random_rotation
 from scenes import box as solid
 from scipy import ndimage

@@ -5,11 +5,12 @@ It shows all that a joint of one's own needs: the scene's item, its elements, th
 
 from dataclasses import dataclass
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import ACCELERATED, INTEGRATORS
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.elements import evaluate_together

@@ -3,11 +3,12 @@
 import base64
 import re
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from scenes import CELLS, RUBBER, box
 from xdmf import read_xdmf
 

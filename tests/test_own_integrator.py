@@ -3,11 +3,12 @@
 import csv
 from dataclasses import dataclass
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from point_mass import PointMass
 
 import dolfinx_nts as nts

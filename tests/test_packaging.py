@@ -11,13 +11,16 @@ import dolfinx_nts as nts
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def project():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
 def stated():
     """Version by file."""
     changes = re.search(r"^## (\d\S*), (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     cite = (ROOT / "CITATION.cff").read_text()
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     return {
-        "pyproject.toml": project["version"],
+        "pyproject.toml": project()["version"],
         "CHANGELOG.md": changes[1],
         "CITATION.cff": re.search(r"^version: (\S+)$", cite, re.MULTILINE)[1],
         "debian/changelog": re.match(r"\S+ \((\S+?)(?:-\d+)?\)", debian())[1],
@@ -47,3 +50,15 @@ def test_the_sdist_has_what_tests_need(folder):
     files = [p for p in (ROOT / folder).rglob("*") if p.is_file() and not made & set(p.parts)]
     missing = {p for p in files if f"*{p.suffix}" not in endings}
     assert files and not missing, missing
+
+
+def test_nothing_is_pulled_in_front_of_another_dolfinx():
+    """What comes from PyPI is asked for by name, and in the versions that were run together."""
+    extras = project()["optional-dependencies"]
+    assert project()["dependencies"] == []
+    names = {}
+    for extra, wanted in extras.items():
+        names[extra] = {name for name, _, _ in (each.partition("==") for each in wanted)}
+        assert all(re.fullmatch(r"[\w-]+==[\d.]+(post\d+)?", each) for each in wanted), wanted
+    assert {"dolfinx-solver-real", "mpich", "mpi4py", "numpy", "scipy"} <= names["wheels"]
+    assert {"h5py", "matplotlib", "tqdm"} <= names["wheels"] and names["gmsh"] == {"gmsh"}

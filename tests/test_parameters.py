@@ -1,10 +1,11 @@
 """Parameters of materials that are Constants and Functions, changed between steps or not."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from scenes import box
 
 import dolfinx_nts as nts

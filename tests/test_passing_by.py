@@ -1,10 +1,11 @@
 """Bodies that pass beside each other, whose whole boundaries are surfaces, feel nothing."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 from scenes import RUBBER, everywhere
 
 import dolfinx_nts as nts

@@ -1,8 +1,9 @@
 """Pressure on shells: dead, or following them; its work, tangent and balance."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from shells import ball, grid, plate, surface_mesh
 
 import dolfinx_nts as nts

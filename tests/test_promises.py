@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
@@ -9,7 +11,6 @@ from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from measures import PROMISED
-from mpi4py import MPI
 from point_mass import PointMass
 
 import dolfinx_nts as nts

@@ -1,16 +1,16 @@
 """What compilers say is not for the user: a cold cache prints nothing, an error is still told."""
 
-import os
 import subprocess
 import sys
 
 import pytest
-from processes import in_fresh_python
+from processes import environment_of_processes, in_fresh_python
 
 SCRIPT = """
+from mpi4py import MPI
+
 import ufl
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat, forms
 
@@ -31,12 +31,9 @@ def run(form, cache, scene="", before=""):
         scene: Lines after it.
         before: Lines before it.
     """
-    mpi = ("OMPI_", "PMIX_", "PRTE_", "ORTE_")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(mpi)}
-    environment |= {"XDG_CACHE_HOME": str(cache), "OMPI_ALLOW_RUN_AS_ROOT": "1"}
     return subprocess.run(
         [sys.executable, "-c", before + SCRIPT.replace("{form}", form) + scene],
-        env=environment | {"OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"},
+        env=environment_of_processes() | {"XDG_CACHE_HOME": str(cache)},
         cwd=cache,
         capture_output=True,
         text=True,
@@ -85,12 +82,27 @@ def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
     assert "no space left" in done.stderr and "Error" in done.stderr
 
 
+def test_without_a_compiler_it_is_said_what_to_install(tmp_path, monkeypatch):
+    """In the last line, and without what cffi has called."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    (tmp_path / "ssh").symlink_to("/bin/true")  # OpenMPI looks for it
+    contact = "from dolfinx_nts.kernels import library\nlibrary.load()\n"
+    done = run("w[2] * ufl.dx", tmp_path, before=contact)
+    assert done.returncode != 0 and "cffi" not in done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("RuntimeError: ") and "No such file or directory" in last
+    for text in (last, *(line for line in done.stderr.splitlines() if "kernels" in line)):
+        assert "gcc, libc6-dev and python3-dev" in text and "ziglang" in text
+    assert "Contact kernels are not compiled" in done.stderr
+
+
 #: A body at rest, whose step asks no linear solver, in a run that nobody closes.
 LEFT_OPEN = """
 import os
 os.environ["PETSC_OPTIONS"] = "-options_left"
-from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
+from dolfinx.mesh import CellType, create_box
 import dolfinx_nts as nts
 
 mesh = create_box(MPI.COMM_SELF, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.hexahedron)

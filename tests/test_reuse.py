@@ -1,11 +1,12 @@
 """Matrices of earlier iterates: fewer of them, the same solution."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
 from measures import difference
-from mpi4py import MPI
 from scenes import RUBBER, UNITS, at, box, rubbing_blocks
 
 import dolfinx_nts as nts

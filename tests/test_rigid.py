@@ -1,10 +1,11 @@
 """Rigid bodies without contact: Euler's equations, degenerate inertia, loads, prescribed motion."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import INTEGRATORS
-from mpi4py import MPI
 from scenes import UNITS
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation

@@ -1,10 +1,11 @@
 """Rigid bodies in contact: at rest, falling, sliding, stacked, with flexible bodies."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 from scenes import UNITS, everywhere
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipk

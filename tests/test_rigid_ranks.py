@@ -1,9 +1,10 @@
 """Rigid bodies in contact and with joints: any number of ranks computes the same."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat

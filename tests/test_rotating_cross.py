@@ -1,10 +1,11 @@
 """Rotating bodies: what both integrators conserve, and how far they turn in a step."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import rotating_cross as demo
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -3,9 +3,10 @@
 import json
 import logging
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from point_mass import mass_on_wall
 
 import dolfinx_nts as nts

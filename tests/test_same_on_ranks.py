@@ -1,8 +1,9 @@
 """Ranks with other numbers are told so by an exception on all, before they wait for each other."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scenes import RUBBER, at, box
 
 import dolfinx_nts as nts

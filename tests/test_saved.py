@@ -2,11 +2,12 @@
 
 import json
 
+from mpi4py import MPI
+
 import h5py
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.step.balance import Switch

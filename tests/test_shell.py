@@ -2,13 +2,14 @@
 
 import logging
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import scipy.linalg
 from dolfinx import fem
 from dolfinx.mesh import CellType, create_box
 from integrators import INTEGRATORS
-from mpi4py import MPI
 from scenes import UNITS
 from scipy.spatial.transform import Rotation
 from shells import grid, plate, plate_nodes, surface_mesh

@@ -3,11 +3,12 @@
 import inspect
 import textwrap
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import two_blocks
 from integrators import MID_STEP
-from mpi4py import MPI
 from scenes import RUBBER, bottom, box, fail_once, top
 
 import dolfinx_nts as nts

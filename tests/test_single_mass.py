@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from integrators import CONTACT_RULES
-from mpi4py import MPI
 from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall
 
 import dolfinx_nts as nts

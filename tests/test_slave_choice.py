@@ -1,9 +1,10 @@
 """`ContactPair.between`: which surface it makes the slave, and what that saves."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from scenes import RUBBER
 
 import dolfinx_nts as nts

@@ -1,12 +1,13 @@
 """`sleep=True`: what nothing moves costs nothing, and the run is the one without it."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 from point_mass import PointMass
 from scenes import UNITS
 

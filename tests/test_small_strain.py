@@ -2,13 +2,14 @@
 
 from decimal import Decimal, localcontext
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box, create_unit_cube
 from integrators import MID_STEP
-from mpi4py import MPI
 from scenes import RUBBER
 from ufl.algorithms.apply_derivatives import apply_derivatives
 

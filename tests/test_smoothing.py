@@ -1,9 +1,10 @@
 """What a change of facet costs while a mass slides over a faceted cylinder or a flat plate."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box, meshtags
-from mpi4py import MPI
 from point_mass import PointSurface, Sledge
 from scenes import UNITS
 

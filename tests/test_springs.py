@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import INTEGRATORS
-from mpi4py import MPI
 from scenes import UNITS
 from scipy.integrate import quad, solve_ivp
 

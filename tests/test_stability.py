@@ -3,9 +3,10 @@
 import csv
 from types import SimpleNamespace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.study import extreme_scenes, stability

@@ -1,9 +1,10 @@
 """Newmark and generalised alpha with rigid bodies in contact."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

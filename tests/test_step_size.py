@@ -2,12 +2,13 @@
 
 import csv
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, mass_on_wall, wall
 from scenes import UNITS, fail_once, rubbing_blocks
 

@@ -1,10 +1,11 @@
 """Supports that move by a function of time, and stop: velocities are the function's (theory 21)."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx import fem
 from integrators import INTEGRATORS, MID_STEP
-from mpi4py import MPI
 from scenes import at, bottom, box, fail_once
 
 import dolfinx_nts as nts

@@ -1,11 +1,12 @@
 """Stresses as DOLFINx Functions, against closed forms of homogeneous deformations."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import io
 from dolfinx.mesh import CellType
-from mpi4py import MPI
 from scenes import CELLS, RUBBER, box
 
 import dolfinx_nts as nts

@@ -2,13 +2,14 @@
 
 import re
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -1,11 +1,12 @@
 """Contacts that touch without force, and friction without bound: the same on any ranks."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES, MID_STEP
 from measures import PROMISED, ledger_or_word
-from mpi4py import MPI
 from point_mass import MASS, turn
 from scenes_obstacles import sliding
 

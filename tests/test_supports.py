@@ -2,11 +2,12 @@
 
 import re
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from scenes import bottom, box, everywhere, top
 
 import dolfinx_nts as nts

@@ -5,10 +5,11 @@ import sys
 import tracemalloc
 from types import SimpleNamespace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.run.solution import Solution

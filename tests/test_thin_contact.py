@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 from scenes import UNITS
 from shells import grid, plate_nodes, surface_mesh
 

@@ -1,9 +1,10 @@
 """Ties of shells' edges and beams' ends to rigid bodies and continua; seams of shells."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 from scenes import UNITS
 from scipy.optimize import brentq
 from shells import grid, plate_nodes, surface_mesh

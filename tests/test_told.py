@@ -1,10 +1,11 @@
 """What a newcomer got without a word: free motions, lost energy, crushed cells, open ledgers."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from point_mass import MASS, SPEED, STEP, mass_on_wall
 from scenes import CELLS, box, everywhere
 

@@ -4,9 +4,10 @@ import csv
 import sys
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -17,8 +18,8 @@ from dolfinx_nts.study import scene_runs, tradeoff
 COMM = MPI.COMM_WORLD
 ROOT = Path(__file__).parents[1]
 SCRIPT = """
-from dolfinx.mesh import create_box
 from mpi4py import MPI
+from dolfinx.mesh import create_box
 from scipy.integrate import solve_ivp
 import dolfinx_nts as nts
 

@@ -3,11 +3,12 @@
 A cube of one cell stands on, hits or leaves a plate of 2 x 2 facets whose top is z = 0.
 """
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from mpi4py import MPI
 from petsc4py import PETSc
 from scenes import RUBBER, everywhere
 

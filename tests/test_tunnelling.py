@@ -1,10 +1,11 @@
 """No node passes through a master within a step, and none that passed beside one is moved out."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from integrators import CONTACT_RULES
 from measures import OPEN, PROMISED, ledger_or_word
-from mpi4py import MPI
 from point_mass import MASS, PointMass, PointSurface
 from scenes import RUBBER, box
 from scipy.interpolate import LinearNDInterpolator

@@ -1,11 +1,12 @@
 """B1, the oblique impact of two cubes: what each integrator keeps, on any mesh, unit and rank."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import two_blocks
 from dolfinx.mesh import CellType
 from integrators import MID_STEP
-from mpi4py import MPI
 from scenes import UNITS, fung
 
 import dolfinx_nts as nts

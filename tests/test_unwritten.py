@@ -9,10 +9,11 @@ import time
 from collections import Counter
 from dataclasses import replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, seed, settings
-from mpi4py import MPI
 from solids import Solid
 from unwritten_judge import judge, judge_restart, law_of
 from unwritten_scenes import NONSENSE, Body, Contact, Floor, Scene, scenes

@@ -6,9 +6,10 @@ Where a test has one rank raise, it is the last one, which is the only one in se
 import re
 from types import SimpleNamespace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from point_mass import PointMass
 from scenes import RUBBER, bottom, box, top
 

@@ -12,9 +12,10 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scenes import meeting_blocks, thrown_block
 from xdmf import read_xdmf
 

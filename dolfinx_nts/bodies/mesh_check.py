@@ -5,10 +5,11 @@ from __future__ import annotations
 import zlib
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
-from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import flux, oriented_nodes

@@ -17,11 +17,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
-from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.continuum import Continuum

@@ -12,9 +12,10 @@ from copy import copy
 from dataclasses import KW_ONLY, dataclass, field, fields, is_dataclass
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from dolfinx_nts.kernels.bounded_slope import highest
 from dolfinx_nts.kernels.nts_element import Gap

@@ -12,9 +12,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
 from dolfinx_nts.contact.inner_edge import InnerEdges, in_inner_edge

@@ -26,6 +26,12 @@ _NAMES = "facets.h", "facets.c", "nts_element.c", "contact_law.c"
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 _FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
 
+#: What compiles, and where it comes from.
+COMPILER = (
+    "it takes a C compiler with the headers of C and Python, as in Debian's gcc, libc6-dev and "
+    'python3-dev, or ziglang of PyPI with CC="python -m ziglang cc" in the environment'
+)
+
 _INT, _LONG, _REAL, _ARRAY = ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_void_p
 #: What begins where an array does.
 _START: Any = ctypes.c_char * 0
@@ -190,7 +196,10 @@ def _make(target: Path, command: Callable[[Path], list[str]]) -> None:
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
         new = Path(folder, target.name)
         given = [*command(Path(folder)), "-shared", "-fPIC", "-o", str(new), "-lm"]
-        subprocess.run([*compiler, *given], check=True, capture_output=True, text=True)
+        try:
+            subprocess.run([*compiler, *given], check=True, capture_output=True, text=True)
+        except FileNotFoundError as error:
+            raise NotMadeError(f"{error}; {COMPILER}") from error
         new.replace(target)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Integrator

@@ -12,9 +12,10 @@ import numbers
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.state import State

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from mpi4py import MPI
 
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
@@ -138,13 +139,16 @@ def functions(body: Any, fields: dict[str, FloatArray]) -> dict[str, Any]:
         fields: As of `at_nodes`.
     """
     scalars, of_vector = body.space.sub(0).collapse()
-    node = np.asarray(of_vector) // 3
+    # Its nodes may have other owners than those of the vectors.
+    first = fem.Function(body.space)
     found = {}
     for name, values in fields.items():
         vector = values.ndim == 2
         found[name] = function = fem.Function(body.space if vector else scalars)
         function.name = re.sub(r"\W", "_", name, flags=re.ASCII)
-        owned = scalars.dofmap.index_map.size_local
-        function.x.array[: values.size] = values.ravel() if vector else values[node[:owned]]
-        function.x.scatter_forward()
+        carrier, each = (function, 1) if vector else (first, 3)
+        carrier.x.array[: each * values.size : each] = values.ravel()
+        carrier.x.scatter_forward()
+        if not vector:
+            function.x.array[:] = first.x.array[of_vector]
     return found

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 from dolfinx_nts.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.step.convergence import ratios

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
-from mpi4py import MPI
 
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max

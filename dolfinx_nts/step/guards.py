@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross

@@ -16,9 +16,10 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from dolfinx_nts.constraints import SHIFT
 from dolfinx_nts.evaluation import Evaluation

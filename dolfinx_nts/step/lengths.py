@@ -103,8 +103,8 @@ def _box(system: System) -> tuple[FloatArray, float, float]:
     for body in system.bodies:
         x = body.reference.reshape(-1, 3)
         directors, x = x[~body.places], x[body.places]
-        np.maximum(ends[0], x.max(axis=0, initial=-np.inf), ends[0])
-        np.maximum(ends[1], (-x).max(axis=0, initial=-np.inf), ends[1])
+        np.maximum(ends[0], x.max(axis=0, initial=-np.inf), out=ends[0])
+        np.maximum(ends[1], (-x).max(axis=0, initial=-np.inf), out=ends[1])
         ends[2, 0] = max(ends[2, 0], np.linalg.norm(directors, axis=1).max(initial=0.0))
     high, low, (directors, *_) = global_max(system.comm, ends) * [[1.0], [-1.0], [1.0]]
     return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)), float(directors)

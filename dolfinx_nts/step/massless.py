@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State

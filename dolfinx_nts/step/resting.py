@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.evaluation import Evaluation

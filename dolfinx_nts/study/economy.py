@@ -20,12 +20,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import dolfinx_nts as nts

@@ -23,10 +23,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx.mesh import CellType, GhostMode, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 from dolfinx_nts.study.scene_runs import load

@@ -29,8 +29,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
+
+import numpy as np
 
 import dolfinx_nts as nts
 from dolfinx_nts.step.accuracy import ACCURACY
