@@ -86,9 +86,7 @@ class Beam(DirectorBody):
 
     def _elements_of(self, y: FloatArray) -> tuple[Elements, FloatArray]:
         """This rank's elements from their reference, see `DirectorBody`."""
-        length = np.linalg.norm(y[:, 4] - y[:, 0], axis=1)
-        found = kernel.beams(y, length, self.length, self.section.stiffness)
-        return found, length[:, None, None] * (np.ones((2, 2)) + np.eye(2)) / 6.0
+        return kernel.beams(y, self.length, self.section.stiffness)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -139,12 +137,8 @@ class Beam(DirectorBody):
 
         They act on what lies before a section from what lies behind it.
         """
-        stress = kernel.strains(self._elements, y) * self.section.stiffness
-        axes = 0.5 * (y[:, 1:4] + y[:, 5:]) / self.length
-        force, moment = (
-            np.einsum("ni,nij->nj", stress[:, part], axes) for part in (slice(3), slice(3, 6))
-        )
-        return force, moment
+        strain = kernel.strains(self._elements, y)
+        return kernel.resultants(strain * self.section.stiffness, y, self._rest, self.length)
 
     def directions_at(self, direction: FloatArray, x: Any) -> Points:
         """A direction that turns with a node, for joints. Collective.
