@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from integrators import INTEGRATORS
+from lines import arc, interval_mesh, straight
 from mpi4py import MPI
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
@@ -19,24 +20,6 @@ STEEL = nts.Section(EA=2000, GA=(800, 700), GJ=3, EI=(1, 2), rhoA=1, rhoI=(1e-2,
 #: Tip of the cantilever by as many elements (B26'); Reissner's is at (.44412985, .81711894).
 TIPS = {8: (0.41736301, 0.83583401), 16: (0.43863131, 0.82096875), 32: (0.44280281, 0.81800656)}
 EM, MID = nts.EnergyMomentum(), nts.Midpoint()
-
-
-def interval_mesh(x, cells=None, comm=MPI.COMM_WORLD):
-    """A mesh of these nodes, all given by rank 0, in their order unless told."""
-    if cells is None:
-        cells = np.column_stack([np.arange(len(x) - 1), np.arange(1, len(x))])
-    mine = slice(None if comm.rank == 0 else 0)
-    x = np.asarray(x, dtype=float)
-    return compat.create_mesh(comm, np.asarray(cells)[mine], x[mine], "interval")
-
-
-def straight(n, length=1.0, way=(1, 0, 0)):
-    return np.linspace(0, length, n + 1)[:, None] * np.array(way, dtype=float)
-
-
-def arc(n, radius, angle):
-    a = np.linspace(0, angle, n + 1)
-    return radius * np.column_stack([np.sin(a), 1 - np.cos(a), 0 * a])
 
 
 # ---- kernel

@@ -21,6 +21,7 @@ from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 
 
@@ -87,6 +88,17 @@ class Beam(DirectorBody):
     def _elements_of(self, y: FloatArray) -> tuple[Elements, FloatArray]:
         """This rank's elements from their reference, see `DirectorBody`."""
         return kernel.beams(y, self.length, self.section.stiffness)
+
+    @property
+    def _neighbours(self) -> IntArray:
+        first = np.arange(self._nodes.shape[1] - 1)
+        return np.stack([first, first + 1], axis=1)
+
+    def _finer(self, times: float) -> str:
+        """Which elements are needed, see `DirectorBody`."""
+        here = len(self._skeleton.cells)
+        needed = int(np.ceil(times * here * (1.0 - 1e-9)))
+        return f"about {needed} elements are needed for that, where it has {here}"
 
     @property
     def settings(self) -> dict[str, Any]:
