@@ -12,7 +12,6 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
-from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.kernels import beam as beam_kernel
 from dolfinx_nts.kernels import quadratic_energy as kernel
 

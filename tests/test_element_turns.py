@@ -21,12 +21,12 @@ def tip(x):
     return x[0] > 1 - 1e-9
 
 
-def turned(degrees, scale=1.0):
-    """One element whose end a rigid body turns by so much until t = 1, shear and stretch free."""
+def turned(degrees, scale=1.0, degree=1):
+    """One element whose end a rigid body turns by so much until t = 1."""
     s = scale
     section = nts.Section(EA=1e4 * s, GA=(5e3 * s,) * 2, GJ=2 * s**3, EI=(2 * s**3,) * 2,
                           rhoA=1 / s, rhoI=(1e-2 * s,) * 2)  # fmt: skip
-    beam = nts.Beam(interval_mesh(straight(1, s)), section, bcs=[nts.Clamp(clamp)])
+    beam = nts.Beam(interval_mesh(straight(1, s)), section, bcs=[nts.Clamp(clamp)], degree=degree)
     head = nts.RigidBody.from_inertia(
         1.0, (s**2,) * 3, (s, 0, 0), name="head", comm=MPI.COMM_WORLD,
         rotation=lambda t: (0, 0, np.radians(degrees) * t),
@@ -36,18 +36,26 @@ def turned(degrees, scale=1.0):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("scale", [1, 1000])
-def test_a_turn_of_60_degrees_is_told(scale):
-    """With how many elements of 30 degrees there should be; before there is nothing to say."""
-    run = nts.equilibrium(turned(59.0, scale), load_steps=4)
+def test_an_element_that_turns_too_far_is_told(scale):
+    """With how many elements of 30 degrees there should be; below 45 there is nothing to say."""
+    run = nts.equilibrium(turned(44.0, scale), load_steps=4)
     assert run.status == "completed" and not run.warnings
     run = nts.equilibrium(turned(76.0, scale), load_steps=4)
     found = run.warnings["turn of an element"]
-    assert found.first == 1.0 and found.about == ("beam",) and not found.grave
+    assert found.first == 0.75 and found.about == ("beam",) and not found.grave
     assert found.worst == pytest.approx(1 - np.cos(np.radians(76.0)))
     middle = f"X = ({0.5 * scale:.4g}, 0, 0)"
     assert f"turns by 76 degrees between neighbouring nodes near {middle}" in found.text
-    assert "about 3 elements are needed for that, where it has 1" in found.text
+    assert "about 3 elements are needed for that, or 2 with degree=2, where it has 1" in found.text
     assert run.balance["min_det"] == pytest.approx(np.cos(np.radians(76 / 4 * np.arange(5))))
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("degrees", [118.0, 122.0])
+def test_of_three_nodes_neighbours_turn_by_60_degrees(degrees):
+    run = nts.equilibrium(turned(degrees, degree=2), load_steps=8)
+    assert run.status == "completed" and ("turn of an element" in run.warnings) == (degrees > 120)
+    assert run.balance["min_det"][-1] == pytest.approx(np.cos(np.radians(degrees / 2)), rel=2e-3)
 
 
 @pytest.mark.mpi

@@ -83,11 +83,11 @@ class DirectorBody(Body):
         raise NotImplementedError
 
     # ---- set-up
-    def _set_up_mesh(self, mesh: Any, name: str) -> None:
+    def _set_up_mesh(self, mesh: Any, name: str, degree: int = 1) -> None:
         """What fields live on."""
-        self.name, self.mesh, self.comm, self.degree = name, mesh, mesh.comm, 1
+        self.name, self.mesh, self.comm, self.degree = name, mesh, mesh.comm, degree
         self.made_on = places_of(mesh)
-        self.space = compat.vector_space(mesh, 1)
+        self.space = compat.vector_space(mesh, degree)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
 

@@ -35,10 +35,10 @@ def shapes(nodes: int, at: FloatArray) -> tuple[FloatArray, FloatArray]:
     return values, np.stack([at - 0.5, -2.0 * at, at + 0.5], axis=1)
 
 
-def stretches(y: FloatArray, at: FloatArray) -> FloatArray:
-    """|dX/dxi| of elements at points [m], shape (n, p)."""
-    _, slopes = shapes(y.shape[1] // 4, at)
-    found: FloatArray = np.linalg.norm(np.einsum("pa,nai->npi", slopes, y[:, ::4]), axis=2)
+def stretches(x: FloatArray, at: FloatArray) -> FloatArray:
+    """|dX/dxi| of elements at points [m], shape (n, p), by their nodes x (n, nodes, 3) [m]."""
+    _, slopes = shapes(x.shape[1], at)
+    found: FloatArray = np.linalg.norm(np.einsum("pa,nai->npi", slopes, x), axis=2)
     return found
 
 
@@ -66,7 +66,7 @@ def beams(
     """
     nodes = y.shape[1] // 4
     at, parts = points(nodes)
-    length = stretches(y, at)
+    length = stretches(y[:, ::4], at)
     values, slopes = shapes(nodes, at)
     slope = slopes / length[:, :, None]
     # Points, products, factors, nodes, their vectors.
@@ -86,15 +86,15 @@ def beams(
     found = energy.elements(
         weights.reshape(n, 9 * p, 2, 4 * nodes), hessian.reshape(n, 9 * p, 9 * p), y
     )
-    return found, _shares(y)
+    return found, shares(y[:, ::4])
 
 
-def _shares(y: FloatArray) -> FloatArray:
-    """The integrals int N_a N_b dS [m], shape (n, nodes, nodes)."""
-    nodes = y.shape[1] // 4
+def shares(x: FloatArray) -> FloatArray:
+    """The integrals int N_a N_b dS [m] by nodes x (n, nodes, 3) [m], shape (n, nodes, nodes)."""
+    nodes = x.shape[1]
     at, parts = np.polynomial.legendre.leggauss(nodes)
     values, _ = shapes(nodes, at)
-    found: FloatArray = np.einsum("p,np,pa,pb->nab", parts, stretches(y, at), values, values)
+    found: FloatArray = np.einsum("p,np,pa,pb->nab", parts, stretches(x, at), values, values)
     return found
 
 
@@ -123,5 +123,5 @@ def resultants(
     moment = np.einsum("npi,npij->nj", stress[:, :, 3:], axes) / len(at)
     # Stretch is resisted along the axis, whichever way the section looks.
     along = np.einsum("pa,nai->npi", slopes, vectors[:, :, 0])
-    axes[:, :, 2] = along / stretches(rest, at)[:, :, None]
+    axes[:, :, 2] = along / stretches(rest[:, ::4], at)[:, :, None]
     return np.einsum("npi,npij->nj", stress[:, :, :3], axes) / len(at), moment
