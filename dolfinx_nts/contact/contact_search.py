@@ -37,6 +37,8 @@ _ONE = 1e-6
 _BESIDE = 1e-3
 #: Depth in facet sizes from which on a node is told that lies behind its facet without a force.
 _UNHELD = 1e-6
+#: Depth in facet sizes from which on flight is a poor first guess.
+_DEEP = 0.03
 #: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
 _SURELY = 1e-3
 
@@ -121,6 +123,17 @@ class ContactSearch:
         self.idle_gaps = [np.empty(0) for _ in self.idle]
         watching = any(c.num_elements for c in self.idle)
         self._watching = anywhere(self._comm, watching)
+
+    def dives(self) -> bool:
+        """Whether free flight presses nodes deep into their masters. Collective."""
+        far = False
+        for k, c in enumerate(self.elements):
+            least = _DEEP * float(c.candidates.length.min(initial=np.inf))
+            far |= self._reach(k, self._step.motion) > least
+        if not anywhere(self._comm, far):
+            return False
+        both = zip(self.elements, self.flight_gaps(), strict=True)
+        return anywhere(self._comm, any((g < -_DEEP * c.candidates.length).any() for c, g in both))
 
     def touched(self) -> set[int]:
         """Bodies of contacts that have unknowns, the same on all ranks. Collective."""

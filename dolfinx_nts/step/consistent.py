@@ -83,7 +83,7 @@ def accelerating_forces(
     ramp = problem.integrator.ramp(state.time)
     moments = [Moment(u, state.time, ramp, 0.0, v) for u, v in zip(state.u, state.v, strict=True)]
     problem.begin(replace(state, a=still), dt, moments=moments)
-    problem.guess(flight=False, carried=True)
+    problem.guess(flight=False, forces=True, carried=True)
     contact = [terms.coupling / problem.factor for terms in problem.evaluate(problem.x).bodies]
     gravity = ramp * problem.system.gravity
     out = []

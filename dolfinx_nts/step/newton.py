@@ -126,12 +126,12 @@ class StepSolver:
         iterations, unsolved = 0, False
         # Without friction there is nothing to let slip.
         for retry in range(3 if self.problem.couplings.may_slip else 2):
-            self._upright.begin(careful=retry > 0)
+            self._upright.begin(careful=retry > 0 or self.problem.dives)
             if retry:
                 self._tangents.due, self._passed = True, None
                 if retry == 2:
                     self.problem.couplings.let_slip()
-                self.problem.guess(flight=False)
+                self.problem.guess(flight=False, forces=False)
                 self.iterates.forget_last()
                 if unsolved:
                     # What failed to factorise once fails from then on.
@@ -208,7 +208,7 @@ class StepSolver:
         if self._presets.name != before:
             name, time = self._presets.name, self.problem.state.time
             logger.info("t=%.6g: linear solver %r for the next steps", time, name)
-        self.problem.guess(flight=True)
+        self.problem.guess(flight=True, forces=True)
         last = self._attempt()
         return replace(last, iterations=iterations + last.iterations)
 

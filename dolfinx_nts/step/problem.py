@@ -54,6 +54,7 @@ class StepProblem:
         couplings: All that makes elements.
         unknowns: Their layout; made anew whenever the elements' coordinates change.
         version: Changes whenever `unknowns` does.
+        dives: Whether free flight presses bodies deep into each other, after `begin`.
         factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
         rtol: As given.
         rounding: What part of the forces on bodies is rounding.
@@ -79,7 +80,7 @@ class StepProblem:
         self.couplings = Couplings(system)
         self._shared = SharedWeight(system.comm, system.contacts)
         self.unknowns: Unknowns | None = None
-        self.version = 0
+        self.version, self.dives = 0, False
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
         self.supports = Supports(system, integrator)
         lengths = self.lengths
@@ -212,7 +213,9 @@ class StepProblem:
             self.version += 1
             self._numbers = numbers
         self._of_none = None
-        self.guess(flight=True, again=again)
+        # From bodies that free flight has pressed deep into each other iterates may not find back.
+        self.dives = self.integrator.inertia and self.couplings.contacts.dives()
+        self.guess(flight=not self.dives, forces=True, again=again)
 
     @property
     def x(self) -> Any:
@@ -262,16 +265,20 @@ class StepProblem:
         return self.stabilization.of(body) * du
 
     def guess(
-        self, *, flight: bool, carried: bool = False, again: Evaluation | None = None
+        self,
+        *,
+        flight: bool,
+        forces: bool,
+        carried: bool = False,
+        again: Evaluation | None = None,
     ) -> None:
         """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
 
         Args:
-            flight: Free flight from t_n under the contact forces of the last step; else the
-                positions of t_n, which free flight of a fast turning or vibrating body may invert,
-                and no forces. Prescribed coordinates are at t_{n+1}.
-            carried: Take the contact forces of the last step unchanged, whatever `flight` is, even
-                where they are a poor guess.
+            flight: Free flight from t_n; else the positions of t_n, which free flight of a fast
+                turning or vibrating body may invert. Prescribed coordinates are at t_{n+1}.
+            forces: The contact forces of the last step; else none, but in statics.
+            carried: Take these forces unchanged, even where they are a poor guess.
             again: Solution of this step with fewer elements: its motion and contact forces are
                 taken in place of these.
         """
@@ -285,7 +292,7 @@ class StepProblem:
                     start = again.bodies[k].u1.copy()
                 start[fixed] = u1[fixed]
                 x[laid.of_body(k)] = start
-        if "constraints" in laid.own and (flight or carried or not self.integrator.inertia):
+        if "constraints" in laid.own and (forces or not self.integrator.inertia):
             found = self.couplings.guess(laid.positions(self.x, elements), carried=carried)
             with self.x as x:
                 x[laid.of_elements("constraints")] = found

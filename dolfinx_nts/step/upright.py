@@ -36,8 +36,8 @@ class Upright:
         """Begin an attempt.
 
         Args:
-            careful: Shorten updates. Where Newton's method ends well without that, what its
-                iterates were does not matter.
+            careful: Shorten updates. Where Newton's method ends well without that, as it does in
+                most steps, what its iterates were does not matter.
         """
         self._careful, self._shortened = careful, 0
 
