@@ -18,6 +18,39 @@ YOUNG, SIDE = 1e6, 0.1
 EULER = np.pi**2 * YOUNG * SIDE**4 / 12 / 4
 
 
+def test_a_ring_that_rolls_over_its_polygon_ends_in_a_stable_state():
+    """Nodes that come or go at each side made Newton's method cycle with period 2 (theory 23)."""
+    import gmsh
+
+    thick, wide, squeeze = 2.62, 22.62, 0.5
+    gmsh.initialize()
+    gmsh.option.setNumber("General.Verbosity", 1)
+    eighth = gmsh.model.occ.addTorus(0, 0, thick / 2, wide / 2, thick / 2, angle=np.pi / 4)
+    gmsh.model.occ.synchronize()
+    gmsh.model.setPhysicalName(3, gmsh.model.addPhysicalGroup(3, [eighth]), "ring")
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.7)
+    gmsh.option.setNumber("Mesh.MeshSizeMin", 0.7)
+    gmsh.model.mesh.generate(3)
+    part = nts.bodies_from_gmsh(gmsh.model, COMM)["ring"]
+    gmsh.finalize()
+    cuts = [
+        nts.Dirichlet(lambda x: x[1] < 1e-6, components=(1,)),
+        nts.Dirichlet(lambda x: np.abs(x[1] - x[0]) < 1e-6, components=(0, 1)),
+    ]
+    rubber = nts.NeoHookean(young=5.0, poisson=0.3)
+    ring = part.continuum(rubber, density=1.0, bcs=cuts, name="ring")
+    press = nts.Plane((0, 0, thick), (0, 0, -1), motion=lambda t: (0, 0, -squeeze * t))
+    floor, skin = nts.Plane((0, 0, 0), (0, 0, 1)), ring.surface(everywhere)
+    pairs = [nts.ContactPair(slave=skin, master=plane) for plane in (floor, press)]
+    run = nts.equilibrium(nts.System([ring], contacts=pairs), load_steps=4)
+    assert run.status == "completed" and "unstable equilibrium" not in run.warnings
+    # A cycle takes all of an attempt's 25 and is solved in another one, if at all.
+    assert run.retries == 0 and run.balance["newton_iterations"].max() < 25
+    # An independent program on a mesh of this size [N/mm]; other versions of Gmsh make others.
+    force = run.contact_forces[-1, 1, 2] / (np.pi * wide / 8)
+    assert abs(force) == pytest.approx(1.41893, rel=0.02)
+
+
 def column(load, width=SIDE):
     """Column of height 1 m under a dead load [N]."""
     foot = nts.Dirichlet(at(2, 0.0))

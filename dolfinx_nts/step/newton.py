@@ -22,6 +22,7 @@ from dolfinx_nts.step.diagnosis import diagnosis
 from dolfinx_nts.step.iterates import Iterates
 from dolfinx_nts.step.kept import KeptTangents
 from dolfinx_nts.step.least_norm import NullSpace, form_tree
+from dolfinx_nts.step.lent_stiffness import LentStiffness
 from dolfinx_nts.step.linear_solver import keep_bodies, set_schur, take_bodies
 from dolfinx_nts.step.presets import Presets
 from dolfinx_nts.step.problem import StepProblem
@@ -74,6 +75,7 @@ class StepSolver:
         )  # fmt: skip
         self._tangents = KeptTangents(problem, lambda: self._presets.keeps)
         self.iterates, self._upright = Iterates(problem), Upright(problem)
+        self._lent, self._wanders = LentStiffness(problem), False
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
         self._version, self._solved = -1, False
@@ -157,6 +159,7 @@ class StepSolver:
                     f"with error {error.ierr}{self._presets.with_options}; two contacts, or a "
                     "contact and a support, may hold the same nodes"
                 ) from error
+            self._lent.begin()
             last = self._passed or self.iterates.at(self.problem.x)
             iterations += self.snes.getIterationNumber()
             # A solver of the user's may stop SNES by its own tests; ours decide.
@@ -216,6 +219,8 @@ class StepSolver:
         """Make SNES and matrices ready for the current step."""
         self.iterates.restart()
         self._passed, self._measured, self._before = None, False, np.inf
+        self._lent.begin()
+        self._wanders = False
         self._tangents.begin()
         if self._version != self.problem.version:
             self.destroy()
@@ -300,6 +305,8 @@ class StepSolver:
     def _jacobian(self, _snes: Any, x: Any, _j: Any, _p: Any) -> None:
         e = self.iterates.at(x)
         if e is not self._assembled:
+            if self._lent.at(e, wanders=self._wanders):
+                self._tangents.due = True
             self.assemble(e)
 
     def _check_update(self, x: Any, y: Any) -> bool:
@@ -333,6 +340,7 @@ class StepSolver:
         self._tangents.due |= unchanged and worst > max(1.0, _SLOW * self._before)
         if iteration > 0 and unchanged:
             self._presets.learn(worst, self._before)
+        self._wanders = iteration > 0 and (not unchanged or worst > self._before)
         self._before = worst
         if worst <= 1.0:
             enough = self._passed is not None or iteration >= self.newton.max_iterations

@@ -55,6 +55,8 @@ class StepProblem:
         unknowns: Their layout; made anew whenever the elements' coordinates change.
         version: Changes whenever `unknowns` does.
         dives: Whether free flight presses bodies deep into each other, after `begin`.
+        lent: Share of the stiffness around each coordinate that is added to matrices, see
+            `LentStiffness`.
         factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
         rtol: As given.
         rounding: What part of the forces on bodies is rounding.
@@ -80,7 +82,7 @@ class StepProblem:
         self.couplings = Couplings(system)
         self._shared = SharedWeight(system.comm, system.contacts)
         self.unknowns: Unknowns | None = None
-        self.version, self.dives = 0, False
+        self.version, self.dives, self.lent = 0, False, 0.0
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
         self.supports = Supports(system, integrator)
         lengths = self.lengths
@@ -395,9 +397,11 @@ class StepProblem:
         """PETSc matrix of a body at a displacement, without contact."""
         mass = 1.0 if self.integrator.inertia else 0.0
         a = self.system.bodies[k].tangent(u1, mass, self.factor)
-        if self.stabilization.share:
-            held = a.createVecLeft()
-            held.array_w[:] = self.stabilization.of(self.system.bodies[k])
+        if self.stabilization.share or self.lent:
+            held, body = a.createVecLeft(), self.system.bodies[k]
+            held.array_w[:] = self.stabilization.of(body)
+            if self.lent:
+                held.array_w[:] += self.lent * self.stabilization.stiffness(body)
             a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
             held.destroy()
         return a
