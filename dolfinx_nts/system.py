@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
+from dolfinx_nts.contact.shared_nodes import areas, check_shared
 from dolfinx_nts.coupling import Joint, is_joint
 from dolfinx_nts.parallel import raise_together, same_kernels
 from dolfinx_nts.state import ContactHistory, State
@@ -103,7 +105,7 @@ class System:
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
-        self._check_overlap()
+        check_shared(self.contacts)
         if self.contacts:
             same_kernels(self.comm)
         start = self.initial_state()
@@ -285,18 +287,10 @@ class System:
         u[body.fixed] = body.prescribed(0.0)
         return u
 
-    def _check_overlap(self) -> None:
-        """Raise if two contacts hold the same nodes out of the same facets or obstacle."""
-        for i, a in enumerate(self.contacts):
-            for b in self.contacts[:i]:
-                if a.slave.body is not b.slave.body:
-                    continue
-                what = a.shares_master(b)
-                if what and np.intersect1d(a.slave.points, b.slave.points).size:
-                    raise ValueError(
-                        f"contacts: two of them hold the same nodes of {a.slave.body.name!r} "
-                        f"out of {what}; drop one"
-                    )
+    @cached_property
+    def slave_areas(self) -> list[FloatArray]:
+        """Area that carries at each point of each contact's slave [m^2], shape (points,)."""
+        return areas(self.contacts)
 
     def penetration(self, state: State) -> list[FloatArray]:
         """Return how deep slaves lie behind their facets, in facet sizes, by contact. Collective.

@@ -14,6 +14,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
+from dolfinx_nts.contact.shared_nodes import held_before
 from dolfinx_nts.coupling import StepWarning
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
@@ -73,6 +74,8 @@ class ContactSearch:
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
+        before = zip(contacts, held_before(contacts), strict=True)
+        self._foreign = [held[pair.slave.share] for pair, held in before]
 
     @property
     def had_unknowns(self) -> list[BoolArray]:
@@ -162,6 +165,7 @@ class ContactSearch:
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia else None,
         )
+        found = found.part(~self._foreign[k][found.node])
         elements: ContactElements = pair.elements(found, positions, path, step)
         gap = _EPS * (elements.extent + float(max(step.length[b] for b in bodies)))
         if elements.strong:
@@ -272,7 +276,7 @@ class ContactSearch:
             raise StepFailedError(text, advises=failure.advises) from None
         if hit is None:
             return False
-        new = hit >= 0
+        new = (hit >= 0) & ~self._foreign[k]
         self._aimed[k] = np.where(new, hit, self._aimed[k])
         # What is held at a facet that its path led to is to be so again.
         at = np.where(self._aimed[k] >= 0, held, -1)

@@ -97,6 +97,11 @@ class Found(NamedTuple):
 class ContactPair:
     """Slave nodes of one surface must not penetrate the facets of another (19)-(21).
 
+    Slaves of two pairs of a system may share a row of nodes between them, as two patches of a face
+    with other coefficients of friction do. Where both have the same master, a shared node belongs
+    to the pair that is declared first: its friction holds there, and its forces and fields have
+    what the node carries, over the areas of both patches.
+
     Args:
         slave: Surface whose nodes are kept outside.
         master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
