@@ -70,7 +70,7 @@ class ContactSearch:
         self.bounded = False
         self.beside = [(0.0, -1)] * len(contacts)
         self._cover = [0.0] * len(contacts)
-        self._known: dict[int, tuple[list[FloatArray], ContactElements]] = {}
+        self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
@@ -149,10 +149,13 @@ class ContactSearch:
         known, reach = self._known.pop(k, None), self._reach(k, self._step.motion)
         if reach > 0.0:
             return self._find(k, reach)
-        if known is None or any(a is not b for a, b in zip(known[0], u, strict=True)):
-            known = u, self._find(k, reach)
+        # Overlap that is pressed out is another one in a load step of another length.
+        ramp = self._step.integrator.ramp(self._step.state.time + self._step.dt)
+        same = known is not None and known[1] == ramp
+        if known is None or not same or any(a is not b for a, b in zip(known[0], u, strict=True)):
+            known = u, ramp, self._find(k, reach)
         self._known[k] = known
-        return known[1]
+        return known[2]
 
     def _find(self, k: int, reach: float) -> ContactElements:
         pair, path, bodies, step = self._pairs[k], self._paths[k], self.bodies[k], self._step
@@ -166,7 +169,12 @@ class ContactSearch:
             self._old[k].followed if step.integrator.inertia else None,
         )
         found = found.part(~self._foreign[k][found.node])
-        elements: ContactElements = pair.elements(found, positions, path, step)
+        overlap, ramp = self._old[k].overlap[found.node], step.integrator.ramp
+        start, end = step.state.time, step.state.time + step.dt
+        found = found._replace(gap=found.gap + (1.0 - ramp(start)) * overlap)
+        elements: ContactElements = replace(
+            pair.elements(found, positions, path, step), overlap=(1.0 - ramp(end)) * overlap
+        )
         gap = _EPS * (elements.extent + float(max(step.length[b] for b in bodies)))
         if elements.strong:
             # Else nodes whose gap is the rounding of given coordinates would stick.
@@ -295,7 +303,8 @@ class ContactSearch:
 
     def smallest(self, parts: Sequence[Contribution]) -> dict[str, float]:
         """The smallest gap of an accepted step on this rank, infinite without candidates."""
-        gaps = [part.gap for part in parts] + self.idle_gaps
+        both = zip(self.elements, parts, strict=True)
+        gaps = [part.gap - c.overlap for c, part in both] + self.idle_gaps
         return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
 
     def warnings(self, parts: Sequence[Contribution]) -> list[StepWarning]:

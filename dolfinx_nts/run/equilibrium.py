@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.parallel import anywhere
@@ -110,12 +111,13 @@ class _LoadStepper(Stepper):
         super().__init__(system, Static(), **options)
         self._stabilization, self._end = stabilization, end
         self._solved: Evaluation | None = None
-        #: Work of each load, support, joint and contact so far [J], and the largest energy.
+        #: Work of each load, support, joint and obstacle and of overlap [J]; the largest energy.
         self._worked: FloatArray | float = 0.0
         self._largest = 0.0
         self._rates = [np.zeros_like(u) for u in self.state.u]
         self._forces = [np.zeros_like(u) for u in self.state.u]
-        self._accept(replace(self.state, v=tuple(self._rates)))
+        resting = replace(self.state, v=tuple(self._rates))
+        self._accept(system.with_overlap(resting, self._left(self.state.time)))
         self._ledger.open(self.state, self._start)
 
     def start(self, dt: float) -> None:
@@ -145,7 +147,8 @@ class _LoadStepper(Stepper):
             local.append(0.5 * float((forces[k] + self._forces[k]) @ (state.u[k] - old.u[k])))
         self._forces = forces
         local += self._joints_works(old, state, relaxed.driven)
-        works = self.system.comm.allreduce(np.array(local)).tolist()
+        local.append(self._interference_work(old, state))
+        *works, pressed = self.system.comm.allreduce(np.array(local)).tolist()
         forces_now, before = resultants.of_step(self.problem, step), self.solution.rows[-1]
         terms = balance.step_terms(self.problem, step)
         for name, lost in relaxed.lost.items():
@@ -154,7 +157,7 @@ class _LoadStepper(Stepper):
             mean = 0.5 * (before["contact_forces"][k] + forces_now["contact_forces"][k])
             start, end = pair.path(old.time, time)
             works.append(float(mean @ (end - start)))
-        terms["external_work"] = sum(works)
+        terms |= {"external_work": sum(works), "interference_work": pressed}
         terms |= {"time": time, "newton_iterations": iterations}
         terms |= {"contact_defect": 0.0, "material_change": self._ledger.take_change()}
         rows, measured = self.solution.rows, balance.measure(self.system, state)
@@ -162,7 +165,7 @@ class _LoadStepper(Stepper):
         rows.append(row | forces_now)
         self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
         # A drive that lifts a weight does the work that the weight takes.
-        self._worked = self._worked + np.array(works)
+        self._worked = self._worked + np.array([*works, pressed])
         worked = float(np.abs(self._worked).sum())
         self._largest = max(self._largest, abs(row["potential"]), worked)
         missing, size = abs(row["ledger_residual"]), self._largest
@@ -210,6 +213,23 @@ class _LoadStepper(Stepper):
             works.append(ledger if found is None else found)
         return works
 
+    def _left(self, time: float) -> float:
+        """Part of the overlap at the start that is left at a pseudo time."""
+        return 1.0 - self.problem.integrator.ramp(time)
+
+    def _interference_work(self, old: State, new: State) -> float:
+        """Work on this rank of overlap that a load step presses out [J], of the mean forces."""
+        pressed = self._left(old.time) - self._left(new.time)
+        both = zip(old.contacts, new.contacts, strict=True)
+        return pressed * sum(float(b.overlap @ (a.force + b.force)) / 2.0 for a, b in both)
+
+    def _look_inside(self, last: bool) -> None:
+        """Look, unless overlap is left that a contact is to resolve. Collective."""
+        both = zip(self.system.contacts, self.state.contacts, strict=True)
+        asked = any(p.interference == "resolve" and bool(c.overlap.any()) for p, c in both)
+        if not (self._left(self.state.time) and anywhere(self.system.comm, asked)):
+            super()._look_inside(last)
+
     def look(self, *, last: bool = False) -> None:
         """Look as `Stepper` does, and at the end for motions that nothing resists and for loads."""
         super().look(last=last)
@@ -255,11 +275,21 @@ class _LoadStepper(Stepper):
     def _tell_part_of_loads(self) -> None:
         """Warn if the load steps were asked to end before all of the constant loads act."""
         now = self.state.time
-        if now == self._end < 1.0 and self.problem.loads.grow():
+        if not now == self._end < 1.0:
+            return
+        if self.problem.loads.grow():
             self.solution.warn(
                 "part of the loads", now, 1.0 - now,
                 f"load_steps end at t={now:.6g}, with {100 * now:.3g} % of the constant loads "
                 "(gravity and loads that are no functions of time); all of them act at t=1",
+            )  # fmt: skip
+        depths = self.system.penetration(self.state)
+        deep = max((float(d.max(initial=0.0)) for d in depths), default=0.0)
+        if deep > INITIAL_PENETRATION:
+            self.solution.warn(
+                "part of the interference", now, deep,
+                f"load_steps end at t={now:.6g}, where {100 * (1.0 - now):.3g} % of the overlap "
+                f"at the start is left, up to {deep:.3g} of a facet; none is at t=1",
             )  # fmt: skip
 
     def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, _Relaxed]:
@@ -345,7 +375,7 @@ class _LoadStepper(Stepper):
 
     def _check_missed(self, state: State) -> None:
         """Raise if a slave went through a facet whose candidate it was not."""
-        depths = self.system.penetration(state)
+        depths = self.system.penetration(state, self._left(state.time))
         for pair, depth in zip(self.system.contacts, depths, strict=True):
             if depth.max(initial=0.0) > _MISSED:
                 node = int(pair.slave.original[depth.argmax()])

@@ -163,6 +163,8 @@ class Stepper:
         refuse_moved_meshes(self.system)
         refuse_overwritten(self.system)
         state = first_state(self.system, start, start_time)
+        if self.problem.integrator.inertia and not (start is not None and start.moving):
+            self.system.refuse_overlap(state)
         if not self.problem.integrator.accelerations:
             state = replace(state, a=())
         self._accept(state)
@@ -414,6 +416,10 @@ class Stepper:
             last: Look wherever anything has moved since the last look.
         """
         tell_stressed(self.solution, self.state.time)
+        self._look_inside(last)
+
+    def _look_inside(self, last: bool) -> None:
+        """`look` at bodies inside each other."""
         if self._overlap is not None:
             state, forces = self.state, [c.force for c in self.state.contacts]
             for found in self._overlap.look(state.u, state.time, forces=forces, last=last):
