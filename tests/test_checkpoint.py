@@ -1005,7 +1005,9 @@ def test_load_steps_end_on_a_signal():
 
     found = nts.equilibrium(system, load_steps=5, before_step=before)
     assert found.status.startswith("interrupted: SIGINT came before t=")
-    assert "go on" not in found.status and 1 < len(found.rows) < 6
+    assert "go on with start=" in found.status and 1 < len(found.rows) < 6
+    rest = nts.equilibrium(system, load_steps=2, start=found)
+    assert rest.status == "completed" and rest.balance["time"][0] == found.balance["time"][-1]
 
 
 def test_a_signal_that_no_step_has_seen_is_handed_on():

@@ -8,7 +8,7 @@ Version 7, with h5py's names of types:
   to the run, see `dolfinx_nts.run.checkpoint`;
 - `bodies/K/NAME`, of body K of the system, shape (nodes, 3), in the order of `Body.file_order`:
   `reference` X [m], `u` [m], `v` [m/s]; `a` [m/s^2], where the integrator carries any; further
-  fields of the run;
+  fields of the run, of an equilibrium `rate` [m] and `force` [N], see `Equilibrium`;
 - `contacts/K/NAME`, of contact K, shape (slave nodes, ...): `number`, the input number of the node,
   ascending, and the fields of `ContactHistory`; further ones of the run;
 - `joints/K/number` and `joints/K/value`, of joint K of `System.joints` that remembers something,
@@ -62,6 +62,8 @@ _VERSION = 7
 _MARK = b"crc32"
 #: Options of bodies that are loads and supports.
 _LOADS = ("body_force", "traction", "bcs", "forces", "force", "torque")
+#: Differences that a refusal names.
+_NAMED = 5
 #: Part of masses and of a body's size by which the same scene may differ on other ranks.
 _ROUNDED = 1e-9
 
@@ -153,6 +155,11 @@ def differences(there: Any, here: Any, where: str = "") -> list[str]:
         there, here = ([item.get("name", item) if isinstance(item, dict) else item
                         for item in items] for items in (there, here))  # fmt: skip
     return [] if same else [f"{where} is {there!r} there and {here!r} here"]
+
+
+def listed(sentences: list[str]) -> str:
+    """The first of some differences."""
+    return "; ".join(sentences[:_NAMED]) + ("; ..." if len(sentences) > _NAMED else "")
 
 
 # ---- a state in the numberings of the file
