@@ -51,11 +51,11 @@ from dolfinx_nts.kernels.strain_energy import Isotropic
 from dolfinx_nts.point_elements import EveryStep, PointElements, PointPart
 from dolfinx_nts.points import Points
 from dolfinx_nts.run.checkpoint import Checkpoint, restart
-from dolfinx_nts.run.equilibrium import Equilibrium, equilibrium
+from dolfinx_nts.run.equilibrium import equilibrium
 from dolfinx_nts.run.intercept import intercept
 from dolfinx_nts.run.saved import Saved, load
 from dolfinx_nts.run.simulate import simulate
-from dolfinx_nts.run.solution import Restart, Solution
+from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
 from dolfinx_nts.run.step_size import Adapt
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer

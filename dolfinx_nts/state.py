@@ -24,6 +24,7 @@ class ContactHistory(NamedTuple):
         stick: Whether it sticks.
         slip: Distance that it has slipped since the start [m].
         followed: Whether it is not known to have passed by the surface's edge.
+        overlap: How deep it may lie in the master at pseudo time 0, >= 0 [m]; at 1, not at all.
     """
 
     facet: IntArray
@@ -33,13 +34,15 @@ class ContactHistory(NamedTuple):
     stick: BoolArray
     slip: FloatArray
     followed: BoolArray
+    overlap: FloatArray
 
     @classmethod
     def of_start(cls, n: int) -> ContactHistory:
         """Return the history of n nodes that have not touched yet."""
         off, none = np.zeros(n, dtype=bool), np.zeros(n)
         return cls(
-            np.full(n, -1), none, np.full(n, np.inf), np.zeros((n, 3)), off, none.copy(), ~off
+            np.full(n, -1), none, np.full(n, np.inf), np.zeros((n, 3)), off, none.copy(), ~off,
+            none.copy(),
         )
 
 

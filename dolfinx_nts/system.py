@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 from mpi4py import MPI
 
@@ -13,7 +14,8 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.overlap import OverlapWatch
-from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
+from dolfinx_nts.contact.shared_nodes import areas, check_shared
 from dolfinx_nts.coupling import Joint, is_joint
 from dolfinx_nts.parallel import raise_together, same_kernels
 from dolfinx_nts.state import ContactHistory, State
@@ -60,7 +62,7 @@ class System:
         TypeError: An item is no body or no contact.
         ValueError: No body, other names on other ranks, equal names, several communicators,
             `gravity` is not three numbers, a contact of a body that is not in the system, initial
-            penetration beyond one part in a hundred of the facet size, or an obstacle inside a
+            penetration deeper than its pair takes, see `ContactPair`, or an obstacle inside a
             body.
     """
 
@@ -104,7 +106,7 @@ class System:
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
-        self._check_overlap()
+        check_shared(self.contacts)
         if self.contacts:
             same_kernels(self.comm)
         start = self.initial_state()
@@ -286,49 +288,80 @@ class System:
         u[body.fixed] = body.prescribed(0.0)
         return u
 
-    def _check_overlap(self) -> None:
-        """Raise if two contacts hold the same nodes out of the same facets or obstacle."""
-        for i, a in enumerate(self.contacts):
-            for b in self.contacts[:i]:
-                if a.slave.body is not b.slave.body:
-                    continue
-                what = a.shares_master(b)
-                if what and np.intersect1d(a.slave.points, b.slave.points).size:
-                    raise ValueError(
-                        f"contacts: two of them hold the same nodes of {a.slave.body.name!r} "
-                        f"out of {what}; drop one"
-                    )
+    @cached_property
+    def slave_areas(self) -> list[FloatArray]:
+        """Area that carries at each point of each contact's slave [m^2], shape (points,)."""
+        return areas(self.contacts)
 
-    def penetration(self, state: State) -> list[FloatArray]:
+    def penetration(self, state: State, left: float = 0.0) -> list[FloatArray]:
         """Return how deep slaves lie behind their facets, in facet sizes, by contact. Collective.
+
+        Args:
+            state: Where they are.
+            left: Part of their overlap at the start that they may have.
 
         Returns:
             Of each contact, shape (points,), the same on all ranks; 0 outside and, but for
             obstacles, deep inside.
         """
         depths = []
-        for pair, bodies, history in zip(
-            self.contacts, self.contact_bodies, state.contacts, strict=True
-        ):
-            positions = pair.positions([state.u[b] for b in bodies])
-            path = pair.path(state.time, state.time)
-            found = pair.find(positions, history.facet, path).candidates
+        both = zip(self.contacts, self._facing(state), state.contacts, strict=True)
+        for pair, found, history in both:
+            deep = np.maximum(-found.gap - left * history.overlap[found.node], 0.0)
             depth = np.zeros(len(pair.slave.points))
-            depth[pair.slave.share[found.node]] = np.maximum(-found.gap, 0.0) / found.length
+            depth[pair.slave.share[found.node]] = deep / found.length
             self.comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)
             depths.append(depth)
         return depths
 
+    def _facing(self, state: State) -> Iterator[Candidates]:
+        """What this rank's slaves of each contact lie over, where they are. Collective."""
+        for pair, bodies, history in zip(
+            self.contacts, self.contact_bodies, state.contacts, strict=True
+        ):
+            positions = pair.positions([state.u[b] for b in bodies])
+            yield pair.find(positions, history.facet, pair.path(state.time, state.time)).candidates
+
+    def with_overlap(self, state: State, left: float) -> State:
+        """The state with the overlap of nodes that no load step has known, see `ContactHistory`.
+
+        Collective.
+
+        Args:
+            state: At the start of an equilibrium.
+            left: Part of the overlap at pseudo time 0 that is left then.
+
+        Raises:
+            ValueError: Nothing is left, but nodes are inside a master.
+        """
+        if not left:
+            self.refuse_overlap(state)
+            return state
+        contacts = []
+        for found, history in zip(self._facing(state), state.contacts, strict=True):
+            new, node = np.zeros_like(history.overlap), found.node
+            new[node] = np.maximum(-found.gap, 0.0) / left
+            known = np.isfinite(history.gap)
+            contacts.append(history._replace(overlap=np.where(known, history.overlap, new)))
+        return replace(state, contacts=tuple(contacts))
+
+    def refuse_overlap(self, state: State) -> None:
+        """Raise on every rank if slaves are inside a master where no load steps press them out."""
+        remedy = (
+            'interference="resolve" is for load steps of equilibrium up to the pseudo time 1; '
+            "begin from the result of one that has got there, start=equilibrium(...)"
+        )
+        for pair, depth in zip(self.contacts, self.penetration(state), strict=True):
+            _refuse_deep(pair, depth, INITIAL_PENETRATION, remedy)
+
     def _check_penetration(self, depths: list[FloatArray]) -> None:
-        """Raise on every rank, with the nodes, if slaves start inside their masters."""
+        """Raise on every rank, with the nodes, if slaves start deeper inside than pairs take."""
+        remedy = (
+            "move the bodies apart, or, for a fit of up to half a facet, pass "
+            'interference="resolve" to the pair and let equilibrium press the overlap out'
+        )
         for pair, depth in zip(self.contacts, depths, strict=True):
-            deep = depth > INITIAL_PENETRATION
-            if deep.any():
-                raise ValueError(
-                    f"contact {pair.name!r}: {deep.sum()} slave nodes start inside the master, "
-                    f"up to {depth.max():.3g} of a facet (allowed {INITIAL_PENETRATION}), nodes "
-                    f"{np.sort(pair.slave.original[deep])[:10].tolist()}; move the bodies apart"
-                )
+            _refuse_deep(pair, depth, INTERFERENCE[pair.interference], remedy)
 
     def _check_sides(self, state: State) -> None:
         """Raise on every rank if a body starts on the wrong side of an obstacle."""
@@ -349,6 +382,17 @@ class System:
                 f"({point(found.place)}) {found.depth:.3g} m from the boundary; move the two "
                 "apart, or give the mesh a hole there"
             )
+
+
+def _refuse_deep(pair: ContactPair, depth: FloatArray, limit: float, remedy: str) -> None:
+    """Raise a ValueError if a contact's slaves (points,) are deeper inside than a limit."""
+    deep = depth > limit
+    if deep.any():
+        raise ValueError(
+            f"contact {pair.name!r}: {deep.sum()} slave nodes start inside the master, up to "
+            f"{depth.max():.3g} of a facet (allowed {limit}), nodes "
+            f"{np.sort(pair.slave.original[deep])[:10].tolist()}; {remedy}"
+        )
 
 
 def _missing(body: Body, names: Sequence[str]) -> str:

@@ -828,7 +828,7 @@ def test_other_files_are_refused(mpi_tmp_path):
     COMM.barrier()
     for path, kind, said in (
         (text, OSError, "cannot be read"), (other, ValueError, "it is no checkpoint"),
-        (newer, ValueError, "version 99, and this package reads version 6"),
+        (newer, ValueError, "version 99, and this package reads version 7"),
     ):  # fmt: skip
         with pytest.raises(kind, match=said):
             nts.restart(path, system)
@@ -940,7 +940,7 @@ def test_the_file_is_as_described(mpi_tmp_path):
         energy = list(notes["columns"]).index("energy")
         assert all(shape == [] for shape in list(notes["columns"].values())[: energy + 1])
         assert np.array_equal(file["balance/table"][:, energy], saved.balance["energy"])
-        assert file.attrs["version"] == 6
+        assert file.attrs["version"] == 7
 
 
 # ---- signals
@@ -1007,7 +1007,9 @@ def test_load_steps_end_on_a_signal():
 
     found = nts.equilibrium(system, load_steps=5, before_step=before)
     assert found.status.startswith("interrupted: SIGINT came before t=")
-    assert "go on" not in found.status and 1 < len(found.rows) < 6
+    assert "go on with start=" in found.status and 1 < len(found.rows) < 6
+    rest = nts.equilibrium(system, load_steps=2, start=found)
+    assert rest.status == "completed" and rest.balance["time"][0] == found.balance["time"][-1]
 
 
 def test_a_signal_that_no_step_has_seen_is_handed_on():

@@ -251,7 +251,7 @@ class Watch:
         largest = max(np.abs(table[name]).max() for name in names)
         residual = (
             table["energy"] - table["energy"][0] - table["external_work"]
-            - table["impact_restored"] - table["material_change"]
+            - table["impact_restored"] - table["material_change"] - table["interference_work"]
             + table["friction_dissipation"] + table["contact_defect"] + table["massless_defect"]
         )  # fmt: skip
         damped = any(kind == "Damper" for kind, _, _ in self._scene.joints)

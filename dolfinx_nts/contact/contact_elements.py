@@ -130,6 +130,7 @@ class ContactElements(ContactLaws):
             "x0": self.x0[chosen],
             "scale": self.scale[chosen],
             "before": self._before_of(chosen),
+            "overlap": np.broadcast_to(self.overlap, len(chosen))[chosen],
         }
 
     @cached_property
@@ -244,6 +245,9 @@ class ContactElements(ContactLaws):
         except Exception:  # any of an obstacle of the user's; the other ranks wait
             self._together(*none)
             raise
+        if np.any(self.overlap):
+            gap = gap + self.overlap
+            residual[:, self._num_places + self.num_augmented] = gap
         together = self._together(gap, slip, multiplier)
         part = self._laws(x, residual, tangent, gap, slip, multiplier, together)
         return self._to_nodes(part)
@@ -419,13 +423,13 @@ class ContactElements(ContactLaws):
         """Return what the contact remembers of an accepted step."""
         new = ContactHistory.of_start(len(old.force))
         node = self.candidates.node
-        new.facet[node], new.gap[node] = self.candidates.facet, part.gap
+        new.facet[node], new.gap[node] = self.candidates.facet, part.gap - self.overlap
         new.stick[node] = self.sticks(part)
         new.force[node] = -np.where(part.active, part.end[:, 0], 0.0) / factor
         new.tangential[node] = self._tangential_at_end(part, old.tangential[node], factor)
         new.slip[:] = old.slip
         new.slip[node] += part.distance
-        return new
+        return new._replace(overlap=old.overlap)
 
     def _tangential_at_end(
         self, part: Contribution, before: FloatArray, factor: float

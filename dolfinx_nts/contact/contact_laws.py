@@ -36,7 +36,7 @@ class Contribution(NamedTuple):
         residual: Shape (n, r), r = coordinates + augmented + constraints.
         tangent: Shape (n, r, r).
         multiplier: h^2/2 lambda of the constraints [kg m], shape (n, constraints).
-        gap: g_N at t_{n+1} [m], shape (n,).
+        gap: g_N at t_{n+1} beyond the overlap that is left there [m], shape (n,).
         active: Active set of the iterate, shape (n,).
         stick: Active pairs that stick, shape (n,).
         slip: Facet size times f_1 - f_0 [m], shape (n, 2); (n, 0) without friction.
@@ -87,6 +87,7 @@ class ContactLaws:
         lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
         imposed: Which pairs are active, whatever their forces and gaps say, shape (n,); None: those
             that the law says.
+        overlap: How deep the slaves may lie behind their facets at t_{n+1} [m], shape (n,).
         before: h^2/2 lambda_N and lambda_T at t_n of massless nodes [kg m], NaN of the others,
             shape (n, 3); None: there are none.
     """
@@ -98,6 +99,7 @@ class ContactLaws:
     x0: FloatArray
     scale: FloatArray
     theta: float
+    overlap: FloatArray | float = 0.0
     rounding: float = 0.0
     force_rounding: float = 0.0
     bounded: bool = False

@@ -14,6 +14,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
+from dolfinx_nts.contact.shared_nodes import held_before
 from dolfinx_nts.coupling import StepWarning
 from dolfinx_nts.elements import Step
 from dolfinx_nts.evaluation import Evaluation
@@ -71,10 +72,12 @@ class ContactSearch:
         self.bounded = False
         self.beside = [(0.0, -1)] * len(contacts)
         self._cover = [0.0] * len(contacts)
-        self._known: dict[int, tuple[list[FloatArray], ContactElements]] = {}
+        self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
+        before = zip(contacts, held_before(contacts), strict=True)
+        self._foreign = [held[pair.slave.share] for pair, held in before]
 
     @property
     def had_unknowns(self) -> list[BoolArray]:
@@ -159,10 +162,13 @@ class ContactSearch:
         known, reach = self._known.pop(k, None), self._reach(k, self._step.motion)
         if reach > 0.0:
             return self._find(k, reach)
-        if known is None or any(a is not b for a, b in zip(known[0], u, strict=True)):
-            known = u, self._find(k, reach)
+        # Overlap that is pressed out is another one in a load step of another length.
+        ramp = self._step.integrator.ramp(self._step.state.time + self._step.dt)
+        same = known is not None and known[1] == ramp
+        if known is None or not same or any(a is not b for a, b in zip(known[0], u, strict=True)):
+            known = u, ramp, self._find(k, reach)
         self._known[k] = known
-        return known[1]
+        return known[2]
 
     def _find(self, k: int, reach: float) -> ContactElements:
         pair, path, bodies, step = self._pairs[k], self._paths[k], self.bodies[k], self._step
@@ -175,7 +181,13 @@ class ContactSearch:
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia else None,
         )
-        elements: ContactElements = pair.elements(found, positions, path, step)
+        found = found.part(~self._foreign[k][found.node])
+        overlap, ramp = self._old[k].overlap[found.node], step.integrator.ramp
+        start, end = step.state.time, step.state.time + step.dt
+        found = found._replace(gap=found.gap + (1.0 - ramp(start)) * overlap)
+        elements: ContactElements = replace(
+            pair.elements(found, positions, path, step), overlap=(1.0 - ramp(end)) * overlap
+        )
         gap = _EPS * (elements.extent + float(max(step.length[b] for b in bodies)))
         if elements.strong:
             # Else nodes whose gap is the rounding of given coordinates would stick.
@@ -285,7 +297,7 @@ class ContactSearch:
             raise StepFailedError(text, advises=failure.advises) from None
         if hit is None:
             return False
-        new = hit >= 0
+        new = (hit >= 0) & ~self._foreign[k]
         self._aimed[k] = np.where(new, hit, self._aimed[k])
         # What is held at a facet that its path led to is to be so again.
         at = np.where(self._aimed[k] >= 0, held, -1)
@@ -304,7 +316,8 @@ class ContactSearch:
 
     def smallest(self, parts: Sequence[Contribution]) -> dict[str, float]:
         """The smallest gap of an accepted step on this rank, infinite without candidates."""
-        gaps = [part.gap for part in parts] + self.idle_gaps
+        both = zip(self.elements, parts, strict=True)
+        gaps = [part.gap - c.overlap for c, part in both] + self.idle_gaps
         return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
 
     def warnings(self, parts: Sequence[Contribution]) -> list[StepWarning]:

@@ -92,11 +92,8 @@ class FacetPair(ContactPair, master=Surface):
         """Return what both have for a master, if they share facets."""
         if not isinstance(other, FacetPair) or other.master.body is not self.master.body:
             return None
-        one, two = (
-            {tuple(sorted(f)) for f in m.points[m.facets].tolist()}
-            for m in (self.master, other.master)
-        )
-        return f"the same facets of {self.master.body.name!r}" if one & two else None
+        common = self.master.facet_points & other.master.facet_points
+        return f"the same facets of {self.master.body.name!r}" if common else None
 
     def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
         """Return how deep slaves start inside the master's body, in facet sizes. Collective."""

@@ -22,10 +22,12 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Part of a facet's size by which a slave may penetrate at the start of a run.
-INITIAL_PENETRATION = 0.01
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 MARGIN = 0.5
+#: Part of a facet's size by which a slave may penetrate at the start of a run.
+INITIAL_PENETRATION = 0.01
+#: The same of an equilibrium, by what is asked for at overlap; deeper nodes are no candidates.
+INTERFERENCE = {"refuse": INITIAL_PENETRATION, "resolve": MARGIN}
 
 
 class Candidates(NamedTuple):
@@ -97,11 +99,22 @@ class Found(NamedTuple):
 class ContactPair:
     """Slave nodes of one surface must not penetrate the facets of another (19)-(21).
 
+    Slaves of two pairs of a system may share a row of nodes between them, as two patches of a face
+    with other coefficients of friction do. Where both have the same master, a shared node belongs
+    to the pair that is declared first: its friction holds there, and its forces and fields have
+    what the node carries, over the areas of both patches.
+
     Args:
         slave: Surface whose nodes are kept outside.
         master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
         friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact stick, but for
             those that no step holds or lets go, which a warning tells.
+        interference: What becomes of slave nodes that start inside the master by more than one part
+            in a hundred of a facet. "refuse" them, or "resolve" it, as for a press fit: the load
+            steps of `equilibrium` press nodes out that start up to half a facet deep, in proportion
+            to the pseudo time, until none is left at 1; the work of that is `interference_work` in
+            the balance. `simulate` starts from its result. Any overlap that a start has is resolved
+            so in equilibrium, also what "refuse" lets pass.
 
     Attributes:
         origin: Point of space that positions are relative to [m], shape (3,).
@@ -110,7 +123,8 @@ class ContactPair:
 
     Raises:
         TypeError: `slave` is no Surface, or `master` of no known kind.
-        ValueError: friction is negative or no number, or the surfaces share nodes.
+        ValueError: friction is negative or no number, `interference` is unknown, or the surfaces
+            share nodes.
     """
 
     #: Class of pairs for each class of masters.
@@ -124,8 +138,13 @@ class ContactPair:
         kinds = (pair for kind, pair in cls._kinds.items() if isinstance(master, kind))
         return super().__new__(next(kinds, cls))
 
-    def __init__(self, slave: Surface, master: Any, *, friction: float = 0.0) -> None:
+    def __init__(
+        self, slave: Surface, master: Any, *, friction: float = 0.0, interference: str = "refuse"
+    ) -> None:
         _check_friction(friction)
+        if not isinstance(interference, str) or interference not in INTERFERENCE:
+            known = ", ".join(map(repr, INTERFERENCE))
+            raise ValueError(f"interference={interference!r}: choose one of {known}")
         if not isinstance(slave, Surface):
             other = isinstance(slave, tuple(self._kinds))
             hint = "; an obstacle is a master" if other else ""
@@ -135,7 +154,7 @@ class ContactPair:
                 f"master={master!r}: pass a Surface, e.g. body.surface(marker), or a Plane, Sphere "
                 "or Cylinder"
             )
-        self.slave, self.friction = slave, float(friction)
+        self.slave, self.friction, self.interference = slave, float(friction), interference
         self.master: Any = master
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())

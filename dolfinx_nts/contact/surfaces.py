@@ -237,6 +237,11 @@ class Surface:
             return not self.material.are_nodes
         return self._touching.redundant
 
+    @cached_property
+    def facet_points(self) -> set[tuple[int, ...]]:
+        """Of each facet the numbers of its corners in the body, ascending."""
+        return {tuple(sorted(corners)) for corners in self.points[self.facets].tolist()}
+
     def leave(self) -> None:
         """Forget what contacts use of the body."""
         if self._touching is not None:

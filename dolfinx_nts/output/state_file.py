@@ -1,14 +1,14 @@
 """Files of states, checkpoints and saved runs: HDF5, in numberings that do not depend on the ranks.
 
-Version 6, with h5py's names of types:
+Version 7, with h5py's names of types:
 
-- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (6) and
+- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (7) and
   `package` (the version that wrote it);
 - `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
   to the run, see `dolfinx_nts.run.checkpoint`;
 - `bodies/K/NAME`, of body K of the system, shape (nodes, 3), in the order of `Body.file_order`:
   `reference` X [m], `u` [m], `v` [m/s]; `a` [m/s^2], where the integrator carries any; further
-  fields of the run;
+  fields of the run, of an equilibrium `rate` [m] and `force` [N], see `Equilibrium`;
 - `contacts/K/NAME`, of contact K, shape (slave nodes, ...): `number`, the input number of the node,
   ascending, and the fields of `ContactHistory`; further ones of the run;
 - `joints/K/number` and `joints/K/value`, of joint K of `System.joints` that remembers something,
@@ -57,11 +57,13 @@ _OTHER = {
     CHECKPOINT: "it is no checkpoint; pass the path that Checkpoint had",
     SOLUTION: "it holds no saved run; pass the path that Solution.save had",
 }
-_VERSION = 6
+_VERSION = 7
 #: What stands between the HDF5 part and its checksum.
 _MARK = b"crc32"
 #: Options of bodies that are loads and supports.
 _LOADS = ("body_force", "traction", "bcs", "forces", "force", "torque")
+#: Differences that a refusal names.
+_NAMED = 5
 #: Part of masses and of a body's size by which the same scene may differ on other ranks.
 _ROUNDED = 1e-9
 
@@ -153,6 +155,11 @@ def differences(there: Any, here: Any, where: str = "") -> list[str]:
         there, here = ([item.get("name", item) if isinstance(item, dict) else item
                         for item in items] for items in (there, here))  # fmt: skip
     return [] if same else [f"{where} is {there!r} there and {here!r} here"]
+
+
+def listed(sentences: list[str]) -> str:
+    """The first of some differences."""
+    return "; ".join(sentences[:_NAMED]) + ("; ..." if len(sentences) > _NAMED else "")
 
 
 # ---- a state in the numberings of the file

@@ -168,7 +168,8 @@ class _Series:
         found = contact_fields.at_nodes(system, state, solution.contact_loads, self.body)
         for label, k in self.contacts.items():
             slave, mean = system.contacts[k].slave, stepper.mean_force(k)
-            for name, values in (("force", mean), ("pressure", mean / slave.area[slave.share])):
+            pressure = mean / system.slave_areas[k][slave.share]
+            for name, values in (("force", mean), ("pressure", pressure)):
                 found[f"contact_{name}_mean_{label}"] = contact_fields.spread(
                     slave, 0.0, values, values
                 )

@@ -48,8 +48,6 @@ logger = logging.getLogger(__name__)
 
 #: Notes that are the stepper's.
 _MEMORY = ("last", "promised", "bounded", "measured", "recent", "solver")
-#: Differences that the refusal of a checkpoint names.
-_NAMED = 5
 
 
 @known_options
@@ -209,8 +207,8 @@ def restart(path: StrPath, system: System) -> Restart:
     found = files.differences(notes["scene"], files.describe(system))
     if found:
         raise ValueError(
-            f"path={str(path)!r}: was written by another system: {_listed(found)}; make the system "
-            "as it was, or start from the Solution of another run"
+            f"path={str(path)!r}: was written by another system: {files.listed(found)}; make the "
+            "system as it was, or start from the Solution of another run"
         )
     numbering = files.Numbering(system)
     numbering.check(tables)
@@ -232,14 +230,9 @@ def restart(path: StrPath, system: System) -> Restart:
     )
     changed = files.differences(notes["loads"], files.loads(system))
     if changed:
-        text = f"the restart was given other loads or supports: {_listed(changed)}"
+        text = f"the restart was given other loads or supports: {files.listed(changed)}"
         made.warn("loads changed", notes["time"], len(changed), text)
     return made
-
-
-def _listed(sentences: list[str]) -> str:
-    """The first of some sentences."""
-    return "; ".join(sentences[:_NAMED]) + ("; ..." if len(sentences) > _NAMED else "")
 
 
 def _read(path: Path) -> tuple[Tables, dict[str, Any]]:

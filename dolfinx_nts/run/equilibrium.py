@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.run.promises import NOT_FINITE
 from dolfinx_nts.run.same import same_run
+from dolfinx_nts.run.saved import Saved
 from dolfinx_nts.run.simulate import run, writers
-from dolfinx_nts.run.solution import Solution
+from dolfinx_nts.run.solution import Equilibrium
+from dolfinx_nts.run.start import kind_of, of_file
 from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.trial import solved, state_after
@@ -65,20 +68,6 @@ _OPEN = 0.1
 _ROUNDING = 16 * float(np.finfo(float).eps)
 
 
-@dataclass(eq=False, repr=False)
-class Equilibrium(Solution):
-    """What `equilibrium` computed, complete up to where it ended.
-
-    `balance` has one row per accepted load step. "time" is the pseudo time. "potential" and
-    "energy" are the strain energy. "external_work" is that of loads and prescribed motion, of the
-    mean of the forces at both ends of each step. "ledger_residual" is what energy and
-    friction_dissipation miss of it. "kinetic" and the momenta are 0. Changes of facet cost nothing
-    and are not listed.
-    """
-
-    moving: ClassVar[bool] = False
-
-
 class _Relaxed:
     """What the relaxations of a load step took.
 
@@ -109,14 +98,24 @@ class _LoadStepper(Stepper):
     ) -> None:
         super().__init__(system, Static(), **options)
         self._stabilization, self._end = stabilization, end
+        still = tuple(np.zeros_like(u) for u in self.state.u)
+        self.solution.rates = self._of_start("rates") or still
+        self.solution.forces = self._of_start("forces") or still
         self._solved: Evaluation | None = None
-        #: Work of each load, support, joint and contact so far [J], and the largest energy.
+        #: Work of each load, support, joint and obstacle and of overlap [J]; the largest energy.
         self._worked: FloatArray | float = 0.0
         self._largest = 0.0
-        self._rates = [np.zeros_like(u) for u in self.state.u]
-        self._forces = [np.zeros_like(u) for u in self.state.u]
-        self._accept(replace(self.state, v=tuple(self._rates)))
+        resting = replace(self.state, v=still)
+        self._accept(system.with_overlap(resting, self._left(self.state.time)))
         self._ledger.open(self.state, self._start)
+
+    def _of_start(self, name: str) -> tuple[FloatArray, ...]:
+        """`rates` or `forces` of the bodies in the equilibrium that this one goes on from."""
+        values = getattr(self._start, name, ())
+        if self._start is None or not values:
+            return ()
+        index = {body.name: k for k, body in enumerate(self._start.system.bodies)}
+        return tuple(values[index[body.name]] for body in self.system.bodies)
 
     def start(self, dt: float) -> None:
         """Nothing moves at the start, but the user may change a material; later calls do nothing.
@@ -137,15 +136,17 @@ class _LoadStepper(Stepper):
         self._prepare(dt)
         old = self.state
         step, state, iterations, relaxed = self._relax(dt, time)
-        self._rates = [(a - b) / dt for a, b in zip(state.u, old.u, strict=True)]
+        rates = tuple((a - b) / dt for a, b in zip(state.u, old.u, strict=True))
         forces = [t.external.copy() for t in step.bodies]
         local = []
         for k, (body, t) in enumerate(zip(self.system.bodies, step.bodies, strict=True)):
             forces[k][body.fixed] += t.residual[body.fixed]
-            local.append(0.5 * float((forces[k] + self._forces[k]) @ (state.u[k] - old.u[k])))
-        self._forces = forces
+            mean = 0.5 * (forces[k] + self.solution.forces[k])
+            local.append(float(mean @ (state.u[k] - old.u[k])))
+        self.solution.rates, self.solution.forces = rates, tuple(forces)
         local += self._joints_works(old, state, relaxed.driven)
-        works = self.system.comm.allreduce(np.array(local)).tolist()
+        local.append(self._interference_work(old, state))
+        *works, pressed = self.system.comm.allreduce(np.array(local)).tolist()
         forces_now, before = resultants.of_step(self.problem, step), self.solution.rows[-1]
         terms = balance.step_terms(self.problem, step)
         for name, lost in relaxed.lost.items():
@@ -154,7 +155,7 @@ class _LoadStepper(Stepper):
             mean = 0.5 * (before["contact_forces"][k] + forces_now["contact_forces"][k])
             start, end = pair.path(old.time, time)
             works.append(float(mean @ (end - start)))
-        terms["external_work"] = sum(works)
+        terms |= {"external_work": sum(works), "interference_work": pressed}
         terms |= {"time": time, "newton_iterations": iterations}
         terms |= {"contact_defect": 0.0, "material_change": self._ledger.take_change()}
         rows, measured = self.solution.rows, balance.measure(self.system, state)
@@ -162,7 +163,7 @@ class _LoadStepper(Stepper):
         rows.append(row | forces_now)
         self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
         # A drive that lifts a weight does the work that the weight takes.
-        self._worked = self._worked + np.array(works)
+        self._worked = self._worked + np.array([*works, pressed])
         worked = float(np.abs(self._worked).sum())
         self._largest = max(self._largest, abs(row["potential"]), worked)
         missing, size = abs(row["ledger_residual"]), self._largest
@@ -186,7 +187,7 @@ class _LoadStepper(Stepper):
 
     def _remedy_of_ledger(self) -> str:
         """Why the ledger is open, and what closes it."""
-        if self.solution.rows[0]["potential"] > self._largest * _OPEN:
+        if self._start is None and self.solution.rows[0]["potential"] > self._largest * _OPEN:
             return (
                 "the first load step starts from a displacement with that much energy, such as "
                 "Dirichlet values other than 0 at t=0, which act at once; let them be functions "
@@ -209,6 +210,23 @@ class _LoadStepper(Stepper):
             found = joint.load_step_work(*both, old.time, new.time)
             works.append(ledger if found is None else found)
         return works
+
+    def _left(self, time: float) -> float:
+        """Part of the overlap at the start that is left at a pseudo time."""
+        return 1.0 - self.problem.integrator.ramp(time)
+
+    def _interference_work(self, old: State, new: State) -> float:
+        """Work on this rank of overlap that a load step presses out [J], of the mean forces."""
+        pressed = self._left(old.time) - self._left(new.time)
+        both = zip(old.contacts, new.contacts, strict=True)
+        return pressed * sum(float(b.overlap @ (a.force + b.force)) / 2.0 for a, b in both)
+
+    def _look_inside(self, last: bool) -> None:
+        """Look, unless overlap is left that a contact is to resolve. Collective."""
+        both = zip(self.system.contacts, self.state.contacts, strict=True)
+        asked = any(p.interference == "resolve" and bool(c.overlap.any()) for p, c in both)
+        if not (self._left(self.state.time) and anywhere(self.system.comm, asked)):
+            super()._look_inside(last)
 
     def look(self, *, last: bool = False) -> None:
         """Look as `Stepper` does, and at the end for motions that nothing resists and for loads."""
@@ -255,11 +273,21 @@ class _LoadStepper(Stepper):
     def _tell_part_of_loads(self) -> None:
         """Warn if the load steps were asked to end before all of the constant loads act."""
         now = self.state.time
-        if now == self._end < 1.0 and self.problem.loads.grow():
+        if not now == self._end < 1.0:
+            return
+        if self.problem.loads.grow():
             self.solution.warn(
                 "part of the loads", now, 1.0 - now,
                 f"load_steps end at t={now:.6g}, with {100 * now:.3g} % of the constant loads "
                 "(gravity and loads that are no functions of time); all of them act at t=1",
+            )  # fmt: skip
+        depths = self.system.penetration(self.state)
+        deep = max((float(d.max(initial=0.0)) for d in depths), default=0.0)
+        if deep > INITIAL_PENETRATION:
+            self.solution.warn(
+                "part of the interference", now, deep,
+                f"load_steps end at t={now:.6g}, where {100 * (1.0 - now):.3g} % of the overlap "
+                f"at the start is left, up to {deep:.3g} of a facet; none is at t=1",
             )  # fmt: skip
 
     def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, _Relaxed]:
@@ -273,7 +301,7 @@ class _LoadStepper(Stepper):
         relaxed = _Relaxed(self.system)
         slipped = [contact.slip for contact in kept.contacts]
         problem.stabilization.share = self._stabilization
-        state = replace(kept, v=tuple(self._rates))
+        state = replace(kept, v=self.solution.rates)
         try:
             for _ in range(_RELAXATIONS):
                 try:
@@ -345,7 +373,7 @@ class _LoadStepper(Stepper):
 
     def _check_missed(self, state: State) -> None:
         """Raise if a slave went through a facet whose candidate it was not."""
-        depths = self.system.penetration(state)
+        depths = self.system.penetration(state, self._left(state.time))
         for pair, depth in zip(self.system.contacts, depths, strict=True):
             if depth.max(initial=0.0) > _MISSED:
                 node = int(pair.slave.original[depth.argmax()])
@@ -355,19 +383,41 @@ class _LoadStepper(Stepper):
                 )
 
 
-def _pseudo_times(load_steps: Any) -> list[float]:
-    """End of each load step."""
+def _pseudo_times(load_steps: Any, begin: float) -> list[float]:
+    """End of each load step of an equilibrium that begins at a pseudo time."""
     if is_whole(load_steps):
-        if load_steps >= 1:
-            return [(k + 1) / int(load_steps) for k in range(int(load_steps))]
+        if load_steps >= 1 and begin < 1.0:
+            n = int(load_steps)
+            return [*(begin + (1.0 - begin) * k / n for k in range(1, n)), 1.0]
     elif isinstance(load_steps, Sequence | np.ndarray) and not isinstance(load_steps, str):
         times = floats(load_steps)
         good = times.ndim == 1 and times.size and np.isfinite(times).all()
-        if good and (np.diff(times, prepend=0.0) > 0).all():
+        if good and (np.diff(times, prepend=begin) > 0).all():
             return [float(t) for t in times]
+    after = f"{begin:.6g}, where the start ends" if begin else "0"
+    number = "a number of steps >= 1, or " if begin < 1.0 else ""
     raise ValueError(
-        f"load_steps={load_steps!r}: pass a number of steps >= 1, or increasing pseudo times > 0"
+        f"load_steps={load_steps!r}: pass {number}increasing pseudo times > {after}"
     )
+
+
+def _begin(start: Any, system: Any) -> tuple[Any, float]:
+    """What an equilibrium goes on from, and its pseudo time. Collective.
+
+    Args:
+        start: As of `equilibrium`.
+        system: The scene, if it is one.
+    """
+    if start is None or not isinstance(system, System):
+        return start, 0.0
+    found = of_file(start, system)
+    if not isinstance(found, Equilibrium) or found.state is None:
+        raise TypeError(
+            f"start of type {type(start).__name__}: pass the result of equilibrium(...), or "
+            "load(...) of one that was saved; to begin where a run in time has ended, pass its "
+            "displacements to the bodies, displacement=..."
+        )
+    return found, found.state.time
 
 
 def _check_bodies(system: System) -> None:
@@ -390,6 +440,7 @@ def equilibrium(
     progress: bool = False,
     watch_overlap: bool = True,
     before_step: Callable[[float, float], Any] | None = None,
+    start: Equilibrium | Saved | None = None,
 ) -> Equilibrium:
     """Equilibrium of a system under its loads, reached in load steps of a pseudo time from 0.
 
@@ -404,6 +455,11 @@ def equilibrium(
     or where directions stay free, pass `stabilization`.
 
     The ledger closes as the square of the load steps: work is that of the mean of their forces.
+
+    A result is gone on from with `start`, also where it has stopped before its last load step, and
+    in another process: `nts.equilibrium(system, load_steps=20, start=nts.load("settled.h5"))`,
+    after `settled.save("settled.h5")`. Its load steps are those from its pseudo time on; the state
+    is that of one equilibrium with the steps of both. The balance begins anew there.
 
     A dynamic run starts from the result with the initial velocities of the bodies, at its pseudo
     time, or at the `start_time` of `simulate`, from which its functions of time count. Bodies
@@ -424,8 +480,8 @@ def equilibrium(
 
     Args:
         system: The scene.
-        load_steps: Number of equal steps from 0 to 1, or the increasing pseudo times where they
-            end.
+        load_steps: Number of equal steps from 0, or the pseudo time of `start`, to 1, or the
+            increasing pseudo times where they end.
         stabilization: Stiffness, over that of its own, that holds each node where it was while a
             load step is solved; the step is then repeated until nothing of it is left in the
             forces. 0.1 is a good value.
@@ -436,6 +492,8 @@ def equilibrium(
         watch_overlap: Look whether bodies of a contact end up inside each other, as in `simulate`.
         before_step: Callable (time, dt) before every attempt at a load step, with the pseudo time
             at its start and its length; see `simulate`. Loads of a load step are those at its end.
+        start: Equilibrium to go on from, or what `load` has read of one: of bodies by the same
+            names, whose supports and obstacles are at its pseudo time where it has left them.
 
     Returns:
         The Equilibrium; the bodies' u hold it. A run that fails says so in `status` and keeps
@@ -446,8 +504,11 @@ def equilibrium(
         ValueError: An argument is out of range; before any work.
         OutputError: A writer raised, on any rank; the Equilibrium until then is its `solution`.
     """
-    same_run(system, load_steps=load_steps, stabilization=stabilization)
-    times = _pseudo_times(load_steps)
+    same_run(
+        system, load_steps=load_steps, stabilization=stabilization, start=kind_of(start)
+    )  # fmt: skip
+    start, begin = _begin(start, system)
+    times = _pseudo_times(load_steps, begin)
     if stabilization is not None:
         require_positive("stabilization", stabilization, "-")
     require_bool("progress", progress)
@@ -456,10 +517,10 @@ def equilibrium(
         _check_bodies(system)
     stepper = _LoadStepper(
         system, float(stabilization or 0.0), times[-1], newton=newton, petsc_options=petsc_options,
-        watch_overlap=watch_overlap, before_step=before_step,
+        watch_overlap=watch_overlap, before_step=before_step, start=start,
     )  # fmt: skip
     stepper.solution.settings |= {"load_steps": times, "stabilization": stabilization}
-    lengths = np.diff(times, prepend=0.0).tolist()
+    lengths = np.diff(times, prepend=begin).tolist()
     steps = list(zip(lengths, times, strict=True))
     run(stepper, steps, output, progress=progress, remedy=_REMEDY)
     return stepper.solution

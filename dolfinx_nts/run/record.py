@@ -15,7 +15,7 @@ import numpy.typing as npt
 from dolfinx_nts.run.run_warnings import RunWarning, RunWarnings
 from dolfinx_nts.run.table import Table
 from dolfinx_nts.step import resultants
-from dolfinx_nts.step.balance import COLUMNS, Switch, Switches
+from dolfinx_nts.step.balance import CHANGES, COLUMNS, Switch, Switches
 
 FloatArray = npt.NDArray[np.float64]
 #: Arrays by their place in a file.
@@ -125,7 +125,7 @@ class Record:
         if np.isnan(last["energy"]):
             lines.append("no ledger was kept")
         else:
-            others = {"massless_defect": -1.0, "impact_restored": 1.0, "material_change": 1.0}
+            others = {"massless_defect": -1.0} | dict.fromkeys(CHANGES, 1.0)
             # What joints add are losses.
             others |= dict.fromkeys(self.balance.keys() - set(COLUMNS), -1.0)
             more = "".join(

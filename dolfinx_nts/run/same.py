@@ -27,6 +27,7 @@ def _scene(system: System) -> dict[str, Any]:
     found: dict[str, Any] = {"gravity": system.gravity}
     for number, pair in enumerate(system.contacts):
         found[f"friction of contacts[{number}]"] = pair.friction
+        found[f"interference of contacts[{number}]"] = pair.interference
         surfaces: Mapping[str, Any] = {"slave": pair.slave, "master": pair.master}
         for role, surface in surfaces.items():
             for name, value in surface.settings.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -28,7 +28,8 @@ class Saved(Record):
     Attributes:
         time: Of the last state [s].
         bodies: Of each body, by its name, arrays of shape (nodes, 3) in the order of its files:
-            `reference` X [m], `u` [m], `v` [m/s], and `a` [m/s^2] where the integrator carries any.
+            `reference` X [m], `u` [m], `v` [m/s], and `a` [m/s^2] where the integrator carries any;
+            of an equilibrium `rate` [m] and `force` [N], see `Equilibrium`.
         contacts: Of each contact, in their order: `number`, the input numbers of its slave nodes,
             ascending, and for each of them the fields of `ContactHistory`.
         joints: Of each joint that remembers something, by its name, `number` and `value`.
@@ -42,6 +43,22 @@ class Saved(Record):
     joints: Mapping[str, Mapping[str, npt.NDArray[Any]]]
     scene: Mapping[str, Any]
     versions: Mapping[str, str]
+
+    def tables(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays of the last state by their places in the file."""
+        names = [joint["name"] for joint in self.scene["joints"]]
+        joints = {names.index(name): found for name, found in self.joints.items()}
+        groups = {
+            "bodies": dict(enumerate(self.bodies.values())),
+            "contacts": dict(enumerate(self.contacts)),
+            "joints": joints,
+        }
+        return {
+            f"{kind}/{number}/{name}": values
+            for kind, group in groups.items()
+            for number, found in group.items()
+            for name, values in found.items()
+        }
 
     def plot(self, path: StrPath | None = None) -> Any:
         """Plot energies, ledger and momenta over time.
@@ -57,12 +74,18 @@ class Saved(Record):
         return plot_balance(self.balance, None if path is None else as_path("path", path))
 
 
-def save(record: Record, system: System, state: State, path: Path) -> None:
-    """Write a run; see `Solution.save`. Collective."""
+def save(
+    record: Record,
+    system: System,
+    state: State,
+    fields: Mapping[str, Sequence[npt.NDArray[np.float64]]],
+    path: Path,
+) -> None:
+    """Write a run, and further fields of its bodies; see `Solution.save`. Collective."""
     from dolfinx_nts.output import state_file as files
     from dolfinx_nts.output.whole_files import replace_file
 
-    tables = files.Numbering(system).pack(state, {}, {})
+    tables = files.Numbering(system).pack(state, fields, {})
     of_record, notes = record.packed()
     tables |= of_record
     notes |= {"scene": files.describe(system), "time": state.time, "versions": versions()}
@@ -79,7 +102,8 @@ def load(path: StrPath) -> Saved:
         print(run.summary)
         heights = run.bodies["ball"]["reference"][:, 2] + run.bodies["ball"]["u"][:, 2]
 
-    A run cannot start from it; see `restart`.
+    Of an equilibrium, `equilibrium` and `simulate` take it as their start. A run in time cannot
+    start from it; see `restart`.
 
     Args:
         path: Of the file.

@@ -13,6 +13,7 @@ from dolfinx_nts.run.intercept import interceptable
 from dolfinx_nts.run.interrupts import Interrupts
 from dolfinx_nts.run.progress import progress_bar
 from dolfinx_nts.run.same import same_run
+from dolfinx_nts.run.saved import Saved
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.stepper import Stepper
@@ -51,7 +52,7 @@ def simulate(
     petsc_options: Mapping[str, Any] | None = None,
     output: Sequence[Writer] = (),
     progress: bool = False,
-    start: Solution | None = None,
+    start: Solution | Saved | None = None,
     start_time: float | None = None,
     accuracy: str | None = None,
     sleep: bool = False,
@@ -92,12 +93,13 @@ def simulate(
                 run = nts.simulate(system, integrator, dt=1e-3, t_end=0.2, output=[heights])
 
         progress: Show a progress line on rank 0.
-        start: Result of `equilibrium` (see there) or of another run to start from; or of `restart`,
-            with which an interrupted run goes on. With the same dt and whole steps before and after
-            the result is that of one run, on one rank to the bit where no matrices are kept (see
-            `Newton.reuse`) or with `restart`, else to the tolerance. From `equilibrium` bodies
-            begin with their `velocity`; from a run or a `restart` they move on as there, and
-            their `velocity` and `angular_velocity` are ignored, as `displacement` always is.
+        start: Result of `equilibrium` (see there), also as `load` reads it, or of another run to
+            start from; or of `restart`, with which an interrupted run goes on. With the same dt and
+            whole steps before and after the result is that of one run, on one rank to the bit where
+            no matrices are kept (see `Newton.reuse`) or with `restart`, else to the tolerance. From
+            `equilibrium` bodies begin with their `velocity`; from a run or a `restart` they move on
+            as there, and their `velocity` and `angular_velocity` are ignored, as `displacement`
+            always is.
         start_time: Time at which a run from `start` begins [s], from which functions of time and
             `t_end` count; default: the time of `start`, which is a pseudo time in equilibrium.
         accuracy: In place of `newton`: "exact", the default, closes the ledger to rounding;
@@ -208,7 +210,7 @@ def simulate(
             checkpoint=checkpoint,
         )  # fmt: skip
     equal = _equal_steps(begin, end, dt)
-    if start is not None and start.moving and start_time is None:
+    if isinstance(start, Solution) and start.moving and start_time is None:
         # The steps of the whole run, to the bit, if it had the same and stopped at the end of one.
         whole = _equal_steps(start.rows[0]["time"], end, dt)
         left = [step for step in whole if step[1] > begin]
@@ -379,10 +381,9 @@ def _march(
 
 def _interrupted(stepper: Stepper, signal: str, checkpoint: Checkpoint | None) -> str:
     text = f"interrupted: {signal} came before t={stepper.state.time!r}"
-    if not stepper.solution.moving:
-        return text
     if checkpoint is None:
-        return text + "; go on with start=this solution; a Checkpoint outlives the process, too"
+        lasting = "a Checkpoint" if stepper.solution.moving else "what save() writes of it"
+        return f"{text}; go on with start=this solution; {lasting} outlives the process, too"
     return text + f"; go on with start=restart({str(checkpoint.path)!r}, system)"
 
 

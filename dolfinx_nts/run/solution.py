@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
+import numpy.typing as npt
+
 from dolfinx_nts.parallel import on_root, write_on_root
 from dolfinx_nts.run.record import Record
 from dolfinx_nts.run.run_warnings import RunWarnings
@@ -18,6 +21,8 @@ from dolfinx_nts.step import contact_fields
 from dolfinx_nts.step.contact_fields import ContactLoads
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import StrPath, as_path
+
+FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(eq=False, repr=False)
@@ -119,7 +124,36 @@ class Solution(Record):
         place = as_path("path", path)
         if self.state is None:
             raise ValueError(f"path={str(path)!r}: the run has no state yet; save it after a step")
-        save(self, self.system, self.state, place)
+        save(self, self.system, self.state, self._fields, place)
+
+    @property
+    def _fields(self) -> dict[str, tuple[FloatArray, ...]]:
+        """What a file has of the coordinates of each body beside the state, by name."""
+        return {}
+
+
+@dataclass(eq=False, repr=False)
+class Equilibrium(Solution):
+    """What `equilibrium` computed, complete up to where it ended.
+
+    `balance` has one row per accepted load step. "time" is the pseudo time. "potential" and
+    "energy" are the strain energy. "external_work" is that of loads and prescribed motion, of the
+    mean of the forces at both ends of each step, and so is "interference_work" of overlap at the
+    start. "ledger_residual" is what energy and friction_dissipation miss of both. "kinetic" and the
+    momenta are 0. Changes of facet cost nothing and are not listed.
+
+    Attributes:
+        rates: Owned displacements of each body in the last load step, per pseudo time [m].
+        forces: Owned loads, and forces of supports, of each body at its end [N].
+    """
+
+    rates: tuple[FloatArray, ...] = ()
+    forces: tuple[FloatArray, ...] = ()
+    moving: ClassVar[bool] = False
+
+    @property
+    def _fields(self) -> dict[str, tuple[FloatArray, ...]]:
+        return {"rate": self.rates, "force": self.forces}
 
 
 @dataclass(eq=False, repr=False)

@@ -11,7 +11,8 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.mesh_check import places_of
 from dolfinx_nts.parallel import first_problem, global_max, raise_together
-from dolfinx_nts.run.solution import Restart, Solution
+from dolfinx_nts.run.saved import Saved
+from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
 from dolfinx_nts.state import State
 from dolfinx_nts.step import consistent, resultants
 from dolfinx_nts.step.problem import StepProblem
@@ -146,6 +147,50 @@ def _is_moved(body: Any) -> bool:
     return bool(made is not None and made != places_of(body.mesh))
 
 
+def kind_of(start: Any) -> tuple[str, float | None] | None:
+    """What ranks compare of a start: its type and its time."""
+    state = getattr(start, "state", start)
+    return None if start is None else (type(start).__name__, getattr(state, "time", None))
+
+
+def of_file(start: Any, system: System) -> Any:
+    """What a run is to start from: of a file the equilibrium that it holds. Collective.
+
+    Args:
+        start: As of `simulate`; what is of no file is returned as it is.
+        system: The scene.
+
+    Raises:
+        ValueError: The file holds a run in time, or one of another system.
+    """
+    if not isinstance(start, Saved):
+        return start
+    from dolfinx_nts.output import state_file as files
+
+    if "load_steps" not in start.settings:
+        raise ValueError(
+            "start: the file holds a run in time, whose steps need more than it has; let that run "
+            "write a Checkpoint, and pass restart(path, system)"
+        )
+    found = files.differences(start.scene, files.describe(system))
+    if found:
+        raise ValueError(
+            f"start: the file is of another system: {files.listed(found)}; make the system as it "
+            "was, or start from the result itself"
+        )
+    numbering, tables = files.Numbering(system), start.tables()
+    numbering.check(tables)
+    return Equilibrium(
+        system,
+        status=start.status,
+        rows=start.rows,
+        settings=start.settings,
+        state=numbering.unpack(tables, start.time),
+        rates=numbering.from_file(tables, "rate"),
+        forces=numbering.from_file(tables, "force"),
+    )
+
+
 def first_state(system: System, start: Any, time: Any) -> State:
     """State that `start` and `start_time` of `simulate` ask for."""
     if time is not None and not is_finite(time):
@@ -157,7 +202,7 @@ def first_state(system: System, start: Any, time: Any) -> State:
     if not (isinstance(start, Solution) and start.state is not None):
         raise TypeError(
             f"start of type {type(start).__name__}: pass the result of equilibrium(...), of "
-            "simulate(...) or of restart(...)"
+            "simulate(...) or of restart(...), or load(...) of a saved equilibrium"
         )
     time = None if time is None else float(time)
     return system.state_from(start.system, start.state, moving=start.moving, time=time)
@@ -177,8 +222,8 @@ def incomplete(start: Solution | None) -> str | None:
     return (
         f"start: the equilibrium that it begins from is not complete: it ended at "
         f"t={start.state.time:.6g} of {last:.6g} ({start.status}), so loads and supports may act "
-        "at once that it had not reached; let it complete, e.g. with more load_steps or "
-        "stabilization=0.1, and begin from that one"
+        "at once that it had not reached; let it complete, e.g. with equilibrium(..., start=it), "
+        "more load_steps or stabilization=0.1, and begin from that one"
     )
 
 

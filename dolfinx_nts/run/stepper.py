@@ -20,13 +20,16 @@ from dolfinx_nts.run.ledger import Ledger
 from dolfinx_nts.run.material_watch import MaterialWatch
 from dolfinx_nts.run.promises import Promises
 from dolfinx_nts.run.same import same_run
+from dolfinx_nts.run.saved import Saved
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
     check_restart,
     consistent_start,
     first_state,
     incomplete,
+    kind_of,
     note_shown,
+    of_file,
     refuse_moved_meshes,
     refuse_overwritten,
     refuse_written,
@@ -78,7 +81,8 @@ class Stepper:
             the user's own with the `Integrator` protocol.
         newton: Tolerances and retries.
         petsc_options: PETSc options of the step's SNES, without prefix.
-        start: Result of `equilibrium` (see there), of another run, or of `restart`, to start from.
+        start: Result of `equilibrium` (see there), of another run, or of `restart`, to start from;
+            or `load` of a saved equilibrium.
         start_time: Time at the start [s]; see `simulate`.
         sleep: Leave bodies that nothing moves out of the steps; see `simulate`.
         watch_overlap: Look whether bodies end up inside each other; see `simulate`.
@@ -106,7 +110,7 @@ class Stepper:
         *,
         newton: Newton | None = None,
         petsc_options: Mapping[str, Any] | None = None,
-        start: Solution | None = None,
+        start: Solution | Saved | None = None,
         start_time: float | None = None,
         sleep: bool = False,
         watch_overlap: bool = True,
@@ -118,7 +122,7 @@ class Stepper:
     ) -> None:
         same_run(
             system, integrator=integrator, newton=newton, petsc_options=petsc_options,
-            start=start is not None, start_time=start_time, sleep=sleep,
+            start=kind_of(start), start_time=start_time, sleep=sleep,
             watch_overlap=watch_overlap, before_step=before_step, project_start=project_start,
             ledger=ledger, impact=impact, restitution=restitution,
         )  # fmt: skip
@@ -128,6 +132,7 @@ class Stepper:
             ledger=ledger,
         )  # fmt: skip
         check_impact(system, integrator, impact, restitution)
+        begun: Solution | None = of_file(start, system)
         given = petsc_options or {}
         self._restitution = float(restitution) if impact == "restored" else None
         self._project_start = project_start
@@ -142,7 +147,7 @@ class Stepper:
         self.system = system
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._last_steps = LastSteps()
-        self.restart = start if isinstance(start, Restart) else None
+        self.restart = begun if isinstance(begun, Restart) else None
         check_restart(self.restart, system, start_time, ledger)
         self.solution = self.restart.go_on() if self.restart else self.makes(system)
         self.solution.settings = {
@@ -156,13 +161,15 @@ class Stepper:
         }
         self._promises = Promises(self.solution, integrator, self.newton.rtol)
         self._ledger = Ledger(self.solution, self._promises, kept=ledger)
-        self._set_out(start, start_time)
+        self._set_out(begun, start_time)
 
     def _set_out(self, start: Solution | None, start_time: float | None) -> None:
         """Accept the state that the run begins with; arguments are those of the class."""
         refuse_moved_meshes(self.system)
         refuse_overwritten(self.system)
         state = first_state(self.system, start, start_time)
+        if self.problem.integrator.inertia and not (start is not None and start.moving):
+            self.system.refuse_overlap(state)
         if not self.problem.integrator.accelerations:
             state = replace(state, a=())
         self._accept(state)
@@ -414,6 +421,10 @@ class Stepper:
             last: Look wherever anything has moved since the last look.
         """
         tell_stressed(self.solution, self.state.time)
+        self._look_inside(last)
+
+    def _look_inside(self, last: bool) -> None:
+        """`look` at bodies inside each other."""
         if self._overlap is not None:
             state, forces = self.state, [c.force for c in self.state.contacts]
             for found in self._overlap.look(state.u, state.time, forces=forces, last=last):

@@ -34,6 +34,7 @@ COLUMNS = (
     "massless_defect",
     "impact_restored",
     "material_change",
+    "interference_work",
     "ledger_residual",
     "linear_momentum",
     "angular_momentum",
@@ -55,8 +56,8 @@ def columns(system: System) -> tuple[str, ...]:
 #: Columns that add up over the steps, and those that count in a step.
 WORKS = ("external_work", "friction_dissipation", "contact_defect", "massless_defect")
 COUNTS = ("active", "stick", "slip")
-#: Columns that add up what changes the energy between steps.
-CHANGES = ("impact_restored", "material_change")
+#: Columns that add up what else changes the energy.
+CHANGES = ("impact_restored", "material_change", "interference_work")
 
 
 class Switch(NamedTuple):
@@ -301,8 +302,7 @@ def next_row(
         row["energy"]
         - first
         - row["external_work"]
-        - row["impact_restored"]
-        - row["material_change"]
+        - sum(row[name] for name in CHANGES)
         + row["friction_dissipation"]
         + row["contact_defect"]
         + row["massless_defect"]

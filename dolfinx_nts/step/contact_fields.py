@@ -86,7 +86,8 @@ def at_nodes(
         if pair.slave.body is body:
             own = state.contacts[k]
             first = np.where(own.force > 0.0, own.force, -own.gap)
-            for name, (elsewhere, values) in _of_slave(pair, state, k).items():
+            area = system.slave_areas[k][pair.slave.share]
+            for name, (elsewhere, values) in _of_slave(pair, state, k, area).items():
                 fields[f"{name}_{label}"] = spread(pair.slave, elsewhere, values, first)
     return fields
 
@@ -114,9 +115,11 @@ def spread(
     return nodal
 
 
-def _of_slave(pair: ContactPair, state: State, k: int) -> dict[str, tuple[float, FloatArray]]:
-    """Name -> value elsewhere and values at this rank's slave nodes."""
-    own, area = state.contacts[k], pair.slave.area[pair.slave.share]
+def _of_slave(
+    pair: ContactPair, state: State, k: int, area: FloatArray
+) -> dict[str, tuple[float, FloatArray]]:
+    """Name -> value elsewhere and values at this rank's slave nodes of these areas [m^2]."""
+    own = state.contacts[k]
     force, gap = own.force, own.gap
     near = np.isfinite(gap)
     fields = {

@@ -45,6 +45,7 @@ class ContactTerms:
             self._system.contacts, self._system.contact_bodies, self._system.comm
         )
         self.state: State = self._system.initial_state()
+        self._system.refuse_overlap(self.state)
         self._laid: Unknowns | None = None
         self._matrix: StepMatrix | None = None
 

@@ -1,0 +1,77 @@
+"""Nodes that several contacts hold out of one master: each of them belongs to one contact."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.pair import ContactPair
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+def check_shared(contacts: Sequence[ContactPair]) -> None:
+    """Raise unless what two contacts hold out of one master is a row of nodes between them.
+
+    Args:
+        contacts: Those of a system.
+
+    Raises:
+        ValueError: Two slaves share facets, or one's nodes are all the other's, or both share nodes
+            and their masters share but a part of their facets.
+    """
+    for i, j, what in _beside(contacts):
+        one, two = contacts[i], contacts[j]
+        name = one.slave.body.name
+        same = np.isin(one.slave.points, two.slave.points)
+        every = same.all() or np.isin(two.slave.points, one.slave.points).all()
+        if every or one.slave.facet_points & two.slave.facet_points:
+            raise ValueError(
+                f"contacts: two of them hold the same nodes of {name!r} out of {what}; drop one"
+            )
+        if not one.has_master_of(two):
+            number = int(one.slave.original[same].min())
+            raise ValueError(
+                f"contacts: two of them hold a row of nodes of {name!r}, node {number} among them, "
+                f"out of {what}, and out of others each by itself; pass one master to both, or "
+                "masters without a common facet"
+            )
+
+
+def held_before(contacts: Sequence[ContactPair]) -> list[BoolArray]:
+    """Which points of each slave belong to a contact declared before, with the same master.
+
+    Args:
+        contacts: Those of a system.
+
+    Returns:
+        Of each contact, shape (points,).
+    """
+    found = [np.zeros(len(c.slave.points), dtype=bool) for c in contacts]
+    for i, j, _ in _beside(contacts):
+        found[j] |= np.isin(contacts[j].slave.points, contacts[i].slave.points)
+    return found
+
+
+def areas(contacts: Sequence[ContactPair]) -> list[npt.NDArray[np.float64]]:
+    """Tributary area of each point of each slave [m^2], (points,), with that of later contacts."""
+    found = [c.slave.area.copy() for c in contacts]
+    for i, j, _ in _beside(contacts):
+        one, two = contacts[i].slave, contacts[j].slave
+        _, here, there = np.intersect1d(one.points, two.points, return_indices=True)
+        found[i][here] += two.area[there]
+    return found
+
+
+def _beside(contacts: Sequence[ContactPair]) -> Iterator[tuple[int, int, str]]:
+    """Pairs of contacts that share slave nodes and a master, in order, and what the master is."""
+    for i, j in combinations(range(len(contacts)), 2):
+        one, two = contacts[i], contacts[j]
+        if one.slave.body is two.slave.body and np.isin(one.slave.points, two.slave.points).any():
+            what: Any = one.shares_master(two)
+            if what:
+                yield i, j, what

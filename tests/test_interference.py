@@ -1,0 +1,187 @@
+"""Overlap at the start that equilibrium presses out, against closed forms of press fits."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, create_box
+from mpi4py import MPI
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+YOUNG, POISSON = 1e6, 0.3
+#: Radii of the pin's bore, the fit and the hub.
+BORE, FIT, HUB = 1.0, 2.0, 3.0
+THICKNESS = 0.1
+
+pytestmark = pytest.mark.mpi
+
+
+def cubes(overlap, *, unit=1.0, friction=0.0, interference="resolve", on="cube"):
+    """A unit cube in one of the same kind, or in a plane, its far face held: plane waves of nu = 0.
+
+    Args:
+        overlap: Of the two, in edges of the cube.
+        unit: Length of the edge [m].
+        on: What it overlaps with.
+    """
+    elastic = nts.StVenantKirchhoff(young=YOUNG, poisson=0.0)
+
+    def cube(name, low):
+        low, high = unit * low, unit * (low + 1.0)
+        far = low if name == "lower" else high
+        mesh = create_box(COMM, [(0, 0, low), (unit, unit, high)], [4] * 3, CellType.hexahedron)
+        held = nts.Dirichlet(lambda x: np.abs(x[2] - far) < 1e-9 * unit)
+        body = nts.Continuum(mesh, elastic, density=1e3, bcs=[held], name=name)
+        return body, body.surface(lambda x: np.abs(x[2] - low - high + far) < 1e-9 * unit)
+
+    upper, face = cube("upper", 1.0 - overlap)
+    bodies, master = [upper], nts.Plane((0, 0, unit), (0, 0, 1))
+    if on == "cube":
+        lower, master = cube("lower", 0.0)
+        bodies.append(lower)
+    pair = nts.ContactPair(face, master, friction=friction, interference=interference)
+    return nts.System(bodies, contacts=[pair])
+
+
+def bar(shortening):
+    """Force and energy of a cube of St. Venant-Kirchhoff's material, shorter by that part of it."""
+    stretch = 1.0 - shortening
+    strain = 0.5 * (stretch**2 - 1.0)
+    return -YOUNG * strain * stretch, 0.5 * YOUNG * strain**2
+
+
+@pytest.mark.parametrize(
+    ("overlap", "options"),
+    [
+        (0.005, {}),
+        (0.005, {"friction": 0.3}),
+        (0.005, {"unit": 2.0**-10}),
+        (0.005, {"on": "plane"}),
+        (0.1, {}),
+        # Less than a hundredth of a facet needs no option.
+        (0.00225, {"interference": "refuse"}),
+    ],
+)
+def test_cubes_share_their_overlap(overlap, options):
+    run = nts.equilibrium(cubes(overlap, **options))
+    assert run.status == "completed" and not run.warnings
+    unit, number = options.get("unit", 1.0), 1 if options.get("on") == "plane" else 2
+    force, energy = bar(overlap / number)
+    assert run.contact_forces[-1, 0, 2] == pytest.approx(force * unit**2, rel=1e-9)
+    table, stored = run.balance, number * energy * unit**3
+    assert table["energy"][-1] == pytest.approx(stored, rel=1e-9)
+    assert abs(table["min_gap"][-1]) < 1e-12 * unit
+    # The work is what is stored, but for the error of the mean force of one load step.
+    assert table["interference_work"][-1] == pytest.approx(stored, rel=overlap)
+    assert np.abs(table["external_work"]).max() < 1e-12 * stored
+
+
+def test_the_ledger_closes_as_the_square_of_the_load_steps():
+    runs = [nts.equilibrium(cubes(0.005), load_steps=n) for n in (1, 2, 4)]
+    left = [run.balance["ledger_residual"][-1] for run in runs]
+    assert left[0] / left[1] == pytest.approx(4.0, rel=1e-2)
+    assert left[1] / left[2] == pytest.approx(4.0, rel=1e-2)
+
+
+def test_overlap_goes_in_proportion_to_the_pseudo_time():
+    run = nts.equilibrium(cubes(0.02), load_steps=[0.25, 0.5])
+    for row, time in ((1, 0.25), (2, 0.5)):
+        assert run.contact_forces[row, 0, 2] == pytest.approx(bar(0.01 * time)[0], rel=1e-9)
+        assert run.balance["min_gap"][row] == pytest.approx(0.02 * (time - 1.0), rel=1e-9)
+    assert list(run.warnings) == ["part of the interference"]
+    with pytest.raises(ValueError, match="start inside the master.*start=equilibrium"):
+        nts.simulate(run.system, nts.EnergyMomentum(), dt=1e-3, t_end=1.0, start=run)
+
+
+def test_a_dynamic_run_begins_from_the_fit():
+    system = cubes(0.005)
+    text = r'25 slave nodes .*interference="resolve" is for .*start='
+    with pytest.raises(ValueError, match=text):
+        nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=1e-3)
+    fit = nts.equilibrium(system)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=1e-3, start=fit, start_time=0)
+    assert run.status == "completed"
+    table = run.balance
+    assert table["kinetic"].max() < 1e-12 * table["energy"][0]
+    force = run.contact_forces[:, 0, 2]
+    assert np.abs(force / bar(0.0025)[0] - 1.0).max() < 1e-6
+
+
+def test_what_cannot_be_resolved_is_refused():
+    with pytest.raises(ValueError, match="interference='press': choose one of 'refuse', 'resolve'"):
+        cubes(0.005, interference="press")
+    text = r'25 slave nodes start inside the master, up to 0\.02 .*interference="resolve"'
+    with pytest.raises(ValueError, match=text):
+        cubes(0.005, interference="refuse")
+    with pytest.raises(ValueError, match=r"up to 0\.6 of a facet \(allowed 0\.5\)"):
+        cubes(0.15)
+
+
+# ---- a pin in a hole
+def ring(inner, outer, cells, name, unit):
+    """A quarter of a tube in plane strain, `cells` across and around."""
+    mesh = create_box(COMM, [(0, 0, 0), (1, 1, 1)], [*cells, 1], CellType.hexahedron)
+    across, around, along = mesh.geometry.x.T.copy()
+    radius, angle = inner + (outer - inner) * across, 0.5 * np.pi * around
+    place = [radius * np.cos(angle), radius * np.sin(angle), THICKNESS * along]
+    mesh.geometry.x[:] = unit * np.column_stack(place)
+    bcs = [
+        nts.Dirichlet(lambda x: x[0] < 1e-9 * unit, components=(0,)),
+        nts.Dirichlet(lambda x: x[1] < 1e-9 * unit, components=(1,)),
+        nts.Dirichlet(lambda x: x[2] > -unit, components=(2,)),
+    ]
+    elastic = nts.StVenantKirchhoff(young=YOUNG, poisson=POISSON)
+    return nts.Continuum(mesh, elastic, density=1e3, bcs=bcs, name=name)
+
+
+def pressed(interference, around, *, unit=1.0, **options):
+    """Pressure of a pin that is thicker than its hole by `interference`, from its push along x.
+
+    Args:
+        interference: Difference of the radii.
+        around: Cells around a quarter of pin and hole.
+        options: Of the master's surface.
+    """
+    pin = ring(BORE, FIT + interference, (8, around[0]), "pin", unit)
+    hub = ring(FIT, HUB, (8, around[1]), "hub", unit)
+
+    def off(x, radius):
+        return np.hypot(x[0], x[1]) / unit - radius
+
+    pair = nts.ContactPair(
+        pin.surface(lambda x: off(x, FIT + interference) > -1e-9),
+        hub.surface(lambda x: off(x, FIT) < 1e-9, **options),
+        interference="resolve",
+    )
+    run = nts.equilibrium(nts.System([pin, hub], contacts=[pair]), load_steps=2)
+    assert run.status == "completed"
+    table = run.balance
+    assert abs(table["ledger_residual"][-1]) < 1e-3 * table["energy"][-1]
+    return -run.contact_forces[-1, 0, 0] / (FIT * THICKNESS * unit**2)
+
+
+def lame(interference):
+    """Lame's pressure between two thick tubes of one material in plane strain [Pa]."""
+    outer = (HUB**2 + FIT**2) / (HUB**2 - FIT**2)
+    inner = (FIT**2 + BORE**2) / (FIT**2 - BORE**2)
+    return interference * YOUNG / ((1.0 - POISSON**2) * FIT * (outer + inner))
+
+
+def test_a_pin_pressed_into_a_hole():
+    """The smooth surface is off at the ends of the quarter; the slow test has finer meshes."""
+    found = pressed(2e-3, (24, 16), smoothing=True)
+    assert found == pytest.approx(lame(2e-3), rel=0.03)
+    unit = 2.0**-10
+    assert pressed(2e-3, (24, 16), smoothing=True, unit=unit) == pytest.approx(found, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_a_pin_pressed_into_a_hole_on_fine_meshes():
+    assert pressed(2e-3, (48, 32), smoothing=True) == pytest.approx(lame(2e-3), rel=2e-3)
+
+
+def test_chords_that_overlap_count_as_interference():
+    """Every third node of the pin is at a corner of the hole; the others are 8/9 of its chords' sag
+    inside, on nodes that do not sink between them."""
+    sag = FIT * (1.0 - np.cos(np.pi / 64.0))
+    assert pressed(0.0, (24, 16)) == pytest.approx(lame(8.0 / 9.0 * sag), rel=0.05)
