@@ -1,9 +1,10 @@
 """Equilibrium that goes on from an earlier one, in memory or from a file."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -1,9 +1,10 @@
 """Overlap at the start that equilibrium presses out, against closed forms of press fits."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 

@@ -3,10 +3,11 @@
 A block of 2 x 1 x 1 stands on a plate, its lower face cut into two patches at x = 1.
 """
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from mpi4py import MPI
 
 import dolfinx_nts as nts
 
