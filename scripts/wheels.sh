@@ -1,7 +1,7 @@
 #!/bin/bash
 # The fast tests on DOLFINx of PyPI, in a virtual environment .venv-wheels with the extras of pyproject.toml.
 # Needs no root: a C compiler, and a Python of 3.12 to 3.14 with its headers. PYTHON_WHEELS chooses it;
-# without, it is the newest one on PATH or of pyenv.
+# without, it is one on PATH or of pyenv.
 set -euo pipefail
 . "$(dirname "$0")/common.sh"
 
@@ -14,7 +14,7 @@ assert pathlib.Path(sysconfig.get_path("include"), "Python.h").exists()' 2>/dev/
 
 find_python() {
   local version candidate
-  for version in 3.14 3.13 3.12; do
+  for version in 3.13 3.12 3.14; do
     for candidate in "$(command -v "python$version")" \
       "${PYENV_ROOT:-${HOME:-/root}/.pyenv}/versions/$version".*/bin/python; do
       if [ -x "$candidate" ] && serves "$candidate"; then

@@ -394,26 +394,73 @@ def test_contacts_that_change_one_at_a_time_end_in_the_same_step(friction, monke
         )
         solver, contacts = stepper.solver, stepper.problem.couplings.contacts
         if alone:
-            restart, impose = solver.iterates.restart, contacts.impose
+            restart, impose = solver.iterates.restart, contacts.imposed
 
             def pivoting(solver=solver, restart=restart):
                 restart()
-                solver.iterates.forget_last()
+                solver.iterates.try_again()
 
             def counted(active, impose=impose):
-                imposed.append(active is not None)
-                impose(active)
+                imposed.append(active)
+                return impose(active)
 
             monkeypatch.setattr(iterates, "_PATIENCE", 0)
             monkeypatch.setattr(solver.iterates, "restart", pivoting)
-            monkeypatch.setattr(contacts, "impose", counted)
+            monkeypatch.setattr(contacts, "imposed", counted)
         for _ in range(8):
             state = stepper.advance(2e-3)
         assert stepper.solution.balance["active"].max() > 1
         ends.append(np.concatenate(state.u))
         stepper.close()
-    assert any(imposed)
+    assert imposed
     assert np.abs(ends[0] - ends[1]).max(initial=0.0) < ROUND_OFF
+
+
+@pytest.mark.parametrize("side", [0.1, 5.0])
+def test_a_fast_soft_cube_on_a_coarse_rigid_plate(side):
+    """It moves by a quarter of a cell in a step; the size of the plate's one facet matters not."""
+    mesh = create_box(
+        COMM, [[0, 0, 0.003], [0.1, 0.1, 0.103]], [2] * 3, CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )  # fmt: skip
+    cube = nts.Continuum(mesh, RUBBER, density=1e3, velocity=(0, 0, -20.0), name="cube")
+    low, high = [0.05 - side, 0.05 - side, -side], [0.05 + side, 0.05 + side, 0.0]
+    plate = nts.RigidBody(
+        create_box(COMM, [low, high], [1] * 3, CellType.hexahedron), density=1e3,
+        motion=lambda t: (0.0, 0.0, 0.0), rotation=(0, 0, 0), name="plate",
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        cube.surface(lambda x: x[2] < 0.003 + 1e-9), plate.surface(lambda x: x[2] > -1e-9)
+    )
+    stepper = nts.Stepper(nts.System([cube, plate], contacts=[pair]), nts.EnergyMomentum())
+    stepper.start(6e-4)
+    stepper.problem.begin(stepper.state, 6e-4)
+    assert stepper.problem.dives
+    stepper.problem.guess(flight=False, forces=True)
+    first = stepper.problem.x.array_r.copy()
+    stepper.problem.first_guess()
+    assert np.array_equal(stepper.problem.x.array_r, first)
+    stepper.close()
+
+
+def test_a_solution_that_misses_contacts_is_gone_on_from():
+    """Its positions, and its forces by node; what is new carries nothing yet."""
+    system = scene("across", velocity=(0.0, 0.0, -1.0))
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
+    for _ in range(2):
+        stepper.advance(2e-3)
+    problem = stepper.problem
+    problem.begin(stepper.state, 2e-3)
+    solved = stepper.solver.solve()
+    problem.begin(stepper.state, 2e-3, solved)
+    again = problem.evaluate(problem.x)
+    for a, b in zip(again.bodies, solved.bodies, strict=True):
+        assert np.abs(a.u1 - b.u1).max(initial=0.0) == 0.0
+    for a, b in zip(again.parts, solved.parts, strict=True):
+        scale = max(1e-30, float(np.abs(b.multiplier).max(initial=0.0)))
+        assert np.abs(a.multiplier[:, 0] - b.multiplier[:, 0]).max(initial=0.0) < 1e-12 * scale
+        assert np.array_equal(a.active, b.active)
+    stepper.close()
 
 
 class Breaks:
@@ -463,7 +510,7 @@ def test_an_error_of_petsc_is_not_told_as_an_earlier_one():
     stepper.problem.begin(stepper.state, 1e-2)
     solver.prepare()
     stepper.problem.evaluate = raising
-    solver.iterates.forget_last()
+    solver.iterates.try_again()
     with pytest.raises(nts.StepFailedError, match="an early failure"):
         solver._function(None, stepper.problem.x, None)
     stepper.problem.evaluate, prepare = evaluate, solver.prepare

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -38,7 +39,7 @@ _ONE = 1e-6
 _BESIDE = 1e-3
 #: Depth in facet sizes from which on a node is told that lies behind its facet without a force.
 _UNHELD = 1e-6
-#: Depth in facet sizes from which on flight is a poor first guess.
+#: Depth from which on flight is a poor first guess, in the size of the facets on either side.
 _DEEP = 0.03
 #: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
 _SURELY = 1e-3
@@ -103,7 +104,8 @@ class ContactSearch:
     ) -> None:
         """Make the elements of a step, as of `Coupling`. Collective."""
         # Their forces are the first guess: of t_n, or of the solution that is gone on from.
-        self._carried = history if again is None else self.history(again.parts)
+        touching = slice(len(self.elements))
+        self._carried = history if again is None else self.history(again.parts[touching])
         self._step, self._old, self._placed = step, history, {}
         time = step.state.time
         self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
@@ -129,14 +131,23 @@ class ContactSearch:
 
     def dives(self) -> bool:
         """Whether free flight presses nodes deep into their masters. Collective."""
-        far = False
-        for k, c in enumerate(self.elements):
-            least = _DEEP * float(c.candidates.length.min(initial=np.inf))
-            far |= self._reach(k, self._step.motion) > least
-        if not anywhere(self._comm, far):
+        limits = []
+        for c in self.elements:
+            slave, there = c.pair.slave, c.candidates
+            own = np.sqrt(slave.area[slave.share[there.node]])
+            limits.append(_DEEP * np.minimum(there.length, own))
+        far = [
+            self._reach(k, self._step.motion) > limit.min(initial=np.inf)
+            for k, limit in enumerate(limits)
+        ]
+        if not anywhere(self._comm, any(far)):
             return False
-        both = zip(self.elements, self.flight_gaps(), strict=True)
-        return anywhere(self._comm, any((g < -_DEEP * c.candidates.length).any() for c, g in both))
+        both = zip(self.flight_gaps(), limits, strict=True)
+        return anywhere(self._comm, any((gap < -limit).any() for gap, limit in both))
+
+    def forget_solution(self) -> None:
+        """Guess forces of t_n again, where those of a solution of this step led nowhere."""
+        self._carried = self._old
 
     def touched(self) -> set[int]:
         """Bodies of contacts that have unknowns, the same on all ranks. Collective."""
@@ -307,7 +318,7 @@ class ContactSearch:
     def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
         """Return what each contact remembers of an accepted step."""
         histories = []
-        for k, (c, part) in enumerate(zip(self.elements, parts, strict=False)):
+        for k, (c, part) in enumerate(zip(self.elements, parts, strict=True)):
             new = c.history(part, self._step.factor, self._old[k])
             idle = self.idle[k].candidates
             new.facet[idle.node], new.gap[idle.node] = idle.facet, self.idle_gaps[k]
@@ -419,15 +430,19 @@ class ContactSearch:
         """Solve this step with nodes that slip rather than leave, see `ContactElements`."""
         self.elements = [replace(c, lets_slip=True) for c in self.elements]
 
-    def impose(self, active: Sequence[BoolArray] | None) -> None:
-        """Hold candidates active or inactive; None: as the laws say.
+    @contextmanager
+    def imposed(self, active: Sequence[BoolArray]) -> Iterator[None]:
+        """Hold candidates active or inactive for a while, whatever the laws say.
 
         Args:
             active: Of each of `elements`, shape (n,).
         """
-        given = [None] * len(self.elements) if active is None else active
-        both = zip(self.elements, given, strict=True)
-        self.elements = [replace(c, imposed=on) for c, on in both]
+        by_law = self.elements
+        self.elements = [replace(c, imposed=on) for c, on in zip(by_law, active, strict=True)]
+        try:
+            yield
+        finally:
+            self.elements = by_law
 
     def give_way(self) -> bool:
         """Let infinite friction have a bound."""

@@ -1,4 +1,4 @@
-"""Geometrically exact beam elements of two nodes or three (theory sections 15, 20).
+"""Geometrically exact beam elements of two nodes or three (theory section 15).
 
 Nodal vectors of an element are (phi, D_1, D_2, D_3) of its nodes as they follow each other, with
 directors d_i = D_i / l. Strains are sums of products of vectors linear in them, at one point fewer

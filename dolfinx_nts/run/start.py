@@ -339,13 +339,13 @@ def consistent_start(
     left = consistent.violation(problem, state, dt, rates=True)
     if left is not None:
         raise ValueError(
-            f"project_start=True: no velocities fit joint {left[1]!r}, which stays violated "
+            f"velocity: no velocities fit joint {left[1]!r}, which stays violated "
             f"at {left[0]:.3g} m/s; prescribed motion, or another joint, contradicts it: leave "
             "one of them out"
         )
     text = (
-        f"joint {found[1]!r} was violated at {found[0]:.3g} m/s at the start, as a centre of mass "
-        "that a mesh puts beside an axis makes it; the run begins with the nearest velocities "
-        "that fit"
+        f"joint {found[1]!r} was violated at {found[0]:.3g} m/s at the start, as it may be "
+        "where a mesh puts a centre of mass beside an axis; the run begins with the nearest "
+        "velocities that fit"
     )
     return state, None if project else (found[0], text)

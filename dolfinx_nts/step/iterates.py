@@ -38,8 +38,9 @@ class Iterates:
         self.last: Evaluation | None = None
         self.flips: list[IntArray] = []
         self.imposed, self._settled, self._pivots = False, True, False
+        self._fewest, self._patience = np.inf, _PATIENCE
 
-    def forget_last(self) -> None:
+    def try_again(self) -> None:
         """Forget the last iterate, as another attempt at the same step begins.
 
         In that one contacts change one at a time where changing all at once leads nowhere. On a
@@ -65,7 +66,10 @@ class Iterates:
         # A diverging iterate may overflow; the convergence test sees it.
         with np.errstate(over="ignore", invalid="ignore"):
             new = self._problem.evaluate(x)
-        self._settled, self.imposed = True, False
+        self.imposed = False
+        if last is not None and self._pivots:
+            new = self._pivoted(last, new, x)
+        self._settled = not self.imposed
         if last is None:
             self.flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
         else:
@@ -74,8 +78,6 @@ class Iterates:
                     changes = a.status != b.status
                     self.flips[k] += changes
                     self._settled &= not changes.any()
-            if self._pivots:
-                new = self._pivoted(last, new, x)
         self.last = new
         return new
 
@@ -102,12 +104,9 @@ class Iterates:
             only = np.flatnonzero(changes[k])[-1]
             before[k] = before[k].copy()
             before[k][only] = after[k][only]
-        contacts.impose(before)
-        with np.errstate(over="ignore", invalid="ignore"):
-            held = self._problem.evaluate(x)
-        contacts.impose(None)
         self.imposed = True
-        return held
+        with contacts.imposed(before), np.errstate(over="ignore", invalid="ignore"):
+            return self._problem.evaluate(x)
 
     @property
     def settled(self) -> bool:

@@ -19,7 +19,9 @@ class LentStiffness:
     Where a state is unstable, Newton's method heads for a saddle of the energy; nodes that come or
     go hold it for an iteration and flip back for ever (theory section 23). With enough stiffness
     lent its updates lead downhill. It is in the matrix alone, never in the residual, so that no
-    solution moves, and it is gone before the iterations end.
+    solution moves, and falls as soon as it is not needed. Nothing is lent where
+    `releasing_motions` tells nothing: beyond 20,000 coordinates, where nodes slip, and under loads
+    that follow a body.
 
     Args:
         problem: Equations of the step.
@@ -46,14 +48,18 @@ class LentStiffness:
             return False
         problem.lent = before / _RATIO if before > _RATIO * _NONE else 0.0
         if wanders and not self._slips(e):
-            while problem.lent < _LARGEST and releasing_motions(problem, e):
+            while releasing_motions(problem, e):
                 problem.lent = max(_RATIO * problem.lent, _FIRST)
+                if problem.lent > _LARGEST:
+                    problem.lent = 0.0
+                    break
         return problem.lent != before
 
     def _slips(self, e: Evaluation) -> bool:
         """Whether nodes slip with friction, whose forces have no potential. Collective."""
         contacts = self._problem.couplings.touching(e)
         slip = any(
-            c.num_tangential and bool((part.active & ~part.stick).any()) for c, part, _ in contacts
+            c.num_tangential and bool((part.active & ~c.sticks(part)).any())
+            for c, part, _ in contacts
         )
         return anywhere(self._problem.system.comm, slip)

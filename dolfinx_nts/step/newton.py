@@ -133,8 +133,9 @@ class StepSolver:
                 self._tangents.due, self._passed = True, None
                 if retry == 2:
                     self.problem.couplings.let_slip()
+                self.problem.couplings.contacts.forget_solution()
                 self.problem.guess(flight=False, forces=False)
-                self.iterates.forget_last()
+                self.iterates.try_again()
                 if unsolved:
                     # What failed to factorise once fails from then on.
                     self.destroy()
@@ -211,7 +212,7 @@ class StepSolver:
         if self._presets.name != before:
             name, time = self._presets.name, self.problem.state.time
             logger.info("t=%.6g: linear solver %r for the next steps", time, name)
-        self.problem.guess(flight=True, forces=True)
+        self.problem.first_guess()
         last = self._attempt()
         return replace(last, iterations=iterations + last.iterations)
 

@@ -83,6 +83,7 @@ class StepProblem:
         self._shared = SharedWeight(system.comm, system.contacts)
         self.unknowns: Unknowns | None = None
         self.version, self.dives, self.lent = 0, False, 0.0
+        self._again: Evaluation | None = None
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
         self.supports = Supports(system, integrator)
         lengths = self.lengths
@@ -217,7 +218,12 @@ class StepProblem:
         self._of_none = None
         # From bodies that free flight has pressed deep into each other iterates may not find back.
         self.dives = self.integrator.inertia and self.couplings.contacts.dives()
-        self.guess(flight=not self.dives, forces=True, again=again)
+        self._again = again
+        self.first_guess()
+
+    def first_guess(self) -> None:
+        """Write into `x` what the iterations of the step begin with."""
+        self.guess(flight=not self.dives, forces=True, again=self._again)
 
     @property
     def x(self) -> Any:
@@ -391,19 +397,18 @@ class StepProblem:
 
     def body_tangents(self, e: Evaluation) -> list[Any]:
         """PETSc matrices of the bodies that are awake at an iterate, without contact."""
-        return [self.body_tangent(k, e.bodies[k].u1) for k in self.awake]
+        tangents = [self.body_tangent(k, e.bodies[k].u1) for k in self.awake]
+        if self.lent:
+            for k, a in zip(self.awake, tangents, strict=True):
+                _add_to_diagonal(a, self.lent * self.stabilization.stiffness(self.system.bodies[k]))
+        return tangents
 
     def body_tangent(self, k: int, u1: FloatArray) -> Any:
         """PETSc matrix of a body at a displacement, without contact."""
         mass = 1.0 if self.integrator.inertia else 0.0
         a = self.system.bodies[k].tangent(u1, mass, self.factor)
-        if self.stabilization.share or self.lent:
-            held, body = a.createVecLeft(), self.system.bodies[k]
-            held.array_w[:] = self.stabilization.of(body)
-            if self.lent:
-                held.array_w[:] += self.lent * self.stabilization.stiffness(body)
-            a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
-            held.destroy()
+        if self.stabilization.share:
+            _add_to_diagonal(a, self.stabilization.of(self.system.bodies[k]))
         return a
 
     @property
@@ -446,6 +451,13 @@ class StepProblem:
         if self.unknowns is not None:
             self.unknowns.destroy()
         self.unknowns, self._numbers = None, None
+
+
+def _add_to_diagonal(a: Any, values: FloatArray) -> None:
+    held = a.createVecLeft()
+    held.array_w[:] = values
+    a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
+    held.destroy()
 
 
 def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:
