@@ -297,11 +297,11 @@ class ContactElements(ContactLaws):
         """Which pairs have stuck in a solved step, shape (n,).
 
         Rounding alone tells on which side of Coulomb's bound a node is that rests at it, so a slip
-        counts from the rounding of places on.
+        counts from a part of the facet on, see `Coulomb.still`.
         """
         if not self.num_tangential:
             return part.stick
-        still: BoolArray = part.active & (part.distance <= self.rounding)
+        still: BoolArray = part.active & (part.distance <= self.coulomb.still)
         return part.stick | still
 
     def ledger(self, part: Contribution, factor: float) -> dict[str, float]:

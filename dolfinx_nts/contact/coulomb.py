@@ -33,7 +33,7 @@ STRONG = 1.0
 _PULL = 0.01
 #: Square of the part of a motion that counts as none.
 _IMMOVABLE = 1e-12
-#: Prescribed slip over the size of the facet that counts as none.
+#: Slip over the size of the facet that counts as none.
 _STILL = 1e-10
 #: Largest ratio of normal forces by which friction of a rigid body's nodes is divided.
 UNEVEN = 100.0
@@ -112,6 +112,11 @@ class Coulomb:
         return bool(np.isinf(self.friction)) and not self.bounded
 
     @property
+    def still(self) -> FloatArray:
+        """Slip that counts as none [m], shape (n,)."""
+        return _STILL * self.size
+
+    @property
     def coefficient(self) -> float:
         """That of the equations, which is a number."""
         return min(self.friction, _BOUND if np.isinf(self.friction) else _LARGEST)
@@ -180,7 +185,7 @@ class Coulomb:
         motion = motion[:, 0] - np.einsum("nk,nki->ni", self.foot, motion[:, 1:])
         slip = np.einsum("nij,nj->ni", self._blocked, motion * self._prescribed)
         held: FloatArray = self.unmoved.copy()
-        held[np.abs(slip).max(axis=1) > _STILL * self.size] = 0.0
+        held[np.abs(slip).max(axis=1) > self.still] = 0.0
         return held
 
     # ---- stick and slip
