@@ -557,7 +557,7 @@ def test_a_start_that_violates_a_joint_of_ones_own_is_refused():
     x, twin = np.array([0.3, 0.4, 0.6]), {}
     body = cube((0, 0, 0), "a")
     system = nts.System([body], joints=[Drive(body, x, 0.1)])
-    with pytest.raises(ValueError, match=r"joint 'drive' is violated at 0\.1 m/s.*project_start"):
+    with pytest.raises(ValueError, match=r"joint 'drive' is violated at .* 0\.1;.*project_start"):
         nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.05)
     ball = nts.Spherical(body, None, point=x, displacement=lambda t: (0.1 * t, 0, 0))
     for name, joint in (("own", Drive(body, x, 0.1)), ("built-in", ball)):
@@ -573,7 +573,7 @@ def test_a_start_that_violates_a_joint_of_ones_own_is_refused():
         twin["built-in"].reshape(-1, 3)[:, 0], abs=1e-12
     )
     off = cube((0, 0, 0), "b", displacement=(0.02, 0, 0), velocity=(0.1, 0, 0))
-    with pytest.raises(ValueError, match=r"at the start 'drive' is off by 0\.02 m"):
+    with pytest.raises(ValueError, match=r"at the start 'drive' is off by 0\.02;"):
         nts.simulate(
             nts.System([off], joints=[Drive(off, x, 0.1)]), nts.EnergyMomentum(), dt=5e-3,
             t_end=0.05,
@@ -658,7 +658,7 @@ def test_a_rod_of_ones_own_turns_as_the_built_in_one():
         2.0, (0.2, 0.5, 0.4), centre=(length, 0, 0), velocity=(0.3, 0, 1), name="bob", comm=COMM
     )
     system = nts.System([body], joints=[Rod(body, (length, 0, 0))])
-    with pytest.raises(ValueError, match=r"joint 'rod' is violated at 0\.3 m/s"):
+    with pytest.raises(ValueError, match=r"joint 'rod' is violated at a speed of 0\.3;"):
         nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.1)
 
 

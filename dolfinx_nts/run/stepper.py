@@ -325,7 +325,7 @@ class Stepper:
                 self.solution.exceeded += 1
                 self.solution.warn(
                     "step error", self.state.time, dt,
-                    f"a step of {dt:.3g} s errs more than Adapt asks for: it is the shortest one, "
+                    f"a step of {dt:.3g} errs more than Adapt asks for: it is the shortest one, "
                     "or it moves a node out from behind its facet; pass a smaller `shortest` or a "
                     "larger `tolerance`",
                 )  # fmt: skip
