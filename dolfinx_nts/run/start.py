@@ -300,7 +300,7 @@ def consistent_start(
         )
     text = (
         f"joint {found[1]!r} was violated at a speed of {found[0]:.3g} at the start, as a "
-        "centre of mass that a mesh puts beside an axis makes it; the run begins with the nearest velocities "
-        "that fit"
+        "centre of mass that a mesh puts beside an axis makes it; the run begins with the nearest "
+        "velocities that fit"
     )
     return state, None if project else (found[0], text)
