@@ -216,7 +216,7 @@ class ConstraintElements(PointElements):
         """The constraint that is off most."""
         size = np.nan_to_num(np.abs(part.gap), nan=np.inf)
         worst = float(size.max())
-        return worst * self.scale, f"{self.name!r}: off by {worst:.3g} m"
+        return worst * self.scale, f"{self.name!r}: off by {worst:.3g}"
 
 
 def _bent(curvature: FloatArray) -> FloatArray:

@@ -258,7 +258,7 @@ class System:
             if off > _ON_SUPPORT * np.abs(body.reference).max(initial=0.0):
                 problem = (
                     f"start: the prescribed values of body {body.name!r} at t={time:.6g} are "
-                    f"{off:.3g} m off its displacement; let them go on from there"
+                    f"off its displacement by {off:.3g}; let them go on from there"
                 )
         raise_together(body.comm, problem)
 
@@ -278,8 +278,8 @@ class System:
         if off > _ON_SUPPORT * size:
             raise ValueError(
                 f"start: the motion of obstacle {pair.master.name!r} at t={begin:.6g} is "
-                f"{off:.3g} m off its displacement at the end of what it starts from; let it go on "
-                "from there, e.g. by leaving start_time out"
+                f"off its displacement at the end of what it starts from by {off:.3g}; let it go "
+                "on from there, e.g. by leaving start_time out"
             )
 
     @staticmethod
@@ -379,7 +379,7 @@ class System:
             name, obstacle = found.bodies
             raise ValueError(
                 f"contact '{name}-{obstacle}': {obstacle!r} starts inside {name!r} as a whole, at "
-                f"({point(found.place)}) {found.depth:.3g} m from the boundary; move the two "
+                f"({point(found.place)}), {found.depth:.3g} from the boundary; move the two "
                 "apart, or give the mesh a hole there"
             )
 

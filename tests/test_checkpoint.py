@@ -628,7 +628,7 @@ def test_another_system_is_refused(mpi_tmp_path):
             nts.restart(path, system)
     system, options = blocks(COMM)
     system.bodies[0].reference += 1e-6
-    with pytest.raises(ValueError, match="body 'left': its mesh has other nodes, up to 1e-06 m"):
+    with pytest.raises(ValueError, match="body 'left': its mesh has other nodes, up to 1e-06 away"):
         nts.restart(path, system)
     with pytest.raises(TypeError, match=r"system=3: pass the System"):
         nts.restart(path, 3)

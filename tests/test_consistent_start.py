@@ -26,7 +26,7 @@ def pendulum(**options):
 @pytest.mark.mpi
 def test_a_start_that_violates_a_joint_is_refused_by_name_and_amount():
     _, system = pendulum(velocity=(0.3, 0, 0))
-    with pytest.raises(ValueError, match=r"joint 'hinge' is violated at 0\.3 m/s.*project_start"):
+    with pytest.raises(ValueError, match=r"joint 'hinge' is violated at .* 0\.3;.*project_start"):
         nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.1)
     with pytest.raises(TypeError, match="project_start='yes'"):
         nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.1, project_start="yes")

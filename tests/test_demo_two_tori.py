@@ -88,7 +88,8 @@ def test_whole_collision_keeps_the_balance(demo):
     result = demo["main"]()
     # Between the nodes of so coarse a slave an edge comes half way through the wall, which is told.
     assert re.fullmatch(
-        r"completed(, but the edge between nodes .* past the middle of '\w+', up to 2\.2\d m .*)?",
+        r"completed(, but the edge between nodes .* past the middle of '\w+', inside it by up to "
+        r"2\.2\d, .*)?",
         result["status"],
     )
     assert_balance(result)

@@ -664,7 +664,7 @@ def number(_):
          r"points=.* of 'distance of a and b': coincide; join them by Spherical\(...\)"),
         (lambda a, b, s: nts.Distance(a, b, points=P), ValueError, "points=.*: pass two points"),
         (lambda a, b, s: nts.Distance(a, b, points=(P, Q), length=2.0), ValueError,
-         "length=2.0 of 'distance of a and b': the points are 0.80.* m apart at the start; leave"),
+         "length=2.0 of 'distance of a and b': the points are 0.80.* apart at the start; leave"),
         (lambda a, b, s: nts.Distance(a, b, points=(P, Q), length=-1.0), ValueError,
          "length of 'distance of a and b'=-1.0: must be positive"),
         (lambda a, b, s: nts.Distance(a, b, points=(P, Q), length=lambda t: 1.0 + t), ValueError,

@@ -175,6 +175,7 @@ def test_a_block_that_tips_too_early(n):
     told = run.warnings["contact inside a rim"]
     assert told.grave and told.about == ("block", "table")
     assert run.status.startswith("completed, but facets of 'block' reach over the rim of 'table'")
+    assert f"inside the rim by {told.worst:.3g}, or " in told.text
     # The centre is over the rim when 0.2 m of the block are; the nodes before it are farther in.
     assert 0.1 < told.worst < 0.4
 

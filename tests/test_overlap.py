@@ -1046,7 +1046,7 @@ def test_a_start_around_an_obstacle_is_refused(place, through, where):
         pair = nts.ContactPair(slave=body.surface(where), master=ball)
         message = (
             rf"^contact 'holed-{ball.name}': '{ball.name}' starts inside 'holed' as a whole, at "
-            r"\(.*\) 0\.\d+ m from the boundary; move the two apart"
+            r"\(.*\), 0\.\d+ from the boundary; move the two apart"
         )
         with pytest.raises(ValueError, match=message):
             nts.System([body], contacts=[pair])

@@ -234,19 +234,23 @@ def test_a_mass_hangs_on_it_at_rest(stabilization):
     assert mass.position[2] == pytest.approx(-10.0 * 9.81 / 1e3, rel=1e-9)
 
 
-def masses():
-    """Two of 1 kg, 1 m apart, and a flexible cube beside them."""
+def masses(speed=0.0):
+    """Two of 1 kg, 1 m apart, and a flexible cube beside them; one moves."""
     a, b = (
-        nts.RigidBody.from_inertia(1.0, (1, 2, 2.5), centre=(x, 0, 0), name=name, comm=COMM)
+        nts.RigidBody.from_inertia(
+            1.0, (1, 2, 2.5), centre=(x, 0, 0), velocity=(x * speed, 0, 0), name=name, comm=COMM
+        )
         for x, name in ((0, "a"), (1, "b"))
     )
     return a, b, cube((1.5, -0.5, -0.5), "flexible")
 
 
-def told(bodies, joints, dt=1e-2):
+def told(bodies, joints, dt=1e-2, steps=0):
     """How many times too fast a spring is said to be."""
     stepper = nts.Stepper(nts.System(bodies, joints=joints), nts.EnergyMomentum())
     stepper.start(dt)
+    for _ in range(steps):
+        stepper.advance(dt)
     found = stepper.solution.warnings.get("unresolved")
     stepper.close()
     return 0.0 if found is None else found.worst
@@ -261,7 +265,10 @@ def test_a_spring_of_ones_own_that_steps_do_not_resolve_is_told():
     assert told((a, b), [Spring(a, b, ends, stiffness=1e6)]) == pytest.approx(1e-2 * omega)
     assert told((a, b), [nts.Spring(a, b, ends, stiffness=1e6)]) == pytest.approx(1e-2 * omega)
     damper = Spring(a, b, ends, stiffness=1.0, damping=1e4)
-    assert told((a, b), [damper]) == pytest.approx(100.0)
+    assert told((a, b), [damper], steps=2) == 0.0
+    a, b, _ = masses(speed=1.0)
+    damper = Spring(a, b, ends, stiffness=1.0, damping=1e4)
+    assert told((a, b), [damper], steps=2) == pytest.approx(100.0)
 
 
 @pytest.mark.mpi
@@ -557,7 +564,7 @@ def test_a_start_that_violates_a_joint_of_ones_own_is_refused():
     x, twin = np.array([0.3, 0.4, 0.6]), {}
     body = cube((0, 0, 0), "a")
     system = nts.System([body], joints=[Drive(body, x, 0.1)])
-    with pytest.raises(ValueError, match=r"joint 'drive' is violated at 0\.1 m/s.*project_start"):
+    with pytest.raises(ValueError, match=r"joint 'drive' is violated at .* 0\.1;.*project_start"):
         nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.05)
     ball = nts.Spherical(body, None, point=x, displacement=lambda t: (0.1 * t, 0, 0))
     for name, joint in (("own", Drive(body, x, 0.1)), ("built-in", ball)):
@@ -573,7 +580,7 @@ def test_a_start_that_violates_a_joint_of_ones_own_is_refused():
         twin["built-in"].reshape(-1, 3)[:, 0], abs=1e-12
     )
     off = cube((0, 0, 0), "b", displacement=(0.02, 0, 0), velocity=(0.1, 0, 0))
-    with pytest.raises(ValueError, match=r"at the start 'drive' is off by 0\.02 m"):
+    with pytest.raises(ValueError, match=r"at the start 'drive' is off by 0\.02;"):
         nts.simulate(
             nts.System([off], joints=[Drive(off, x, 0.1)]), nts.EnergyMomentum(), dt=5e-3,
             t_end=0.05,
@@ -658,7 +665,7 @@ def test_a_rod_of_ones_own_turns_as_the_built_in_one():
         2.0, (0.2, 0.5, 0.4), centre=(length, 0, 0), velocity=(0.3, 0, 1), name="bob", comm=COMM
     )
     system = nts.System([body], joints=[Rod(body, (length, 0, 0))])
-    with pytest.raises(ValueError, match=r"joint 'rod' is violated at 0\.3 m/s"):
+    with pytest.raises(ValueError, match=r"joint 'rod' is violated at a speed of 0\.3;"):
         nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.1)
 
 

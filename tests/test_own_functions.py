@@ -161,7 +161,7 @@ def test_a_run_shows_itself_in_jupyter():
     _, system = moving()
     run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=2e-4)
     text, image = run._repr_html_().split("<img ")
-    assert text.startswith("<pre>completed: 2 steps to t = 0.0002 s")
+    assert text.startswith("<pre>completed: 2 steps to t = 0.0002,")
     picture = base64.b64decode(re.search(r"base64,([^\"]+)\"", image)[1])
     assert picture.startswith(b"\x89PNG") and len(picture) < 1e5
     without = nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=2e-4, ledger=False)

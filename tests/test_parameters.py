@@ -128,7 +128,7 @@ def test_a_density_that_is_doubled_is_told_with_its_momentum():
         nts.System([body]), nts.EnergyMomentum(), dt=DT, t_end=3 * DT, before_step=change
     )
     text = run.warnings["material changed"].text
-    assert "adds 1.25e+04 J" in text and "5e+03 kg m/s and 2.55e+03 kg m^2/s" in text
+    assert "adds 1.25e+04 to" in text and "5e+03 of linear and 2.55e+03 of angular" in text
     assert np.allclose(run.balance["linear_momentum"][-1], [6e3, 0, 8e3], rtol=1e-12)
 
 

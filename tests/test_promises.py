@@ -254,7 +254,7 @@ def test_a_gain_in_one_step_is_measured_without_driven_bodies(monkeypatch):
     stepper.close()
     ((kind, _, size, text),) = told
     assert kind == "energy from behind facets" and size == 0.1
-    assert text.startswith("nodes that start behind their facets bring 0.1 J")
+    assert text.startswith("nodes that start behind their facets bring an energy of 0.1 ")
 
 
 def impact_on_a_heavy_plate(along):

@@ -56,7 +56,7 @@ def test_a_grave_warning_stands_in_status_summary_and_csv(mpi_tmp_path):
         system, nts.EnergyMomentum(), dt=1e-2, t_end=2e-2, output=[BalanceCSV(path)]
     )
     assert run.status.startswith("completed, but nodes that start behind their facets bring")
-    assert "warning, energy from behind facets: 1 step from t = 0.01 s" in run.summary
+    assert "warning, energy from behind facets: 1 step from t = 0.01;" in run.summary
     MPI.COMM_WORLD.Barrier()
     text = path.read_text()
     assert "# warning, energy from behind facets: 1 step" in text

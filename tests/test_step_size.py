@@ -345,8 +345,9 @@ def test_a_node_that_is_moved_out_is_named(caplog):
     messages = [r.getMessage() for r in caplog.records]
     assert len(messages) == (COMM.rank == 0)
     for text in messages:
-        assert f"bring {brought:.3g} J" in text and f"{brought:.3g} J by node 0 of" in text
-        assert "0.004 m deep" in text
+        assert f"bring an energy of {brought:.3g} " in text
+        assert f"{brought:.3g} by node 0 of" in text
+        assert "deep by 0.004" in text
 
 
 @pytest.mark.mpi

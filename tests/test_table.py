@@ -73,7 +73,7 @@ def test_summary_says_what_changes_of_facet_cost():
     table = Table([dict.fromkeys(COLUMNS, 0.0)])
     run = Solution(SimpleNamespace(joints=()), rows=table)
     run.switches.extend(Switch(0.1, "c", 1, (2, 3), d) for d in (-8.0, 3.0, -1.0))
-    line = "3 changes of facet: contact defect -6 J in all, mean of absolute values 4 J; most -8 J"
+    line = "3 changes of facet: contact defect -6 in all, mean of absolute values 4; most -8"
     assert line in run.summary
 
 

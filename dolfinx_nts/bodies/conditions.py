@@ -205,8 +205,8 @@ class Meetings:
         place = self._x[dof // self._width].tolist()
         where = ", ".join(f"{x if abs(x) > near else 0.0:.4g}" for x in place)
         return (
-            f"bcs[{j}] and bcs[{k}] of {self._name!r}: at t={time:.6g} they prescribe {one:.6g} m "
-            f"and {other:.6g} m along {'xyz'[dof % self._width % 3]} of the node at X = ({where}); "
+            f"bcs[{j}] and bcs[{k}] of {self._name!r}: at t={time:.6g} they prescribe {one:.6g} "
+            f"and {other:.6g} along {'xyz'[dof % self._width % 3]} of the node at X = ({where}); "
             "leave that place or component out of one of them, or give both one value"
         )
 

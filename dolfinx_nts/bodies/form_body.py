@@ -181,14 +181,14 @@ class FormBody(UflBody):
             problem = "depends on the direction; make it of rho * ufl.inner(v, w) alone"
         total = self.comm.allreduce(float(self.nodal_mass.sum()))
         if not total > 0.0:
-            problem = f"is {total / 3:.3g} kg in all; it must be positive"
+            problem = f"is {total / 3:.3g} in all; it must be positive"
         elif not mass.isSymmetric(_ROUNDING * size):
             problem = "is not symmetric in v and w"
         diagonal = mass.getDiagonal()
         if problem is None and not (diagonal.array_r > 0.0).all():
             k = int(diagonal.array_r.argmin())
             where = self.reference[3 * (k // 3) : 3 * (k // 3) + 3].tolist()
-            problem = f"is {diagonal.array_r[k]:.3g} kg at the node x={where}; make it positive"
+            problem = f"is {diagonal.array_r[k]:.3g} at the node x={where}; make it positive"
         diagonal.destroy()
         text = f"mass={self._given_mass!r} of {self.name!r}: {problem}"
         raise_together(self.comm, text if problem else None)

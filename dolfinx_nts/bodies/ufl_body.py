@@ -420,7 +420,7 @@ class UflBody(Body):
         total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
         if not total > 0.0:
             raise UserFunctionError(
-                f"mass of {self.name!r}: its parameters now make {total:.3g} kg; it must be "
+                f"mass of {self.name!r}: its parameters now make {total:.3g}; it must be "
                 "positive"
             )
 

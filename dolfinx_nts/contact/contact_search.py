@@ -387,7 +387,7 @@ class ContactSearch:
                 text = (
                     f"nodes of contact {name!r} would pull if they stuck and would enter the "
                     "master if they left: in spite of infinite friction they slip, by up to "
-                    f"{slip:.3g} m in a step; a finite coefficient may be meant"
+                    f"{slip:.3g} in a step; a finite coefficient may be meant"
                 )
                 yield StepWarning("slip", float(slip), text, (name,))
 

@@ -209,9 +209,9 @@ class Watched:
             )
         depth, size = float(found.depth[i]), float(found.size[i])
         if found.middle[i]:
-            where = f"past the middle of {two!r}, up to {depth:.3g} m inside,"
+            where = f"past the middle of {two!r}, inside it by up to {depth:.3g},"
         else:
-            where = f"up to {depth:.3g} m, or {size:.2g} of a facet, inside {two!r}"
+            where = f"inside {two!r}, by up to {depth:.3g}, or {size:.2g} of a facet,"
         text = f"{what} lies {where} at ({point(found.place[i])}); {remedy}"
         return Finding(kind, depth, size, found.place[i], (one, two), nodes, text)
 

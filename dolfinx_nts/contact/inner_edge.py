@@ -128,8 +128,8 @@ def in_inner_edge(
     one, two, node = slave.body.name, master.body.name, int(slave.original[found.node])
     corners = sorted(int(n) for n in master.original[master.facets[found.facet]])
     text = (
-        f"node {node} of {one!r} lies in an inner edge of {two!r}, {found.depth:.3g} m, or "
-        f"{found.size:.2g} of a facet, behind the facet of nodes {corners}: contact "
+        f"node {node} of {one!r} lies in an inner edge of {two!r}, behind the facet of nodes "
+        f"{corners} by {found.depth:.3g}, or {found.size:.2g} of a facet: contact "
         f"{contact.name!r} holds a node out of one facet at a time; declare a contact for each of "
         f"the faces of {two!r} that meet there"
     )

@@ -221,8 +221,8 @@ class ObstacleContact:
         node = int(watched.surface.original[points[i]])
         place = x[points[i]] + moved
         text = (
-            f"node {node} of {name!r} lies {depth:.3g} m, or {size:.2g} of a facet, inside "
-            f"{other!r} at ({point(place)}); no contact is declared of it with "
+            f"node {node} of {name!r} lies inside {other!r}, by {depth:.3g}, or "
+            f"{size:.2g} of a facet, at ({point(place)}); no contact is declared of it with "
             f"{other!r}: extend the marker of the slave to it"
         )
         bodies = name, other
@@ -301,8 +301,8 @@ class ObstacleContact:
         depth, size = float(some.depth[i]), float(some.depth[i] / some.size[i])
         place: FloatArray = some.place[i] + moved
         text = (
-            f"the facet of nodes {list(nodes)} of {name!r} lies up to {depth:.3g} m, or "
-            f"{size:.2g} of its size, inside {other!r} at ({point(place)}); {remedy}"
+            f"the facet of nodes {list(nodes)} of {name!r} lies inside {other!r}, by up to "
+            f"{depth:.3g}, or {size:.2g} of its size, at ({point(place)}); {remedy}"
         )
         return Finding("facet in an obstacle", depth, size, place, (name, other), nodes, text)
 
@@ -335,7 +335,7 @@ class ObstacleContact:
         depth, size = float(found.value[i]), float(found.value[i] / sizes[i])
         place: FloatArray = inner[i] + moved
         text = (
-            f"{other!r} lies inside {name!r} as a whole, at ({point(place)}) {depth:.3g} m, or "
+            f"{other!r} lies inside {name!r} as a whole, at ({point(place)}), {depth:.3g}, or "
             f"{size:.2g} of a facet, from the boundary; contact holds nodes of the slave out of "
             "an obstacle, but not what is between them: use a smaller dt, or a finer mesh of the "
             "slave where it came in"

@@ -355,7 +355,7 @@ class Distance(Between):
             require_positive(f"length of {self.name!r}", begins, "m")
             if abs(begins - self.rest) > ROUNDED * self.rest:
                 raise ValueError(
-                    f"length={length!r} of {self.name!r}: the points are {self.rest!r} m apart at "
+                    f"length={length!r} of {self.name!r}: the points are {self.rest!r} apart at "
                     "the start; leave length out, or move them"
                 )
 

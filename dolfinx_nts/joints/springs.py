@@ -69,8 +69,8 @@ def _unlike(stored: kernel.Stored, start: float, label: str) -> str | None:
     if missing <= _ALIKE * way * float(np.abs(force).max()) + rounding:
         return None
     return (
-        f"{label}: changes by {energy[-1] - energy[0]:.6g} J from {x[0]:.6g} to {x[-1]:.6g}, its "
-        f"derivative says {work:.6g} J; pass force=dV/dl, or write it so that it takes complex "
+        f"{label}: changes by {energy[-1] - energy[0]:.6g} from {x[0]:.6g} to {x[-1]:.6g}, its "
+        f"derivative says {work:.6g}; pass force=dV/dl, or write it so that it takes complex "
         "arrays"
     )
 

@@ -308,7 +308,7 @@ class Numbering:
             if not off <= _ROUNDED * np.ptp(here, axis=0).max(initial=0.0):
                 problem = problem or (
                     f"body {self.system.bodies[k].name!r}: its mesh has other nodes, up to "
-                    f"{off:.3g} m away, or the same in another order"
+                    f"{off:.3g} away, or the same in another order"
                 )
         raise_together(self.comm, problem)
 

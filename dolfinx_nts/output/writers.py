@@ -149,7 +149,7 @@ class _Series:
         if len(foreign):
             raise FileExistsError(
                 f"folder={str(path.parent)!r}: {path.name} is of another run, with a time "
-                f"{foreign[0]:.6g} s that is none of this one's; pass another folder for what "
+                f"{foreign[0]:.6g} that is none of this one's; pass another folder for what "
                 "follows"
             )
         if len(kept) < len(times):

@@ -173,7 +173,7 @@ class _LoadStepper(Stepper):
         rounding = _ROUNDING * self.problem.rounded_length * pressed
         if not missing <= _OPEN * size + rounding:
             text = (
-                f"work and stored energy differ by {missing:.3g} J of {size:.3g} J: "
+                f"work and stored energy differ by {missing:.3g} of {size:.3g}: "
                 f"{self._remedy_of_ledger()}"
             )
             endless = not np.isfinite(missing)

@@ -66,14 +66,14 @@ class Ledger:
         self._restated, change = now, added["kinetic"] + added["potential"]
         self._material_change += change
         text = (
-            f"{what} adds {change:.3g} J to the energy without work, see material_change in the "
+            f"{what} adds {change:.3g} to the energy without work, see material_change in the "
             "balance"
         )
         if added["kinetic"]:
             momentum, spin = (np.linalg.norm(added[f"{s}_momentum"]) for s in ("linear", "angular"))
             text += (
-                f"; {added['kinetic']:.3g} J of it are kinetic: velocities stay as they are, and "
-                f"{momentum:.3g} kg m/s and {spin:.3g} kg m^2/s of momentum come without a force"
+                f"; {added['kinetic']:.3g} of it are kinetic: velocities stay as they are, and "
+                f"{momentum:.3g} of linear and {spin:.3g} of angular momentum come without a force"
             )
         self._solution.warn("material changed", state.time, abs(change), text)
 

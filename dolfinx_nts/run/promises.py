@@ -96,12 +96,12 @@ class Promises:
         part = self._part(missing)
         if self._closes:
             text = (
-                f"the ledger misses {missing:.3g} J, {part:.2g} of the largest energy, where this "
+                f"the ledger misses {missing:.3g}, {part:.2g} of the largest energy, where this "
                 f"accuracy promises {self._promise:.0e}; {self._remedy}"
             )
         else:
             text = (
-                f"the energy has changed by {missing:.3g} J, {part:.2g} of the largest, more than "
+                f"the energy has changed by {missing:.3g}, {part:.2g} of the largest, more than "
                 f"work, friction and contact account for; this integrator does not keep it: "
                 f"{self._open}"
             )
@@ -157,8 +157,9 @@ class Promises:
         if massless > _GAIN * self._largest + self._rounding:
             self._solution.warn(
                 "energy from massless nodes", row["time"], massless,
-                f"nodes without mass that leave within steps have brought {massless:.3g} J, "
-                f"{self._part(massless):.2g} of the largest energy; use a smaller dt",
+                "nodes without mass that leave within steps have brought an energy of "
+                f"{massless:.3g}, {self._part(massless):.2g} of the largest energy; "
+                "use a smaller dt",
                 grave=True,
             )  # fmt: skip
         remedy = (
@@ -168,13 +169,13 @@ class Promises:
         if gain > _GAIN * energy + self._rounding:
             where = balance.expelled(problem, step)
             text = (
-                f"nodes that start behind their facets bring {gain:.3g} J to "
-                f"{before['energy']:.3g} J, most {where}; after changes of facet {remedy}"
+                f"nodes that start behind their facets bring an energy of {gain:.3g} to "
+                f"{before['energy']:.3g}, most {where}; after changes of facet {remedy}"
             )
         elif gain > 0.0 and total > _GAIN * self._largest + self._rounding:
             gain, text = total, (
-                f"nodes that start steps behind their facets have brought {total:.3g} J in all, "
-                f"{self._part(total):.2g} of the largest energy; {remedy}"
+                "nodes that start steps behind their facets have brought an energy of "
+                f"{total:.3g} in all, {self._part(total):.2g} of the largest energy; {remedy}"
             )
         else:
             # What a coefficient of restitution takes is asked for.
@@ -182,7 +183,7 @@ class Promises:
             if not asked and -total > _LOSS * self._largest + self._rounding:
                 self._solution.warn(
                     "energy lost to contact", row["time"], -total,
-                    f"gaps that close in mid step have taken {-total:.3g} J, "
+                    f"gaps that close in mid step have taken an energy of {-total:.3g}, "
                     f"{self._part(-total):.2g} of the largest energy: how bodies rebound may "
                     "depend on it; compare with a smaller dt (with Adapt a smaller tolerance) "
                     "and a finer mesh",

@@ -119,7 +119,7 @@ class Record:
         steps = len(self.rows) - 1
         iterations = self.balance["newton_iterations"].sum() / max(steps, 1)
         lines = [
-            f"{self.status}: {steps} steps to t = {last['time']:.6g} s, {self.retries} retries, "
+            f"{self.status}: {steps} steps to t = {last['time']:.6g}, {self.retries} retries, "
             f"{self.rejected} rejected, {iterations:.2f} Newton iterations per step",
         ]
         if np.isnan(last["energy"]):
@@ -129,24 +129,24 @@ class Record:
             # What joints add are losses.
             others |= dict.fromkeys(self.balance.keys() - set(COLUMNS), -1.0)
             more = "".join(
-                f"{' + ' if sign > 0 else ' - '}{name.replace('_', ' ')} {last[name]:.6g} J"
+                f"{' + ' if sign > 0 else ' - '}{name.replace('_', ' ')} {last[name]:.6g}"
                 for name, sign in sorted(others.items())
                 if last[name]
             )
             lines.append(
-                f"energy {first['energy']:.6g} J + external work {last['external_work']:.6g} J - "
-                f"friction {last['friction_dissipation']:.6g} J - contact "
-                f"{last['contact_defect']:.6g} J{more} = {last['energy']:.6g} J, "
-                f"but for {last['ledger_residual']:.2g} J"
+                f"energy {first['energy']:.6g} + external work {last['external_work']:.6g} - "
+                f"friction {last['friction_dissipation']:.6g} - contact "
+                f"{last['contact_defect']:.6g} {more} = {last['energy']:.6g}, "
+                f"but for {last['ledger_residual']:.2g}"
             )
         if self.exceeded:
             lines.append(f"{self.exceeded} steps taken though they err more than their tolerance")
         found, worst = self.switches, self.switches.worst
         if worst is not None:
             lines.append(
-                f"{found.number} changes of facet: contact defect {found.defect:.3g} J in all, "
-                f"mean of absolute values {found.size / found.number:.3g} J; most "
-                f"{worst.defect:.3g} J at t = {worst.time:.6g} s ({worst.contact}, node "
+                f"{found.number} changes of facet: contact defect {found.defect:.3g} in all, "
+                f"mean of absolute values {found.size / found.number:.3g}; most "
+                f"{worst.defect:.3g} at t = {worst.time:.6g} ({worst.contact}, node "
                 f"{worst.node}, facet {worst.facets[0]} to {worst.facets[1]})"
             )
         return "\n".join([*lines, *self.warnings.lines])

@@ -115,6 +115,6 @@ class RunWarnings(Mapping[str, RunWarning]):
         """A line for each, for summaries and files."""
         return [
             f"warning, {w.kind}: {w.count} step{'s' if w.count > 1 else ''} from "
-            f"t = {w.first:.6g} s; {w.text}"
+            f"t = {w.first:.6g}; {w.text}"
             for w in self._found.values()
         ]

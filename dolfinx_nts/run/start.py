@@ -321,7 +321,7 @@ def consistent_start(
     found = consistent.violation(problem, state, dt, rates=False)
     if found is not None:
         raise ValueError(
-            f"joints: at the start {found[1]!r} is off by {found[0]:.3g} m; let the bodies' "
+            f"joints: at the start {found[1]!r} is off by {found[0]:.3g}; let the bodies' "
             "displacements and prescribed motion, and what the joint prescribes, begin where "
             "it holds"
         )
@@ -331,7 +331,7 @@ def consistent_start(
     far = consistent.violation(problem, state, dt, rates=True, part=_OF_MESHES)
     if far is not None and not project:
         raise ValueError(
-            f"velocity: at the start joint {far[1]!r} is violated at {far[0]:.3g} m/s; "
+            f"velocity: at the start joint {far[1]!r} is violated at a speed of {far[0]:.3g}; "
             "change the bodies' velocities or the prescribed rates so that they fit, or pass "
             "project_start=True"
         )
@@ -339,12 +339,12 @@ def consistent_start(
     left = consistent.violation(problem, state, dt, rates=True)
     if left is not None:
         raise ValueError(
-            f"velocity: no velocities fit joint {left[1]!r}, which stays violated "
-            f"at {left[0]:.3g} m/s; prescribed motion, or another joint, contradicts it: leave "
-            "one of them out"
+            f"velocity: no velocities fit joint {left[1]!r}, which stays violated at a speed of "
+            f"{left[0]:.3g}; prescribed motion, or another joint, contradicts it: leave one of "
+            "them out"
         )
     text = (
-        f"joint {found[1]!r} was violated at {found[0]:.3g} m/s at the start, as it may be "
+        f"joint {found[1]!r} was violated at a speed of {found[0]:.3g} at the start, as it may be "
         "where a mesh puts a centre of mass beside an axis; the run begins with the nearest "
         "velocities that fit"
     )

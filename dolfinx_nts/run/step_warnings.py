@@ -109,7 +109,7 @@ def tell_frictionless(solution: Solution, impulses: FloatArray, time: float) -> 
         if pair.friction and size:
             solution.warn(
                 "impulses without friction", time, size,
-                f"impact='restored' has given contact {pair.name!r} an impulse of {size:.3g} N s "
+                f"impact='restored' has given contact {pair.name!r} an impulse of {size:.3g} "
                 f"along its normals, none of friction={pair.friction:.3g}; pass "
                 "impact='published' if friction in impacts matters",
             )  # fmt: skip
@@ -183,17 +183,17 @@ def _tell_corners(
                 continue
             if len(both) < 2:
                 size = pair.master.width
-                missed = f"obstacle {pair.master.name!r}, whose radius is {size:.2g} m"
+                missed = f"obstacle {pair.master.name!r}, whose radius is {size:.2g}"
             else:
                 other = pair.master if k == both[0] else pair.slave
                 size = other.smallest
-                missed = f"facets of {other.body.name!r} that are {size:.2g} m wide"
+                missed = f"facets of {other.body.name!r} that are {size:.2g} wide"
             if way > size:
                 name = system.bodies[k].name
                 solution.warn(
                     "cut corners", new.time, way,
                     f"body {name!r} turns by {turns[k]:.2g} rad in a step: its points leave their "
-                    f"straight ways by up to {way:.2g} m, and contact {pair.name!r}, which is "
+                    f"straight ways by up to {way:.2g}, and contact {pair.name!r}, which is "
                     f"sought on these, may miss {missed}; use a smaller dt",
                     grave=True, about=(pair.name,),
                 )  # fmt: skip

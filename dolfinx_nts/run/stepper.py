@@ -48,7 +48,7 @@ from dolfinx_nts.step.massless import off_balance
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.resting import with_resting_forces
-from dolfinx_nts.step.unresolved import tell_unresolved
+from dolfinx_nts.step.unresolved import DamperWatch, tell_unresolved
 from dolfinx_nts.system import System, is_like
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -146,7 +146,7 @@ class Stepper:
         self.solver, self._given = StepSolver(self.problem, self.newton, preset, given), given
         self.system = system
         self._overlap = OverlapWatch(system) if watch_overlap else None
-        self._last_steps = LastSteps()
+        self._last_steps, self._dampers = LastSteps(), DamperWatch(self.problem)
         self.restart = begun if isinstance(begun, Restart) else None
         check_restart(self.restart, system, start_time, ledger)
         self.solution = self.restart.go_on() if self.restart else self.makes(system)
@@ -332,7 +332,7 @@ class Stepper:
                 self.solution.exceeded += 1
                 self.solution.warn(
                     "step error", self.state.time, dt,
-                    f"a step of {dt:.3g} s errs more than Adapt asks for: it is the shortest one, "
+                    f"a step of {dt:.3g} errs more than Adapt asks for: it is the shortest one, "
                     "or it moves a node out from behind its facet; pass a smaller `shortest` or a "
                     "larger `tolerance`",
                 )  # fmt: skip
@@ -503,6 +503,9 @@ class Stepper:
         self._last_steps.take(self.state, self.problem.dt, state)
         self._accept(state)
         tell_step(self.solution, self.problem, step, state)
+        alternates = self._dampers.look(state)
+        if alternates:
+            self.solution.warn("unresolved", state.time, *alternates)
         if impact is not None:
             tell_frictionless(self.solution, impact.impulses[0], state.time)
         self.look()

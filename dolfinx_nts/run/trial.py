@@ -63,7 +63,7 @@ def solved(problem: StepProblem, solver: StepSolver) -> Evaluation:
     far = float(problem.lengths.motion_of(step).max())
     raise StepFailedError(
         f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g}: bodies move by "
-        f"{far:.3g} m, and no search found all contacts on the way of their nodes; use a "
+        f"{far:.3g}, and no search found all contacts on the way of their nodes; use a "
         "smaller dt",
         advises=True,
     )

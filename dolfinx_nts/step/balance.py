@@ -255,7 +255,7 @@ def expelled(problem: StepProblem, step: Evaluation) -> str:
         if len(gain) and gain.max() > best[0]:
             i = int(gain.argmax())
             where = f"node {contact.input_node(i)} of {contact.name!r}"
-            text = f"{gain[i]:.3g} J by {where}, {-contact.candidates.gap[i]:.3g} m deep"
+            text = f"{gain[i]:.3g} by {where}, deep by {-contact.candidates.gap[i]:.3g}"
             best = float(gain[i]), text
     return max(problem.system.comm.allgather(best))[1]
 

@@ -178,7 +178,7 @@ class ContactTerms:
         motion = global_max(self._system.comm, local)
         if self._search.misses(e, parts, motion):
             raise StepFailedError(
-                f"step to t={self._time:.6g}: points move by up to {motion.max():.3g} m with "
+                f"step to t={self._time:.6g}: points move by up to {motion.max():.3g} with "
                 f"reach={self._reach:.3g}, and contact may have been missed; begin the step again "
                 "with a larger reach, or take a shorter one"
             )

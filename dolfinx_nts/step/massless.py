@@ -91,8 +91,8 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
         if missing > max(worst, _BALANCED * internal) and internal > _ROUNDED * stiffness * length:
             worst = missing
             text = (
-                f"nodes of {body.name!r} without mass start {missing:.3g} N off balance and will "
-                "move to and fro about it in every step; start from equilibrium(...), or without "
-                "displacement"
+                f"nodes of {body.name!r} without mass start off balance by a force of "
+                f"{missing:.3g} and will move to and fro about it in every step; start from "
+                "equilibrium(...), or without displacement"
             )
     return worst, text
