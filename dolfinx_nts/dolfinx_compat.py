@@ -42,22 +42,23 @@ def _partitioner() -> Any:
 
 
 def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Any:
-    """Degree-1 mesh with shared-facet ghosts.
+    """Mesh of degree 1, of intervals with three nodes of degree 2, with shared-facet ghosts.
 
     Args:
         comm: MPI communicator.
-        cells: This rank's part of the cells in DOLFINx vertex order, shape (m, corners).
+        cells: This rank's part of the cells in DOLFINx vertex order, shape (m, corners); of
+            intervals of degree 2 both ends, then the middle node, shape (m, 3).
         x: This rank's part of the points [m], shape (n, 3).
         cell_type: Of DOLFINx, e.g. "hexahedron", "tetrahedron", "quadrilateral", "interval".
     """
     cells, x = np.ascontiguousarray(cells, np.int64), np.ascontiguousarray(x, np.float64)
-    part = _partitioner()
+    part, degree = _partitioner(), 2 if (cell_type, cells.shape[1]) == ("interval", 3) else 1
     if _OLD:
         cell = ufl.Cell(cell_type, geometric_dimension=x.shape[1])
-        domain = ufl.Mesh(ufl.VectorElement("Lagrange", cell, 1))
+        domain = ufl.Mesh(ufl.VectorElement("Lagrange", cell, degree))
         return mesh.create_mesh(comm, cells, x, domain, _SHARED, part)
     basix_ufl = importlib.import_module("basix.ufl")
-    e = basix_ufl.element("Lagrange", cell_type, 1, shape=(x.shape[1],))
+    e = basix_ufl.element("Lagrange", cell_type, degree, shape=(x.shape[1],))
     args = (x, e) if VERSION < (0, 10) else (e, x)
     return mesh.create_mesh(comm, cells, *args, partitioner=part)
 

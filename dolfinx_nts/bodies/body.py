@@ -50,6 +50,7 @@ class Body:
         rounded: Length [m] whose rounding enters the forces in addition to that of u, the same on
             all ranks; None: the size of the positions.
         allow_inversion: Whether steps are accepted that end with `smallest_det` <= 0.
+        low_dets: `smallest_det` below which a run warns, and below which failed steps name it.
         has_massless: Whether coordinates on any rank have no mass.
         law: W as a function of Green's strain in UFL; None: it has no material.
         made_on: Places of its mesh's nodes when it was made, see `places_of`; None without a mesh.
@@ -76,6 +77,7 @@ class Body:
     length: float
     rounded: float | None = None
     allow_inversion: bool = False
+    low_dets: tuple[float, float] = (0.05, 0.1)
     has_massless: bool = False
     law: Any = None
     made_on: Any = None
@@ -224,9 +226,21 @@ class Body:
     def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
         """Smallest det F on this rank, inf without cells in 3D, and X of its cell [m], shape (3,).
 
-        A step that ends with det F <= 0 is not accepted unless `allow_inversion` is True.
+        Of a body with directors at its nodes the smallest cosine of the turn between neighbours. A
+        step that ends with one <= 0 is not accepted unless `allow_inversion` is True.
         """
         return np.inf, np.full(3, np.nan)
+
+    def describe_det(self, det: float, place: FloatArray) -> tuple[str, str]:
+        """What is so with a low `smallest_det` of all ranks, and what may prevent it."""
+        x = ", ".join(f"{c:.4g}" for c in place)
+        turns = "is nearly" if det > 0.0 else "turns"
+        return (
+            f"a cell of body {self.name!r} {turns} inside out, which W(C) cannot see: det F = "
+            f"{det:.3g} near X = ({x})",
+            "smaller loads or speeds may prevent it, "
+            f"{type(self).__name__}(..., allow_inversion=True) accepts it",
+        )
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn of its directors between two displacements on this rank [rad].

@@ -36,6 +36,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
+#: Turn between neighbouring nodes [rad] that leaves the moment right to 5 %: sin(a) is for a.
+_RESOLVED = np.pi / 6.0
 #: Part of a body's size within which a point is a node.
 _AT_NODE = 1e-9
 
@@ -52,6 +54,7 @@ class DirectorBody(Body):
     """
 
     oriented = True
+    low_dets = 0.5, float(np.cos(_RESOLVED))
     kind: ClassVar[str]
 
     # ---- what each kind has of its own
@@ -70,12 +73,21 @@ class DirectorBody(Body):
         """Its whole skin."""
         raise NotImplementedError
 
+    @property
+    def _neighbours(self) -> IntArray:
+        """Nodes of a cell that are neighbours, shape (pairs, 2)."""
+        raise NotImplementedError
+
+    def _finer(self, times: float) -> str:
+        """Which elements are needed, so many times as many along an axis as there are."""
+        raise NotImplementedError
+
     # ---- set-up
-    def _set_up_mesh(self, mesh: Any, name: str) -> None:
+    def _set_up_mesh(self, mesh: Any, name: str, degree: int = 1) -> None:
         """What fields live on."""
-        self.name, self.mesh, self.comm, self.degree = name, mesh, mesh.comm, 1
+        self.name, self.mesh, self.comm, self.degree = name, mesh, mesh.comm, degree
         self.made_on = places_of(mesh)
-        self.space = compat.vector_space(mesh, 1)
+        self.space = compat.vector_space(mesh, degree)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
 
@@ -499,6 +511,42 @@ class DirectorBody(Body):
     def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the places of each condition, this rank's part [N], (conditions, 3)."""
         return self._conditions.reactions(residual)
+
+    @np.errstate(over="ignore", invalid="ignore")  # an iterate may run off
+    def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
+        """Smallest cosine of the turn between neighbouring nodes, and X of their middle [m].
+
+        An element bends with the sine of that angle: from 90 degrees on a larger one needs a
+        smaller moment, and nothing in it can tell. Collective.
+        """
+        y, pairs = self._vectors(u), self._neighbours
+        if not len(y):
+            return np.inf, np.full(3, np.nan)
+        nodes = self._nodes.shape[1]
+        directors = y.reshape(len(y), nodes, self._width // 3, 3)[:, :, 1:]
+        directors = directors.reshape(len(y), nodes, self._width - 3)
+        size = np.linalg.norm(directors, axis=2)
+        a, b = pairs.T
+        cosine = np.einsum("npk,npk->np", directors[:, a], directors[:, b])
+        cosine /= size[:, a] * size[:, b]
+        i = int(cosine.argmin())  # the first NaN, if there is one
+        least = float(cosine.flat[i])
+        if self._width > 6:
+            # Products of three directors are 1 + 2 cos of their turn, in terms of one.
+            least = 1.5 * least - 0.5
+        cell, pair = divmod(i, len(pairs))
+        places = self._rest[cell, :: self._width // 3][pairs[pair]]
+        return least if np.isfinite(least) else -np.inf, places.mean(axis=0)
+
+    def describe_det(self, det: float, place: FloatArray) -> tuple[str, str]:
+        """How far neighbouring nodes turn against each other, and what elements are needed."""
+        angle = float(np.arccos(np.clip(det, -1.0, 1.0)))
+        x = ", ".join(f"{c:.4g}" for c in place)
+        text = (
+            f"{self.kind} {self.name!r} turns by {np.degrees(angle):.3g} degrees between "
+            f"neighbouring nodes near X = ({x})"
+        )
+        return text, self._finer(min(angle, 0.5 * np.pi) / _RESOLVED)
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""

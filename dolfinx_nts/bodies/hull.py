@@ -65,13 +65,14 @@ def of_beam(skeleton: Skeleton, outline: FloatArray) -> Hull:
     """
     k, n, cells = len(outline), len(skeleton.x), skeleton.cells
     corner, following = np.arange(k), np.roll(np.arange(k), -1)
-    a, b = ((k + 1) * cells[:, i, None] for i in (0, 1))
+    starts, stops = cells[:, :-1].ravel(), cells[:, 1:].ravel()
+    a, b = ((k + 1) * ends[:, None] for ends in (starts, stops))
     facets = [np.stack([a + corner, a + following, b + following, b + corner], axis=-1)]
     every = np.arange(n)
     fan = np.stack([np.full(k // 2, k), *(np.roll(corner, -i)[::2] for i in range(3))], axis=1)
-    for column, way in ((0, -1), (1, 1)):
+    for other, way in ((stops, -1), (starts, 1)):
         # The first node of a line has no cell that ends there.
-        ends = np.setdiff1d(every, cells[:, 1 - column])
+        ends = np.setdiff1d(every, other)
         caps = (k + 1) * ends[:, None, None] + fan
         facets.append(caps[:, :, [0, 1, 2, 3][::way]])
     weights = np.zeros((k + 1, 4))

@@ -178,21 +178,13 @@ def forbidden(system: Any, dets: FloatArray) -> FloatArray:
     return np.where(allowed, np.inf, dets)
 
 
-def describe(system: Any, u: Sequence[FloatArray], dets: FloatArray) -> str:
-    """Return which body turns inside out most, and where; the same on all ranks. Collective.
+def describe(body: Any, u: FloatArray) -> tuple[str, str]:
+    """Where a body's smallest det F is, and what may prevent it, see `Body`. Collective.
 
     Args:
-        system: Its bodies.
-        u: Displacements of each body [m].
-        dets: As of `smallest_dets` or `forbidden`.
+        body: The body.
+        u: Its displacements [m].
     """
-    worst = int(dets.argmin())
-    body = system.bodies[worst]
-    found = system.comm.allgather(body.smallest_det(u[worst]))
-    det, place = min(found, key=lambda one: one[0])
-    x = ", ".join(f"{c:.4g}" for c in place)
-    turns = "is nearly" if det > 0.0 else "turns"
-    return (
-        f"a cell of body {body.name!r} {turns} inside out, which W(C) cannot see: det F = "
-        f"{det:.3g} near X = ({x})"
-    )
+    found = body.comm.allgather(body.smallest_det(u))
+    text: tuple[str, str] = body.describe_det(*min(found, key=lambda one: one[0]))
+    return text

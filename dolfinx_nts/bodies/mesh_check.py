@@ -64,12 +64,13 @@ def check_mesh(mesh: Any, name: str) -> None:
     _check_cells(mesh, name, mesh.geometry.x[cells[:owned].reshape(owned, _CORNERS[kind])])
 
 
-def check_any_mesh(mesh: Any, name: str) -> None:
+def check_any_mesh(mesh: Any, name: str, degree: int = 1) -> None:
     """Raise on every rank unless the mesh is valid and of degree 1, of any dimension.
 
     Args:
         mesh: DOLFINx mesh.
         name: Of its body, for messages.
+        degree: Largest one of a mesh of intervals, 1 or 2.
 
     Raises:
         ValueError: Cells of another kind, not finite; in 3D inverted or overlapping.
@@ -77,17 +78,17 @@ def check_any_mesh(mesh: Any, name: str) -> None:
     if mesh.topology.dim == 3:
         check_mesh(mesh, name)
     else:
-        _check_nodes(mesh, name)
+        _check_nodes(mesh, name, degree)
 
 
-def _check_nodes(mesh: Any, name: str) -> None:
+def _check_nodes(mesh: Any, name: str, degree: int = 1) -> None:
     """Raise on every rank unless the nodes are corners of known cells, and finite."""
     kind, cells = compat.cell_name(mesh), compat.geometry_dofmap(mesh)
     if kind not in _CORNERS:
         raise ValueError(f"mesh of {name!r}: {kind}; pass a mesh of {', '.join(_CORNERS)}")
     corners = _CORNERS[kind]
     nodes = mesh.comm.allreduce(cells.shape[1], op=MPI.MAX)
-    if nodes != corners:
+    if not corners <= nodes < corners + degree:
         raise ValueError(
             f"mesh of {name!r}: {nodes} nodes per {kind}, not {corners}; pass a mesh of degree 1, "
             "e.g. nts.linear(mesh), which keeps its corners, or mesh with order 1 in Gmsh"

@@ -18,7 +18,7 @@ from dolfinx_nts.validation import is_whole, require_positive
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
-_CORNERS = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
+_CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
 #: Corners of three tetrahedra in a prism, whose lower corners 0, 1, 2 ascend by their numbers: so
 #: neighbours split the quadrilateral between them alike.
 _TETRAHEDRA = [[0, 1, 2, 5], [0, 1, 4, 5], [0, 3, 4, 5]]
@@ -72,7 +72,8 @@ def linear(mesh: Any) -> Any:
     h^2 / (8 r) beside the curve, and the volume errs by as much of its surface.
 
     Args:
-        mesh: DOLFINx mesh of tetrahedra, hexahedra, triangles or quadrilaterals of any degree.
+        mesh: DOLFINx mesh of tetrahedra, hexahedra, triangles, quadrilaterals or intervals of any
+            degree.
 
     Returns:
         DOLFINx mesh of degree 1.

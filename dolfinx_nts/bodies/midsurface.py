@@ -82,7 +82,10 @@ def midsurface_of(space: Any, name: str) -> Skeleton:
     directors = _directors(x, cells, name)
     edge, count = _edges(cells)
     ends = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
-    return Skeleton(x, np.argsort(given), cells, directors[:, None], ends[count[edge] == 1])
+    edges = ends[count[edge] == 1]
+    halves = 0.5 * np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1)
+    lengths = np.repeat(halves[:, None], 2, axis=1)
+    return Skeleton(x, np.argsort(given), cells, directors[:, None], edges, lengths)
 
 
 def _edges(cells: IntArray) -> tuple[IntArray, IntArray]:

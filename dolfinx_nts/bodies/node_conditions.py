@@ -130,14 +130,14 @@ class NodeConditions:
             chosen = self._chosen(what, load.where)
         weights = chosen.astype(float)
         if load.per_length:
-            along = edges[chosen[edges].all(axis=1)]
-            if not len(along):
+            along = chosen[edges].all(axis=1)
+            if not along.any():
                 raise ValueError(
                     f"{what}={load.where!r}: selects no two neighbours; select both ends of the "
                     "elements it acts on"
                 )
-            halves = 0.5 * np.linalg.norm(x[along[:, 1]] - x[along[:, 0]], axis=1)
-            weights = np.bincount(along.ravel(), np.repeat(halves, 2), len(x))
+            borne = self._skeleton.lengths[along].ravel()
+            weights = np.bincount(edges[along].ravel(), borne, len(x))
         elif chosen.sum() != 1:
             raise ValueError(f"{what}={load.where!r}: selects {chosen.sum()} nodes; select one")
         return load, weights[self._here], f"{kind}.value of forces[{k}] of {self._name!r}"

@@ -29,6 +29,7 @@ from dolfinx_nts.validation import (
 )
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 
 #: Sine of the angle between a direction and a director within which they are parallel.
@@ -110,6 +111,14 @@ class Shell(DirectorBody):
         """This rank's elements from their reference, see `DirectorBody`."""
         stiffness = kernel.stiffness(self.young, self.poisson, self.thickness)
         return kernel.shells(y, self.length, stiffness)
+
+    @property
+    def _neighbours(self) -> IntArray:
+        return np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
+
+    def _finer(self, times: float) -> str:
+        """Which elements are needed, see `DirectorBody`."""
+        return f"about {times:.2g} times as many elements are needed there in that direction"
 
     @property
     def settings(self) -> dict[str, Any]:

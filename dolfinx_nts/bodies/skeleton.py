@@ -22,7 +22,8 @@ class Skeleton(NamedTuple):
         order: Nodes in the order of files, shape (n,).
         cells: Nodes of the cells of all ranks in rank order, oriented, shape (c, corners).
         directors: Unit vectors, shape (n, d, 3).
-        edges: Pairs of nodes along which loads per length act, shape (e, 2).
+        edges: Nodes of lines along which loads per length act, neighbours, shape (e, 2 or 3).
+        lengths: Of each line what its nodes bear [m], as `edges`.
     """
 
     x: FloatArray
@@ -30,17 +31,18 @@ class Skeleton(NamedTuple):
     cells: IntArray
     directors: FloatArray
     edges: IntArray
+    lengths: FloatArray
 
 
 def nodes_and_cells(space: Any) -> tuple[FloatArray, IntArray, IntArray]:
     """Nodes and cells of a mesh on all ranks. Collective.
 
     Args:
-        space: Lagrange space of degree 1 on it.
+        space: Lagrange space of degree 1 on it, or of 2 on intervals.
 
     Returns:
         Nodes [m], (n, 3), nodes of the cells in DOLFINx's order, (c, corners), and numbers of the
-        nodes in the user's input, (n,).
+        nodes in the user's input, (n,), -1 of those that it does not have.
     """
     mesh, comm, index_map = space.mesh, space.mesh.comm, space.dofmap.index_map
     owned, own_cells = index_map.size_local, mesh.topology.index_map(mesh.topology.dim).size_local
@@ -50,6 +52,6 @@ def nodes_and_cells(space: Any) -> tuple[FloatArray, IntArray, IntArray]:
     cells = gather_rows(comm, np.asarray(numbers, dtype=np.int64))
     blocks = compat.node_blocks(mesh, space)
     here = (blocks >= 0) & (blocks < owned)
-    given = np.empty(owned, dtype=np.int64)
+    given = np.full(owned, -1, dtype=np.int64)
     given[blocks[here]] = np.asarray(mesh.geometry.input_global_indices)[here]
     return x, cells, gather_rows(comm, given)

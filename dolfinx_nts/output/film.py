@@ -161,7 +161,7 @@ class Film:
 
 def _loads(stepper: Running, body: Any) -> Sequence[tuple[FloatArray, FloatArray]]:
     """Places [m] and contact forces [N] of this rank's nodes, (n, 3) each. Collective."""
-    if body.degree != 1:
+    if body.degree is None:
         return []
     loads = stepper.solution.contact_loads
     fields = contact_fields.at_nodes(stepper.system, stepper.state, loads, body)

@@ -56,6 +56,8 @@ _CELLS = {
     "tetrahedron": ("Tetrahedron", [0, 1, 2, 3]),
     "hexahedron": ("Hexahedron", [0, 1, 3, 2, 4, 5, 7, 6]),
 }
+#: The same of intervals of degree 2.
+_CURVED = ('Polyline" NodesPerElement="3', [0, 2, 1])
 
 
 def _shape(values: FloatArray) -> tuple[int, ...]:
@@ -93,6 +95,8 @@ class _Series:
         self._cell_order = np.argsort(order)
         self._cells = np.searchsorted(numbers, cells[self._cell_order])
         self._kind, self._corners = _CELLS[compat.cell_name(body.mesh)]
+        if self._cells.shape[1:] == (3,) and len(self._corners) == 2:
+            self._kind, self._corners = _CURVED
 
     def _nodal(self, values: FloatArray) -> FloatArray:
         """Values of owned blocks in the order of the file, on rank 0."""

@@ -54,15 +54,15 @@ class Solution(Record):
             body: Body of the system with a mesh.
 
         Raises:
-            ValueError: It is not in the system, has no mesh, or its space is not of degree 1.
+            ValueError: It is not in the system, or has no mesh.
         """
         state = self.state
         if state is None or not any(b is body for b in self.system.bodies):
             raise ValueError(f"body={body!r}: is not in the system of this run")
-        if body.degree != 1:
+        if body.degree is None:
             raise ValueError(
-                f"body {body.name!r}: has no mesh with nodes of degree 1; its contacts are in "
-                "contact_forces and contact_moments"
+                f"body {body.name!r}: has no mesh; its contacts are in contact_forces and "
+                "contact_moments"
             )
         nodal = contact_fields.at_nodes(self.system, state, self.contact_loads, body)
         return contact_fields.functions(body, nodal)

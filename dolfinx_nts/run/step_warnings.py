@@ -18,8 +18,6 @@ from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Smallest det F below which cells count as crushed.
-_CRUSHED = 0.05
 #: As `FAR_TURN`, of a flexible body, by its spin: as it turns it stretches, and turns more slowly.
 _STRETCHED = 0.95
 #: Its spin is measured after 1, 2, 4, 8, 16 steps and then every so many, as it costs 1 % of one.
@@ -46,15 +44,23 @@ def tell_inversion(
     solution: Solution, problem: StepProblem, step: Evaluation, state: State
 ) -> None:
     """Warn of cells that are inside out, or nearly so. Collective; arguments as of `tell_step`."""
-    if step.min_det >= _CRUSHED:
+    bodies = problem.system.bodies
+    low = np.array([body.low_dets[0] for body in bodies])
+    if step.min_det >= low.max(initial=0.0):
         return
-    text = describe(problem.system, state.u, smallest_dets(problem.system, state.u))
-    if step.min_det <= 0.0:
-        text += "; what comes after it may be wrong"
-        solution.warn("inversion", state.time, -step.min_det, text, grave=True)
-    else:
-        text += "; so near to that the result depends on the mesh"
-        solution.warn("crushed cells", state.time, 1.0 - step.min_det, text)
+    dets = smallest_dets(problem.system, state.u)
+    for k in np.flatnonzero(dets < low):
+        body, det = bodies[k], float(dets[k])
+        text, remedy = describe(body, state.u[k])
+        if body.oriented:
+            text += f", where it is too easy to bend; {remedy}"
+            solution.warn("turn of an element", state.time, 1.0 - det, text, about=(body.name,))
+        elif det <= 0.0:
+            text += "; what comes after it may be wrong"
+            solution.warn("inversion", state.time, -det, text, grave=True)
+        else:
+            text += "; so near to that the result depends on the mesh"
+            solution.warn("crushed cells", state.time, 1.0 - det, text)
 
 
 def tell_couplings(

@@ -182,7 +182,7 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
 
     Returns:
         By columns of the balance table: works [J] and counts of the step, min_gap [m] (infinite
-        without candidates), min_det (infinite without flexible bodies).
+        without candidates), min_det (infinite without flexible bodies; see `Body.smallest_det`).
     """
     scale = 1.0 / problem.factor
     losses = (name for joint in problem.system.joints for name in joint.losses)

@@ -131,10 +131,10 @@ def _of_slave(pair: ContactPair, state: State, k: int) -> dict[str, tuple[float,
 
 
 def functions(body: Any, fields: dict[str, FloatArray]) -> dict[str, Any]:
-    """DOLFINx Functions of nodal fields on the body's mesh, of degree 1. Collective.
+    """DOLFINx Functions of nodal fields on the body's mesh, of its degree. Collective.
 
     Args:
-        body: Its space is of degree 1.
+        body: The body.
         fields: As of `at_nodes`.
     """
     scalars, of_vector = body.space.sub(0).collapse()

@@ -73,8 +73,12 @@ def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:
     """Name, weight and text of where the body's equation is worst solved."""
     r = np.nan_to_num(np.abs(terms.residual), nan=np.inf)
     r[body.fixed] = 0.0
-    x = ", ".join(f"{c:.4g}" for c in body.reference.reshape(-1, 3)[int(np.argmax(r)) // 3])
-    return body.name, float(r.max()), f"body {body.name!r}: largest residual at X = ({x})"
+    worst = int(np.argmax(r)) // 3
+    # Directors follow the place of their node.
+    place = int(np.flatnonzero(body.places[: worst + 1])[-1])
+    of = f"of director {worst - place} " if worst > place else ""
+    x = ", ".join(f"{c:.4g}" for c in body.reference.reshape(-1, 3)[place])
+    return body.name, float(r.max()), f"body {body.name!r}: largest residual {of}at X = ({x})"
 
 
 def _held_twice(problem: StepProblem, e: Evaluation) -> list[str]:

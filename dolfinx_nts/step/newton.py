@@ -390,7 +390,8 @@ class StepSolver:
         """
         flat = self._upright.describe_flat(e.x)
         if flat:
-            return StepFailedError(f"{message}; {flat}", advises=True)
+            text, sure = flat
+            return StepFailedError(f"{message}; {text}", advises=advises or sure)
         return StepFailedError(message, advises=advises)
 
     def destroy(self) -> None:

@@ -18,7 +18,6 @@ _KEPT_DET = 0.1
 _HALVINGS = 10
 #: ... and in so many iterations in a row before the step is dropped.
 _SHORTENED = 5
-_REMEDY = "smaller loads or speeds may prevent it"
 
 
 class Upright:
@@ -76,21 +75,26 @@ class Upright:
 
     def describe_inverted(self, x: FloatArray) -> str:
         """The cell that is inside out at an iterate, and what to do. Collective."""
-        system, dets = self._problem.system, self._forbidden(x)
-        kind = type(system.bodies[int(dets.argmin())]).__name__
-        where = describe(system, self._displacements(x), dets)
-        return f"{where}; {_REMEDY}, {kind}(..., allow_inversion=True) accepts it"
+        system = self._problem.system
+        worst = int(forbidden(system, self.smallest(x)).argmin())
+        return "; ".join(describe(system.bodies[worst], self._displacements(x)[worst]))
 
-    def describe_flat(self, x: FloatArray) -> str | None:
-        """The cell that is nearly inside out at an iterate, if one is. Collective."""
-        dets = self._forbidden(x)
-        if not dets.min() <= _KEPT_DET:
-            return None
-        where = describe(self._problem.system, self._displacements(x), dets)
-        return f"{where}; {_REMEDY}"
+    def describe_flat(self, x: FloatArray) -> tuple[str, bool] | None:
+        """The cell that is nearly inside out at t_n or an iterate, if one is. Collective.
 
-    def _forbidden(self, x: FloatArray) -> FloatArray:
-        return forbidden(self._problem.system, self.smallest(x))
+        Returns:
+            A sentence, and whether that may be all there is to say.
+        """
+        system = self._problem.system
+        low = [body.low_dets[1] for body in system.bodies]
+        # Iterates that run off tell less than where they began.
+        for u in (list(self._problem.state.u), self._displacements(x)):
+            over = forbidden(system, smallest_dets(system, u)) - low
+            worst = int(over.argmin())
+            if over[worst] <= 0.0:
+                sure = bool(over[worst] + low[worst] <= _KEPT_DET)
+                return "; ".join(describe(system.bodies[worst], u[worst])), sure
+        return None
 
     def _displacements(self, x: FloatArray) -> list[FloatArray]:
         """Displacement of each body at an iterate [m]; the array of t_n if it stays. Collective."""

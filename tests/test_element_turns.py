@@ -1,0 +1,116 @@
+"""Elements of beams and shells that turn too far to bend as they should: theory section 20."""
+
+import numpy as np
+import pytest
+from lines import interval_mesh, straight
+from mpi4py import MPI
+from shells import plate
+
+import dolfinx_nts as nts
+from dolfinx_nts.step.diagnosis import diagnosis
+
+SECTION = nts.Section(EA=1e4, GA=(5e3, 5e3), GJ=2, EI=(2, 2), rhoA=1, rhoI=(1e-2, 1e-2))
+SENTENCE = "turns by 90 degrees between neighbouring nodes near X = "
+
+
+def clamp(x):
+    return x[0] < 1e-9
+
+
+def tip(x):
+    return x[0] > 1 - 1e-9
+
+
+def turned(degrees, scale=1.0, degree=1):
+    """One element whose end a rigid body turns by so much until t = 1."""
+    s = scale
+    section = nts.Section(EA=1e4 * s, GA=(5e3 * s,) * 2, GJ=2 * s**3, EI=(2 * s**3,) * 2,
+                          rhoA=1 / s, rhoI=(1e-2 * s,) * 2)  # fmt: skip
+    beam = nts.Beam(interval_mesh(straight(1, s)), section, bcs=[nts.Clamp(clamp)], degree=degree)
+    head = nts.RigidBody.from_inertia(
+        1.0, (s**2,) * 3, (s, 0, 0), name="head", comm=MPI.COMM_WORLD,
+        rotation=lambda t: (0, 0, np.radians(degrees) * t),
+    )  # fmt: skip
+    return nts.System([beam, head], joints=[nts.Fixed(beam, head, point=(s, 0, 0))])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("scale", [1, 1000])
+def test_an_element_that_turns_too_far_is_told(scale):
+    """With how many elements of 30 degrees there should be; below 45 there is nothing to say."""
+    run = nts.equilibrium(turned(44.0, scale), load_steps=4)
+    assert run.status == "completed" and not run.warnings
+    run = nts.equilibrium(turned(76.0, scale), load_steps=4)
+    found = run.warnings["turn of an element"]
+    assert found.first == 0.75 and found.about == ("beam",) and not found.grave
+    assert found.worst == pytest.approx(1 - np.cos(np.radians(76.0)))
+    middle = f"X = ({0.5 * scale:.4g}, 0, 0)"
+    assert f"turns by 76 degrees between neighbouring nodes near {middle}" in found.text
+    assert "about 3 elements are needed for that, or 2 with degree=2, where it has 1" in found.text
+    assert run.balance["min_det"] == pytest.approx(np.cos(np.radians(76 / 4 * np.arange(5))))
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("degrees", [118.0, 122.0])
+def test_of_three_nodes_neighbours_turn_by_60_degrees(degrees):
+    run = nts.equilibrium(turned(degrees, degree=2), load_steps=8)
+    assert run.status == "completed" and ("turn of an element" in run.warnings) == (degrees > 120)
+    assert run.balance["min_det"][-1] == pytest.approx(np.cos(np.radians(degrees / 2)), rel=2e-3)
+
+
+@pytest.mark.mpi
+def test_a_step_that_turns_an_element_by_90_degrees_is_not_accepted():
+    run = nts.equilibrium(turned(100.0), load_steps=10)
+    assert run.balance["time"][-1] <= 0.9 and run.balance["min_det"].min() > 0.0
+    assert "between neighbouring nodes near X = (0.5, 0, 0); about 3 elements" in run.status
+
+
+@pytest.mark.mpi
+def test_a_strip_of_too_few_beams_is_told():
+    """An element bears EI / (2 length) at most, at a turn of 45 degrees."""
+    load = nts.PointMoment(tip, (0, 0, 2 * np.pi * 2))
+    beam = nts.Beam(interval_mesh(straight(8)), SECTION, bcs=[nts.Clamp(clamp)], forces=[load])
+    run = nts.equilibrium(nts.System([beam]), load_steps=10)
+    assert run.balance["time"][-1] == pytest.approx(8 / 2 / (2 * np.pi), rel=1e-2)
+    assert "beam 'beam' turns by" in run.status and "about 24 elements are needed" in run.status
+    assert "more load steps" not in run.status
+
+
+def test_a_strip_of_too_few_shells_is_told():
+    """An element bears EI / length at most, if it does not stretch."""
+    moment = 2 * np.pi * 1.2e6 * 0.1**3 / 12 / 12.0
+    shell = nts.Shell(
+        plate(5, 1, 12.0, 1.0), young=1.2e6, poisson=0.0, thickness=0.1, density=1.0,
+        bcs=[nts.Clamp(clamp)],
+        forces=[nts.LineMoment((0, -moment, 0), where=lambda x: x[0] > 12 - 1e-9)],
+    )  # fmt: skip
+    run = nts.equilibrium(nts.System([shell]), load_steps=10)
+    assert run.balance["time"][-1] == pytest.approx(5 / (2 * np.pi), rel=1e-2)
+    assert "shell 'shell' turns by" in run.status and "times as many elements" in run.status
+    assert "shell 'shell' turns by" in run.warnings["turn of an element"].text
+
+
+def test_a_beam_that_a_moment_rolls_up_is_stopped():
+    """In motion; more elements go on."""
+    section = nts.Section(EA=1e4, GA=(1e4,) * 2, GJ=100, EI=(100,) * 2, rhoA=1, rhoI=(10,) * 2)
+    first = nts.PointMoment(lambda x: x[0] < 1e-9, (0, 0, 60))
+    beam = nts.Beam(interval_mesh(straight(2, 10.0)), section, forces=[first])
+    run = nts.simulate(nts.System([beam]), nts.EnergyMomentum(), dt=0.02, t_end=2)
+    assert SENTENCE in run.status and "about 6 elements" in run.status
+    assert run.balance["min_det"].min() > 0.0 and "turn of an element" in run.warnings
+
+
+def test_largest_residuals_are_at_places_of_nodes():
+    """Also where the equation of a director is unsolved, which is named."""
+    beam = nts.Beam(interval_mesh(straight(2)), SECTION)
+    stepper = nts.Stepper(nts.System([beam]), nts.EnergyMomentum())
+    stepper.start(1e-2)
+    problem = stepper.problem
+    problem.begin(stepper.state, 1e-2)
+    for vector, text in ((4, "residual at X = (0.5, 0, 0)"),
+                         (6, "residual of director 2 at X = (0.5, 0, 0)")):  # fmt: skip
+        e = problem.evaluate(problem.x)
+        e.bodies[0].residual[:] = 0.0
+        e.bodies[0].residual[3 * vector] = 1.0
+        assert text in diagnosis(problem, e, [()] * len(problem.elements), "why", 0)
+    stepper.close()
