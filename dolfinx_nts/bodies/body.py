@@ -238,8 +238,7 @@ class Body:
         return (
             f"a cell of body {self.name!r} {turns} inside out, which W(C) cannot see: det F = "
             f"{det:.3g} near X = ({x})",
-            "smaller loads or speeds may prevent it, "
-            f"{type(self).__name__}(..., allow_inversion=True) accepts it",
+            "smaller loads or speeds may prevent it",
         )
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:

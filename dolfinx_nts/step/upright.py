@@ -77,7 +77,11 @@ class Upright:
         """The cell that is inside out at an iterate, and what to do. Collective."""
         system = self._problem.system
         worst = int(forbidden(system, self.smallest(x)).argmin())
-        return "; ".join(describe(system.bodies[worst], self._displacements(x)[worst]))
+        body = system.bodies[worst]
+        text = "; ".join(describe(body, self._displacements(x)[worst]))
+        if body.oriented:
+            return text
+        return f"{text}, {type(body).__name__}(..., allow_inversion=True) accepts it"
 
     def describe_flat(self, x: FloatArray) -> tuple[str, bool] | None:
         """The cell that is nearly inside out at t_n or an iterate, if one is. Collective.
