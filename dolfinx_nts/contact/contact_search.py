@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
-from dolfinx_nts.contact.coulomb import no_pull
+from dolfinx_nts.contact.coulomb import Rub, no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.coupling import StepWarning
 from dolfinx_nts.elements import Step
@@ -402,6 +402,10 @@ class ContactSearch:
         given = [None] * len(self.elements) if active is None else active
         both = zip(self.elements, given, strict=True)
         self.elements = [replace(c, imposed=on) for c, on in both]
+
+    def rub(self, how: Rub) -> None:
+        """What candidates with friction that touch obey from the next iterate on."""
+        self.elements = [replace(c, rubs=how) for c in self.elements]
 
     def give_way(self) -> bool:
         """Let infinite friction have a bound."""

@@ -124,19 +124,13 @@ class StepSolver:
         self.prepare()
         assert self.matrix is not None
         iterations, unsolved = 0, False
+        may_slip = self.problem.couplings.may_slip
+        first = -1 if may_slip and not self.problem.integrator.inertia else 0
         # Without friction there is nothing to let slip.
-        for retry in range(3 if self.problem.couplings.may_slip else 2):
-            self._upright.begin(careful=retry > 0)
-            if retry:
-                self._tangents.due, self._passed = True, None
-                if retry == 2:
-                    self.problem.couplings.let_slip()
-                self.problem.guess(flight=False)
-                self.iterates.forget_last()
-                if unsolved:
-                    # What failed to factorise once fails from then on.
-                    self.destroy()
-                    self.prepare()
+        for retry in range(first, 3 if may_slip else 2):
+            if first < 0 == retry and not self.iterates.runs_away:
+                continue
+            self._begin(retry, again=retry > first, unsolved=unsolved)
             try:
                 self._raised = None
                 self._presets.options.check(self.snes, self.matrix.operator, self._source.operator)
@@ -175,6 +169,30 @@ class StepSolver:
         if unsolved:
             self.destroy()
         raise failure
+
+    def _begin(self, retry: int, *, again: bool, unsolved: bool) -> None:
+        """Begin an attempt at the step; every rank must call it.
+
+        Args:
+            retry: Number of the attempt; -1 comes before 0 where statics have friction.
+            again: Whether there was another one before.
+            unsolved: Whether the linear solver failed in that.
+        """
+        self._upright.begin(careful=retry > 0)
+        if again:
+            self._tangents.due, self._passed = True, None
+            if retry == 2:
+                self.problem.couplings.let_slip()
+            self.problem.guess(flight=retry == 0)
+            self.iterates.forget_last(pivots=retry > 0)
+            if unsolved:
+                # What failed to factorise once fails from then on.
+                self.destroy()
+                self.prepare()
+        # Inertia passes on the forces that sticking nodes keep from each other in statics.
+        slides = retry == (1 if self.problem.integrator.inertia else -1)
+        if slides and self.problem.couplings.may_slip:
+            self.iterates.slide_first()
 
     def _of_least_norm(self, solved: Evaluation) -> Evaluation:
         """The solution with multipliers of least norm, where constraints repeat each other."""
@@ -343,7 +361,8 @@ class StepSolver:
             # One more iteration left rounding only: what it started from is the solution.
             return reasons.CONVERGED_FNORM_RELATIVE
         late = iteration > 0 and iteration % _INSIDE_OUT == 0
-        if self._upright.gives_up or (late and self._is_inside_out(last)):
+        in_vain = self.iterates.runs_away or self._upright.gives_up
+        if in_vain or (late and self._is_inside_out(last)):
             return reasons.DIVERGED_FUNCTION_DOMAIN
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
