@@ -389,6 +389,10 @@ class ContactSearch:
         coefficients = [pair.friction for pair in self._pairs]
         return any(mu > 0.0 and (self.bounded or np.isfinite(mu)) for mu in coefficients)
 
+    def carried_any(self) -> bool:
+        """Whether any node pressed at t_n. Collective."""
+        return anywhere(self._comm, any((old.force > 0.0).any() for old in self._old))
+
     def let_slip(self) -> None:
         """Solve this step with nodes that slip rather than leave, see `ContactElements`."""
         self.elements = [replace(c, lets_slip=True) for c in self.elements]

@@ -16,6 +16,8 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Iterations in a row without fewer changes of the active set before one changes at a time.
 _PATIENCE = 4
+#: Changes of an element's status from which on it goes to and fro.
+_TO_AND_FRO = 4
 #: Iterations at most in which nodes hardly rub.
 _SLIDING = 8
 
@@ -160,3 +162,9 @@ class Iterates:
     def settled(self) -> bool:
         """Whether no element changed its status in the last iteration. Collective."""
         return everywhere(self._problem.system.comm, self._settled)
+
+    @property
+    def cycles(self) -> bool:
+        """Whether an element goes to and fro between two states. Collective."""
+        often = any(bool((flips >= _TO_AND_FRO).any()) for flips in self.flips)
+        return anywhere(self._problem.system.comm, often)

@@ -43,6 +43,8 @@ _NEAR = 1e4
 #: In every so many-th iteration an iterate that is inside out ends the attempt: Newton's method
 #: hardly ever comes back, and most steps never get there.
 _INSIDE_OUT = 8
+#: Iterations before an attempt whose contacts go to and fro ends, where another way is left.
+_CYCLING = 8
 #: Where residuals add up over steps, one above this part of its tolerance gets one more iteration.
 _SURE = 0.05
 #: The part of the tolerance by which work may be left where it has either sign.
@@ -76,7 +78,7 @@ class StepSolver:
         self.iterates, self._upright = Iterates(problem), Upright(problem)
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
-        self._version, self._solved = -1, False
+        self._version, self._solved, self._patient = -1, False, True
         self._raised: StepFailedError | None = None
         joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
         self._independent: bool | None = True if form_tree(joints) else None
@@ -124,13 +126,17 @@ class StepSolver:
         self.prepare()
         assert self.matrix is not None
         iterations, unsolved = 0, False
-        may_slip = self.problem.couplings.may_slip
-        first = -1 if may_slip and not self.problem.integrator.inertia else 0
+        couplings, moves = self.problem.couplings, self.problem.integrator.inertia
+        may_slip = couplings.may_slip
+        # Inertia passes on the forces that sticking nodes keep from each other in statics.
+        first = 0 if moves or not may_slip or couplings.contacts.carried_any() else -1
         # Without friction there is nothing to let slip.
         for retry in range(first, 3 if may_slip else 2):
             if first < 0 == retry and not self.iterates.runs_away:
                 continue
-            self._begin(retry, again=retry > first, unsolved=unsolved)
+            slides = may_slip and retry == (-1 if first < 0 else 1)
+            self._patient = moves or not may_slip or retry != 0 or first < 0
+            self._begin(retry, slides=slides, again=retry > first, unsolved=unsolved)
             try:
                 self._raised = None
                 self._presets.options.check(self.snes, self.matrix.operator, self._source.operator)
@@ -170,11 +176,12 @@ class StepSolver:
             self.destroy()
         raise failure
 
-    def _begin(self, retry: int, *, again: bool, unsolved: bool) -> None:
+    def _begin(self, retry: int, *, slides: bool, again: bool, unsolved: bool) -> None:
         """Begin an attempt at the step; every rank must call it.
 
         Args:
-            retry: Number of the attempt; -1 comes before 0 where statics have friction.
+            retry: Number of the attempt; -1 comes before 0 where statics with friction begin.
+            slides: Whether nodes slide in it before they rub.
             again: Whether there was another one before.
             unsolved: Whether the linear solver failed in that.
         """
@@ -189,9 +196,7 @@ class StepSolver:
                 # What failed to factorise once fails from then on.
                 self.destroy()
                 self.prepare()
-        # Inertia passes on the forces that sticking nodes keep from each other in statics.
-        slides = retry == (1 if self.problem.integrator.inertia else -1)
-        if slides and self.problem.couplings.may_slip:
+        if slides:
             self.iterates.slide_first()
 
     def _of_least_norm(self, solved: Evaluation) -> Evaluation:
@@ -362,6 +367,8 @@ class StepSolver:
             return reasons.CONVERGED_FNORM_RELATIVE
         late = iteration > 0 and iteration % _INSIDE_OUT == 0
         in_vain = self.iterates.runs_away or self._upright.gives_up
+        # In statics what slides first hardly ever fails.
+        in_vain |= not self._patient and iteration >= _CYCLING and self.iterates.cycles
         if in_vain or (late and self._is_inside_out(last)):
             return reasons.DIVERGED_FUNCTION_DOMAIN
         if iteration >= self.newton.max_iterations:
