@@ -1,5 +1,7 @@
 """Coulomb friction on rigid planes, spheres and cylinders: closed forms, and a meshed plate."""
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
@@ -23,6 +25,7 @@ from scenes_obstacles import (
 )
 
 import dolfinx_nts as nts
+from dolfinx_nts.contact.coulomb import Rub
 
 COMM = MPI.COMM_WORLD
 
@@ -50,6 +53,32 @@ def test_tangent_is_the_derivative_of_the_residual(name, integrator, state):
         for e in np.eye(6)
     ]
     np.testing.assert_allclose(part.tangent[0].T, expected, rtol=0, atol=1e-8 * MASS)
+
+
+@pytest.mark.parametrize("rubs", [Rub.HARDLY, Rub.SLIDES])
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_friction_before_the_normal_forces_are_known(name, rubs):
+    """Next to none, but not none; then mu p_N against the slip wherever a node has slid."""
+    pair = Pair(name, "midpoint", friction=0.3)
+    pair.step = replace(pair.step, rubs=rubs)
+    tangential = np.array([0.13, -0.08])
+    pressed = 0.3 + pair.at(np.append(pair.x, np.zeros(3))).gap[0]
+    unknowns = np.array([*pair.x, -pressed, *tangential])
+    part = pair.at(unknowns)
+    assert part.active[0] and not part.stick[0]
+    wanted = tangential - part.residual[0, 4:] / MASS
+    if name == "plane":
+        slip = part.slip[0] / part.distance[0]
+        expected = 0.3 * pressed * slip if rubs is Rub.SLIDES else np.zeros(2)
+        np.testing.assert_allclose(wanted, expected, rtol=0, atol=1e-8)
+    step, slides = 1e-3, rubs is Rub.SLIDES
+    slopes = [
+        sum(w / step * pair.residual(unknowns + k * step * e)[0] for k, w in STENCIL)
+        for e in np.eye(6)
+    ]
+    tangent = part.tangent[0].T
+    assert np.linalg.norm(tangent[:3, 4:]) > (0.1 if slides else 1e-10) * MASS
+    np.testing.assert_allclose(tangent, slopes, rtol=0, atol=(1e-6 if slides else 1e-11) * MASS)
 
 
 @pytest.mark.parametrize("integrator", CONTACT_RULES)

@@ -398,7 +398,7 @@ def test_contacts_that_change_one_at_a_time_end_in_the_same_step(friction, monke
 
             def pivoting(solver=solver, restart=restart):
                 restart()
-                solver.iterates.try_again()
+                solver.iterates.try_again(pivots=True)
 
             def counted(active, impose=impose):
                 imposed.append(active)
@@ -510,7 +510,7 @@ def test_an_error_of_petsc_is_not_told_as_an_earlier_one():
     stepper.problem.begin(stepper.state, 1e-2)
     solver.prepare()
     stepper.problem.evaluate = raising
-    solver.iterates.try_again()
+    solver.iterates.try_again(pivots=True)
     with pytest.raises(nts.StepFailedError, match="an early failure"):
         solver._function(None, stepper.problem.x, None)
     stepper.problem.evaluate, prepare = evaluate, solver.prepare

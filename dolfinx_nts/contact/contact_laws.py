@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.constraints import SHIFT
-from dolfinx_nts.contact.coulomb import STRONG, UNEVEN, Coulomb, Slip, Together
+from dolfinx_nts.contact.coulomb import STRONG, UNEVEN, Coulomb, Rub, Slip, Together
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.parallel import gather_rows
@@ -88,6 +88,7 @@ class ContactLaws:
         imposed: Which pairs are active, whatever their forces and gaps say, shape (n,); None: those
             that the law says.
         overlap: How deep the slaves may lie behind their facets at t_{n+1} [m], shape (n,).
+        rubs: What pairs with friction that touch obey instead of Coulomb's law.
         before: h^2/2 lambda_N and lambda_T at t_n of massless nodes [kg m], NaN of the others,
             shape (n, 3); None: there are none.
     """
@@ -105,6 +106,7 @@ class ContactLaws:
     bounded: bool = False
     lets_slip: bool = False
     imposed: BoolArray | None = None
+    rubs: Rub = Rub.LAW
     before: FloatArray | None = None
 
     @property
@@ -253,6 +255,7 @@ class ContactLaws:
             scale=self.scale,
             yielding=self._yielding,
             of_end=self._of_end,
+            rubs=self.rubs,
         )
 
     @cached_property
@@ -303,6 +306,9 @@ class ContactLaws:
         )
         if found is None:
             found = self._write(x, residual, tangent, gap, slip, multiplier, together, normal)
+        if slip is not None and self.rubs is Rub.HARDLY and not self.coulomb.endless:
+            self.coulomb.rub_hardly(found.residual, found.tangent, slip, found.end, found.active)
+            found.stick[found.active] = False
         return Contribution(
             found.residual,
             found.tangent,

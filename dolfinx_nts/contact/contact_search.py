@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
-from dolfinx_nts.contact.coulomb import no_pull
+from dolfinx_nts.contact.coulomb import Rub, no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.shared_nodes import held_before
 from dolfinx_nts.coupling import StepWarning
@@ -426,6 +426,10 @@ class ContactSearch:
         coefficients = [pair.friction for pair in self._pairs]
         return any(mu > 0.0 and (self.bounded or np.isfinite(mu)) for mu in coefficients)
 
+    def carried_any(self) -> bool:
+        """Whether any node pressed at t_n. Collective."""
+        return anywhere(self._comm, any((old.force > 0.0).any() for old in self._old))
+
     def let_slip(self) -> None:
         """Solve this step with nodes that slip rather than leave, see `ContactElements`."""
         self.elements = [replace(c, lets_slip=True) for c in self.elements]
@@ -443,6 +447,10 @@ class ContactSearch:
             yield
         finally:
             self.elements = by_law
+
+    def rub(self, how: Rub) -> None:
+        """What candidates with friction that touch obey from the next iterate on."""
+        self.elements = [replace(c, rubs=how) for c in self.elements]
 
     def give_way(self) -> bool:
         """Let infinite friction have a bound."""

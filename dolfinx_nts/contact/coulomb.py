@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 from typing import NamedTuple
 
@@ -35,8 +36,24 @@ _PULL = 0.01
 _IMMOVABLE = 1e-12
 #: Slip over the size of the facet that counts as none.
 _STILL = 1e-10
+#: Stiffness against sliding of pairs that hardly rub, over that of the nodes: next to nothing, but
+#: the equations of a body that friction alone holds have a solution.
+_HARDLY = 1e-9
 #: Largest ratio of normal forces by which friction of a rigid body's nodes is divided.
 UNEVEN = 100.0
+
+
+class Rub(Enum):
+    """What pairs obey that touch: Coulomb's law, or what leads Newton's method to it.
+
+    Where nothing carries yet, all bounds are zero: nodes would stick, whatever pulls at them, and
+    pass no force on to those whose normal forces it makes. So nodes slide first almost freely, till
+    it is known which ones touch; then each slips where it has slid.
+    """
+
+    LAW = "law"
+    HARDLY = "hardly"
+    SLIDES = "slides"
 
 
 class Slip(NamedTuple):
@@ -90,6 +107,7 @@ class Coulomb:
         scale: As of `ContactLaws`, shape (n,).
         yielding: The part of it that slave and foot move against each other, shape (n,).
         of_end: Derivative of the multipliers at t_{n+1} by those of the step, shape (n,).
+        rubs: As of `ContactLaws`.
     """
 
     friction: float
@@ -105,6 +123,7 @@ class Coulomb:
     scale: FloatArray
     yielding: FloatArray
     of_end: FloatArray
+    rubs: Rub = Rub.LAW
 
     @property
     def endless(self) -> bool:
@@ -130,6 +149,9 @@ class Coulomb:
     @cached_property
     def tangential_scale(self) -> FloatArray:
         """Algorithmic scale of the return map, shape (n,)."""
+        if self.rubs is Rub.SLIDES:
+            # Whatever has slid is beyond the bound.
+            return self.yielding / _HARDLY
         return (TANGENTIAL_SCALE if self.yields else _OF_SHARED) * self.yielding
 
     # ---- what cannot slip
@@ -225,6 +247,26 @@ class Coulomb:
         part = np.clip(part, 1.0 / UNEVEN, UNEVEN)
         lent: FloatArray = together.tangential * part / self.scale[stick]
         return lent
+
+    def rub_hardly(
+        self, residual: FloatArray, tangent: FloatArray, slip: Slip, end: FloatArray, of: BoolArray
+    ) -> None:
+        """Write the rows of lambda_T [kg m] of pairs that touch as if they hardly rubbed.
+
+        Args:
+            residual: Of the pairs as of the step, shape (n, r).
+            tangent: Shape (n, r, r).
+            slip: At the iterate.
+            end: h^2/2 lambda at t_{n+1} [kg m]: lambda_T last.
+            of: Which pairs, shape (n,).
+        """
+        stiffness = _HARDLY * self.yielding[of, None]
+        metric = slip.metric[of]
+        residual[of, -2:] = end[of, -2:]
+        residual[of, -2:] -= stiffness * np.einsum("nab,nb->na", metric, slip.value[of])
+        rows = -stiffness[:, :, None] * np.matmul(metric, slip.gradient[of])
+        rows[:, :, -2:] += (self.of_end * self.scale)[of, None, None] * np.eye(2)
+        tangent[of, -2:] = rows
 
     def write(
         self,

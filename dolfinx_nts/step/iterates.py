@@ -7,14 +7,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.contact.coulomb import Rub
 from dolfinx_nts.evaluation import Evaluation
-from dolfinx_nts.parallel import everywhere, global_max, global_sum
+from dolfinx_nts.parallel import anywhere, everywhere, global_max, global_sum
 from dolfinx_nts.step.problem import StepProblem
 
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Iterations in a row without fewer changes of the active set before one changes at a time.
 _PATIENCE = 4
+#: Changes of an element's status from which on it goes to and fro.
+_TO_AND_FRO = 4
+#: Iterations at most in which nodes hardly rub.
+_SLIDING = 8
 
 
 class Iterates:
@@ -27,10 +32,11 @@ class Iterates:
         last: Evaluation of the last iterate.
         flips: Of each batch of elements how often each has changed its status.
         imposed: Whether the last iterate was evaluated with contacts that its laws would change.
+        runs_away: Whether nodes that hardly rub slid so far that friction must be what holds them.
     """
 
     def __init__(self, problem: StepProblem) -> None:
-        self._problem = problem
+        self._problem, self._sliding = problem, 0
         self.restart()
 
     def restart(self) -> None:
@@ -39,17 +45,29 @@ class Iterates:
         self.flips: list[IntArray] = []
         self.imposed, self._settled, self._pivots = False, True, False
         self._fewest, self._patience = np.inf, _PATIENCE
+        self.runs_away = False
+        self._rub_by_law()
 
-    def try_again(self) -> None:
+    def slide_first(self) -> None:
+        """Let nodes hardly rub until it is settled which ones touch, and slip from there on.
+
+        See `Rub`. What friction alone holds runs away.
+        """
+        self.last, self._sliding = None, _SLIDING
+        self._problem.couplings.contacts.rub(Rub.HARDLY)
+
+    def try_again(self, *, pivots: bool) -> None:
         """Forget the last iterate, as another attempt at the same step begins.
 
-        In that one contacts change one at a time where changing all at once leads nowhere. On a
-        linear problem without friction this ends (block pivoting with single pivots, Judice and
-        Pires 1994), where the plain active set may cycle. In statics it is the state that cycles,
-        see `LentStiffness`.
+        Args:
+            pivots: Whether contacts change one at a time in it where changing all at once leads
+                nowhere. On a linear problem without friction this ends (block pivoting with single
+                pivots, Judice and Pires 1994), where the plain active set may cycle. In statics it
+                is the state that cycles, see `LentStiffness`.
         """
-        self.last, self.imposed = None, False
-        self._pivots = self._problem.integrator.inertia
+        self._rub_by_law()
+        self.last, self.imposed, self.runs_away = None, False, False
+        self._pivots = pivots and self._problem.integrator.inertia
         self._fewest, self._patience = np.inf, _PATIENCE
 
     def at(self, x: Any) -> Evaluation:
@@ -69,6 +87,8 @@ class Iterates:
         self.imposed = False
         if last is not None and self._pivots:
             new = self._pivoted(last, new, x)
+        if self._sliding:
+            new = self._slid(last, new, x)
         self._settled = not self.imposed
         if last is None:
             self.flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
@@ -80,6 +100,37 @@ class Iterates:
                     self._settled &= not changes.any()
         self.last = new
         return new
+
+    def _slid(self, last: Evaluation | None, new: Evaluation, x: Any) -> Evaluation:
+        """The new iterate of nodes that hardly rub, or slip once it is settled which touch.
+
+        Collective.
+        """
+        contacts, comm = self._problem.couplings.contacts, self._problem.system.comm
+        parts = new.parts[: len(contacts.elements)]
+        far = [
+            (part.distance > c.candidates.length).any()
+            for c, part in zip(contacts.elements, parts, strict=True)
+        ]
+        before = [] if last is None else last.parts[: len(parts)]
+        changes = [(a.active != b.active).any() for a, b in zip(before, parts, strict=False)]
+        # Inertia holds what slides, and what is fast slides far.
+        self.runs_away = anywhere(comm, any(far)) and not self._problem.integrator.inertia
+        left = self._sliding - 1
+        self.imposed = True
+        if (last is not None and not anywhere(comm, any(changes))) or left == 0:
+            contacts.rub(Rub.SLIDES)
+            with np.errstate(over="ignore", invalid="ignore"):
+                new = self._problem.evaluate(x)
+            self._rub_by_law()
+        else:
+            self._sliding = left
+        return new
+
+    def _rub_by_law(self) -> None:
+        if self._sliding:
+            self._sliding = 0
+            self._problem.couplings.contacts.rub(Rub.LAW)
 
     def _pivoted(self, last: Evaluation, new: Evaluation, x: Any) -> Evaluation:
         """The new iterate, with one change of the last one's active set if all do not settle.
@@ -112,3 +163,9 @@ class Iterates:
     def settled(self) -> bool:
         """Whether no element changed its status in the last iteration. Collective."""
         return everywhere(self._problem.system.comm, self._settled)
+
+    @property
+    def cycles(self) -> bool:
+        """Whether an element goes to and fro between two states. Collective."""
+        often = any(bool((flips >= _TO_AND_FRO).any()) for flips in self.flips)
+        return anywhere(self._problem.system.comm, often)

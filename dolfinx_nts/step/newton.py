@@ -44,6 +44,8 @@ _NEAR = 1e4
 #: In every so many-th iteration an iterate that is inside out ends the attempt: Newton's method
 #: hardly ever comes back, and most steps never get there.
 _INSIDE_OUT = 8
+#: Iterations before an attempt whose contacts go to and fro ends, where another way is left.
+_CYCLING = 8
 #: Where residuals add up over steps, one above this part of its tolerance gets one more iteration.
 _SURE = 0.05
 #: The part of the tolerance by which work may be left where it has either sign.
@@ -78,7 +80,7 @@ class StepSolver:
         self._lent, self._wanders = LentStiffness(problem), False
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
-        self._version, self._solved = -1, False
+        self._version, self._solved, self._patient = -1, False, True
         self._raised: StepFailedError | None = None
         joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
         self._independent: bool | None = True if form_tree(joints) else None
@@ -126,20 +128,17 @@ class StepSolver:
         self.prepare()
         assert self.matrix is not None
         iterations, unsolved = 0, False
+        couplings, moves = self.problem.couplings, self.problem.integrator.inertia
+        may_slip = couplings.may_slip
+        # Inertia passes on the forces that sticking nodes keep from each other in statics.
+        first = 0 if moves or not may_slip or couplings.contacts.carried_any() else -1
         # Without friction there is nothing to let slip.
-        for retry in range(3 if self.problem.couplings.may_slip else 2):
-            self._upright.begin(careful=retry > 0 or self.problem.dives)
-            if retry:
-                self._tangents.due, self._passed = True, None
-                if retry == 2:
-                    self.problem.couplings.let_slip()
-                self.problem.couplings.contacts.forget_solution()
-                self.problem.guess(flight=False, forces=False)
-                self.iterates.try_again()
-                if unsolved:
-                    # What failed to factorise once fails from then on.
-                    self.destroy()
-                    self.prepare()
+        for retry in range(first, 3 if may_slip else 2):
+            if first < 0 == retry and not self.iterates.runs_away:
+                continue
+            slides = may_slip and retry == (-1 if first < 0 else 1)
+            self._patient = moves or not may_slip or retry != 0 or first < 0
+            self._begin(retry, slides=slides, again=retry > first, unsolved=unsolved)
             try:
                 self._raised = None
                 self._presets.options.check(self.snes, self.matrix.operator, self._source.operator)
@@ -179,6 +178,33 @@ class StepSolver:
         if unsolved:
             self.destroy()
         raise failure
+
+    def _begin(self, retry: int, *, slides: bool, again: bool, unsolved: bool) -> None:
+        """Begin an attempt at the step; every rank must call it.
+
+        Args:
+            retry: Number of the attempt; -1 comes before 0 where statics with friction begin.
+            slides: Whether nodes slide in it before they rub.
+            again: Whether there was another one before.
+            unsolved: Whether the linear solver failed in that.
+        """
+        self._upright.begin(careful=retry > 0 or self.problem.dives)
+        if again:
+            self._tangents.due, self._passed = True, None
+            if retry == 2:
+                self.problem.couplings.let_slip()
+            if retry == 0:
+                self.problem.first_guess()
+            else:
+                self.problem.couplings.contacts.forget_solution()
+                self.problem.guess(flight=False, forces=False)
+            self.iterates.try_again(pivots=retry > 0)
+            if unsolved:
+                # What failed to factorise once fails from then on.
+                self.destroy()
+                self.prepare()
+        if slides:
+            self.iterates.slide_first()
 
     def _of_least_norm(self, solved: Evaluation) -> Evaluation:
         """The solution with multipliers of least norm, where constraints repeat each other."""
@@ -352,7 +378,10 @@ class StepSolver:
             # One more iteration left rounding only: what it started from is the solution.
             return reasons.CONVERGED_FNORM_RELATIVE
         late = iteration > 0 and iteration % _INSIDE_OUT == 0
-        if self._upright.gives_up or (late and self._is_inside_out(last)):
+        in_vain = self.iterates.runs_away or self._upright.gives_up
+        # In statics what slides first hardly ever fails.
+        in_vain |= not self._patient and iteration >= _CYCLING and self.iterates.cycles
+        if in_vain or (late and self._is_inside_out(last)):
             return reasons.DIVERGED_FUNCTION_DOMAIN
         if iteration >= self.newton.max_iterations:
             return reasons.DIVERGED_MAX_IT
