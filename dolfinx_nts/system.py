@@ -127,8 +127,9 @@ class System:
         for b in self.bodies:
             if MPI.Comm.Compare(b.comm, self.comm) not in (MPI.IDENT, MPI.CONGRUENT):
                 raise ValueError(
-                    f"bodies: {b.name!r} and {names[0]!r} live on different communicators; "
-                    "make all meshes on one"
+                    f"bodies: {b.name!r} and {names[0]!r} live on different communicators, of "
+                    f"{b.comm.size} and {self.comm.size} ranks; make all meshes on one, e.g. "
+                    "MPI.COMM_WORLD, each with its cells spread over the ranks"
                 )
 
     def _check_members(self) -> None:
