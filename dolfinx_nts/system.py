@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body, is_body
+from dolfinx_nts.bodies.jumps import jumps
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, ContactPair
@@ -113,7 +114,7 @@ class System:
             # The search looks half a facet deep; this, the whole body.
             depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
         self._check_sides(start)
-        self._check_penetration(depths)
+        self._check_penetration(depths, jumps(self.bodies))
         self._check_enclosed(start)
 
     def _check_bodies(self) -> None:
@@ -320,15 +321,16 @@ class System:
             depths.append(depth)
         return depths
 
-    def _check_penetration(self, depths: list[FloatArray]) -> None:
-        """Raise on every rank, with the nodes, if slaves start inside their masters."""
+    def _check_penetration(self, depths: list[FloatArray], jump: str = "") -> None:
+        """Raise on every rank, with the nodes and a jump, if slaves start inside their masters."""
         for pair, depth in zip(self.contacts, depths, strict=True):
             deep = depth > INITIAL_PENETRATION
             if deep.any():
                 raise ValueError(
                     f"contact {pair.name!r}: {deep.sum()} slave nodes start inside the master, "
                     f"up to {depth.max():.3g} of a facet (allowed {INITIAL_PENETRATION}), nodes "
-                    f"{np.sort(pair.slave.original[deep])[:10].tolist()}; move the bodies apart"
+                    f"{np.sort(pair.slave.original[deep])[:10].tolist()}; "
+                    + (jump or "move the bodies apart")
                 )
 
     def _check_sides(self, state: State) -> None:
