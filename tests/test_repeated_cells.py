@@ -4,9 +4,11 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from dolfinx import mesh as dolfinx_mesh
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.mesh_check import refuse_repeated
 
 COMM = MPI.COMM_WORLD
 SEVERAL = pytest.mark.skipif(COMM.size == 1, reason="needs several ranks")
@@ -69,3 +71,13 @@ def test_cells_at_the_same_places_are_refused():
             make()
     with pytest.raises(ValueError, match="^mesh: 2 cells are there 2 times"):
         nts.linear(twice)
+
+
+@pytest.mark.mpi
+def test_cells_of_a_lattice_are_not_taken_for_each_other():
+    """Gmsh's are equilateral: x + sqrt(3) z is the same at many nodes."""
+    box = dolfinx_mesh.create_box(
+        COMM, [np.zeros(3), np.array([8.0, 8.0, 8.0 / np.sqrt(3.0)])], [8] * 3,
+        dolfinx_mesh.CellType.tetrahedron,
+    )  # fmt: skip
+    refuse_repeated(box, "mesh")

@@ -16,6 +16,7 @@ from dolfinx_nts.contact.surfaces import flux, oriented_nodes
 from dolfinx_nts.parallel import gather_rows, raise_together
 
 FloatArray = npt.NDArray[np.float64]
+HashArray = npt.NDArray[np.uint64]
 
 #: Corners of the cells of each kind.
 _CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
@@ -98,15 +99,13 @@ def refuse_repeated(mesh: Any, name: str) -> None:
     dim = mesh.topology.dim
     cells = compat.geometry_dofmap(mesh)[: mesh.topology.index_map(dim).size_local]
     if dim == 3:
-        x, y, z = mesh.geometry.x.T
-        # Of each place a number of its own; 0.0 takes signs of zeros away.
-        of_node = (0.0 + x + np.sqrt(2.0) * y + np.sqrt(3.0) * z).view(np.uint64)
+        # As bits, as lattices put many a sum of coordinates twice; 0.0 takes signs of zeros away.
+        x = _hashed((mesh.geometry.x + 0.0).view(np.uint64))
+        of_node = _hashed(x[:, 0] + _hashed(x[:, 1] + _hashed(x[:, 2])))
     else:
-        of_node = np.asarray(mesh.geometry.input_global_indices, dtype=np.uint64)
-    of_node = of_node ^ (of_node >> np.uint64(32))
-    # Of the nodes of a cell in any order, the same on all ranks.
-    factors = np.random.default_rng(0).integers(1, 2**63, cells.shape[1], dtype=np.uint64)
-    of_cell = (np.sort(of_node[cells], axis=1) * factors).sum(axis=1)
+        of_node = _hashed(np.asarray(mesh.geometry.input_global_indices, dtype=np.uint64))
+    # Whatever their order.
+    of_cell = of_node[cells].sum(axis=1)
     found, count = np.unique(gather_rows(mesh.comm, of_cell), return_counts=True)
     if (count == 1).all():
         return
@@ -117,6 +116,13 @@ def refuse_repeated(mesh: Any, name: str) -> None:
         f"x={where}; give each cell once, on one rank, not the whole mesh on every rank"
     )
     raise_together(mesh.comm, text if len(twice) else None)
+
+
+def _hashed(a: HashArray) -> HashArray:
+    """Numbers of 64 bits, one for each, that look like random ones (splitmix64)."""
+    a = (a ^ (a >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    a = (a ^ (a >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return a ^ (a >> np.uint64(31))
 
 
 def _check_nodes(mesh: Any, name: str, degree: int = 1) -> None:
