@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import importlib
 import logging
 import re
@@ -24,6 +25,7 @@ from ufl.core.expr import Expr
 
 from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.canonical import canonical
+from dolfinx_nts.parallel import raise_together
 
 logger = logging.getLogger(__name__)
 
@@ -54,8 +56,12 @@ def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: st
             intervals of degree 2 both ends, then the middle node, shape (m, 3).
         x: This rank's part of the points [m], shape (n, 3).
         cell_type: Of DOLFINx, e.g. "hexahedron", "tetrahedron", "quadrilateral", "interval".
+
+    Raises:
+        ValueError: Several ranks give the same cells.
     """
     cells, x = np.ascontiguousarray(cells, np.int64), np.ascontiguousarray(x, np.float64)
+    _refuse_whole(comm, cells, x)
     degree = 2 if (cell_type, cells.shape[1]) == ("interval", 3) else 1
     if _OLD:
         cell = ufl.Cell(cell_type, geometric_dimension=x.shape[1])
@@ -65,6 +71,25 @@ def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: st
     e = basix_ufl.element("Lagrange", cell_type, degree, shape=(x.shape[1],))
     args = (x, e) if VERSION < (0, 10) else (e, x)
     return mesh.create_mesh(comm, cells, *args, **_ghosts())
+
+
+def _refuse_whole(comm: Any, cells: IntArray, x: FloatArray) -> None:
+    """Raise on every rank if two give the same cells, of the same points or of a copy of them."""
+    if comm.size == 1:
+        return
+    low = cells.min(initial=np.iinfo(np.int64).max)
+    parts = (cells.tobytes(), (cells - low).tobytes() + x.tobytes())
+    own = [hashlib.sha256(part).digest() for part in parts] if len(cells) else None
+    given = comm.allgather(own)
+    problem = None
+    for rank, other in enumerate(given[: comm.rank]):
+        if own and other and any(a == b for a, b in zip(own, other, strict=True)):
+            problem = problem or (
+                f"cells: ranks {rank} and {comm.rank} give the same {len(cells)} cells; give each "
+                "cell on one rank, e.g. all cells and points on rank 0 and arrays without rows, "
+                f"np.empty((0, {cells.shape[1]})) and np.empty((0, {x.shape[1]})), on the others"
+            )
+    raise_together(comm, problem)
 
 
 def model_to_mesh(model: Any, comm: Any, rank: int = 0) -> tuple[Any, Any, Any]:

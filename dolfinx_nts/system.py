@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body, is_body
+from dolfinx_nts.bodies.jumps import jumps
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
@@ -115,7 +116,7 @@ class System:
             # The search looks half a facet deep; this, the whole body.
             depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
         self._check_sides(start)
-        self._check_penetration(depths)
+        self._check_penetration(depths, jumps(self.bodies))
         self._check_enclosed(start)
 
     def _check_bodies(self) -> None:
@@ -129,8 +130,9 @@ class System:
         for b in self.bodies:
             if MPI.Comm.Compare(b.comm, self.comm) not in (MPI.IDENT, MPI.CONGRUENT):
                 raise ValueError(
-                    f"bodies: {b.name!r} and {names[0]!r} live on different communicators; "
-                    "make all meshes on one"
+                    f"bodies: {b.name!r} and {names[0]!r} live on different communicators, of "
+                    f"{b.comm.size} and {self.comm.size} ranks; make all meshes on one, e.g. "
+                    "MPI.COMM_WORLD, each with its cells spread over the ranks"
                 )
 
     def _check_members(self) -> None:
@@ -354,9 +356,9 @@ class System:
         for pair, depth in zip(self.contacts, self.penetration(state), strict=True):
             _refuse_deep(pair, depth, INITIAL_PENETRATION, remedy)
 
-    def _check_penetration(self, depths: list[FloatArray]) -> None:
-        """Raise on every rank, with the nodes, if slaves start deeper inside than pairs take."""
-        remedy = (
+    def _check_penetration(self, depths: list[FloatArray], jump: str = "") -> None:
+        """Raise on every rank, with nodes and a jump, if slaves start deeper than pairs take."""
+        remedy = jump or (
             "move the bodies apart, or, for a fit of up to half a facet, pass "
             'interference="resolve" to the pair and let equilibrium press the overlap out'
         )

@@ -54,6 +54,7 @@ class Body:
         has_massless: Whether coordinates on any rank have no mass.
         law: W as a function of Green's strain in UFL; None: it has no material.
         made_on: Places of its mesh's nodes when it was made, see `places_of`; None without a mesh.
+        starts_moved: Whether the user has given it a displacement to start with.
         stressed: Stress of the undeformed body over its stiffness, once it is known and too large.
         destroyed: Whether `destroy` was called.
     """
@@ -81,6 +82,7 @@ class Body:
     has_massless: bool = False
     law: Any = None
     made_on: Any = None
+    starts_moved: bool = False
     stressed: float | None = None
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None

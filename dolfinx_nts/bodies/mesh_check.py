@@ -13,9 +13,10 @@ from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import flux, oriented_nodes
-from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.parallel import gather_rows, raise_together
 
 FloatArray = npt.NDArray[np.float64]
+HashArray = npt.NDArray[np.uint64]
 
 #: Corners of the cells of each kind.
 _CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
@@ -82,6 +83,48 @@ def check_any_mesh(mesh: Any, name: str, degree: int = 1) -> None:
         _check_nodes(mesh, name, degree)
 
 
+def refuse_repeated(mesh: Any, name: str) -> None:
+    """Raise on every rank if cells are there twice, as where each rank gives the whole mesh.
+
+    In 3D cells are the same that have the same places; surfaces and lines may lie on each other,
+    and are the same if they have the same nodes.
+
+    Args:
+        mesh: DOLFINx mesh.
+        name: Argument, and whose it is, for messages.
+
+    Raises:
+        ValueError: They are.
+    """
+    dim = mesh.topology.dim
+    cells = compat.geometry_dofmap(mesh)[: mesh.topology.index_map(dim).size_local]
+    if dim == 3:
+        # As bits, as lattices put many a sum of coordinates twice; 0.0 takes signs of zeros away.
+        x = _hashed((mesh.geometry.x + 0.0).view(np.uint64))
+        of_node = _hashed(x[:, 0] + _hashed(x[:, 1] + _hashed(x[:, 2])))
+    else:
+        of_node = _hashed(np.asarray(mesh.geometry.input_global_indices, dtype=np.uint64))
+    # Whatever their order.
+    of_cell = of_node[cells].sum(axis=1)
+    found, count = np.unique(gather_rows(mesh.comm, of_cell), return_counts=True)
+    if (count == 1).all():
+        return
+    twice = np.flatnonzero(np.isin(of_cell, found[count > 1]))
+    where = mesh.geometry.x[cells[twice[:1]]].mean(axis=(0, 1)).tolist() if len(twice) else []
+    text = (
+        f"{name}: {(count > 1).sum()} cells are there {count.max()} times, e.g. the one at "
+        f"x={where}; give each cell once, on one rank, not the whole mesh on every rank"
+    )
+    raise_together(mesh.comm, text if len(twice) else None)
+
+
+def _hashed(a: HashArray) -> HashArray:
+    """Numbers of 64 bits, one for each, that look like random ones (splitmix64)."""
+    a = (a ^ (a >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    a = (a ^ (a >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return a ^ (a >> np.uint64(31))
+
+
 def _check_nodes(mesh: Any, name: str, degree: int = 1) -> None:
     """Raise on every rank unless the nodes are corners of known cells, and finite."""
     kind, cells = compat.cell_name(mesh), compat.geometry_dofmap(mesh)
@@ -97,6 +140,7 @@ def _check_nodes(mesh: Any, name: str, degree: int = 1) -> None:
     nan = np.flatnonzero(~np.isfinite(mesh.geometry.x).all(axis=1))
     text = f"mesh of {name!r}: {len(nan)} nodes are not finite, e.g. {mesh.geometry.x[nan[:1]]}"
     raise_together(mesh.comm, f"{text}; check the coordinates for NaN" if len(nan) else None)
+    refuse_repeated(mesh, f"mesh of {name!r}")
 
 
 def _check_cells(mesh: Any, name: str, x: FloatArray) -> None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.mesh_check import refuse_repeated
 from dolfinx_nts.parallel import gather_on_root
 from dolfinx_nts.validation import is_whole, require_positive
 
@@ -93,6 +94,7 @@ def _kind(mesh: Any, known: tuple[str, ...]) -> str:
     kind = compat.cell_name(mesh)
     if kind not in known:
         raise ValueError(f"mesh: {kind} in {mesh.geometry.dim}D; pass a mesh of {', '.join(known)}")
+    refuse_repeated(mesh, "mesh")
     return kind
 
 

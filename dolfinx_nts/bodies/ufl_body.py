@@ -242,7 +242,7 @@ class UflBody(Body):
         self.v.x.scatter_forward()
         self.initial_velocity = self.v.x.array[: self.num_owned].copy()
         self.u.x.array[:] = self._given("displacement", displacement, "m")
-        self._starts_moved = self.comm.allreduce(bool(self.u.x.array.any()), op=MPI.LOR)
+        self.starts_moved = self.comm.allreduce(bool(self.u.x.array.any()), op=MPI.LOR)
         self.u.x.array[self.fixed] = self.prescribed(0.0)
         self.u.x.scatter_forward()
         self.initial_displacement = self.u.x.array[: self.num_owned].copy()
@@ -254,7 +254,7 @@ class UflBody(Body):
 
     def _refuse_inversion(self) -> None:
         """Raise on every rank if the start turns a cell inside out."""
-        if self._determinants is None or not self._starts_moved or self.allow_inversion:
+        if self._determinants is None or not self.starts_moved or self.allow_inversion:
             return
         smallest = self._determinants.smallest(self.u.x.array)
         det, place = min(self.comm.allgather(smallest), key=lambda found: found[0])

@@ -304,7 +304,11 @@ def _run(
             _stop(stepper, str(failure), failure.__cause__)
         except StepFailedError as failure:
             _last_look(stepper)
-            _stop(stepper, str(failure) if failure.advises else f"{failure}. {remedy}")
+            jump = stepper.jumps_at_start(steps[0][0])
+            if jump:
+                _stop(stepper, f"{failure}; {jump}")
+            else:
+                _stop(stepper, str(failure) if failure.advises else f"{failure}. {remedy}")
         except BaseException:
             # Where one rank alone comes here, no other answers.
             _call(stepper, started, "close")

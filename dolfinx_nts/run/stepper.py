@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.jumps import jumps
 from dolfinx_nts.contact.hidden_facets import hidden_facets
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme
@@ -64,6 +65,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: What a step chosen by its error is cut to: halves would soon end where it has failed.
 _CUT = 0.4
+#: First steps whose failure may come from how the run starts.
+_FIRST = 2
 #: Cuts of a step before nodes that infinite friction holds may slip.
 _CUTS = 3
 #: Part of the energies by which a restart may differ from its checkpoint, as sums of other ranks
@@ -524,6 +527,15 @@ class Stepper:
         """
         mean = self._last_steps.mean_force(k)
         return self.state.contacts[k].force if mean is None else mean
+
+    def jumps_at_start(self, dt: float) -> str:
+        """What a failure may come of that `bodies.jumps` tells, in the first steps. Collective.
+
+        Args:
+            dt: First step [s].
+        """
+        late = self.state.time > self.solution.rows[0]["time"] + _FIRST * dt
+        return "" if late or self._start is not None else jumps(self.system.bodies)
 
     def close(self) -> None:
         """Free the PETSc objects of the last step."""
