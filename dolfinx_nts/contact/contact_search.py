@@ -131,11 +131,9 @@ class ContactSearch:
 
     def dives(self) -> bool:
         """Whether free flight presses nodes deep into their masters. Collective."""
-        limits = []
-        for c in self.elements:
-            slave, there = c.pair.slave, c.candidates
-            own = np.sqrt(slave.area[slave.share[there.node]])
-            limits.append(_DEEP * np.minimum(there.length, own))
+        limits = [
+            _DEEP * np.minimum(c.candidates.length, c.pair.slave.smallest) for c in self.elements
+        ]
         far = [
             self._reach(k, self._step.motion) > limit.min(initial=np.inf)
             for k, limit in enumerate(limits)
