@@ -1,5 +1,7 @@
 """Cells inside out: det F in closed form, steps refused, cut back, or allowed and told."""
 
+import re
+
 from mpi4py import MPI
 
 import numpy as np
@@ -296,6 +298,30 @@ def test_statics(allowed):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("pressed", [True, False], ids=["by a plane", "by its own face"])
+def test_contact_is_named_before_the_cell_that_it_crushes(pressed):
+    """A face is pushed through the one that is held, by a contact or by its own condition."""
+
+    def down(t):
+        return 0, 0, -1.2 * t
+
+    bcs = [nts.Dirichlet(lambda x: x[2] < 1e-9)]
+    if not pressed:
+        bcs.append(nts.Dirichlet(lambda x: x[2] > 1 - 1e-9, down))
+    body, contacts = cube(2, bcs=bcs), []
+    if pressed:
+        plane = nts.Plane((0, 0, 1), (0, 0, -1), motion=down)
+        contacts.append(nts.ContactPair(body.surface(lambda x: x[2] > 1 - 1e-9), plane))
+    system = nts.System([body], contacts=contacts)
+    run = nts.equilibrium(system, newton=nts.Newton(max_retries=0))
+    cell = run.status.index("a cell of body 'cube'")
+    if pressed:
+        assert run.status.index("contact 'cube-plane'") < run.status.index("look there") < cell
+    else:
+        assert "contact '" not in run.status
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("held", [True, False], ids=["held", "on a plane"])
 def test_a_load_step_that_ends_nearly_inside_out_says_so(held, monkeypatch):
     """Newton's method ends there, or the relaxations; under 1 g, nothing is near it."""
@@ -316,6 +342,8 @@ def test_a_load_step_that_ends_nearly_inside_out_says_so(held, monkeypatch):
     assert 0.0 < float(run.status.split(SENTENCE)[1].split()[0]) <= 0.1
     assert "smaller loads or speeds may prevent it" in run.status
     assert "Try more load steps" not in run.status
+    named = r"contact '.*' (flips \d+ times|carries) at node \d+, on the body .*; a cell of body"
+    assert bool(re.search(named, run.status)) != held and ("look there first" in run.status) != held
     mild = load(1.0)
     assert mild.status == "completed" and mild.balance["min_det"][-1] > 0.9
 

@@ -70,6 +70,34 @@ def diagnosis(
     )
 
 
+def contact_on(problem: StepProblem, e: Evaluation, flips: Sequence[Any], body: int) -> str:
+    """The contact that may have crushed a body, to be told before its cell, or nothing. Collective.
+
+    Args:
+        problem: The step.
+        e: The last iterate.
+        flips: As of `diagnosis`.
+        body: Number of the body with a cell that is inside out or nearly so.
+    """
+    found = []
+    both = zip(problem.couplings.touching(e), problem.couplings.bodies, flips, strict=False)
+    for (contact, part, _), bodies, changes in both:
+        if body not in bodies or not contact.num_elements:
+            continue
+        # What flips most, else what carries.
+        times = changes.sum(axis=0) + part.active
+        i = int(times.argmax())
+        how = f"flips {changes[:, i].sum()} times" if changes[:, i].any() else "carries"
+        found.append((int(times[i]), f"contact {contact.name!r} {how} at {contact.place(i)}"))
+    most, text = max(f for part in problem.system.comm.allgather([(0, ""), *found]) for f in part)
+    if not most:
+        return ""
+    return (
+        f"{text}, on the body that is named next: look there first, and if these should not "
+        "touch, leave them out of the contact's surfaces; "
+    )
+
+
 def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:
     """Name, weight and text of where the body's equation is worst solved."""
     r = np.nan_to_num(np.abs(terms.residual), nan=np.inf)

@@ -18,7 +18,7 @@ from dolfinx_nts.step.accuracy import EXACT, Newton
 from dolfinx_nts.step.assembly import StepMatrix
 from dolfinx_nts.step.augmented import AugmentedMatrix
 from dolfinx_nts.step.convergence import leaves_work, ratios
-from dolfinx_nts.step.diagnosis import diagnosis
+from dolfinx_nts.step.diagnosis import contact_on, diagnosis
 from dolfinx_nts.step.iterates import Iterates
 from dolfinx_nts.step.kept import KeptTangents
 from dolfinx_nts.step.least_norm import NullSpace, form_tree
@@ -409,9 +409,11 @@ class StepSolver:
         """What failed, and where a body is inside out or nearly so; every rank must call it."""
         problem = self.problem
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
+            worst, text = self._upright.describe_inverted(e.x)
+            text = contact_on(problem, e, self.iterates.flips, worst) + text
             return StepFailedError(
                 f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
-                f"{iterations} iterations: {self._upright.describe_inverted(e.x)}",
+                f"{iterations} iterations: {text}",
                 advises=True,
             )
         why, advises = self._presets.why_failed(self.snes, reason)
@@ -428,7 +430,8 @@ class StepSolver:
         """
         flat = self._upright.describe_flat(e.x)
         if flat:
-            text, sure = flat
+            worst, text, sure = flat
+            text = contact_on(self.problem, e, self.iterates.flips, worst) + text
             return StepFailedError(f"{message}; {text}", advises=advises or sure)
         return StepFailedError(message, advises=advises)
 

@@ -73,21 +73,21 @@ class Upright:
         y.scale(part)
         return True
 
-    def describe_inverted(self, x: FloatArray) -> str:
-        """The cell that is inside out at an iterate, and what to do. Collective."""
+    def describe_inverted(self, x: FloatArray) -> tuple[int, str]:
+        """The body that is inside out at an iterate, and its cell with a remedy. Collective."""
         system = self._problem.system
         worst = int(forbidden(system, self.smallest(x)).argmin())
         body = system.bodies[worst]
         text = "; ".join(describe(body, self._displacements(x)[worst]))
         if body.oriented:
-            return text
-        return f"{text}, {type(body).__name__}(..., allow_inversion=True) accepts it"
+            return worst, text
+        return worst, f"{text}, {type(body).__name__}(..., allow_inversion=True) accepts it"
 
-    def describe_flat(self, x: FloatArray) -> tuple[str, bool] | None:
+    def describe_flat(self, x: FloatArray) -> tuple[int, str, bool] | None:
         """The cell that is nearly inside out at t_n or an iterate, if one is. Collective.
 
         Returns:
-            A sentence, and whether that may be all there is to say.
+            The body's number, a sentence, and whether that may be all there is to say.
         """
         system = self._problem.system
         low = [body.low_dets[1] for body in system.bodies]
@@ -97,7 +97,7 @@ class Upright:
             worst = int(over.argmin())
             if over[worst] <= 0.0:
                 sure = bool(over[worst] + low[worst] <= _KEPT_DET)
-                return "; ".join(describe(system.bodies[worst], u[worst])), sure
+                return worst, "; ".join(describe(system.bodies[worst], u[worst])), sure
         return None
 
     def _displacements(self, x: FloatArray) -> list[FloatArray]:
