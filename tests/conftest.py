@@ -33,8 +33,8 @@ PATIENCE = 20.0
 
 COMM = MPI.COMM_WORLD.Dup()
 if threading.current_thread() is not threading.main_thread():
-    # A busy machine may make a process of xdist run its tests beside its main thread. There Gmsh 4.8,
-    # which sets a signal's handler, cannot be imported.
+    # A busy machine may make a process of xdist run its tests beside its main thread. Gmsh 4.8,
+    # which sets a handler of signals, cannot be imported there.
     signal.signal = lambda number, _handler: signal.getsignal(number)
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []

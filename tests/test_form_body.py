@@ -255,12 +255,12 @@ BAD = [
     (
         dict(density=None, mass=lambda v, w: -ufl.inner(v, w) * ufl.dx),
         ValueError,
-        "mass=.* is -1 kg in all",
+        "mass=.* is -1 in all",
     ),
     (
         dict(density=None, mass=_heavy_on_one_side),
         ValueError,
-        "mass=.* is -.* kg at the node x=",
+        "mass=.* is -.* at the node x=",
     ),
     (
         dict(density=None, mass=lambda v, w: ufl.inner(v + v.dx(0), w) * ufl.dx),
