@@ -198,11 +198,11 @@ class StepSolver:
             else:
                 self.problem.couplings.contacts.forget_solution()
                 self.problem.guess(flight=False, forces=False)
-            self.iterates.try_again(pivots=retry > 0)
             if unsolved:
                 # What failed to factorise once fails from then on.
                 self.destroy()
                 self.prepare()
+            self.iterates.try_again(pivots=retry > 0)
         if slides:
             self.iterates.slide_first()
 
