@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from mpi4py import MPI
+
 import cffi
 import dolfinx
 import dolfinx.fem.petsc as fem_petsc
@@ -439,13 +441,36 @@ def plain_dofs(space: Any, cells: int) -> IntArray | None:
     return np.asarray(dofs[:cells])
 
 
+#: One for all meshes of the same ranks in the same order, see `petsc_communicator`.
+_COMMUNICATORS: list[Any] = [MPI.COMM_SELF, MPI.COMM_WORLD]
+
+
+def petsc_communicator(comm: Any) -> Any:
+    """Communicator of the same ranks, one for all meshes, for PETSc's objects.
+
+    In parallel PETSc frees what Python has dropped in `free_dropped` alone, by communicator. Each
+    mesh has its own, which may be gone by then; and MPICH has only 2,048.
+    """
+    for known in _COMMUNICATORS:
+        if MPI.Comm.Compare(known, comm) in (MPI.IDENT, MPI.CONGRUENT):
+            return known
+    _COMMUNICATORS.append(comm.Dup())
+    return _COMMUNICATORS[-1]
+
+
+def free_dropped(comm: Any) -> None:
+    """Free what PETSc made on a communicator and Python has dropped; all ranks call it."""
+    if comm.size > 1:
+        PETSc.garbage_cleanup(comm)
+
+
 def create_vector(space: Any) -> Any:
     """New zero ghosted PETSc vector in the layout of the space."""
-    f = fem.Function(space)  # a temporary would be freed under its petsc_vec in 0.9 and later
-    like = f.x.petsc_vec if hasattr(f.x, "petsc_vec") else f.vector
-    b = like.duplicate()
-    # Else it waits for a collection on a communicator that goes with the mesh.
-    like.destroy()
+    blocks, size = space.dofmap.index_map, space.dofmap.index_map_bs
+    b = PETSc.Vec().createGhost(
+        np.asarray(blocks.ghosts, dtype=PETSc.IntType), (size * blocks.size_local, None),
+        bsize=size, comm=petsc_communicator(space.mesh.comm),
+    )  # fmt: skip
     b.set(0.0)
     return b
 
@@ -464,7 +489,12 @@ def sum_ghosts(b: Any) -> None:
 
 def create_matrix(form: Any) -> Any:
     """New PETSc matrix with the sparsity of a bilinear form."""
-    return fem_petsc.create_matrix(form)
+    pattern = fem.create_sparsity_pattern(form)
+    if _OLD:
+        pattern.assemble()
+    else:
+        pattern.finalize()
+    return cpp.la.petsc.create_matrix(petsc_communicator(form.mesh.comm), pattern)
 
 
 def dense_matrix(comm: Any, size: int) -> Any:

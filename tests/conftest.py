@@ -159,6 +159,7 @@ def pytest_runtest_protocol(item, nextitem):
     yield
     if COMM.size > 1:
         gc.collect()
+        dolfinx_compat.free_dropped(MPI.COMM_WORLD)
 
 
 def pytest_collectreport(report):

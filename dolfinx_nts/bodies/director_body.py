@@ -85,7 +85,8 @@ class DirectorBody(Body):
     # ---- set-up
     def _set_up_mesh(self, mesh: Any, name: str, degree: int = 1) -> None:
         """What fields live on."""
-        self.name, self.mesh, self.comm, self.degree = name, mesh, mesh.comm, degree
+        self.name, self.mesh, self.degree = name, mesh, degree
+        self.comm = compat.petsc_communicator(mesh.comm)
         self.made_on = places_of(mesh)
         self.space = compat.vector_space(mesh, degree)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)

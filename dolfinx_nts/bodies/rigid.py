@@ -197,7 +197,8 @@ class RigidBody(Body):
         rotation: Any,
     ) -> None:
         """Set up what both constructors share."""
-        self.name, self.comm, self._inertia = name, comm, inertia
+        self.name, self._inertia = name, inertia
+        self.comm = compat.petsc_communicator(comm)
         self.mass, self.centre, self.moments = inertia.mass, inertia.centre, inertia.moments
         self.length = inertia.length
         linear = vector("velocity", velocity, "m/s")

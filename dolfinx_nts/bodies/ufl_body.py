@@ -81,7 +81,7 @@ class UflBody(Body):
         self.name, self.space, self.degree, self._extra_form = name, space, degree, extra_form
         self.mesh = space.mesh
         self.made_on = places_of(self.mesh)
-        self.comm = self.mesh.comm
+        self.comm = compat.petsc_communicator(self.mesh.comm)
         # DOLFINx makes C identifiers of the names.
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(space, name=f"{stem}_{s}") for s in "uv")

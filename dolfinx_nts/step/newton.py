@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere
@@ -294,6 +295,7 @@ class StepSolver:
 
     def _configure(self) -> None:
         assert self.matrix is not None
+        compat.free_dropped(self.problem.system.comm)  # what earlier runs left
         self.snes = PETSc.SNES().create(self.problem.system.comm)
         self._f = self.problem.x.duplicate()
         self.snes.setFunction(self._function, self._f)

@@ -212,7 +212,7 @@ class PlainBody:
         self._force = compat.create_vector(space)
         self._x, self._f = self._a.createVecs()
         self._first, self._change = self._x.duplicate(), self._x.duplicate()
-        self.snes = PETSc.SNES().create(mesh.comm)
+        self.snes = PETSc.SNES().create(self._a.comm)
         self.snes.setFunction(self._residual, self._f)
         self.snes.setJacobian(self._jacobian, self._a, self._a)
         self._options = SolverOptions(mesh.comm, "direct", False, _ORDERING)
