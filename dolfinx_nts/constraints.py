@@ -437,16 +437,20 @@ class Constraints(EveryStep):
                 batch.scale * np.array([gap, first, second]),
                 np.array([np.abs(values).max(initial=0.0) for values in (gap, first)]),
                 np.array([off, doubt]),
-                batch.evaluate(batch.y0, own).tangent,
+                batch.evaluate(self._places(state), own).tangent,
             )
         ]
 
-    def _gap(self, state: State) -> tuple[FloatArray, float]:
-        """G - c at a state [m], shape (n, m), and what it may be by rounding [m]. Collective."""
+    def _places(self, state: State) -> FloatArray:
+        """Nodal vectors at a state [m], shape (n, k, 3)."""
         u = [state.u[k] for k in self.bodies[0]]
         y = [s.reference + s.nodal(w) for s, w in zip(self._sides, u, strict=True)]
+        return np.concatenate(y, axis=1)
+
+    def _gap(self, state: State) -> tuple[FloatArray, float]:
+        """G - c at a state [m], shape (n, m), and what it may be by rounding [m]. Collective."""
+        both = self._places(state)
         (weights, constants, _), (c, *_) = self._at(state.time, state.time)
-        both = np.concatenate(y, axis=1)
         found = kernel.value(kernel.factors(weights, constants, both)) - c
         return found, OFF * float(np.abs(both).max(initial=0.0))
 
@@ -461,8 +465,7 @@ class Constraints(EveryStep):
             [m/s] and [m/s^2], both (n, m), and what the first may err by [m/s]: by rounding, and
             by what prescribed values leave open within `dt`.
         """
-        u, v = ([values[k] for k in self.bodies[0]] for values in (state.u, state.v))
-        y = [s.reference + s.nodal(w) for s, w in zip(self._sides, u, strict=True)]
+        v = [state.v[k] for k in self.bodies[0]]
         speed = np.concatenate(
             [s.nodal(w) for s, w in zip(self._sides, v, strict=True)], axis=1
         )
@@ -470,7 +473,7 @@ class Constraints(EveryStep):
         (weights, constants, _), (c0, c_in, c1, c2) = self._at(*times)
         rate = (4.0 * (c1 - c0) - (c2 - c0)) / dt
         finer = 2.0 * (4.0 * (c_in - c0) - (c1 - c0)) / dt
-        vectors = kernel.factors(weights, constants, np.concatenate(y, axis=1))
+        vectors = kernel.factors(weights, constants, self._places(state))
         rates = kernel.factors(weights, np.zeros_like(constants), speed)
         gradient = kernel.gradient(weights, vectors)
         first = np.einsum("nmai,nai->nm", gradient, speed) - rate

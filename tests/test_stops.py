@@ -205,3 +205,67 @@ def test_a_restart_and_halved_steps_stop_alike(mpi_tmp_path):
     assert not velocities_below(cut.bodies[0]).any()
     table = stepper.solution.balance
     assert abs(table["ledger_residual"]).max() < 1e-10 * table["energy"].max()
+
+
+@few
+@one_on_ranks
+@both
+def test_a_driven_slider_stops(rule):
+    """In mid step: at rest from the step after that on, with the work of its kinetic energy."""
+    body = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), velocity=(1, 0, 0), name="body")
+    joint = nts.Prismatic(
+        body, None, point=(0, 0, 0), axis=(1, 0, 0), displacement=lambda t: min(t, STOP)
+    )
+    run = nts.simulate(nts.System([body], joints=[joint]), rule, dt=0.013, t_end=0.13)
+    table = run.balance
+    stopped = table["time"] > STOP + 0.013
+    place = body.last_accepted()[0][:1]  # of a rigid body one rank has all
+    np.testing.assert_allclose(place, STOP, atol=1e-14)
+    assert abs(table["kinetic"][stopped]).max() < 1e-28
+    if rule.closes_ledger:
+        assert table["external_work"][-1] == pytest.approx(-1.0, rel=1e-12)
+        assert abs(table["ledger_residual"]).max() < 1e-13
+        force = run.reactions[joint.name][:, 0]
+        change = np.diff(table["linear_momentum"], axis=0)
+        np.testing.assert_allclose(0.013 * force[1:], change, rtol=1e-12, atol=1e-14)
+
+
+@middle
+def test_a_driven_hinge_between_free_bodies_keeps_the_momenta(rule):
+    """It turns one against the other, and stops: no force from elsewhere."""
+    w = 3.0
+    wheel = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), angular_velocity=(0, 0, w), name="wheel")
+    frame = nts.RigidBody.from_inertia(3.0, (2, 1, 1.5), (0.3, 0, 0), name="frame")
+    hinge = nts.Revolute(
+        wheel, frame, point=(0, 0, 0), axis=(0, 0, 1), angle=lambda t: w * min(t, STOP)
+    )
+    system = nts.System([wheel, frame], joints=[hinge])
+    run = nts.simulate(system, rule, dt=0.0025, t_end=0.1)
+    table, stopped = run.balance, run.balance["time"] > STOP + 0.0025
+    for name in ("linear_momentum", "angular_momentum"):
+        assert abs(table[name] - table[name][0]).max() < 1e-12
+    assert abs(table["ledger_residual"]).max() < 1e-12 * table["kinetic"].max()
+    # From then on both are one rigid body.
+    spins = np.array([wheel.angular_velocity, frame.angular_velocity])
+    np.testing.assert_allclose(spins[0], spins[1], atol=1e-10)
+    assert np.ptp(table["kinetic"][stopped]) < 1e-10 * table["kinetic"].max()
+
+
+@few
+@both
+def test_a_driven_flexible_body_stops_where_it_is_held(rule):
+    """The face that the slider holds is at rest, what it carries goes on to vibrate."""
+    body = nts.Continuum(box(), MATERIAL, density=2.0, velocity=(1, 0, 0), name="cube")
+    foot = nts.RigidBody.from_inertia(0.5, (1, 1, 1), velocity=(1, 0, 0), name="foot")
+    slider = nts.Prismatic(
+        foot, None, point=(0, 0, 0), axis=(1, 0, 0), displacement=lambda t: min(t, STOP)
+    )
+    tie = nts.Tie(foot, body.surface(bottom))
+    system = nts.System([body, foot], joints=[slider, tie])
+    run = nts.simulate(system, rule, dt=0.004, t_end=0.08)
+    assert run.status.startswith("completed")
+    assert abs(foot.velocity).max() < 1e-9
+    assert run.balance["kinetic"][-1] > 1e-3
+    if rule.closes_ledger:
+        table = run.balance
+        assert abs(table["ledger_residual"]).max() < 1e-10 * table["energy"].max()

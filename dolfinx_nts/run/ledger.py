@@ -115,6 +115,8 @@ class Ledger:
             terms = balance.step_terms(problem, step) | known
             terms["impact_restored"] = 0.0 if impact is None else impact.energy
             terms["material_change"] = self.take_change()
+            if trial.fitted is not None:
+                terms["external_work"] += trial.fitted.work
             first = float(rows.column("energy")[0])
             row = balance.next_row(first, before, trial.measured, terms)
         else:
@@ -122,6 +124,9 @@ class Ledger:
         forces = resultants.of_step(problem, step)
         if impact is not None:
             for name, impulse in zip(resultants.CONTACTS, impact.impulses, strict=True):
+                forces[name] = forces[name] + impulse / problem.dt
+        if trial.fitted is not None:
+            for name, impulse in trial.fitted.reactions.items():
                 forces[name] = forces[name] + impulse / problem.dt
         row |= forces
         rows.append(row)

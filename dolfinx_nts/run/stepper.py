@@ -493,10 +493,12 @@ class Stepper:
         impulses = check_momentum(problem, step, state, before, measured)
         if self._restitution is not None:
             impact = restored(problem, step, state, self._restitution)
-        if impact is not None:
-            state = impact.state
+        state = state if impact is None else impact.state
+        drives = consistent.fitted(problem, state)
+        state = state if drives is None else drives.state
+        if impact or drives:
             measured = ledger.measure(state)
-        return Trial(step, state, measured, impulses, impact)
+        return Trial(step, state, measured, impulses, impact, drives)
 
     def _take(self, trial: Trial) -> None:
         """Accept a step: a row of the ledger, and the new state."""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
+from dolfinx_nts.step.consistent import Fitted
 from dolfinx_nts.step.impact import Impact
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
@@ -32,6 +33,7 @@ class Trial(NamedTuple):
         measured: `Ledger.measure` of that state.
         impulses: Of all forces in the step, see `check_momentum` [kg m/s].
         impact: What restoring did to its velocities.
+        fitted: What made them those of its drives.
     """
 
     step: Evaluation
@@ -39,6 +41,7 @@ class Trial(NamedTuple):
     measured: Mapping[str, Any]
     impulses: float
     impact: Impact | None
+    fitted: Fitted | None
 
 
 def solved(problem: StepProblem, solver: StepSolver) -> Evaluation:

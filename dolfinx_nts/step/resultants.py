@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
@@ -68,33 +69,56 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     parts.append(np.reshape(forces, (len(contacts), 3)))
     moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
     parts.append(np.reshape(moments, (len(contacts), 3)))
-    first = [bodies[0] for bodies in problem.system.joint_bodies]
-    held = list(zip(first, problem.couplings.of_joints(step), strict=True))[: len(joints)]
-    parts += [_of_joint(problem, step, k, *each) for k, each in held]
+    each, theta = zip(problem.state.u, step.bodies, strict=True), problem.integrator.theta
+    u = [u0 + theta * terms.du for u0, terms in each]
+    held = {
+        id(batch): part
+        for coupling, of in problem.couplings.of_joints(step)
+        for batch, part in zip(coupling.elements, of, strict=True)
+    }
+    parts += _of_joints(problem, held, u)
     total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     stops = accumulate(map(len, parts))
     split = [total[stop - len(part) : stop] for part, stop in zip(parts, stops, strict=True)]
     names = [*map(reactions_of, bodies), CONTACT_FORCES, CONTACT_MOMENTS]
     found = {name: value / problem.factor for name, value in zip(names, split, strict=False)}
-    for joint, (force, moment, places, count) in zip(joints, split[len(names) :], strict=True):
-        point = places / max(count[0], 1.0)
-        both = np.array([force, moment - cross(point, force)])
-        found[reactions_of(joint)] = both / problem.factor
+    for joint, total in zip(joints, split[len(names) :], strict=True):
+        found[reactions_of(joint)] = _about_point(total) / problem.factor
     return found
 
 
-def _of_joint(
-    problem: StepProblem, step: Evaluation, first: int, coupling: Any, parts: tuple[Any, ...]
-) -> FloatArray:
-    """Of a joint on its first body, whose number is given, on this rank. Collective.
+def of_joints(
+    problem: StepProblem, parts: Mapping[int, Any], u: Sequence[FloatArray]
+) -> dict[str, FloatArray]:
+    """Resultants of joints alone, as of `of_step` times the factor of the step. Collective.
 
-    Returns:
-        As of `Elements.resultant`, shape (4, 3).
+    Args:
+        problem: Equations of the step.
+        parts: What elements contribute, by their id; of others nothing.
+        u: Owned displacements of each body where they act [m].
     """
-    out = np.zeros((4, 3))
-    u = problem.state.u[first] + problem.integrator.theta * step.bodies[first].du
-    for batch, of, part in zip(coupling.elements, coupling.bodies, parts, strict=True):
-        if first in of:
-            out += batch.resultant(part, of.index(first), u)
-    return out
+    total = np.array(_of_joints(problem, parts, u)).reshape(-1, 4, 3)
+    problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    both = zip(problem.system.declared_joints, total, strict=True)
+    return {reactions_of(joint): _about_point(of) for joint, of in both}
+
+
+def _of_joints(
+    problem: StepProblem, parts: Mapping[int, Any], u: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Of each declared joint on its first body, as of `Elements.resultant`, on this rank."""
+    out, system = [], problem.system
+    for bodies, coupling in zip(system.joint_bodies, problem.couplings.joints, strict=True):
+        first, total = bodies[0], np.zeros((4, 3))
+        for batch, of in zip(coupling.elements, coupling.bodies, strict=True):
+            if first in of and id(batch) in parts:
+                total += batch.resultant(parts[id(batch)], of.index(first), u[first])
+        out.append(total)
+    return out[: len(system.declared_joints)]
+
+
+def _about_point(total: FloatArray) -> FloatArray:
+    """Force, and moment about the mean of the points where a joint holds its body, (2, 3)."""
+    force, moment, places, count = total
+    return np.array([force, moment - cross(places / max(count[0], 1.0), force)])
