@@ -21,6 +21,7 @@ from dolfinx_nts.contact.pair import (
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.elements import Step
 from dolfinx_nts.kernels import compiled, facets, nts_element, patches
+from dolfinx_nts.parallel import anywhere
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -35,6 +36,8 @@ _WEDGE = 0.5
 #: A foot is followed from piece to piece of the surface over a facet so often; then the last will
 #: do, as neighbours go on alike beyond their border.
 _MOST_PATCHES = 3
+#: A node that is held farther than this from the master, in facet sizes, is held beside it.
+_ASIDE = 1e-4
 #: A node this part of a facet behind it, or less, is outside.
 _OUTSIDE = 1e-6
 #: Weights of a foot that are rounding.
@@ -57,6 +60,7 @@ class FacetPair(ContactPair, master=Surface):
         corners = master.reference[master.facets]
         self._joined = patches.neighbours(master.facets, corners)
         self._beside = patches.neighbours(master.facets, corners, sharp=-np.inf)
+        self._sharp = ((self._beside >= 0) & (self._joined < 0)).any(axis=1)
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:
@@ -268,19 +272,63 @@ class FacetPair(ContactPair, master=Surface):
         reach: float,
         held: IntArray,
     ) -> IntArray | None:
-        """Facet that each of the rank's slaves has come through unseen, as of `ContactPair`."""
-        if not self.is_long(reach):
+        """Do as `ContactPair`. Collective."""
+        by_edges = np.flatnonzero((held >= 0) & self._sharp[held])
+        aside = self._sharp.any() and anywhere(self.slave.body.comm, bool(by_edges.size))
+        if not (aside or self.is_long(reach)):
             return None
-        slaves, master = positions
-        x, corners = slaves[self.slave.share], master[self.master.facets]
-        slave_path, master_path = self._gather_paths(motions)
-        hit, _ = search.first_hits(x, slave_path, corners, master_path[self.master.facets])
+        x, paths = positions[0][self.slave.share], self._gather_paths(motions)
+        end, moved = x + paths[0], positions[1] + paths[1]
+        hit = np.full(len(held), -1)
+        if self.is_long(reach):
+            hit = self._came_through(x, positions[1], *paths, held)
+        if by_edges.size:
+            behind = self._behind_edges(end[by_edges], moved, held[by_edges])
+            hit[by_edges] = np.where(behind >= 0, behind, hit[by_edges])
+        return hit
+
+    def _behind_edges(self, end: FloatArray, moved: FloatArray, held: IntArray) -> IntArray:
+        """Facet behind the sharp edge that nodes (n, 3) are held beyond at the end, or -1, (n,).
+
+        The plane of a facet goes on beyond its edges, the body does not.
+
+        Args:
+            end: Nodes at the end [m].
+            moved: Points of the master there [m].
+            held: Facets that hold them, shape (n,).
+        """
+        at, nc = self.master.facets, self.master.facets.shape[1]
+        _, control, xi, converged = self._projected(end, moved, held, np.zeros((len(held), 2)))
+        out = np.flatnonzero(converged & (facets.edge_excess(xi, nc).max(axis=1) > _ASIDE))
+        found = np.full(len(held), -1)
+        if not out.size:
+            return found
+        closest = search.closest_facets(end[out], moved[at], reach=np.inf, current=held[out])
+        foot, _, normal = facets.frame(moved[at[closest.facet]], closest.xi)
+        _, _, own = facets.frame(control[out], xi[out])
+        gap = np.einsum("ni,ni->n", normal, end[out] - foot)
+        turned = np.einsum("ni,ni->n", normal, own) < patches.SHARP
+        away = turned & (gap > _ASIDE * facets.size(moved[at[closest.facet]]))
+        found[out[away]] = closest.facet[away]
+        return found
+
+    def _came_through(
+        self,
+        x: FloatArray,
+        master: FloatArray,
+        slave_path: FloatArray,
+        master_path: FloatArray,
+        held: IntArray,
+    ) -> IntArray:
+        """`missed` of nodes that have passed a facet, with arguments as of `_round_edges`."""
+        at = self.master.facets
+        hit, _ = search.first_hits(x, slave_path, master[at], master_path[at])
         node = np.flatnonzero((hit >= 0) & (hit != held))
         end, moved = (x + slave_path)[node], master + master_path
         start = np.zeros((len(node), 2))
         _, control, xi, converged = self._projected(end, moved, hit[node], start)
         foot, _, normal = facets.frame(control, xi)
-        length = facets.size(moved[self.master.facets[hit[node]]])
+        length = facets.size(moved[at[hit[node]]])
         depth = np.einsum("ni,ni->n", normal, foot - end) / length
         # A node that is held at another facet may end a little behind this one.
         deep = depth > np.where(held[node] >= 0, MARGIN, _OUTSIDE)

@@ -308,7 +308,9 @@ class ContactPair:
         reach: float,
         held: IntArray,
     ) -> IntArray | None:
-        """Facet that each of the rank's slaves has come through unseen, or -1. Collective.
+        """Facet that each slave of the rank ends at by another way than its own, or -1. Collective.
+
+        It has come through it unseen, or is held in the plane of another one, beside the body.
 
         Args:
             positions: Of all points at t_n [m].
@@ -318,7 +320,7 @@ class ContactPair:
             held: Facet that each of the rank's slaves is held at in the end, or -1, shape (share,).
 
         Returns:
-            Shape (share,), or None where no motion as short as this passes a facet.
+            Shape (share,), or None where that cannot be.
 
         Raises:
             StepFailedError: A node has passed the master, and a shorter step is needed.

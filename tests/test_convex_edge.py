@@ -1,0 +1,116 @@
+"""Beyond a convex edge a facet's plane goes on, the body does not."""
+
+from mpi4py import MPI
+
+import gmsh
+import numpy as np
+import pytest
+from integrators import MID_STEP
+from scenes import box, everywhere
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+
+
+def frustum(metre):
+    """A fixed block of 1 m whose sides slope by 45 degrees, its top from -0.5 to 0.5 m."""
+    mesh = box(low=(-0.5, -0.5, 0.0), high=(0.5, 0.5, 1.0), cells=2)
+    x = mesh.geometry.x
+    x[:, 0] *= 2.0 - x[:, 2]
+    x *= metre
+    return nts.RigidBody(mesh, density=1.0, motion=lambda t: (0, 0, 0), name="block")
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("metre", [1.0, 2.0**-10])
+@pytest.mark.parametrize("rule", MID_STEP.values(), ids=MID_STEP)
+def test_what_passes_an_edge_closely_is_not_held_by_the_plane_beyond_it(rule, metre):
+    """Above the top at the start of a step, beside it and below its plane at the end."""
+    block = frustum(metre)
+    mesh = box(low=(0.49, -0.1, 1.05), high=(0.69, 0.1, 1.25), cells=1)
+    mesh.geometry.x[:] *= metre
+    velocity = metre * np.array([2.0, 0.0, -1.0])
+    cube = nts.RigidBody(mesh, density=1.0, velocity=velocity, name="cube")
+    sides = block.surface(everywhere)
+    pair = nts.ContactPair(slave=cube.surface(everywhere), master=sides)
+    run = nts.simulate(nts.System([block, cube], contacts=[pair]), rule, dt=0.1, t_end=0.1)
+    assert run.status == "completed"
+    assert not run.contact_forces.any()
+    np.testing.assert_allclose(cube.velocity, velocity, rtol=1e-13)
+
+
+def profile(teeth, module=4.0, points=7):
+    """Outline of an involute gear, shape (n, 2) [mm], one tooth about angle 0."""
+    pressure = np.deg2rad(20.0)
+    pitch = module * teeth / 2
+    tip, root, base = pitch + module, pitch - 1.25 * module, pitch * np.cos(pressure)
+    radius = np.linspace(max(base, root), tip, points)
+
+    def involute(a):
+        return np.tan(a) - a
+
+    turn = involute(np.arccos(np.minimum(base / radius, 1.0)))
+    half = np.pi / (2 * teeth) - 0.004 + involute(pressure) - turn
+    radius, half = np.r_[root, radius], np.r_[half[0], half]
+    r, angle = np.r_[radius, radius[::-1]], np.r_[-half, half[::-1]]
+    each = angle + 2 * np.pi * np.arange(teeth)[:, None] / teeth
+    return np.column_stack([(r * np.cos(each)).ravel(), (r * np.sin(each)).ravel()])
+
+
+def gear(teeth, x0, turn, spin, torque, name):
+    """A rigid gear on a hinge: body, flanks, hinge."""
+    c, s = np.cos(turn), np.sin(turn)
+    outline = profile(teeth) @ [[c, s], [-s, c]] * 1e-3 + [x0, 0]
+    gmsh.initialize()
+    gmsh.option.setNumber("General.Verbosity", 1)
+    geo = gmsh.model.geo
+    points = [geo.addPoint(*p, -0.005, 9e-3) for p in outline]
+    lines = [geo.addLine(p, q) for p, q in zip(points, points[1:] + points[:1], strict=True)]
+    face = geo.addPlaneSurface([geo.addCurveLoop(lines)])
+    made = geo.extrude([(2, face)], 0, 0, 0.01, numElements=[1])
+    geo.synchronize()
+    gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 9e-3)
+    gmsh.model.setPhysicalName(3, gmsh.model.addPhysicalGroup(3, [made[1][1]]), "part")
+    flanks = gmsh.model.addPhysicalGroup(2, [tag for _, tag in made[2:]])
+    gmsh.model.setPhysicalName(2, flanks, "flanks")
+    gmsh.model.mesh.generate(3)
+    part = nts.bodies_from_gmsh(gmsh.model, COMM)["part"]
+    gmsh.finalize()
+    body = part.rigid(
+        density=7800, angular_velocity=(0, 0, spin), torque=(0, 0, torque), name=name
+    )
+    hinge = nts.Revolute(body, None, point=(x0, 0, 0), axis=(0, 0, 1))
+    return body, body.surface(*part.where("flanks")), hinge
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["pinion", "wheel", "both", "between"])
+def test_spur_gears_turn_each_other(way):
+    """Nodes were held in the plane of a tooth's tip beside the tooth, and the pair jammed.
+
+    Teeth of straight facets rattle about the ratio of their numbers, so the speed is that of the
+    pair: of both momenta about their axes, reduced to the pinion.
+    """
+    driving, resisting = 2.0, 1.0
+    pinion, of_pinion, first = gear(16, 0.0, 0.0, 20.0, driving, "pinion")
+    wheel, of_wheel, second = gear(24, 0.0803, np.pi / 24, -20 / 1.5, resisting, "wheel")
+    there = nts.ContactPair(slave=of_pinion, master=of_wheel)
+    back = nts.ContactPair(slave=of_wheel, master=of_pinion)
+    pairs = {
+        "pinion": [there], "wheel": [back], "both": [there, back],
+        "between": [nts.ContactPair.between(of_pinion, of_wheel)],
+    }[way]  # fmt: skip
+    system = nts.System([pinion, wheel], contacts=pairs, joints=[first, second])
+    run = nts.simulate(
+        system, nts.EnergyMomentum(), dt=1e-4, t_end=0.024, accuracy="balanced",
+        project_start=True,
+    )  # fmt: skip
+    assert run.status.startswith("completed")
+    one, two = (nts.motion_of(body).inertia[2, 2] for body in (pinion, wheel))
+    whole = one + two / 1.5**2
+    speed = (one * pinion.angular_velocity[2] - two * wheel.angular_velocity[2] / 1.5) / whole
+    right = 20.0 + (driving - resisting / 1.5) / whole * 0.024
+    assert speed == pytest.approx(right, rel=0.04)
+    assert -wheel.angular_velocity[2] * 1.5 == pytest.approx(right, rel=0.1)
