@@ -1104,11 +1104,11 @@ def killed(path, delay, *more):
 
 @pytest.mark.slow
 def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path):
-    """Fifty processes that write after every step; each goes on where the last was killed."""
+    """Twenty processes that write after every step; each goes on where the last was killed."""
     if COMM.size > 1:
         pytest.skip("starts processes of its own")
     path, random, before = tmp_path / "run.h5", np.random.default_rng(17), 0.0
-    kills = 50
+    kills = 20
     for k in range(kills):
         killed(path, random.uniform(0.2, 0.6), *(["go on"] if k else []))
         system, _ = floor(COMM)

@@ -76,15 +76,15 @@ def test_all_rules_are_of_second_order(rule):
 
 
 @pytest.mark.slow
-def test_a_hundred_thousand_steps_do_not_drift():
+def test_twenty_thousand_steps_do_not_drift():
     body = nts.RigidBody.from_inertia(1.0, MOMENTS, angular_velocity=SPIN)
     stepper = nts.Stepper(nts.System([body]), nts.EnergyMomentum(), watch_overlap=False)
-    for _ in range(100_000):
+    for _ in range(20_000):
         stepper.advance(0.05)
     first, last = stepper.solution.rows[0], stepper.solution.rows[-1]
-    assert abs(last["energy"] / first["energy"] - 1.0) < 1e-10
+    assert abs(last["energy"] / first["energy"] - 1.0) < 2e-11
     change = last["angular_momentum"] - first["angular_momentum"]
-    assert np.abs(change).max() < 1e-10 * np.abs(first["angular_momentum"]).max()
+    assert np.abs(change).max() < 2e-11 * np.abs(first["angular_momentum"]).max()
     assert np.abs(body.rotation.T @ body.rotation - np.eye(3)).max() < 1e-12
 
 
