@@ -130,7 +130,7 @@ class ContactElements(ContactLaws):
             "x0": self.x0[chosen],
             "scale": self.scale[chosen],
             "before": self._before_of(chosen),
-            "overlap": np.broadcast_to(self.overlap, len(chosen))[chosen],
+            "overlap": self.overlap[chosen] if np.ndim(self.overlap) else self.overlap,
         }
 
     @cached_property
@@ -245,9 +245,8 @@ class ContactElements(ContactLaws):
         except Exception:  # any of an obstacle of the user's; the other ranks wait
             self._together(*none)
             raise
-        if np.any(self.overlap):
-            gap = gap + self.overlap
-            residual[:, self._num_places + self.num_augmented] = gap
+        gap = gap + self.overlap
+        residual[:, self._num_places + self.num_augmented] = gap
         together = self._together(gap, slip, multiplier)
         part = self._laws(x, residual, tangent, gap, slip, multiplier, together)
         return self._to_nodes(part)

@@ -70,6 +70,8 @@ class Couplings:
     @property
     def mechanisms(self) -> list[list[int]]:
         """Positions among `elements` of those of joints, of each mechanism that bodies link."""
+        if not self._mechanisms:
+            return []
         found: list[list[int]] = [[] for _ in range(max(self._mechanisms, default=-1) + 1)]
         start = len(self.contacts.elements)
         for mechanism, coupling in zip(self._mechanisms, self.joints, strict=False):

@@ -71,11 +71,7 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     parts.append(np.reshape(moments, (len(contacts), 3)))
     each, theta = zip(problem.state.u, step.bodies, strict=True), problem.integrator.theta
     u = [u0 + theta * terms.du for u0, terms in each]
-    held = {
-        id(batch): part
-        for coupling, of in problem.couplings.of_joints(step)
-        for batch, part in zip(coupling.elements, of, strict=True)
-    }
+    held = {id(batch): part for batch, part in zip(problem.elements, step.parts, strict=True)}
     parts += _of_joints(problem, held, u)
     total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
@@ -109,13 +105,15 @@ def _of_joints(
 ) -> list[FloatArray]:
     """Of each declared joint on its first body, as of `Elements.resultant`, on this rank."""
     out, system = [], problem.system
-    for bodies, coupling in zip(system.joint_bodies, problem.couplings.joints, strict=True):
+    # Others, which come last, hold bodies in shape.
+    each = zip(system.declared_joints, system.joint_bodies, problem.couplings.joints, strict=False)
+    for _, bodies, coupling in each:
         first, total = bodies[0], np.zeros((4, 3))
         for batch, of in zip(coupling.elements, coupling.bodies, strict=True):
             if first in of and id(batch) in parts:
                 total += batch.resultant(parts[id(batch)], of.index(first), u[first])
         out.append(total)
-    return out[: len(system.declared_joints)]
+    return out
 
 
 def _about_point(total: FloatArray) -> FloatArray:
