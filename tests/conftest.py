@@ -36,6 +36,9 @@ if threading.current_thread() is not threading.main_thread():
     # A busy machine may make a process of xdist run its tests beside its main thread. Gmsh 4.8,
     # which sets a handler of signals, cannot be imported there.
     signal.signal = lambda number, _handler: signal.getsignal(number)
+#: On several ranks so many cases of a slow test run at most, spread over its parameters. All of
+#: them run in serial, and what ranks do seldom depends on the case.
+CASES_ON_RANKS = 3
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
 
@@ -140,6 +143,22 @@ def pytest_collection_modifyitems(config, items):
     if not named and "PYTEST_XDIST_WORKER" not in os.environ and any(unknown.values()):
         missing = [f"{test}: {sorted(ids)}" for test, ids in unknown.items() if ids]
         raise pytest.UsageError("marks name no test: " + "; ".join(missing))
+    if COMM.size > 1 and not named:
+        _drop_cases(config, items)
+
+
+def _drop_cases(config, items) -> None:
+    """Leave out cases of slow tests beyond `CASES_ON_RANKS`."""
+    cases: dict[str, list] = {}
+    for item in items:
+        if item.get_closest_marker("slow"):
+            cases.setdefault(item.nodeid.split("[")[0], []).append(item)
+    dropped = set()
+    for of_test in cases.values():
+        kept = of_test[:: -(-len(of_test) // CASES_ON_RANKS)]
+        dropped.update(item for item in of_test if item not in kept)
+    items[:] = [item for item in items if item not in dropped]
+    config.hook.pytest_deselected(items=list(dropped))
 
 
 def pytest_collection_finish(session):
