@@ -36,8 +36,8 @@ if threading.current_thread() is not threading.main_thread():
     # A busy machine may make a process of xdist run its tests beside its main thread. Gmsh 4.8,
     # which sets a handler of signals, cannot be imported there.
     signal.signal = lambda number, _handler: signal.getsignal(number)
-#: On several ranks so many cases of a slow test run at most, spread over its parameters. All of
-#: them run in serial, and what ranks do seldom depends on the case.
+#: On several ranks so many cases of a test run at most, spread over its parameters. All of them run
+#: in serial, and what ranks do seldom depends on the case.
 CASES_ON_RANKS = 3
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
@@ -148,11 +148,11 @@ def pytest_collection_modifyitems(config, items):
 
 
 def _drop_cases(config, items) -> None:
-    """Leave out cases of slow tests beyond `CASES_ON_RANKS`."""
-    cases: dict[str, list] = {}
+    """Leave out cases of a test beyond `CASES_ON_RANKS`, of fast and slow ones each."""
+    cases: dict[tuple[str, bool], list] = {}
     for item in items:
-        if item.get_closest_marker("slow"):
-            cases.setdefault(item.nodeid.split("[")[0], []).append(item)
+        slow = item.get_closest_marker("slow") is not None
+        cases.setdefault((item.nodeid.split("[")[0], slow), []).append(item)
     dropped = set()
     for of_test in cases.values():
         kept = of_test[:: -(-len(of_test) // CASES_ON_RANKS)]
