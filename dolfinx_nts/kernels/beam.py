@@ -100,7 +100,9 @@ def shares(x: FloatArray) -> FloatArray:
 
 def strains(of: energy.Elements, y: FloatArray) -> FloatArray:
     """Gamma_1, Gamma_2, E_33 [-], K [1/m] less those of the reference, shape (n, points, 6)."""
-    found: FloatArray = energy.changes(of, y).reshape(len(y), -1, 9) @ _SUMS.T
+    changes = energy.changes(of, y)
+    points = changes.shape[1] // 9  # told, as a rank may have no element
+    found: FloatArray = changes.reshape(len(y), points, 9) @ _SUMS.T
     return found
 
 
