@@ -36,9 +36,9 @@ if threading.current_thread() is not threading.main_thread():
     # A busy machine may make a process of xdist run its tests beside its main thread. Gmsh 4.8,
     # which sets a handler of signals, cannot be imported there.
     signal.signal = lambda number, _handler: signal.getsignal(number)
-#: On several ranks so many cases of a test run at most, spread over its parameters. All of them run
-#: in serial, and what ranks do seldom depends on the case.
-CASES_ON_RANKS = 3
+#: On several ranks so many cases of a fast test and of a slow one run at most, spread over its
+#: parameters. All of them run in serial, and what ranks do seldom depends on the case.
+CASES_ON_RANKS = 3, 1
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
 
@@ -154,8 +154,8 @@ def _drop_cases(config, items) -> None:
         slow = item.get_closest_marker("slow") is not None
         cases.setdefault((item.nodeid.split("[")[0], slow), []).append(item)
     dropped = set()
-    for of_test in cases.values():
-        kept = of_test[:: -(-len(of_test) // CASES_ON_RANKS)]
+    for (_, slow), of_test in cases.items():
+        kept = of_test[:: -(-len(of_test) // CASES_ON_RANKS[slow])]
         dropped.update(item for item in of_test if item not in kept)
     items[:] = [item for item in items if item not in dropped]
     config.hook.pytest_deselected(items=list(dropped))
