@@ -5,18 +5,21 @@ from dataclasses import replace
 from mpi4py import MPI
 
 import bar_impact
+import explicit_friction
 import numpy as np
 import pytest
+import rough_rebound
 import two_blocks
 from dolfinx.mesh import CellType
 from integrators import MID_STEP
 from measures import STENCIL, block_errors, dense, drift
-from scenes import RUBBER, UNITS, box, rotated_state
+from scenes import RUBBER, UNITS, YOUNG, box, rotated_state
 
 import dolfinx_nts as nts
 from dolfinx_nts.bodies.motion import motion_of
 
 COMM = MPI.COMM_WORLD
+MASSES = ("consistent", "redistributed")
 
 
 def linear_bar(elements, courant, closing, t_end=1.5):
@@ -394,3 +397,69 @@ def test_a_start_off_balance_is_told():
         kinds = list(stepper.solution.warnings)
         stepper.close()
         assert kinds == (["massless nodes"] if told else [])
+
+
+@pytest.mark.mpi
+def test_a_layer_too_thick_for_friction_is_told():
+    """By c_p/c_s = sqrt((2 - 2 nu)/(1 - 2 nu)) times a cell over the cube, in any unit and turned.
+
+    The cube's thickness is that of its nodal masses, sqrt(1 + 2/n^2) times its edge.
+    """
+    for poisson, cells, unit, told in (
+        (0.3, 4, 1.0, True), (0.3, 5, 1.0, False), (0.49, 5, UNITS[0], True),
+    ):  # fmt: skip
+        turn = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0], [0.8, 0.0, 0.6]])
+        mesh = box(high=(unit,) * 3, cells=cells)
+        mesh.geometry.x[:] = mesh.geometry.x @ turn.T
+        rubber = nts.NeoHookean(young=YOUNG / unit, poisson=poisson)
+        body = nts.Continuum(mesh, rubber, density=1e3 / unit**3)
+        normal = turn[:, 2]
+        slave = body.surface(lambda x, n=normal, u=unit: n @ x < 1e-9 * u, mass="redistributed")
+        thickness, speeds = body.waves_in_layer()
+        right = 1 / cells / np.sqrt(1 + 2 / cells**2)
+        assert thickness == pytest.approx(right, rel=1e-6)
+        assert speeds == pytest.approx(np.sqrt((2 - 2 * poisson) / (1 - 2 * poisson)), rel=1e-6)
+        for friction in (0.0, 0.5):
+            plane = nts.Plane(-unit * normal, normal)
+            pair = nts.ContactPair(slave=slave, master=plane, friction=friction)
+            stepper = nts.Stepper(nts.System([body], contacts=[pair]), nts.EnergyMomentum())
+            stepper.start(1e-3)
+            kinds = list(stepper.solution.warnings)
+            stepper.close()
+            assert kinds == (["thick layer"] if told and friction else [])
+
+
+@pytest.mark.slow
+def test_both_masses_go_to_one_rebound_from_opposite_sides():
+    """Friction and nu = 0.49: with mass too much of it, without too little, by an explicit code.
+
+    It settles between the two as its mesh is refined (docs/impacts.md). At nu = 0.3, where five
+    cells resolve the impact, all three agree to 6 % of the speed of the throw.
+    """
+    finer = explicit_friction.run(16)
+    found = {mass: rough_rebound.throw(5, 1.25e-4, mass, 0.49, 0.8) for mass in MASSES}
+    speed, (consistent, massless) = np.hypot(1.5, 1.0), [found[mass][1] for mass in MASSES]
+    assert "thick layer" in found["redistributed"][0].warnings
+    assert consistent.velocity[0] + 0.05 * speed < finer.v_x < massless.velocity[0] - 0.2 * speed
+    assert massless.velocity[2] + 0.05 * speed < finer.v_z < consistent.velocity[2] - 0.03 * speed
+    same = explicit_friction.run(5)
+    assert abs(consistent.velocity[0] - same.v_x) < 0.06 * speed
+    assert abs(consistent.velocity[2] - same.v_z) < 0.06 * speed
+    right = explicit_friction.run(16, nu=0.3)
+    for mass in MASSES:
+        run, motion = rough_rebound.throw(5, 2.5e-4, mass, 0.3, 0.8)
+        assert "thick layer" not in run.warnings
+        apart = np.hypot(motion.velocity[0] - right.v_x, motion.velocity[2] - right.v_z)
+        assert apart < 0.08 * speed
+
+
+def test_the_explicit_code_keeps_energy_and_momentum():
+    """Without friction it loses nothing to speak of, and less in shorter steps."""
+    lost = []
+    for courant in (0.4, 0.1):
+        rebound = explicit_friction.run(4, nu=0.3, friction=0.0, courant=courant)
+        assert rebound.v_x == pytest.approx(1.5, rel=1e-12)
+        assert rebound.missing < 1e-13
+        lost.append(abs(rebound.lost))
+    assert lost[0] < 5e-3
+    assert lost[1] < 0.2 * lost[0]

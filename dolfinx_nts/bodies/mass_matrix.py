@@ -25,6 +25,7 @@ class MassMatrix:
     Attributes:
         matrix: PETSc matrix, the same scalar in each of the three directions.
         nodal: Its row sums [kg], shape (num_owned,).
+        nodal_before: The same before nodes lost their mass.
     """
 
     def __init__(self, form: Any) -> None:
@@ -47,6 +48,7 @@ class MassMatrix:
         self.matrix = compat.without_zeros(full)
         full.destroy()
         self._sum_up()
+        self.nodal_before = self.nodal
 
     def _sum_up(self) -> None:
         self.nodal = self.times(np.ones(self._in.getLocalSize()))

@@ -17,6 +17,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.inversion import Determinants
+from dolfinx_nts.bodies.layer import waves
 from dolfinx_nts.bodies.mass_matrix import MassMatrix
 from dolfinx_nts.bodies.materials import misfit
 from dolfinx_nts.bodies.mesh_check import places_of
@@ -202,6 +203,13 @@ class UflBody(Body):
             )
         self.massless, self.has_massless = massless, True
         self.nodal_mass = self._mass.nodal
+
+    def waves_in_layer(self) -> tuple[float, float]:
+        """Massless layer's thickness over the body's, and wave speeds, see `waves`. Collective."""
+        return waves(
+            lambda u: self.potential(u.ravel()), self.reference.reshape(-1, 3),
+            self._mass.nodal_before[::3], self.massless[::3], self.comm,
+        )  # fmt: skip
 
     def points(self, x: Any) -> Points:
         """Material points, for joints and springs. Collective.

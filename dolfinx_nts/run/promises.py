@@ -179,12 +179,12 @@ class Promises:
             )
         else:
             # What a coefficient of restitution takes is asked for.
-            asked = row["impact_restored"] != 0.0
-            if not asked and -total > _LOSS * self._largest + self._rounding:
+            asked, lost = row["impact_restored"] != 0.0, -total - massless
+            if not asked and lost > _LOSS * self._largest + self._rounding:
                 self._solution.warn(
-                    "energy lost to contact", row["time"], -total,
-                    f"gaps that close in mid step have taken an energy of {-total:.3g}, "
-                    f"{self._part(-total):.2g} of the largest energy: how bodies rebound may "
+                    "energy lost to contact", row["time"], lost,
+                    f"nodes that touch or leave in mid step have taken an energy of {lost:.3g}, "
+                    f"{self._part(lost):.2g} of the largest energy: how bodies rebound may "
                     "depend on it; compare with a smaller dt (with Adapt a smaller tolerance) "
                     "and a finer mesh",
                 )  # fmt: skip

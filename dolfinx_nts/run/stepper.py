@@ -45,7 +45,7 @@ from dolfinx_nts.step.accuracy import Newton
 from dolfinx_nts.step.contact_fields import ContactLoads
 from dolfinx_nts.step.guards import check_momentum
 from dolfinx_nts.step.impact import restored
-from dolfinx_nts.step.massless import off_balance
+from dolfinx_nts.step.massless import off_balance, thick_layer
 from dolfinx_nts.step.newton import StepSolver
 from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.step.resting import with_resting_forces
@@ -377,6 +377,9 @@ class Stepper:
         missing, text = off_balance(self.problem, state, dt)
         if text:
             self.solution.warn("massless nodes", state.time, missing, text)
+        ratio, text = thick_layer(self.system)
+        if text:
+            self.solution.warn("thick layer", state.time, ratio, text)
         fast = tell_unresolved(self.problem, state, dt)
         if fast:
             self.solution.warn("unresolved", state.time, *fast)

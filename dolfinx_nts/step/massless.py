@@ -18,6 +18,10 @@ from dolfinx_nts.system import System
 _BALANCED = 1e-2
 #: Rounding of a force over stiffness times the size of a body.
 _ROUNDED = 1e3 * float(np.finfo(float).eps)
+#: Time of a shear wave through the massless layer over that of a pressure wave through the body,
+#: above which rebounds with friction, of nodes with and without mass, part: by 3 to 5 % of the
+#: speed at 0.23 to 0.37, by 10 to 16 % at 0.42 to 0.49, by 30 to 44 % above (docs/impacts.md).
+_SLOW = 0.4
 
 
 def check_massless(system: System, integrator: Any, impact: str) -> None:
@@ -94,5 +98,31 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
                 f"nodes of {body.name!r} without mass start off balance by a force of "
                 f"{missing:.3g} and will move to and fro about it in every step; start from "
                 "equilibrium(...), or without displacement"
+            )
+    return worst, text
+
+
+def thick_layer(system: System) -> tuple[float, str]:
+    """The massless layer with friction that is too thick by most for an impact. Collective.
+
+    Args:
+        system: The scene.
+
+    Returns:
+        Time of a shear wave through it over that of a pressure wave through the body, and a
+        warning: empty where all are thin enough.
+    """
+    worst, text = _SLOW, ""
+    pairs = [p for p in system.contacts if p.friction and p.slave.body.has_massless]
+    for body, name in {p.slave.body: p.name for p in pairs}.items():
+        thickness, speeds = body.waves_in_layer()
+        if thickness * speeds > worst:
+            worst = thickness * speeds
+            text = (
+                f"{body.name!r} has nodes without mass and friction, contact {name!r}, and "
+                f"{1.0 / thickness:.2g} of their cells from side to side; its pressure waves are "
+                f"{speeds:.2g} times as fast as its shear waves, for which an impact takes "
+                f"{speeds / _SLOW:.2g} cells. With fewer, friction turns the body too little, and "
+                "too much with mass='consistent': compare both, or take thinner cells there"
             )
     return worst, text
