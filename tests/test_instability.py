@@ -49,8 +49,8 @@ def test_a_ring_that_rolls_over_its_polygon_settles():
     assert run.status == "completed"
     # A cycle takes all of an attempt's 25 and is solved in another one, if at all.
     assert run.retries == 0 and run.balance["newton_iterations"].max() < 25
-    # An independent program on the mesh of Gmsh 4.8 [N/mm]. Linear tetrahedra of other meshes of this
-    # size are up to 3 % stiffer, as those of Gmsh 4.15.
+    # An independent program on the mesh of Gmsh 4.8 [N/mm]. Linear tetrahedra of other meshes of
+    # this size are up to 3 % stiffer, as those of Gmsh 4.15.
     force = run.contact_forces[-1, 1, 2] / (np.pi * wide / 8)
     assert abs(force) == pytest.approx(1.41893, rel=0.05)
 
