@@ -130,7 +130,9 @@ class ContactElements(ContactLaws):
             "x0": self.x0[chosen],
             "scale": self.scale[chosen],
             "before": self._before_of(chosen),
-            "overlap": self.overlap[chosen] if np.ndim(self.overlap) else self.overlap,
+            "overlap": (
+                self.overlap[chosen] if isinstance(self.overlap, np.ndarray) else self.overlap
+            ),
         }
 
     @cached_property
