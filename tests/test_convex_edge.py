@@ -36,8 +36,8 @@ def test_what_passes_an_edge_closely_is_not_held_by_the_plane_beyond_it(rule, me
     pair = nts.ContactPair(slave=cube.surface(everywhere), master=sides)
     run = nts.simulate(nts.System([block, cube], contacts=[pair]), rule, dt=0.1, t_end=0.1)
     assert run.status == "completed"
-    assert not run.contact_forces.any()
-    np.testing.assert_allclose(cube.velocity, velocity, rtol=1e-13)
+    assert np.abs(run.contact_forces).max() < 1e-13 * cube.mass * metre / 0.1**2
+    np.testing.assert_allclose(cube.velocity, velocity, rtol=1e-13, atol=1e-13 * metre)
 
 
 def profile(teeth, module=4.0, points=7):
