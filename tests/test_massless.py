@@ -197,7 +197,7 @@ def impact(integrator, *, mass="redistributed", dt=2e-3, t_end=0.2, **options):
         changes += 0 if on is None else int(((force > 0) != on).sum())
         on = force > 0
     table = stepper.solution.balance
-    assert not stepper.solution.warnings
+    assert set(stepper.solution.warnings) <= {"thick layer"}  # four cells, with friction
     stepper.close()
     total = np.array(total)
     return table, COMM.allreduce(changes), np.abs(np.diff(total, 2)).sum() / total.sum()

@@ -20,7 +20,7 @@ _BALANCED = 1e-2
 _ROUNDED = 1e3 * float(np.finfo(float).eps)
 #: Time of a shear wave through the massless layer over that of a pressure wave through the body,
 #: above which rebounds with friction, of nodes with and without mass, part: by 3 to 5 % of the
-#: speed at 0.23 to 0.37, by 10 to 16 % at 0.42 to 0.49, by 30 to 44 % above (docs/impacts.md).
+#: speed at 0.23 to 0.36, by 10 to 16 % at 0.41 to 0.47, by 30 to 44 % above (docs/impacts.md).
 _SLOW = 0.4
 
 
