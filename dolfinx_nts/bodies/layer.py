@@ -53,8 +53,11 @@ def waves(
     moved = sum(_stiffness(potential, size * on * axes[k]) for k in range(3)) / size**2
     of_all = global_sum(comm, np.array([pressed, sheared, moved]))
     pressed, sheared, moved = of_all / [3.0, 3.0, 1.0]
-    thickness = np.sqrt(2.0 * taken / moved * (pressed + 2.0 * sheared) / total)
-    return float(thickness / size), float(np.sqrt(pressed / sheared))
+    # NaN of a body that resists no shear, or whose energy has no value at rest: nothing is told.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        thickness = np.sqrt(2.0 * taken / moved * (pressed + 2.0 * sheared) / total)
+        speeds = np.sqrt(pressed / sheared)
+    return float(thickness / size), float(speeds)
 
 
 def _stiffness(potential: Callable[[FloatArray], float], u: FloatArray) -> float:
