@@ -2,7 +2,6 @@
 
 from mpi4py import MPI
 
-import gmsh
 import numpy as np
 import pytest
 from integrators import MID_STEP
@@ -60,6 +59,7 @@ def profile(teeth, module=4.0, points=7):
 
 def gear(teeth, x0, turn, spin, torque, name):
     """A rigid gear on a hinge: body, flanks, hinge."""
+    gmsh = pytest.importorskip("gmsh")
     c, s = np.cos(turn), np.sin(turn)
     outline = profile(teeth) @ [[c, s], [-s, c]] * 1e-3 + [x0, 0]
     gmsh.initialize()
