@@ -19,10 +19,10 @@ from clock import Clock
 from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.accuracy import ACCURACY
-from dolfinx_nts.step.assembly import StepMatrix
-from dolfinx_nts.step.newton import StepSolver
-from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.equations.assembly import StepMatrix
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.solve.accuracy import ACCURACY
+from dolfinx_nts.solve.newton import StepSolver
 
 
 def _spinning(speed: float) -> Any:

@@ -20,7 +20,7 @@ from memory import resident
 from step_time import PARTS, cubes
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.accuracy import ACCURACY
+from dolfinx_nts.solve.accuracy import ACCURACY
 
 #: Of `PARTS`, what contact costs beside the linear solver; the bodies' matrices are stored in
 #: blocks in the last two of them.

@@ -43,7 +43,7 @@ import numpy as np
 from step_time import cubes
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.accuracy import ACCURACY
+from dolfinx_nts.solve.accuracy import ACCURACY
 
 _STEP, _GAP, _DENSITY = 1e-3, 0.05, 1e3
 _YOUNG, _POISSON = 1e6, 0.3

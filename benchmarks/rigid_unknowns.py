@@ -33,7 +33,7 @@ from scipy.sparse import bmat, bsr_matrix, csr_matrix
 from scipy.sparse.linalg import spsolve
 
 import dolfinx_nts as nts
-from dolfinx_nts.elements import evaluate_together
+from dolfinx_nts.interaction.elements import evaluate_together
 
 STEP = 5e-3
 

@@ -18,12 +18,12 @@ from clock import Clock
 from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
-from dolfinx_nts.bodies.continuum import Continuum
+from dolfinx_nts.bodies.solid.continuum import Continuum
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.facet_pair import FacetPair
-from dolfinx_nts.step.accuracy import ACCURACY
-from dolfinx_nts.step.assembly import StepMatrix
-from dolfinx_nts.step.newton import StepSolver
+from dolfinx_nts.equations.assembly import StepMatrix
+from dolfinx_nts.solve.accuracy import ACCURACY
+from dolfinx_nts.solve.newton import StepSolver
 
 #: What a step is made of: label -> class and method that are timed.
 PARTS = {

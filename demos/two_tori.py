@@ -39,7 +39,7 @@ from mpi4py import MPI
 import numpy as np
 
 import dolfinx_nts as nts
-from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh
+from dolfinx_nts.bodies.meshes.mesh_input import bodies_from_gmsh
 
 MESHES = Path(__file__).resolve().parents[1] / "meshes"
 RADIUS, VELOCITY, DENSITY = 76.0, (30.0, 0.0, 23.0), 0.1

@@ -3,29 +3,27 @@
 from importlib.metadata import version
 
 from dolfinx_nts import mpi_first  # noqa: F401 - before anything of DOLFINx
-from dolfinx_nts.bodies.beam import Beam
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction
-from dolfinx_nts.bodies.continuum import Continuum
-from dolfinx_nts.bodies.form_body import FormBody
-from dolfinx_nts.bodies.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
-from dolfinx_nts.bodies.mesh_input import Part, bodies_from_gmsh, bodies_from_tags
-from dolfinx_nts.bodies.mesh_made import extrude, linear
+from dolfinx_nts.bodies.meshes.mesh_input import Part, bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.bodies.meshes.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
-from dolfinx_nts.bodies.pressure import Pressure
-from dolfinx_nts.bodies.rigid import RigidBody
-from dolfinx_nts.bodies.section import Circle, Rectangle, Section
-from dolfinx_nts.bodies.shell import Shell
-from dolfinx_nts.bodies.stress import cauchy_stress, von_mises
+from dolfinx_nts.bodies.rigid.rigid import RigidBody
+from dolfinx_nts.bodies.slender.beam import Beam
+from dolfinx_nts.bodies.slender.pressure import Pressure
+from dolfinx_nts.bodies.slender.section import Circle, Rectangle, Section
+from dolfinx_nts.bodies.slender.shell import Shell
+from dolfinx_nts.bodies.solid.continuum import Continuum
+from dolfinx_nts.bodies.solid.form_body import FormBody
+from dolfinx_nts.bodies.solid.materials import MooneyRivlin, NeoHookean, StVenantKirchhoff
+from dolfinx_nts.bodies.solid.stress import cauchy_stress, von_mises
 from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.coupling import Coupling, Joint, JointCoupling, Slopes, StepWarning
-from dolfinx_nts.elements import Elements, Step
-from dolfinx_nts.evaluation import Moment
+from dolfinx_nts.equations.contact_terms import ContactTerms
 from dolfinx_nts.integrators import (
     EnergyMomentum,
     GeneralizedAlpha,
@@ -33,6 +31,11 @@ from dolfinx_nts.integrators import (
     Midpoint,
     Newmark,
 )
+from dolfinx_nts.interaction.coupling import Coupling, Joint, JointCoupling, Slopes, StepWarning
+from dolfinx_nts.interaction.elements import Elements, Step
+from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.point_elements import EveryStep, PointElements, PointPart
+from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints import (
     Cylindrical,
     Distance,
@@ -48,20 +51,17 @@ from dolfinx_nts.joints import (
 from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.strain_energy import Isotropic
-from dolfinx_nts.point_elements import EveryStep, PointElements, PointPart
-from dolfinx_nts.points import Points
 from dolfinx_nts.run.checkpoint import Checkpoint, restart
 from dolfinx_nts.run.equilibrium import equilibrium
 from dolfinx_nts.run.intercept import intercept
-from dolfinx_nts.run.saved import Saved, load
+from dolfinx_nts.run.run_file import Saved, load
 from dolfinx_nts.run.simulate import simulate
 from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
 from dolfinx_nts.run.step_size import Adapt
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
+from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.state import ContactHistory, State
-from dolfinx_nts.step.accuracy import Newton
-from dolfinx_nts.step.contact_terms import ContactTerms
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import OutputError, StepFailedError, UserFunctionError
 

@@ -17,7 +17,7 @@ from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
 from dolfinx_nts.contact.shared_nodes import areas, check_shared
-from dolfinx_nts.coupling import Joint, is_joint
+from dolfinx_nts.interaction.coupling import Joint, is_joint
 from dolfinx_nts.parallel import raise_together, same_kernels
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.validation import items, known_options, require_same, vector

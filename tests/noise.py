@@ -16,7 +16,7 @@ import zlib
 
 import numpy as np
 
-from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.equations.problem import StepProblem
 
 KINDS = ("residual", "forces", "both")
 _EPS = float(np.finfo(float).eps)

@@ -15,8 +15,8 @@ from processes import in_fresh_python
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import forms
-from dolfinx_nts.bodies.inversion import Determinants
-from dolfinx_nts.bodies.step_forms import fill
+from dolfinx_nts.bodies.solid.inversion import Determinants
+from dolfinx_nts.bodies.solid.step_forms import fill
 from dolfinx_nts.kernels import cell_batches, library
 
 COMM = MPI.COMM_WORLD

@@ -7,8 +7,8 @@ from scenes import box
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.convergence import ratios
-from dolfinx_nts.step.problem import StepProblem
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.solve.convergence import ratios
 
 MASS, INERTIA, ARM, G = 2.0, 0.5, 0.7, 9.81
 Z = np.array([0.0, 0.0, 1.0])

@@ -11,7 +11,7 @@ import pytest
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh
+from dolfinx_nts.bodies.meshes.mesh_input import bodies_from_gmsh
 
 ROOT = Path(__file__).resolve().parents[1]
 COMM = MPI.COMM_WORLD

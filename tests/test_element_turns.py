@@ -8,7 +8,7 @@ from lines import interval_mesh, straight
 from shells import plate
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.diagnosis import diagnosis
+from dolfinx_nts.solve.failure import diagnosis
 
 SECTION = nts.Section(EA=1e4, GA=(5e3, 5e3), GJ=2, EI=(2, 2), rhoA=1, rhoI=(1e-2, 1e-2))
 SENTENCE = "turns by 90 degrees between neighbouring nodes near X = "

@@ -18,7 +18,7 @@ from dolfinx_nts.contact import coulomb
 from dolfinx_nts.kernels import facets
 from dolfinx_nts.kernels.friction import return_map
 from dolfinx_nts.kernels.nts_element import invariants, metric, projection
-from dolfinx_nts.step.convergence import ratios
+from dolfinx_nts.solve.convergence import ratios
 
 COMM = MPI.COMM_WORLD
 TO_ROUNDING = nts.Newton(rtol=1e-14, max_iterations=60)

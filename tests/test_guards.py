@@ -14,9 +14,9 @@ from point_mass import STEP, PointMass, mass_on_wall
 from scenes import fung
 
 import dolfinx_nts as nts
+from dolfinx_nts.ledger import balance
+from dolfinx_nts.ledger.guards import check_momentum
 from dolfinx_nts.run.trial import state_after
-from dolfinx_nts.step import balance
-from dolfinx_nts.step.guards import check_momentum
 
 COMM = MPI.COMM_WORLD
 STEEP = ["b=1000", "b=300"]

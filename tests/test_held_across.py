@@ -9,8 +9,8 @@ from integrators import MID_STEP
 from scenes import RUBBER
 
 import dolfinx_nts as nts
+from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Static
-from dolfinx_nts.step.problem import StepProblem
 
 COMM = MPI.COMM_WORLD
 #: Twist, skew and smoothing of `held_across`.

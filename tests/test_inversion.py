@@ -15,11 +15,11 @@ from scenes import RUBBER, green, saint_venant
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.inversion import smallest_dets
+from dolfinx_nts.bodies.solid.inversion import smallest_dets
+from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.step.accuracy import ACCURACY
-from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.step.upright import Upright
+from dolfinx_nts.solve.accuracy import ACCURACY
+from dolfinx_nts.solve.inversion_guard import Upright
 
 COMM = MPI.COMM_WORLD
 SENTENCE = "inside out, which W(C) cannot see: det F = "

@@ -12,7 +12,7 @@ from scenes import UNITS
 from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
-from dolfinx_nts.step import least_norm
+from dolfinx_nts.equations import least_norm
 
 COMM = MPI.COMM_WORLD
 N = np.array([2.0, -1.0, 2.0]) / 3.0

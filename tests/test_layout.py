@@ -24,11 +24,16 @@ PACKAGE = ROOT / "dolfinx_nts"
 LEVELS = [
     {"parallel", "validation", "mpi_first", "dolfinx_compat", "forms", "kernels"},
     {"integrators"},
-    {
-        "bodies", "constraints", "contact", "coupling", "elements", "evaluation", "joints",
-        "kinematics", "point_elements", "points", "state", "system",
-    },
-    {"step"},
+    {"state"},
+    {"interaction"},
+    {"contact"},
+    {"bodies"},
+    {"joints"},
+    {"system"},
+    {"equations"},
+    {"solve"},
+    {"ledger"},
+    {"start"},
     {"output"},
     {"run"},
     {"study"},
@@ -146,8 +151,8 @@ def test_level_0_knows_neither_mpi_nor_petsc(module):
 
 #: What makes PETSc matrices.
 MATRICES = {
-    "step.assembly", "step.schur", "step.mass_solves", "step.model_problem", "step.instability",
-    "dolfinx_compat",
+    "equations.assembly", "equations.schur", "equations.mass_solves", "solve.model_problem",
+    "solve.instability", "dolfinx_compat",
 }  # fmt: skip
 
 

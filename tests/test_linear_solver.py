@@ -10,9 +10,10 @@ from petsc4py import PETSc
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.step import linear_solver, node_blocks
-from dolfinx_nts.step.assembly import StepMatrix
-from dolfinx_nts.step.presets import Presets
+from dolfinx_nts.equations import node_blocks
+from dolfinx_nts.equations.assembly import StepMatrix
+from dolfinx_nts.solve import linear_solver
+from dolfinx_nts.solve.presets import Presets
 
 COMM = MPI.COMM_WORLD
 
@@ -66,7 +67,7 @@ def test_krylov_is_left_where_it_is_slow_and_tried_again(caplog):
 
     Krylov's method alone cannot solve these steps.
     """
-    caplog.set_level("INFO", logger="dolfinx_nts.step.newton")
+    caplog.set_level("INFO", logger="dolfinx_nts.solve.newton")
     long, short = 0.06, 5e-4
     tables = {}
     for solver in ("auto", "direct"):

@@ -9,7 +9,7 @@ from scenes import RUBBER
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.mesh_input import bodies_from_gmsh, bodies_from_tags
+from dolfinx_nts.bodies.meshes.mesh_input import bodies_from_gmsh, bodies_from_tags
 
 COMM = MPI.COMM_WORLD
 #: Young's moduli and a traction [Pa].

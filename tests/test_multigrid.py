@@ -7,7 +7,7 @@ import pytest
 from dolfinx.mesh import CellType, create_box
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.augmented import augmented
+from dolfinx_nts.solve.augmented import augmented
 
 COMM = MPI.COMM_WORLD
 RUBBER = nts.NeoHookean(young=1e6, poisson=0.3)

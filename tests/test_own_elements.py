@@ -13,7 +13,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import ACCELERATED, INTEGRATORS
 
 import dolfinx_nts as nts
-from dolfinx_nts.elements import evaluate_together
+from dolfinx_nts.interaction.elements import evaluate_together
 from dolfinx_nts.output import BalanceCSV
 
 COMM = MPI.COMM_WORLD

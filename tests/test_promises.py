@@ -15,7 +15,7 @@ from point_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.run.promises import Promises
+from dolfinx_nts.run.ledger_check import Promises
 
 COMM = MPI.COMM_WORLD
 
@@ -241,7 +241,7 @@ class Driven(PointMass):
 @pytest.mark.mpi
 def test_a_gain_in_one_step_is_measured_without_driven_bodies(monkeypatch):
     """0.1 J of 1 J, beside a mass of 2e6 kg at 1 m/s."""
-    monkeypatch.setattr("dolfinx_nts.step.balance.expelled", lambda *_: "by one node")
+    monkeypatch.setattr("dolfinx_nts.ledger.balance.expelled", lambda *_: "by one node")
     told = []
     solution = SimpleNamespace(warn=lambda kind, *rest, **_: told.append((kind, *rest)))
     stepper = nts.Stepper(nts.System([Sprung(1.0), Driven(2e6, 1.0)]), nts.EnergyMomentum())

@@ -8,7 +8,7 @@ from dolfinx import mesh as dolfinx_mesh
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.bodies.mesh_check import refuse_repeated
+from dolfinx_nts.bodies.meshes.mesh_check import refuse_repeated
 
 COMM = MPI.COMM_WORLD
 SEVERAL = pytest.mark.skipif(COMM.size == 1, reason="needs several ranks")

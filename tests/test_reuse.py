@@ -10,7 +10,7 @@ from measures import difference
 from scenes import RUBBER, UNITS, at, box, rubbing_blocks
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.accuracy import ACCURACY
+from dolfinx_nts.solve.accuracy import ACCURACY
 
 COMM = MPI.COMM_WORLD
 

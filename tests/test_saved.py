@@ -10,7 +10,7 @@ import pytest
 from dolfinx.mesh import CellType, create_box
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.balance import Switch
+from dolfinx_nts.ledger.balance import Switch
 
 COMM = MPI.COMM_WORLD
 NAME = "run.h5"

@@ -12,8 +12,8 @@ from scenes import UNITS
 from scipy.integrate import quad, solve_ivp
 
 import dolfinx_nts as nts
+from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Static
-from dolfinx_nts.step.problem import StepProblem
 
 COMM = MPI.COMM_WORLD
 MIDDLE = ("energy-momentum", "midpoint")

@@ -12,9 +12,9 @@ import pytest
 from dolfinx.mesh import CellType, create_box
 
 import dolfinx_nts as nts
+from dolfinx_nts.ledger.balance import COLUMNS, Switch, Switches
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.table import Table
-from dolfinx_nts.step.balance import COLUMNS, Switch, Switches
 
 COMM = MPI.COMM_WORLD
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.accuracy import ACCURACY
+from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.study import scene_runs, tradeoff
 
 COMM = MPI.COMM_WORLD

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from scenes import RUBBER, everywhere
 
 import dolfinx_nts as nts
-from dolfinx_nts.step import iterates
+from dolfinx_nts.solve import iterates
 
 COMM = MPI.COMM_WORLD
 ROUND_OFF = 1e-12

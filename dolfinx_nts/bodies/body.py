@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
-from dolfinx_nts.evaluation import Moment
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import range_of
-from dolfinx_nts.points import Points
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

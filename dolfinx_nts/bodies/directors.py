@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.constraints import Constraints, Equations
-from dolfinx_nts.coupling import Joint
+from dolfinx_nts.interaction.constraints import Constraints, Equations
+from dolfinx_nts.interaction.coupling import Joint
 
 if TYPE_CHECKING:
-    from dolfinx_nts.points import Points
+    from dolfinx_nts.interaction.points import Points
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution
 from dolfinx_nts.contact.coulomb import Slip
-from dolfinx_nts.elements import over
+from dolfinx_nts.interaction.elements import over
+from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.kernels.vectors import cross
-from dolfinx_nts.points import Points
 from dolfinx_nts.state import ContactHistory
 
 FloatArray = npt.NDArray[np.float64]
@@ -271,7 +271,7 @@ class ContactElements(ContactLaws):
         gaps = self.rows(part, "constraints") / self.scale[:, None]
         arrays = (self.rows(part, "augmented"), gaps, part.multiplier, self.scale)
         found = [float(np.abs(a).max(initial=0.0)) for a in arrays]
-        # Rows of gaps that repeat each other miss what no motion closes, see `step.shared_weight`.
+        # Rows of gaps that repeat each other miss what no motion closes, see `equations.shared_weight`.
         found[1] = max(found[1], float(np.abs(part.gap[part.active]).max(initial=0.0)))
         return found
 

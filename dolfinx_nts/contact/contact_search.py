@@ -16,9 +16,9 @@ from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import Rub, no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.shared_nodes import held_before
-from dolfinx_nts.coupling import StepWarning
-from dolfinx_nts.elements import Step
-from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.interaction.coupling import StepWarning
+from dolfinx_nts.interaction.elements import Step
+from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, global_max
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.validation import StepFailedError, UserFunctionError

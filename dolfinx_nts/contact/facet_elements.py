@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.coulomb import Slip
+from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import compiled, facets, nts_element
-from dolfinx_nts.points import Points
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]

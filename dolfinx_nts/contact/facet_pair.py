@@ -19,7 +19,7 @@ from dolfinx_nts.contact.pair import (
     Motion,
 )
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.elements import Step
+from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets, nts_element, patches
 from dolfinx_nts.parallel import anywhere
 

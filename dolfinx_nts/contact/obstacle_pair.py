@@ -18,7 +18,7 @@ from dolfinx_nts.contact.pair import (
     Found,
     Motion,
 )
-from dolfinx_nts.elements import Step
+from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.validation import StepFailedError
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.elements import Step
+from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.validation import known_options
 
 FloatArray = npt.NDArray[np.float64]

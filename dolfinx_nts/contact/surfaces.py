@@ -21,10 +21,10 @@ from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact import search
+from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import facets as facet_math
 from dolfinx_nts.kernels import patches, triangle_patches
 from dolfinx_nts.parallel import gather_rows
-from dolfinx_nts.points import Points
 from dolfinx_nts.validation import at_points, is_whole
 
 logger = logging.getLogger(__name__)

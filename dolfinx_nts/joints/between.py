@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.constraints import Constraints, Equations, Upright, rank_of
-from dolfinx_nts.coupling import Joint
+from dolfinx_nts.interaction.constraints import Constraints, Equations, Upright, rank_of
+from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.kernels import quadratic
 from dolfinx_nts.validation import require_name, require_same, vector
 

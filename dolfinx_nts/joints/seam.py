@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.shell import Shell
-from dolfinx_nts.constraints import Constraints, Equations
+from dolfinx_nts.bodies.slender.shell import Shell
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.coupling import Joint
+from dolfinx_nts.interaction.constraints import Constraints, Equations
+from dolfinx_nts.interaction.coupling import Joint
+from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import named, points_of
-from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options
 
 FloatArray = npt.NDArray[np.float64]

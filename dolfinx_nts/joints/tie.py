@@ -9,13 +9,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.constraints import Constraints, Equations
 from dolfinx_nts.contact.search import closest_facets
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.coupling import Joint
+from dolfinx_nts.interaction.constraints import Constraints, Equations
+from dolfinx_nts.interaction.coupling import Joint
+from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import named, points_of
 from dolfinx_nts.kernels import facets as fc
-from dolfinx_nts.points import Points
 from dolfinx_nts.validation import known_options
 
 #: Nodes lie on a surface up to this part of its largest facet; weights up to the other hold none.

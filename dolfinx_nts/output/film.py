@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.ledger import contact_fields
 from dolfinx_nts.output.cadence import Cadence
 from dolfinx_nts.output.pictures import (
     Drawn,
@@ -23,7 +24,6 @@ from dolfinx_nts.output.pictures import (
 from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
-from dolfinx_nts.step import contact_fields
 from dolfinx_nts.validation import StrPath, as_path, require_bool, require_positive
 
 FloatArray = npt.NDArray[np.float64]

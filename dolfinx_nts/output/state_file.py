@@ -41,9 +41,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
 from dolfinx_nts.state import ContactHistory, State
-from dolfinx_nts.step import balance, resultants
 from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.ledger.impact import IMPACTS
 from dolfinx_nts.run.start import refuse_moved
-from dolfinx_nts.step.accuracy import Newton
-from dolfinx_nts.step.impact import IMPACTS
-from dolfinx_nts.step.massless import check_massless
+from dolfinx_nts.solve.accuracy import Newton
+from dolfinx_nts.start.massless_start import check_massless
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import is_finite, require_bool
 

@@ -11,12 +11,14 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION
-from dolfinx_nts.evaluation import Evaluation
 from dolfinx_nts.integrators import Static
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.ledger import balance, resultants
+from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.parallel import anywhere
-from dolfinx_nts.run.promises import NOT_FINITE
-from dolfinx_nts.run.same import same_run
-from dolfinx_nts.run.saved import Saved
+from dolfinx_nts.run.ledger_check import NOT_FINITE
+from dolfinx_nts.run.rank_agreement import same_run
+from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Equilibrium
 from dolfinx_nts.run.start import kind_of, of_file
@@ -24,13 +26,11 @@ from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.trial import solved, state_after
 from dolfinx_nts.run.writer import Writer
+from dolfinx_nts.solve.accuracy import Newton
+from dolfinx_nts.solve.convergence import unrest
+from dolfinx_nts.solve.instability import releasing_motions
+from dolfinx_nts.start.free_motion import free_motion
 from dolfinx_nts.state import State
-from dolfinx_nts.step import balance, resultants
-from dolfinx_nts.step.accuracy import Newton
-from dolfinx_nts.step.contact_fields import ContactLoads
-from dolfinx_nts.step.convergence import unrest
-from dolfinx_nts.step.free_motion import free_motion
-from dolfinx_nts.step.instability import releasing_motions
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import (
     StepFailedError,

@@ -12,13 +12,13 @@ from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.intercept import interceptable
 from dolfinx_nts.run.interrupts import Interrupts
 from dolfinx_nts.run.progress import progress_bar
-from dolfinx_nts.run.same import same_run
-from dolfinx_nts.run.saved import Saved
+from dolfinx_nts.run.rank_agreement import same_run
+from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_size import Adapt, Pace
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
-from dolfinx_nts.step.accuracy import ACCURACY, Newton
+from dolfinx_nts.solve.accuracy import ACCURACY, Newton
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import (
     OutputError,

@@ -9,14 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.mesh_check import places_of
+from dolfinx_nts.bodies.meshes.mesh_check import places_of
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.equations.supports import rates_at
+from dolfinx_nts.ledger import resultants
 from dolfinx_nts.parallel import first_problem, global_max, raise_together
-from dolfinx_nts.run.saved import Saved
+from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
+from dolfinx_nts.start import consistent
 from dolfinx_nts.state import State
-from dolfinx_nts.step import consistent, resultants
-from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.step.supports import rates_at
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import UserFunctionError, is_finite
 

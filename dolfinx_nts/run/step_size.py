@@ -17,10 +17,10 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.equations.lengths import Lengths
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.state import State
-from dolfinx_nts.step.lengths import Lengths
-from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import known_options
 

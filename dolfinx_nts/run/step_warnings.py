@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.inversion import describe, smallest_dets
 from dolfinx_nts.bodies.motion import motion_of
-from dolfinx_nts.evaluation import Evaluation
-from dolfinx_nts.kinematics import FAR_TURN
+from dolfinx_nts.bodies.solid.inversion import describe, smallest_dets
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.interaction.kinematics import FAR_TURN
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.state import State
-from dolfinx_nts.step.problem import StepProblem
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -15,13 +15,17 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.jumps import jumps
 from dolfinx_nts.contact.hidden_facets import hidden_facets
 from dolfinx_nts.contact.overlap import OverlapWatch
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.ledger.contact_fields import ContactLoads
+from dolfinx_nts.ledger.guards import check_momentum
+from dolfinx_nts.ledger.impact import restored
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme
+from dolfinx_nts.run.balance_table import Ledger
 from dolfinx_nts.run.last_steps import LastSteps
-from dolfinx_nts.run.ledger import Ledger
+from dolfinx_nts.run.ledger_check import Promises
 from dolfinx_nts.run.material_watch import MaterialWatch
-from dolfinx_nts.run.promises import Promises
-from dolfinx_nts.run.same import same_run
-from dolfinx_nts.run.saved import Saved
+from dolfinx_nts.run.rank_agreement import same_run
+from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
     check_restart,
@@ -39,17 +43,13 @@ from dolfinx_nts.run.start import (
 from dolfinx_nts.run.step_size import Pace
 from dolfinx_nts.run.step_warnings import tell_frictionless, tell_step, tell_stressed
 from dolfinx_nts.run.trial import Trial, solved, state_after
+from dolfinx_nts.solve.accuracy import Newton
+from dolfinx_nts.solve.newton import StepSolver
+from dolfinx_nts.start import consistent
+from dolfinx_nts.start.initial_contact_forces import with_resting_forces
+from dolfinx_nts.start.massless_start import off_balance, thick_layer
+from dolfinx_nts.start.unresolved import DamperWatch, tell_unresolved
 from dolfinx_nts.state import State
-from dolfinx_nts.step import consistent
-from dolfinx_nts.step.accuracy import Newton
-from dolfinx_nts.step.contact_fields import ContactLoads
-from dolfinx_nts.step.guards import check_momentum
-from dolfinx_nts.step.impact import restored
-from dolfinx_nts.step.massless import off_balance, thick_layer
-from dolfinx_nts.step.newton import StepSolver
-from dolfinx_nts.step.problem import StepProblem
-from dolfinx_nts.step.resting import with_resting_forces
-from dolfinx_nts.step.unresolved import DamperWatch, tell_unresolved
 from dolfinx_nts.system import System, is_like
 from dolfinx_nts.validation import (
     StepFailedError,

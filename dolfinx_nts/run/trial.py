@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.evaluation import Evaluation
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.ledger.impact import Impact
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.solve.newton import StepSolver
+from dolfinx_nts.start.consistent import Fitted
 from dolfinx_nts.state import State
-from dolfinx_nts.step.consistent import Fitted
-from dolfinx_nts.step.impact import Impact
-from dolfinx_nts.step.newton import StepSolver
-from dolfinx_nts.step.problem import StepProblem
 from dolfinx_nts.validation import StepFailedError
 
 FloatArray = npt.NDArray[np.float64]

@@ -34,7 +34,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.forms import CellForm, assemble_vector
 from dolfinx_nts.kernels.strain_energy import strain_energy
 from dolfinx_nts.output import writers as output
-from dolfinx_nts.step.linear_solver import SolverOptions
+from dolfinx_nts.solve.linear_solver import SolverOptions
 from dolfinx_nts.validation import known_options, require_positive
 
 FloatArray = npt.NDArray[np.float64]

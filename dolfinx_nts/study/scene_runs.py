@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.accuracy import ACCURACY
+from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.validation import require_bool, require_positive
 
 FloatArray = npt.NDArray[np.float64]

@@ -34,7 +34,7 @@ from mpi4py import MPI
 import numpy as np
 
 import dolfinx_nts as nts
-from dolfinx_nts.step.accuracy import ACCURACY
+from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.study.extreme_scenes import MATERIALS, Case, Scene, closing, long_run, strips
 
 INTEGRATORS: Mapping[str, Any] = {

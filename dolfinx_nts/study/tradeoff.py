@@ -30,7 +30,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.run.saved import versions
+from dolfinx_nts.run.run_file import versions
 from dolfinx_nts.study import economy
 from dolfinx_nts.study.scene_runs import check, check_value, measure
 

@@ -1,0 +1,1 @@
+"""Meshes of bodies: read, checked, and made of others."""

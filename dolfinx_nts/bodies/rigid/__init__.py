@@ -1,0 +1,1 @@
+"""Rigid bodies: inertia, prescribed motion and loads."""

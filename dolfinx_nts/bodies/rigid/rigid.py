@@ -1,0 +1,511 @@
+"""Rigid bodies: centre of mass and three directors, held orthonormal (theory section 12)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.directors import Directors
+from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
+from dolfinx_nts.bodies.rigid.inertia import Inertia, inertia_of, principal
+from dolfinx_nts.bodies.rigid.prescribed_motion import PrescribedMotion
+from dolfinx_nts.bodies.rigid.rigid_loads import RigidLoads, VectorInTime
+from dolfinx_nts.bodies.solid.parameters import (
+    Parameter,
+    is_number,
+    require_positive_parameter,
+    values_of,
+)
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.interaction.constraints import rank_of
+from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.kernels.vectors import cross, range_of
+from dolfinx_nts.parallel import gather_rows, raise_together
+from dolfinx_nts.validation import (
+    UserFunctionError,
+    known_options,
+    require_bool,
+    require_name,
+    require_positive,
+    require_same,
+    vector,
+    vectors,
+)
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Part of the mass that the matrix lends to directors without mass where a rotation has no
+#: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
+_LENT = 1e-8
+
+
+@known_options
+class RigidBody(Body):
+    """A rigid body on a DOLFINx mesh, with twelve coordinates and six constraints.
+
+    Its coordinates are those of four nodes: the centre of mass phi and D_i = l d_i, l the radius of
+    gyration and d_i the principal axes, so that all are lengths and the mass matrix is constant and
+    diagonal: m, E_i / l^2 (theory section 12). They live on one rank; the mesh, which may be
+    distributed, serves contact surfaces, fields and pictures.
+
+    Args:
+        mesh: 3D hexahedral or tetrahedral mesh.
+        density: [kg/m^3], > 0: a number, or a Constant or Function on the mesh, which must keep
+            its values.
+        velocity: Of the centre of mass at the start [m/s]; not beside `motion`.
+        angular_velocity: At the start [rad/s]; not beside `rotation`.
+        force: Dead force on the centre of mass [N]: a vector, or a function of time.
+        torque: Dead torque [N m]: a vector, or a function of time.
+        motion: Displacement of the centre of mass from its reference [m], as a vector, or a
+            function of time, where the body starts, too; its work is external work. None: the
+            centre is free.
+        rotation: Rotation from the reference, as a rotation vector [rad], a matrix (3, 3), or a
+            function of time to one of them, likewise. None: the body is free to turn. A run warns
+            of more than a radian in a step, whole turns included.
+        name: Name in messages and files.
+
+    Attributes:
+        mass: [kg].
+        moments: Principal moments of inertia [kg m^2], shape (3,).
+        centre: Centre of mass in the reference [m], shape (3,).
+        u: Displacement of the mesh [m], dolfinx Function of the last accepted state; of a body with
+            a mesh, as are the next ones.
+        v: Velocity of the mesh [m/s], dolfinx Function.
+        space: Their function space.
+
+    Raises:
+        TypeError: `mesh` is none, or an argument is of another kind.
+        ValueError: An argument is out of range, or the mesh is not a valid 3D mesh.
+    """
+
+    rigid = oriented = bound = True
+    _densities: Sequence[Any] = ()
+    _made = False
+
+    def __init__(
+        self,
+        mesh: Any,
+        *,
+        density: Parameter,
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        force: VectorInTime = (0.0, 0.0, 0.0),
+        torque: VectorInTime = (0.0, 0.0, 0.0),
+        motion: VectorInTime | None = None,
+        rotation: Any = None,
+        name: str = "rigid",
+    ) -> None:
+        require_name("name", name)
+        check_mesh(mesh, name)
+        given = {
+            "name": name, "velocity": velocity, "angular_velocity": angular_velocity,
+            "force": force, "torque": torque, "motion": motion, "rotation": rotation,
+        }  # fmt: skip
+        require_same(mesh.comm, density=density if is_number(density) else None, **given)
+        require_positive_parameter("density", density, "kg/m^3")
+        self.mesh, self.density, self.degree = mesh, density, 1
+        self.made_on = places_of(mesh)
+        self.space = compat.vector_space(mesh, 1)
+        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
+        self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
+        self._densities = [] if is_number(density) else [density]
+        self._measured = self.parameters()
+        self._set_up(mesh.comm, inertia_of(self.space, density), **given)
+
+    @classmethod
+    @known_options
+    def from_inertia(
+        cls,
+        mass: float,
+        inertia: Any,
+        centre: Any = (0.0, 0.0, 0.0),
+        axes: Any = None,
+        *,
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        force: VectorInTime = (0.0, 0.0, 0.0),
+        torque: VectorInTime = (0.0, 0.0, 0.0),
+        motion: VectorInTime | None = None,
+        rotation: Any = None,
+        name: str = "rigid",
+        comm: Any = MPI.COMM_WORLD,
+    ) -> RigidBody:
+        """A rigid body without a mesh.
+
+        Args:
+            mass: [kg], > 0.
+            inertia: Principal moments of inertia about the centre of mass [kg m^2], shape (3,), or
+                their tensor, shape (3, 3). Moments of 0 are legal: a rod, a point.
+            centre: Centre of mass at the start [m].
+            axes: Principal axes as the columns of a right-handed orthonormal matrix (3, 3);
+                default: those of x, y, z, or of the tensor.
+            velocity: As of the class, and so are the next ones.
+            angular_velocity: [rad/s].
+            force: [N].
+            torque: [N m].
+            motion: [m].
+            rotation: [rad], or a matrix.
+            name: Name in messages and files.
+            comm: MPI communicator.
+
+        Raises:
+            TypeError: An argument is of another kind.
+            ValueError: An argument is out of range: moments that no body has, axes that are not
+                right-handed or not orthonormal.
+        """
+        if not isinstance(comm, MPI.Comm):
+            raise TypeError(f"comm={comm!r}: pass an MPI communicator of mpi4py")
+        given = {
+            "name": name, "velocity": velocity, "angular_velocity": angular_velocity,
+            "force": force, "torque": torque, "motion": motion, "rotation": rotation,
+        }  # fmt: skip
+        require_same(comm, mass=mass, inertia=inertia, centre=centre, axes=axes, **given)
+        require_name("name", name)
+        require_positive("mass", mass, "kg")
+        where = vector("centre", centre, "m")
+        moments, columns = principal(inertia, axes)
+        body = cls.__new__(cls)
+        body._set_up(comm, Inertia.of_moments(float(mass), where, moments, columns), **given)
+        body._made = True
+        return body
+
+    def _set_up(
+        self,
+        comm: Any,
+        inertia: Inertia,
+        *,
+        name: str,
+        velocity: Any,
+        angular_velocity: Any,
+        force: VectorInTime,
+        torque: VectorInTime,
+        motion: VectorInTime | None,
+        rotation: Any,
+    ) -> None:
+        """Set up what both constructors share."""
+        self.name, self._inertia = name, inertia
+        self.comm = compat.petsc_communicator(comm)
+        self.mass, self.centre, self.moments = inertia.mass, inertia.centre, inertia.moments
+        self.length = inertia.length
+        linear = vector("velocity", velocity, "m/s")
+        turning = vector("angular_velocity", angular_velocity, "rad/s")
+        self._drive = PrescribedMotion(comm, name, motion, rotation)
+        self._drive.refuse_beside(linear, turning)
+        self.driven = self._drive.in_time
+        self._loads = RigidLoads(comm, name, force, torque, inertia.euler)
+        self.loads_in_time = self._loads.in_time
+        self._loads.begin(0.0, 1.0, inertia.axes)
+        self._set_up_nodes(linear, turning)
+        self.prescribed(0.0)
+        held = self.points(self.centre).part(slice(0, int(comm.rank == self.owner)))
+        self._directors_held = Directors(self, held, self.length, np.arange(len(held)))
+        self.joints = () if self._drive.turns else (self._directors_held,)
+        self._matrix: Any = None
+        # Mass factor that it holds, and PETSc's count of changes since.
+        self._holds: tuple[float, int] | None = None
+        self._reach = np.ones(4)
+        if self.mesh is not None:
+            x = self.space.tabulate_dof_coordinates()
+            self._mesh_weights = self._weights(x)
+            local = np.abs(self._mesh_weights).max(axis=0, initial=0.0)
+            comm.Allreduce(local, self._reach, op=MPI.MAX)
+        self.accept(np.zeros(self.num_owned), self.initial_velocity)
+
+    def _set_up_nodes(self, linear: FloatArray, turning: FloatArray) -> None:
+        """Place, mass and velocity of the four nodes, all on one rank."""
+        self.owner = rank_of(self.name, self.comm)
+        self.num_owned = 12 if self.comm.rank == self.owner else 0
+        self.places = np.array([True, False, False, False])[: self.num_owned // 3]
+        y, masses = self._inertia.nodes, self._inertia.nodal_mass
+        self.reference: FloatArray = y.ravel()[: self.num_owned]
+        self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
+        self._lent = np.zeros(self.num_owned)
+        if np.count_nonzero(masses[1:]) < 2:
+            self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * self.mass
+        speeds = np.vstack([linear, np.cross(turning, y[1:])])
+        self.initial_velocity = speeds.ravel()[: self.num_owned]
+        self._fixed = np.repeat([self._drive.moves] + 3 * [self._drive.turns], 3)
+        self.fixed = np.flatnonzero(self._fixed[: self.num_owned])
+
+    # ---- the last accepted state
+    @property
+    def position(self) -> FloatArray:
+        """Centre of mass [m], shape (3,), the same on all ranks."""
+        return self._y[0].copy()
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Velocity of the centre of mass [m/s], shape (3,), the same on all ranks."""
+        return self._v[0].copy()
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Directors d_i as columns, shape (3, 3), the same on all ranks.
+
+        They are the principal axes of inertia as they stand now, so this is not the identity at the
+        start. The rotation from there is `body.rotation @ at_start.T`, with a copy of it made then.
+        """
+        turned: FloatArray = self._y[1:].T / self.length
+        return turned
+
+    @property
+    def angular_velocity(self) -> FloatArray:
+        """1/2 sum d_i x v_i [rad/s], shape (3,), the same on all ranks."""
+        spin: FloatArray = 0.5 * cross(self._y[1:], self._v[1:]).sum(axis=0) / self.length**2
+        return spin
+
+    # ---- points
+    def _weights(self, x: FloatArray) -> FloatArray:
+        """Weights of the four nodes in points x (n, 3) of the reference, shape (n, 4)."""
+        local = (x - self.centre) @ self._inertia.axes / self.length
+        return np.column_stack([np.ones(len(x)), local])
+
+    def _points(self, weights: FloatArray) -> Points:
+        n, y = len(weights), self._inertia.nodes
+        nodes = np.tile(np.arange(4), (n, 1))
+        fixed = np.tile(self._fixed.reshape(4, 3), (n, 1, 1))
+        places = np.tile([True, False, False, False], (n, 1))
+        return Points(self, nodes, weights, np.tile(y, (n, 1, 1)), fixed, places)
+
+    def points(self, x: Any) -> Points:
+        """Material points, inside the body or not, for joints and springs.
+
+        Args:
+            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
+
+        Raises:
+            ValueError: x is no array of points.
+        """
+        return self._points(self._weights(vectors("x", x, "points [m]")))
+
+    def directions(self, x: Any) -> Points:
+        """Directions that turn with the body, for joints.
+
+        Args:
+            x: At the start [-], shape (3,) or (n, 3), the same on all ranks.
+
+        Raises:
+            ValueError: x is no array of vectors.
+        """
+        local = vectors("x", x, "vectors") @ self._inertia.axes / self.length
+        return self._points(np.column_stack([np.zeros(len(local)), local]))
+
+    def directions_at(self, direction: FloatArray, x: Any) -> Points:
+        """A direction, which turns alike at all points.
+
+        Args:
+            direction: At the start [-], shape (3,).
+            x: Reference position of a point [m].
+        """
+        return self.directions(direction)
+
+    def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
+        """Nodes of the mesh as material points, for surfaces.
+
+        Args:
+            nodes: Global numbers in `space`, shape (n,).
+            x: Their reference positions [m], shape (n, 3).
+        """
+        return self._points(self._weights(x))
+
+    def at_mesh(self, values: FloatArray) -> FloatArray:
+        """Values at the mesh's nodes on this rank, as of `space`, from the coordinates. Collective.
+
+        Args:
+            values: At the owned coordinates, shape (num_owned,).
+        """
+        owned = self.space.dofmap.index_map.size_local
+        return (self._mesh_weights[:owned] @ self._everywhere(values)).ravel()
+
+    def _everywhere(self, values: FloatArray) -> FloatArray:
+        """Nodal vectors (4, 3) on all ranks. Collective."""
+        return gather_rows(self.comm, values.reshape(-1, 3))
+
+    def surface(
+        self,
+        marker: Any,
+        tag: int | None = None,
+        *,
+        smoothing: bool = False,
+        mass: str = "consistent",
+    ) -> Surface:
+        """A part of the boundary for contact, as of `Continuum.surface`.
+
+        Args:
+            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
+                meshtags.
+            tag: Value in the meshtags.
+            smoothing: Whether slaves touch a smooth surface when this one is the master.
+            mass: "consistent"; no node of a rigid body can lose its mass.
+
+        Raises:
+            TypeError: smoothing is no bool.
+            ValueError: The body has no mesh; no facet, or interior facets; mass is another one.
+        """
+        require_bool("smoothing", smoothing)
+        if mass != "consistent":
+            raise ValueError(
+                f"mass={mass!r} of a surface of {self.name!r}: a rigid body has no nodes that "
+                "could do without mass; leave mass out, or let a Continuum be the slave"
+            )
+        if self.mesh is None:
+            raise ValueError(
+                f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
+            )
+        found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
+        return Surface(self, skin_of_mesh(self, found), smoothing)
+
+    def motion_range(self, du: FloatArray) -> FloatArray:
+        """Bounds on the motion of the mesh's points on this rank, see `Body` [m]."""
+        moved = du.reshape(-1, 4, 3)
+        turned = np.einsum("k,nki->ni", self._reach[1:], np.abs(moved[:, 1:]))
+        return range_of(moved[:, 0], turned)
+
+    # ---- as of Body
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        return dict(self._loads.settings)
+
+    def prescribed(self, time: float) -> FloatArray:
+        """Displacements of the prescribed coordinates [m]. Collective."""
+        u = np.zeros((4, 3))
+        if self._drive.moves:
+            u[0] = self._drive.displacement(time)
+        if self._drive.turns:
+            turn = self._drive.rotation(time) - np.eye(3)
+            u[1:] = self.length * (turn @ self._inertia.axes).T
+        return u.ravel()[self.fixed]
+
+    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+        """Set the state at t_n and the loads of the step."""
+        self._u0, self._theta = moment.u0, rule.theta
+        self._loads.begin(moment.time, moment.ramp, self.rotation)
+
+    def inertia(self, v: FloatArray) -> FloatArray:
+        """M v [kg m/s for a velocity]."""
+        return self.nodal_mass * v
+
+    def internal(self, u1: FloatArray) -> FloatArray:
+        """None [N]: what holds the directors are constraints."""
+        return np.zeros(self.num_owned)
+
+    def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
+        """Gravity, force, and the torque's forces on the directors [N]."""
+        f = self.weight(gravity).reshape(-1, 3)
+        if self.num_owned:
+            f[0] += self._loads.force
+            if self._loads.turn:
+                f[1:] = self._loads.on_directors(self._directors(u1))
+        return f.ravel()
+
+    def _directors(self, u1: FloatArray) -> FloatArray:
+        """Return where the forces of the step act [m], shape (3, 3)."""
+        u = self._u0 + self._theta * (u1 - self._u0)
+        return (self.reference + u).reshape(4, 3)[1:]
+
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+        """Return mass M less stiffness times the derivative of the torque's forces."""
+        self.check_alive()
+        if self._matrix is None:
+            self._matrix = compat.dense_matrix(self.comm, self.num_owned)
+        constant = not self._loads.turn
+        if constant and self._holds == (mass, self._matrix.stateGet()):
+            return self._matrix
+        if self.num_owned:
+            whole = np.diag(mass * (self.nodal_mass + self._lent))
+            if not constant:
+                by_directors = self._loads.gradient(self._directors(u1))
+                whole[3:, 3:] -= stiffness * self._theta * by_directors
+            if self.fixed.size:
+                whole[self.fixed] = whole[:, self.fixed] = 0.0
+                whole[self.fixed, self.fixed] = mass * self.mass or 1.0
+            numbers = np.arange(12, dtype=PETSc.IntType)
+            self._matrix.setValues(numbers, numbers, whole.ravel())
+        self._matrix.assemble()
+        self._holds = (mass, self._matrix.stateGet()) if constant else None
+        return self._matrix
+
+    def nodal_stiffness(self) -> FloatArray:
+        """None [N/m]."""
+        return np.zeros(self.num_owned)
+
+    def parameters(self) -> FloatArray:
+        """Values of a density that a caller may change, (n,)."""
+        return values_of(self._densities)
+
+    def take_parameters(self) -> None:
+        """Refuse a density that has changed since mass and inertia were measured. Collective.
+
+        Raises:
+            UserFunctionError: It has.
+        """
+        if self._densities:
+            same, problem = np.array_equal(self.parameters(), self._measured), None
+            if not same:
+                problem = (
+                    f"density of {self.name!r}: has changed, but the mass of a rigid body is "
+                    "measured when it is made; make a new body"
+                )
+            raise_together(self.comm, problem, UserFunctionError)
+
+    def potential(self, u: FloatArray) -> float:
+        """None [J]: loads do external work."""
+        return 0.0
+
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
+        """Return what prescribed motion needs on this rank: force [N], then moment [N m].
+
+        Shape (2, 3), (1, 3) if only one of them is prescribed, (0, 3) if none is.
+        """
+        rows = np.zeros((2, 3))
+        if self.num_owned and self._fixed.any():
+            forces = residual.reshape(4, 3)
+            rows[0] = forces[0]
+            rows[1] = cross(self._directors(u1), forces[1:]).sum(axis=0)
+        return rows[[self._drive.moves, self._drive.turns]]
+
+    @property
+    def reaction_labels(self) -> list[tuple[str, str]]:
+        """Name and unit of each row of `reactions`."""
+        force = [("force", "N")] if self._drive.moves else []
+        return force + ([("moment", "N m")] if self._drive.turns else [])
+
+    def turn(self, u0: FloatArray, u1: FloatArray) -> float:
+        """Largest turn between two displacements on this rank [rad]."""
+        return self._directors_held.largest_turn(self.reference + u0, self.reference + u1)
+
+    def prescribed_turn(self, start: float, end: float) -> float:
+        """Turn that `rotation` prescribes between two times [rad], at least. Collective."""
+        return self._drive.turn(start, end)
+
+    def accept(self, u: FloatArray, v: FloatArray) -> None:
+        """Make u and v the body's current state. Collective."""
+        super().accept(u, v)
+        local = np.concatenate([(self.reference + u).reshape(-1, 3), v.reshape(-1, 3)], axis=1)
+        both = gather_rows(self.comm, local)
+        self._y, self._v = both[:, :3], both[:, 3:]
+        if self.mesh is not None:
+            for function, values in ((self.u, u), (self.v, v)):
+                whole = self._everywhere(values)
+                function.x.array[:] = (self._mesh_weights @ whole).ravel()
+
+    def destroy(self) -> None:
+        """Free the PETSc objects; the body is of no use then."""
+        super().destroy()
+        if self._matrix is not None:
+            self._matrix.destroy()

@@ -1,0 +1,1 @@
+"""Slender bodies: beams and shells, nodes of a place and directors."""

@@ -1,0 +1,127 @@
+"""Pressure on cells of shells, which follows them or is dead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.bodies.slender.director_mesh import Skeleton
+from dolfinx_nts.kernels import pressure as kernel
+from dolfinx_nts.validation import (
+    at_points,
+    is_finite,
+    known_options,
+    number_at,
+    require_bool,
+)
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@known_options
+@dataclass(frozen=True)
+class Pressure:
+    """Pressure on a shell, which pushes its middle surface from the bottom to the top.
+
+    A pressure that follows acts along the normal and on the area that a cell has at the time. In a
+    step of `EnergyMomentum` its force is the mean on the way of the step, so that the work of a
+    constant one on a closed shell is p times the change of the volume exactly; its moment on a
+    closed shell, none, is then off by a third-order term, with `Midpoint` it is exact.
+
+    Attributes:
+        value: [Pa]: a number, or a function of time.
+        where: Function x (3, n) -> bool (n,): it acts on cells at all whose corners it is true;
+            None: everywhere.
+        follower: Whether it follows the shell; False: it acts along the normal and on the area of
+            the reference, a dead load.
+
+    Raises:
+        TypeError: follower is no bool.
+        ValueError: value is neither a finite number nor a function.
+    """
+
+    value: float | Callable[[float], float]
+    where: Any = None
+    follower: bool = True
+
+    def __post_init__(self) -> None:
+        require_bool("follower", self.follower)
+        if not callable(self.value) and not is_finite(self.value):
+            raise ValueError(
+                f"Pressure.value={self.value!r}: must be a finite number [Pa], or a function of "
+                "time that returns one"
+            )
+
+
+class Pressures:
+    """The pressures on this rank's cells. Collective.
+
+    Args:
+        comm: MPI communicator.
+        skeleton: The shell's nodes.
+        cells: Nodes of this rank's cells, cyclic, shape (n, corners).
+        loads: Loads by their position among all of the body's.
+        name: Of the body, for messages.
+
+    Raises:
+        TypeError: where is no function.
+        ValueError: where selects no cell.
+    """
+
+    def __init__(
+        self, comm: Any, skeleton: Skeleton, cells: npt.NDArray[Any],
+        loads: dict[int, Pressure], name: str,
+    ) -> None:  # fmt: skip
+        self._comm = comm
+        self._loads: list[tuple[Pressure, FloatArray, str]] = []
+        rest = skeleton.x[cells]
+        self._unit = kernel.force(rest, rest, 1.0) if loads else np.zeros((len(cells), 0, 3))
+        for k, load in loads.items():
+            chosen = np.ones(len(skeleton.x), dtype=bool)
+            if load.where is not None:
+                what = f"Pressure.where of forces[{k}] of {name!r}"
+                if not callable(load.where):
+                    raise TypeError(
+                        f"{what}={load.where!r}: pass a function x (3, n) -> bool (n,)"
+                    )
+                chosen = at_points(comm, what, load.where, skeleton.x.T, (), "b")
+                if not chosen[skeleton.cells].all(axis=1).any():
+                    raise ValueError(
+                        f"{what}={load.where!r}: selects no cell; select all corners of the cells "
+                        "it acts on"
+                    )
+            on_cells = chosen[cells].all(axis=1).astype(float)
+            self._loads.append((load, on_cells, f"Pressure.value of forces[{k}] of {name!r}"))
+        self.begin(0.0, 1.0)
+
+    def __bool__(self) -> bool:
+        """Whether there are any, on all ranks."""
+        return bool(self._loads)
+
+    def begin(self, time: float, ramp: float) -> None:
+        """Set the pressures of a step. Collective.
+
+        Args:
+            time: [s].
+            ramp: Part of constant loads that acts.
+        """
+        dead, following = np.zeros((2, len(self._unit)))
+        for load, on_cells, what in self._loads:
+            value = ramp * load.value if not callable(load.value) else number_at(
+                self._comm, what, load.value, time, "Pa"
+            )  # fmt: skip
+            (following if load.follower else dead)[:] += value * on_cells
+        self._following = following[:, None, None]
+        self._dead = dead[:, None, None] * self._unit
+
+    def forces(self, x0: FloatArray, x1: FloatArray, theta: float | None) -> FloatArray:
+        """Forces on the corners of this rank's cells [N], see `kernels.pressure.force`."""
+        return self._dead + self._following * kernel.force(x0, x1, theta)
+
+    def tangent(self, x0: FloatArray, x1: FloatArray, theta: float | None) -> FloatArray:
+        """Their derivative by x_1 [N/m], shape (n, 4, 3, 4, 3)."""
+        return self._following[..., None, None] * kernel.tangent(x0, x1, theta)

@@ -1,0 +1,1 @@
+"""Solid bodies, with forms in UFL: continua, their materials, mass and stress."""

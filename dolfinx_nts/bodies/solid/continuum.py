@@ -1,0 +1,253 @@
+"""Flexible bodies: hexahedral or tetrahedral DOLFINx meshes with a strain energy in UFL."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dolfinx_mesh
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
+from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
+from dolfinx_nts.bodies.solid.materials import misfit, with_constants
+from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
+from dolfinx_nts.bodies.solid.ufl_body import UflBody
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
+from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.validation import (
+    is_whole,
+    items,
+    known_options,
+    require_name,
+    vector_in_time,
+)
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Stress of an undeformed body, over its stiffness, that counts as none.
+_STRESS_FREE = 1e-6
+#: Strain that tells the stiffness: of the size that leaves linear terms and rounding far apart.
+_SMALL_STRAIN = 1e-4
+
+
+@known_options
+class Continuum(UflBody):
+    """A flexible body on a DOLFINx mesh (theory section 2).
+
+    Args:
+        mesh: 3D hexahedral or tetrahedral mesh.
+        material: Strain energy W(C) [J/m^3]: a material of this package, an `Isotropic` of one's
+            own, or any callable C -> UFL scalar.
+        density: Reference density [kg/m^3], > 0: a number, or a Constant or Function on the mesh.
+            What it or a parameter of the material is changed to between steps, e.g. by
+            `before_step`, holds in the next one; what that does to the energy is
+            `material_change` in the balance.
+        velocity: Initial velocity [m/s]: a vector, a callable x (3, n) -> (3, n) as in DOLFINx's
+            interpolate, or a Function of vectors on the mesh.
+        displacement: Displacement [m] from the stress-free mesh in which the body starts, as
+            `velocity`; prescribed coordinates start where their condition says. `equilibrium` takes
+            it as its first guess, so that its ledger misses the energy stored in the guess.
+        bcs: `Dirichlet` conditions, fixed or moving in time.
+        name: Name in messages and files.
+        degree: Polynomial degree; contact surfaces need 1.
+        body_force: Force per reference volume [N/m^3], a vector or a function of time.
+        traction: `Traction` loads.
+        quadrature_degree: For energy, stress and loads; default 2 x 2 x 2 Gauss points on trilinear
+            hexahedra. Mass has never less than that: with one point a cell could turn for nothing.
+        extra_form: Further virtual work as UFL, a callable (u, v, w, t) -> form of displacement,
+            velocity and time where the integrator takes forces (the middle of the step; in statics
+            its end, at rest) and of the test function w; it is added to the internal virtual work
+            and its work counts as external.
+        allow_inversion: Accept steps that turn a cell inside out, det F <= 0 at a corner or
+            quadrature point, with a warning in the Solution; else such a step is cut, and the
+            run stops where that does not help. W(C) cannot see it.
+
+    Attributes:
+        u: Displacement [m], dolfinx Function of the last accepted state.
+        v: Velocity [m/s], dolfinx Function.
+        space: Their function space.
+        law: W as a function of Green's strain in UFL, with Constants for numbers of the package's
+            materials.
+        stressed: Stress of the undeformed body over its stiffness; None: it has none, or no step
+            was made yet.
+
+    Raises:
+        TypeError: `material`, `extra_form`, `name` or a condition is not of the right kind, or what
+            the first two make cannot be compiled on this mesh.
+        ValueError: An argument is out of range, the mesh is not a valid 3D mesh, or `displacement`
+            turns a cell inside out.
+    """
+
+    def __init__(
+        self,
+        mesh: Any,
+        material: Callable[[Any], Any],
+        *,
+        density: Parameter,
+        velocity: Any = (0.0, 0.0, 0.0),
+        displacement: Any = (0.0, 0.0, 0.0),
+        bcs: Sequence[Dirichlet] = (),
+        name: str = "body",
+        degree: int = 1,
+        body_force: VectorInTime = (0.0, 0.0, 0.0),
+        traction: Sequence[Traction] = (),
+        quadrature_degree: int | None = None,
+        extra_form: Callable[[Any, Any, Any, Any], Any] | None = None,
+        allow_inversion: bool = False,
+    ) -> None:
+        if not callable(material):
+            raise TypeError(
+                f"material={material!r}: pass a callable C -> W(C), "
+                "e.g. NeoHookean(young=1e6, poisson=0.3)"
+            )
+        require_positive_parameter("density", density, "kg/m^3")
+        for option, value in (("degree", degree), ("quadrature_degree", quadrature_degree)):
+            default = option == "quadrature_degree" and value is None
+            if not default and not (is_whole(value) and value > 0):
+                raise ValueError(f"{option}={value!r}: must be a positive integer")
+        require_name("name", name)
+        traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
+        check_mesh(mesh, name)
+        quadrature_degree = quadrature_degree or 2 * degree
+        super().__init__(
+            compat.vector_space(mesh, degree), degree, name, extra_form, quadrature_degree,
+            allow_inversion,
+        )  # fmt: skip
+        self.material, self.density = material, density
+        # A W(C) is rounded at C = 1; a steep one at more than the size of a cell.
+        self.rounded = 0.0 if isinstance(material, Isotropic) else self._size()
+        self.body_force, self._traction = body_force, traction
+        self._of_mass = max(quadrature_degree, 2 * degree)
+        self._dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": quadrature_degree})
+        self._ds = self._boundary_measure(quadrature_degree)
+        changing = any(callable(value) for value, _ in self._loads_at(0.0))
+        self.loads_in_time = changing or extra_form is not None
+        self._stand(bcs, velocity, displacement)
+        self._rho = self._density(density)
+        self.law = strain_energy(with_constants(material, self.mesh))
+        load = self._load_in_ufl()
+        (self._load_form,) = self._set_forms(self._energy() * self._dx, load)
+        self._assembled_loads = np.zeros(3 * len(self._loads))
+        self._seen_at_rest = False
+        self.stressed = None
+
+    # ---- set-up
+    def _boundary_measure(self, degree: int) -> Any:
+        indices = [
+            facets_of(self.mesh, load.where, f"Traction.where of traction[{k}] of {self.name!r}")
+            for k, load in enumerate(self._traction)
+        ]
+        tags = [np.full(len(i), k, np.int32) for k, i in enumerate(indices)]
+        empty = np.empty(0, np.int32)
+        index, tag = (
+            np.concatenate([empty, *indices]).astype(np.int32),
+            np.concatenate([empty, *tags]),
+        )
+        shared = len(index) - len(np.unique(index))
+        text = (
+            f"traction of {self.name!r}: {shared} facets carry two loads; add their values up in "
+            "one Traction"
+        )
+        raise_together(self.comm, text if shared else None)
+        order = np.argsort(index)
+        data = dolfinx_mesh.meshtags(self.mesh, 2, index[order], tag[order])
+        return ufl.Measure(
+            "ds", self.mesh, subdomain_data=data, metadata={"quadrature_degree": degree}
+        )
+
+    def _load_in_ufl(self) -> Any:
+        """Virtual work of body force and tractions, whose values are Constants."""
+        w, count = ufl.TestFunction(self.space), 1 + len(self._traction)
+        self._loads = [fem.Constant(self.mesh, np.zeros(3)) for _ in range(count)]
+        load = ufl.inner(self._loads[0], w) * self._dx
+        for k, value in enumerate(self._loads[1:]):
+            load += ufl.inner(value, w) * self._ds(k)
+        return load
+
+    def _energy(self) -> Any:
+        """W of the displacement in UFL; what is wrong with it raises on every rank."""
+        problem, cause, energy = None, None, None
+        try:
+            with compat.without_floats():
+                energy = ufl.as_ufl(self.law(green_strain(ufl.grad(self.u))))
+        except Exception as error:  # any: a rank that raises alone would leave the others waiting
+            remedy = "return a UFL scalar, made of functions of ufl as ufl.ln"
+            problem, cause = f"raised {error!r}; {remedy}", error
+        else:
+            if energy.ufl_shape != ():
+                problem = f"has shape {energy.ufl_shape}; return a UFL scalar"
+            else:
+                problem = misfit([energy], self.mesh.ufl_domain())
+        text = f"material={self.material!r} of {self.name!r}: W(C) {problem}"
+        raise_together(self.comm, text if problem else None, TypeError, cause)
+        return energy
+
+    def _mass_form(self, v: Any, w: Any) -> Any:
+        """Mass in UFL."""
+        dx = ufl.Measure("dx", self.mesh, metadata={"quadrature_degree": self._of_mass})
+        return self._rho * ufl.inner(v, w) * dx
+
+    def _check_parameters(self) -> None:
+        """Raise ValueError unless density and moduli are in their ranges."""
+        super()._check_parameters()
+        if isinstance(self.material, Isotropic):
+            self.material.check()
+
+    def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
+        """Virtual work of the rule's stress in UFL."""
+        h0, h1 = ufl.grad(u0), ufl.grad(u1)
+        return ufl.inner(rule.piola(self.law, h0, h1), ufl.grad(w)) * self._dx
+
+    # ---- as of Body
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
+        own = {"material": self.material, "density": self.density, "degree": self.degree}
+        return own | loads | super().settings
+
+    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+        """Set the state at t_n and the loads of the step."""
+        if not self._seen_at_rest:
+            self._seek_stress_at_rest(rule)
+        super().begin_step(rule, moment)
+        for constant, (value, now) in zip(self._loads, self._loads_at(moment.time), strict=True):
+            constant.value[:] = now if callable(value) else moment.ramp * now
+        loads = np.concatenate([constant.value for constant in self._loads])
+        if not np.array_equal(loads, self._assembled_loads):
+            self._load, self._assembled_loads = self._forms.assemble(self._load_form), loads
+
+    def _seek_stress_at_rest(self, rule: Integrator) -> None:
+        """Note whether forces of its own move the undeformed body, as where dW/dC(1) is not 0.
+
+        Beside them stand those of a small shear x, -y. Costs two evaluations of internal forces.
+        """
+        self._seen_at_rest = True
+        shear = _SMALL_STRAIN * np.resize([1.0, -1.0, 0.0], self.num_owned) * self.reference
+        still = np.zeros_like(shear)
+        at_rest = self._forms.forces(rule, still, still)
+        change = self._forms.forces(rule, still, shear) - at_rest
+        change /= rule.theta * _SMALL_STRAIN
+        at_rest[self.fixed] = 0.0
+        squares = np.array([at_rest @ at_rest, change @ change])
+        stress, stiffness = np.sqrt(self.comm.allreduce(squares)).tolist()
+        if not stress <= _STRESS_FREE * stiffness:
+            self.stressed = stress / stiffness if stiffness else math.inf
+
+    def _loads_at(self, time: float) -> list[tuple[VectorInTime, FloatArray]]:
+        """Body force and tractions as they were given, and their values at a time."""
+        given = [("body_force", self.body_force, "N/m^3")]
+        for k, traction in enumerate(self._traction):
+            given.append((f"Traction.value of traction[{k}]", traction.value, "Pa"))
+        return [
+            (value, vector_in_time(self.comm, f"{name} of {self.name!r}", value, time, unit))
+            for name, value, unit in given
+        ]

@@ -1,0 +1,189 @@
+"""Bodies whose slave nodes have no mass (theory section 16; Khenous, Laborde and Renard 2008).
+
+To the mass, each massless node moves with its nearest neighbour that has some. A smooth factor
+close to 1 of each node's velocity, 1 + a polynomial of degree 2 in X, then sets mass, centre of
+mass and inertia right: the kinetic energy of every motion as a rigid body, and of every uniform
+deformation, is as before. What is left is positive definite on the nodes with mass.
+
+A velocity that is extrapolated to the massless nodes would keep these moments by itself, but
+contact forces oscillate three times as much with it: in a bar of 50 elements, Courant number 1, by
+0.042 of 0.3 in place of 0.012.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.interaction.points import of_nodes
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Part by which neighbours that count as equally near may differ in their distance.
+_AS_NEAR = 1e-6
+#: Newton iterations for the factors, in which the moments are quadratic.
+_ITERATIONS = 30
+#: Moments over their sizes that count as kept.
+_KEPT = 1e-14
+#: Smallest and largest factor of a node's coordinates.
+_FACTORS = (0.5, 2.0)
+#: Singular values of the moments' derivative that count as zero.
+_SINGULAR = 1e-10
+_TOO_THIN = "has fewer than four cells or so behind them, too few to keep its inertia"
+
+
+def redistributed(mass: Any, massless: BoolArray, x: FloatArray) -> tuple[Any, str]:
+    """A mass matrix with zeros at some nodes that keeps a body's moments of mass. Collective.
+
+    Args:
+        mass: PETSc AIJ matrix with the same scalar in each of the three directions, kept as it is.
+        massless: This rank's nodes without mass, shape (n,).
+        x: Their reference positions [m], shape (n, 3).
+
+    Returns:
+        The new matrix, and what is wrong with it for messages: empty if nothing is.
+    """
+    comm, work = mass.getComm().tompi4py(), _Products(mass)
+    shape = _polynomials(x, comm)
+    affine = shape[:, :4]
+    wanted = _moments(affine, [work.times(f) for f in affine.T], comm)
+    level = _levels(work, massless, comm)
+    work.destroy()
+    if level is None:
+        return None, "has a part without any other nodes"
+    parent, new = _parents(mass, level, x), mass.copy()
+    for _ in range(int(comm.allreduce(level.max(initial=0), op=MPI.MAX))):
+        old, new = new, new.ptap(parent)
+        old.destroy()
+    parent.destroy()
+    factor, problem = _factors(_Products(new), shape, wanted, ~massless, comm)
+    scaling = new.createVecLeft()
+    scaling.array_w[:] = np.repeat(factor, 3)
+    new.diagonalScale(scaling, scaling)
+    scaling.destroy()
+    return new, problem
+
+
+class _Products:
+    """Products of a mass matrix with nodal scalars."""
+
+    def __init__(self, matrix: Any) -> None:
+        self._matrix, (self._in, self._out) = matrix, matrix.createVecs()
+
+    def times(self, values: FloatArray) -> FloatArray:
+        """M times nodal scalars, shape (n,). Collective."""
+        self._in.array_w[:] = np.repeat(values, 3)
+        self._matrix.mult(self._in, self._out)
+        product: FloatArray = self._out.array_r[::3].copy()
+        return product
+
+    def destroy(self) -> None:
+        """Free the vectors."""
+        self._in.destroy()
+        self._out.destroy()
+
+
+def _levels(mass: _Products, massless: BoolArray, comm: Any) -> IntArray | None:
+    """Cells from each node to one with mass, shape (n,); None if some node reaches none."""
+    level, layer = np.where(massless, -1, 0), 0
+    while comm.allreduce(bool((level < 0).any()), op=MPI.LOR):
+        near = (level < 0) & (mass.times((level == layer).astype(float)) != 0.0)
+        if not comm.allreduce(bool(near.any()), op=MPI.LOR):
+            return None
+        layer += 1
+        level[near] = layer
+    return level
+
+
+def _parents(mass: Any, level: IntArray, x: FloatArray) -> Any:
+    """PETSc matrix that gives each node its own velocity, but massless ones their neighbour's.
+
+    That is the nearest of those neighbours that are one level nearer to nodes with mass; the mean
+    of several that are as near.
+    """
+    first = mass.getOwnershipRange()[0] // 3
+    rows = np.flatnonzero(level > 0)
+    found = [mass.getRow(3 * (first + int(r)))[0] // 3 for r in rows]
+    used = np.unique(np.concatenate([np.empty(0, int), *found])).astype(PETSc.IntType)
+    known = _at_nodes(mass, used, np.column_stack([x, level]))
+    parents = [np.array([first + k]) for k in range(len(x))]
+    for r, nodes in zip(rows, found, strict=True):
+        at = known[np.searchsorted(used, nodes)]
+        distance = np.linalg.norm(at[:, :3] - x[r], axis=1)
+        distance[at[:, 3] != level[r] - 1] = np.inf
+        parents[r] = nodes[distance <= (1.0 + _AS_NEAR) * distance.min()]
+    counts = np.repeat([len(nodes) for nodes in parents], 3)
+    cols = [column for nodes in parents for column in of_nodes(nodes).T]
+    start = np.concatenate([[0], np.cumsum(counts)])
+    columns = np.concatenate([np.empty(0, int), *cols])
+    return compat.with_entries(mass, start, columns, 1.0 / np.repeat(counts, counts))
+
+
+def _at_nodes(mass: Any, nodes: npt.NDArray[Any], values: FloatArray) -> FloatArray:
+    """Values (n, k) of this rank's nodes at any nodes, by global numbers. Collective."""
+    vector = mass.createVecRight()
+    target = PETSc.Vec().createSeq(len(nodes), comm=PETSc.COMM_SELF)
+    source = PETSc.IS().createGeneral(3 * nodes, comm=PETSc.COMM_SELF)
+    scatter = PETSc.Scatter().create(vector, source, target, None)
+    found = np.empty((len(nodes), values.shape[1]))
+    for k in range(values.shape[1]):
+        vector.array_w[:] = np.repeat(values[:, k], 3)
+        scatter.scatter(vector, target, mode=PETSc.ScatterMode.FORWARD)
+        found[:, k] = target.array_r
+    for a in (vector, target, source, scatter):
+        a.destroy()
+    return found
+
+
+def _polynomials(x: FloatArray, comm: Any) -> FloatArray:
+    """1, x, y, z and their products about the middle of the nodes, over their size, (n, 10)."""
+    ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
+    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+    size = 0.5 * float((ends[0] + ends[1]).max())
+    one = np.column_stack([np.ones(len(x)), (x - 0.5 * (ends[0] - ends[1])) / size])
+    pairs = [one[:, i] * one[:, j] for i in range(4) for j in range(i, 4)]
+    columns: FloatArray = np.column_stack(pairs)
+    return columns
+
+
+def _moments(affine: FloatArray, products: list[FloatArray], comm: Any) -> FloatArray:
+    """Return the moments of mass in the order of `_polynomials`, shape (10,). Collective."""
+    local = [float(affine[:, i] @ products[j]) for i in range(4) for j in range(i, 4)]
+    total: FloatArray = comm.allreduce(np.array(local))
+    return total
+
+
+def _factors(
+    mass: _Products, shape: FloatArray, wanted: FloatArray, kept: BoolArray, comm: Any
+) -> tuple[FloatArray, str]:
+    """Factors of the nodal masses, (n,), that give the wanted moments, and why none do."""
+    affine, unknown = shape[:, :4], np.zeros(shape.shape[1])
+    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
+    problem = _TOO_THIN
+    for _ in range(_ITERATIONS):
+        factor = 1.0 + shape @ unknown
+        scaled = affine * factor[:, None]
+        products = [mass.times(f) for f in scaled.T]
+        missing = _moments(scaled, products, comm) - wanted
+        if np.abs(missing).max() <= _KEPT * wanted[0]:
+            problem = ""
+            break
+        slope = np.array([
+            shape.T @ (affine[:, i] * products[j] + affine[:, j] * products[i]) for i, j in pairs
+        ])  # fmt: skip
+        slope = comm.allreduce(slope)
+        unknown -= np.linalg.lstsq(slope, missing, rcond=_SINGULAR)[0]
+    mass.destroy()
+    ends = np.array([-factor[kept].min(initial=np.inf), factor[kept].max(initial=-np.inf)])
+    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+    if not (-ends[0] > _FACTORS[0] and ends[1] < _FACTORS[1]):
+        problem = _TOO_THIN
+    return factor, problem

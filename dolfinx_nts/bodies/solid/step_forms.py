@@ -1,0 +1,180 @@
+"""Internal forces of a body with forms in UFL, and their tangent, between two displacements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.forms import assemble_vector, compile_forms
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.integrators.static import EQUILIBRIUM
+from dolfinx_nts.interaction.evaluation import Moment
+
+FloatArray = npt.NDArray[np.float64]
+ExtraForm = Callable[[Any, Any, Any, Any], Any]
+
+
+class StepForms:
+    """What a body's energy does in a step, compiled once for each integrator.
+
+    Arrays are the owned values of nodal vectors, shape (n,).
+
+    Args:
+        space: Function space of the displacements.
+        virtual_work: The internal virtual work in UFL by an integrator, between two displacements:
+            (rule, u0, u1, w) -> form.
+        mass: Kinetic energy's second derivative in UFL, (v, w) -> form.
+        extra: As `extra_form` of `Continuum`.
+        check_alive: Raises an error once the body was destroyed.
+    """
+
+    def __init__(
+        self,
+        space: Any,
+        virtual_work: Callable[[Integrator, Any, Any, Any], Any],
+        mass: Callable[[Any, Any], Any],
+        extra: ExtraForm | None,
+        check_alive: Callable[[], None],
+    ) -> None:
+        self._check_alive = check_alive
+        self._space, self._virtual_work, self._mass, self._extra = space, virtual_work, mass, extra
+        self._forms: dict[Integrator, tuple[Any, Any, Any]] = {}
+        self._u0, self._u1, self._drift = (fem.Function(space) for _ in range(3))
+        # What multiplies mass and stiffness: in one Constant, as UFL sorts several by their counts
+        # as text, and a form would be compiled again where 9 and 10 meet.
+        self._factors = fem.Constant(space.mesh, np.zeros(2))
+        # Change of the velocity with u_1; time.
+        self._rate, self._time = (fem.Constant(space.mesh, 0.0) for _ in range(2))
+        self._vector = compat.create_vector(space)
+        self._size, self._alone = self._vector.getLocalSize(), space.mesh.comm.size == 1
+        self._matrix: Any = None
+
+    @property
+    def used(self) -> bool:
+        """Whether a step was made with them."""
+        return bool(self._forms)
+
+    def begin(self, rule: Integrator, moment: Moment) -> None:
+        """Set the state at t_n."""
+        self._work, self._tangent, self._extra_work = self._compiled(rule)
+        if self._matrix is None:
+            self._matrix = compat.create_matrix(self._tangent)
+        fill(self._u0, moment.u0)
+        if self._extra is not None:
+            self._rate.value, self._time.value = moment.rate, moment.time
+            if moment.drift is not None:
+                fill(self._drift, moment.drift)
+
+    def internal(self, u1: FloatArray) -> FloatArray:
+        """Internal forces of the step [N]."""
+        fill(self._u1, u1)
+        return self.assemble(self._work)
+
+    def extra(self, u1: FloatArray) -> FloatArray | float:
+        """Forces of the extra virtual work [N]."""
+        if self._extra_work is None:
+            return 0.0
+        fill(self._u1, u1)
+        return self.assemble(self._extra_work)
+
+    def tangent(
+        self, u1: FloatArray, mass: float, stiffness: float, masks: Any, diagonal: float
+    ) -> Any:
+        """Return mass M + stiffness K, the same matrix in each call.
+
+        Args:
+            u1: Displacement at t_{n+1} [m].
+            mass: Factor of M.
+            stiffness: Factor of K.
+            masks: Of prescribed coordinates, whose rows and columns are left out.
+            diagonal: What stands on the diagonal there.
+        """
+        fill(self._u1, u1)
+        self._factors.value = mass, stiffness
+        compat.assemble_matrix(self._matrix, self._tangent, masks, diagonal)
+        return self._matrix
+
+    def forces(self, rule: Integrator, u0: FloatArray, u1: FloatArray) -> FloatArray:
+        """Internal forces by a rule between two displacements [N]; set the state anew after it."""
+        work = self._compiled(rule)[0]
+        fill(self._u0, u0)
+        fill(self._u1, u1)
+        return self.assemble(work)
+
+    def stiffness_at_rest(self) -> FloatArray:
+        """Diagonal of the tangent in equilibrium, without deformation [N/m]."""
+        tangent = self._compiled(EQUILIBRIUM)[1]
+        kept, rate = [f.x.array.copy() for f in (self._u0, self._u1)], self._rate.value.copy()
+        for u in (self._u0, self._u1):
+            u.x.array[:] = 0.0
+        self._factors.value, self._rate.value = (0.0, 1.0), 0.0
+        # The matrix of the step may be kept from an earlier one.
+        matrix = compat.create_matrix(tangent)
+        compat.assemble_matrix(matrix, tangent, (), 0.0)
+        diagonal = matrix.getDiagonal()
+        found: FloatArray = diagonal.array_r.copy()
+        for petsc_object in (diagonal, matrix):
+            petsc_object.destroy()
+        self._rate.value = rate
+        for u, values in zip((self._u0, self._u1), kept, strict=True):
+            u.x.array[:] = values
+        return found
+
+    def assemble(self, form: Any) -> FloatArray:
+        """Owned entries of a compiled linear form."""
+        self._check_alive()
+        if self._alone:
+            values = np.zeros(self._size)
+            form.add(values)
+            return values
+        assemble_vector(self._vector, form)
+        return self._vector.array_r.copy()
+
+    def with_ghosts(self, u: FloatArray) -> FloatArray:
+        """Values at all nodes of this rank, on one rank u itself. Collective."""
+        self._check_alive()
+        if self._alone:
+            return u
+        self._vector.array_w[:] = u
+        self._vector.ghostUpdate()
+        with self._vector.localForm() as here:
+            return here.array_r.copy()
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for a in (self._vector, self._matrix):
+            if a is not None:
+                a.destroy()
+
+    def _compiled(self, rule: Integrator) -> tuple[Any, Any, Any]:
+        """Internal virtual work, tangent and extra virtual work by a rule."""
+        if rule not in self._forms:
+            du, w = ufl.TrialFunction(self._space), ufl.TestFunction(self._space)
+            virtual = work = self._virtual_work(rule, self._u0, self._u1, w)
+            extra = None
+            if self._extra is not None:
+                moved = self._u1 - self._u0
+                place, velocity = self._u0 + rule.theta * moved, self._rate * moved
+                if rule.accelerations:
+                    velocity += self._drift
+                extra = self._extra(place, velocity, w, self._time)
+                if self._u1 in extra.coefficients():  # else the tangent is that without it
+                    virtual = work + extra
+            tangent = self._factors[1] * ufl.derivative(virtual, self._u1, du)
+            if rule.inertia:
+                tangent += self._factors[0] * self._mass(du, w)
+            forms = compile_forms([work, tangent] + ([] if extra is None else [extra]))
+            self._forms[rule] = forms[0], forms[1], forms[2] if extra is not None else None
+        return self._forms[rule]
+
+
+def fill(function: Any, owned: FloatArray) -> None:
+    """Give a dolfinx Function its owned values. Collective."""
+    function.x.array[: len(owned)] = owned
+    function.x.scatter_forward()

@@ -1,0 +1,457 @@
+"""What bodies with a DOLFINx function space and forms in UFL have in common."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.bodies.conditions import Dirichlet, Supports
+from dolfinx_nts.bodies.meshes.mesh_check import places_of
+from dolfinx_nts.bodies.nodal_values import nodal_values
+from dolfinx_nts.bodies.solid.inversion import Determinants
+from dolfinx_nts.bodies.solid.layer import waves
+from dolfinx_nts.bodies.solid.mass_matrix import MassMatrix
+from dolfinx_nts.bodies.solid.materials import misfit
+from dolfinx_nts.bodies.solid.parameters import (
+    Parameter,
+    in_expressions,
+    is_number,
+    require_positive_parameter,
+    values_of,
+)
+from dolfinx_nts.bodies.solid.step_forms import ExtraForm, StepForms, fill
+from dolfinx_nts.bodies.solid.user_forms import checked_form
+from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.forms import compile_forms
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.integrators.rule import choose
+from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.points import Points, in_mesh
+from dolfinx_nts.parallel import gather_on_root, raise_together
+from dolfinx_nts.validation import (
+    UserFunctionError,
+    require_bool,
+    require_name,
+    vectors,
+)
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+
+class UflBody(Body):
+    """A body whose coordinates are the nodes of a Lagrange space of 3-vectors.
+
+    A kind of body calls `_stand`, then `_set_forms`, and has `_mass_form` and `_virtual_work`.
+
+    Args:
+        space: Function space of the displacements.
+        degree: Its polynomial degree.
+        name: Name in messages and files.
+        extra_form: As of `Continuum`.
+        quadrature_degree: That of the energy; cells of 3D meshes are watched at its points.
+        allow_inversion: As of `Continuum`.
+
+    Attributes:
+        u: Displacement [m], dolfinx Function of the last accepted state.
+        v: Velocity [m/s], dolfinx Function.
+        massless: Owned coordinates without mass, shape (num_owned,), see `surface`.
+        has_massless: Whether there are such on any rank.
+    """
+
+    _mass: MassMatrix
+
+    def __init__(
+        self, space: Any, degree: int, name: str, extra_form: ExtraForm | None,
+        quadrature_degree: int, allow_inversion: bool,
+    ) -> None:  # fmt: skip
+        require_name("name", name)
+        require_bool("allow_inversion", allow_inversion)
+        if extra_form is not None and not callable(extra_form):
+            raise TypeError(f"extra_form={extra_form!r}: pass a callable (u, v, w, t) -> UFL form")
+        self.name, self.space, self.degree, self._extra_form = name, space, degree, extra_form
+        self.mesh = space.mesh
+        self.made_on = places_of(self.mesh)
+        self.comm = compat.petsc_communicator(self.mesh.comm)
+        # DOLFINx makes C identifiers of the names.
+        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
+        self.u, self.v = (fem.Function(space, name=f"{stem}_{s}") for s in "uv")
+        self.num_owned = 3 * space.dofmap.index_map.size_local
+        self.reference = space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
+        self._stiffness: FloatArray | None = None
+        self._given_density: Parameter | None = None
+        self.allow_inversion = allow_inversion
+        # Cells of a surface or a line have no inside.
+        self._determinants: Determinants | None = None
+        if self.mesh.topology.dim == 3:
+            self._determinants = Determinants(space, degree, quadrature_degree)
+        self._forms = StepForms(
+            space, self._virtual_work, self._mass_form, extra_form, self.check_alive
+        )
+
+    # ---- what a kind of body has of its own
+    def _mass_form(self, v: Any, w: Any) -> Any:
+        """Kinetic energy's second derivative in UFL, linear in v and w."""
+        raise NotImplementedError
+
+    def _check_parameters(self) -> None:
+        """Raise ValueError unless parameters are in their ranges. Collective."""
+        if self._given_density is not None:
+            require_positive_parameter("density", self._given_density, "kg/m^d")
+
+    def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
+        """Internal virtual work between two displacements by a rule, in UFL."""
+        raise NotImplementedError
+
+    def surface(
+        self,
+        marker: Any,
+        tag: int | None = None,
+        *,
+        smoothing: bool = False,
+        mass: str = "consistent",
+    ) -> Surface:
+        """A part of the boundary for contact.
+
+        With smoothing, a slave touches a smooth surface through the nodes instead of the flat or
+        bilinear facets of a master. It is linear in the nodes, so momentum and energy are kept as
+        without. Over quadrilaterals lie bicubic patches of Overhauser's cubics (Catmull and Rom
+        1974), over each triangle three quartic ones (Clough and Tocher 1965; Shirman and Sequin
+        1987) whose tangent planes fit the rings of its nodes, of any number of neighbours. The
+        normal no longer jumps from facet to facet, and the energy lost or gained by changes of
+        facet (`contact_defect`) falls: on a cylinder more than 1e4 times on even quadrilaterals, 20
+        to 100 times where they differ by up to a half in size, 4e3 times and more on triangles,
+        even or not. For smoothing in contact see Wriggers, Krstulovic-Opara and Korelc (2001) and
+        Puso and Laursen (2002). Limits:
+
+        - It is not smooth at edges whose facets meet at more than 60 degrees, at nodes where other
+          than four quadrilaterals meet, and at nodes whose triangles see no common plane, such as
+          corners where three sharp edges meet on a flat side. A warning tells how many facets.
+        - It bulges beyond the facets by what they cut off the curve, an eighth of the angle between
+          neighbours times the size of a facet: gaps are measured from there.
+        - Beyond its facet a patch goes on as a polynomial, which is good for half a facet; let no
+          slave slide over more than a third of a facet in a step.
+        - An element of a pair takes some ten times as long, and a triangle some 8 kB on each rank.
+          As a slave, a surface is not changed.
+
+        With mass="redistributed" the nodes of a slave surface have no mass (theory section 16;
+        Khenous, Laborde and Renard 2008): other nodes get it, and the body keeps its mass, centre
+        of mass and inertia. An impact then stops no mass at once, so its contact forces do not
+        alternate from step to step. The laws of contact and friction hold for the forces at
+        t_{n+1}, and those of the step are the mean of both ends, so that momenta and the ledger
+        are as exact as without (`massless_defect` in the balance). Only the slave of a contact may
+        have it, of a Continuum with some four cells behind the surface, with `EnergyMomentum()` or
+        `Midpoint()` and without restored impacts. `equilibrium` refuses it: a run begins from that
+        of a body of the same mesh and name without it. Gravity then moves with the mass, so that
+        what rests under its weight starts as far off balance, which the run tells.
+
+        Args:
+            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
+                meshtags.
+            tag: Value in the meshtags.
+            smoothing: Whether slaves touch a smooth surface when this one is the master.
+            mass: "consistent" or "redistributed".
+
+        Raises:
+            TypeError: smoothing is no bool.
+            ValueError: Degree above 1, no facet, or interior facets; mass is unknown, too little of
+                the body is left beside the surface to take its mass, or the body has moved already.
+        """
+        require_bool("smoothing", smoothing)
+        choose("mass", mass, ("consistent", "redistributed"))
+        if self.mesh.topology.dim != 3:
+            raise ValueError(
+                f"body {self.name!r}: contact surfaces are boundaries of 3D meshes, not of "
+                f"{compat.cell_name(self.mesh)}s"
+            )
+        if self.degree != 1:
+            raise ValueError(
+                f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1; "
+                "pass degree=1, on a finer mesh for the same accuracy"
+            )
+        found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
+        surface = Surface(self, skin_of_mesh(self, found), smoothing)
+        if mass == "redistributed":
+            self._make_massless(surface)
+        return surface
+
+    def _make_massless(self, surface: Surface) -> None:
+        """Take the mass of a surface's nodes, and give it to others. Collective."""
+        self.check_alive()
+        what = f"mass='redistributed' of a surface of {self.name!r}"
+        if self._forms.used:
+            raise ValueError(f"{what}: the body has moved already; ask for it before the first run")
+        massless = self.massless.copy()
+        massless.reshape(-1, 3)[surface.rows] = True
+        problem = self._mass.redistribute(
+            massless[::3], self.reference.reshape(-1, 3), self.fixed
+        )
+        if problem:
+            raise ValueError(
+                f"{what}: beside its nodes without mass the body {problem}; use a finer mesh, a "
+                "smaller surface, or mass='consistent'"
+            )
+        self.massless, self.has_massless = massless, True
+        self.nodal_mass = self._mass.nodal
+
+    def waves_in_layer(self) -> tuple[float, float]:
+        """Massless layer's thickness over the body's, and wave speeds, see `waves`. Collective."""
+        return waves(
+            lambda u: self.potential(u.ravel()), self.reference.reshape(-1, 3),
+            self._mass.nodal_before[::3], self.massless[::3], self.comm,
+        )  # fmt: skip
+
+    def points(self, x: Any) -> Points:
+        """Material points, for joints and springs. Collective.
+
+        Args:
+            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
+
+        Raises:
+            ValueError: x is no array of points, or one of them lies in no cell.
+        """
+        return in_mesh(self, vectors("x", x, "points [m]"), "x")
+
+    def file_order(self) -> IntArray:
+        """Nodes in the order in which the cells of the input name them, on rank 0. Collective."""
+        owned = self.mesh.topology.index_map(self.mesh.topology.dim).size_local
+        cells = compat.cell_dofs(self.space)[:owned]
+        index_map = self.space.dofmap.index_map
+        nodes = index_map.local_to_global(cells.ravel().astype(np.int32)).reshape(cells.shape)
+        original = np.asarray(self.mesh.topology.original_cell_index[:owned], dtype=np.int64)
+        order = np.argsort(gather_on_root(self.comm, original))
+        _, first = np.unique(gather_on_root(self.comm, nodes)[order], return_index=True)
+        return np.argsort(first)
+
+    # ---- set-up
+    def _size(self) -> float:
+        """Largest side of the box around the body [m], the same on all ranks. Collective."""
+        x = self.reference.reshape(-1, 3)
+        ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
+        self.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+        return float(ends.sum(axis=0).max())
+
+    def _stand(self, bcs: Sequence[Dirichlet], velocity: Any, displacement: Any) -> None:
+        """Set conditions, and displacement and velocity at the start."""
+        self._supports = Supports(self.comm, self.space, bcs, self.name)
+        self.fixed, self.driven = self._supports.fixed, self._supports.driven
+        self.v.x.array[:] = self._given("velocity", velocity, "m/s")
+        self.v.x.array[self._supports.still] = 0.0
+        self.v.x.scatter_forward()
+        self.initial_velocity = self.v.x.array[: self.num_owned].copy()
+        self.u.x.array[:] = self._given("displacement", displacement, "m")
+        self.starts_moved = self.comm.allreduce(bool(self.u.x.array.any()), op=MPI.LOR)
+        self.u.x.array[self.fixed] = self.prescribed(0.0)
+        self.u.x.scatter_forward()
+        self.initial_displacement = self.u.x.array[: self.num_owned].copy()
+        self._refuse_inversion()
+
+    def _given(self, name: str, given: Any, unit: str) -> FloatArray:
+        """Values of an argument at all nodes of this rank, shape (coordinates,)."""
+        return nodal_values(self.space, name, self.name, given, unit).ravel()
+
+    def _refuse_inversion(self) -> None:
+        """Raise on every rank if the start turns a cell inside out."""
+        if self._determinants is None or not self.starts_moved or self.allow_inversion:
+            return
+        smallest = self._determinants.smallest(self.u.x.array)
+        det, place = min(self.comm.allgather(smallest), key=lambda found: found[0])
+        if det <= 0.0:
+            where = ", ".join(f"{x:.4g}" for x in place)
+            raise ValueError(
+                f"displacement of {self.name!r}: with its Dirichlet values at t=0 it turns a cell "
+                f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
+            )
+
+    def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
+        """Compile mass and energy in UFL and any loads, which are returned."""
+        v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+        mass = self._mass_form(v, w)
+        of_energy, self._mass_parameters = (
+            in_expressions((part.integrand() for part in form.integrals()), [self.u])
+            for form in (energy, mass)
+        )
+        self._parameters = [*of_energy, *self._mass_parameters]
+        self._taken = self.parameters()
+        if self._extra_form is not None:
+            self._check_extra_form(self._extra_form, w)
+        self._energy_form, of_mass, *compiled = compile_forms([energy, mass, *loads])
+        self._load = np.zeros(self.num_owned)
+        self._mass = MassMatrix(of_mass)
+        self._take_mass()
+        return compiled
+
+    def _take_mass(self) -> None:
+        """Take over the mass matrix as it was assembled."""
+        self.nodal_mass = self._mass.nodal
+        self._mass_values = values_of(self._mass_parameters)
+
+    def _density(self, density: Any) -> Any:
+        """A density as the forms take it: bodies of any number share compiled forms.
+
+        It is checked again where it changes.
+
+        Raises:
+            ValueError: It is on another mesh.
+        """
+        self._given_density = density
+        if is_number(density):
+            return fem.Constant(self.mesh, float(density))
+        problem = misfit([density], self.mesh.ufl_domain())
+        if problem:
+            raise ValueError(f"density={density!s} of {self.name!r}: {problem}")
+        return density
+
+    def _check_extra_form(self, extra_form: ExtraForm, w: Any) -> None:
+        # Sums, as those that it will be given.
+        given = self.u + self.v, self.u - self.v, w, fem.Constant(self.mesh, 0.0)
+        checked_form(
+            self, f"extra_form={extra_form!r}", lambda: extra_form(*given), {w},
+            "is not linear in the test function w alone",
+            "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx",
+        )  # fmt: skip
+
+    # ---- as of Body
+    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+        """Set the state at t_n."""
+        self._forms.begin(rule, moment)
+
+    def inertia(self, v: FloatArray) -> FloatArray:
+        """M v [kg m/s for a velocity]."""
+        self.check_alive()
+        return self._mass.times(v)
+
+    def internal(self, u1: FloatArray) -> FloatArray:
+        """Internal forces of the step [N]."""
+        return self._forms.internal(u1)
+
+    def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
+        """Loads and gravity, less the extra work [N]."""
+        force = self._load.copy()
+        if gravity.any():
+            force += self.weight(gravity)
+        return force - self._forms.extra(u1)
+
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+        """Return mass M + stiffness K, the same matrix in each call."""
+        self.check_alive()
+        diagonal = mass * self._mean(self.nodal_mass)
+        if not mass:
+            diagonal = stiffness * self._mean(self.nodal_stiffness())
+        matrix = self._forms.tangent(u1, mass, stiffness, self._supports.masks, diagonal)
+        return self._mass.corrected(matrix, mass)
+
+    def _mean(self, values: FloatArray) -> float:
+        """Over all coordinates. Collective."""
+        total = self.comm.allreduce(np.array([values.sum(), self.num_owned]))
+        return float(total[0] / total[1])
+
+    def nodal_stiffness(self) -> FloatArray:
+        """Mean diagonal of the tangent in equilibrium at each node, without deformation [N/m]."""
+        self.check_alive()
+        if self._stiffness is None:
+            # The mean of a node's three entries does not depend on the directions of the axes.
+            mean = self._forms.stiffness_at_rest().reshape(-1, 3).mean(axis=1)
+            self._stiffness = np.repeat(mean, 3)
+        return self._stiffness
+
+    def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
+        """Resultants on the coordinates of each `Dirichlet` condition, this rank's part [N]."""
+        return self._supports.reactions(residual)
+
+    def prescribed(self, time: float) -> FloatArray:
+        """Prescribed displacements at a time, in the order of `fixed` [m]. Collective."""
+        return self._supports.prescribed(time)
+
+    def potential(self, u: FloatArray) -> float:
+        """Strain energy on this rank [J]."""
+        kept = self.u.x.array.copy()
+        fill(self.u, u)
+        value = self._energy_form.value()
+        self.u.x.array[:] = kept
+        return value
+
+    def smallest_det(self, u: FloatArray) -> tuple[float, FloatArray]:
+        """Smallest det F at corners and quadrature points on this rank, and X of its cell [m].
+
+        Without cells, or on a mesh that is not 3D, it is inf.
+        """
+        if self._determinants is None:
+            return np.inf, np.full(3, np.nan)
+        return self._determinants.smallest(self._forms.with_ghosts(u))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ranks must have in common, see `Body`."""
+        constants = [t.value for t in self._parameters if isinstance(t, fem.Constant)]
+        return {"bcs": self._supports.settings, "constants in the material": constants}
+
+    def parameters(self) -> FloatArray:
+        """Values of Constants and Functions in energy and mass, which a caller may change, (n,)."""
+        return values_of(self._parameters)
+
+    def take_parameters(self) -> None:
+        """Assemble the mass anew if what it is made of has changed. Collective.
+
+        Raises:
+            UserFunctionError: A value is out of range, there is no mass left, or it has been moved
+                between nodes.
+        """
+        if not self._parameters:
+            return
+        known = (self._parameters, self._taken), (self._mass_parameters, self._mass_values)
+        changed = np.array([not np.array_equal(values_of(p), last) for p, last in known])
+        self.comm.Allreduce(MPI.IN_PLACE, changed, op=MPI.LOR)
+        if not changed.any():
+            return
+        self._refuse_values()
+        self._taken, self._stiffness = self.parameters(), None
+        if not changed[1]:
+            return
+        if self.has_massless:
+            raise UserFunctionError(
+                f"density of {self.name!r}: has changed after mass='redistributed' of a surface "
+                "took it from its nodes; keep it, or use mass='consistent'"
+            )
+        self._mass.assemble()
+        self._take_mass()
+        total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
+        if not total > 0.0:
+            raise UserFunctionError(
+                f"mass of {self.name!r}: its parameters now make {total:.3g}; it must be "
+                "positive"
+            )
+
+    def _refuse_values(self) -> None:
+        """Raise a UserFunctionError on every rank if a changed parameter is out of its range."""
+        problem, cause = None, None
+        try:
+            self._check_parameters()
+        except ValueError as error:
+            problem, cause = f"a parameter of {self.name!r} has changed: {error}", error
+        raise_together(self.comm, problem, UserFunctionError, cause)
+
+    def accept(self, u: FloatArray, v: FloatArray) -> None:
+        """Write the accepted state into the dolfinx Functions u and v."""
+        fill(self.u, u)
+        fill(self.v, v)
+
+    def last_accepted(self) -> tuple[FloatArray, FloatArray]:
+        """Owned values of the Functions u [m] and v [m/s]."""
+        return self.u.x.array[: self.num_owned], self.v.x.array[: self.num_owned]
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, for those who make many bodies; the body is of no use then."""
+        super().destroy()
+        for a in (self._mass, self._forms):
+            a.destroy()

@@ -1,0 +1,1 @@
+"""The equations of one step: unknowns, residual, and the only PETSc matrices."""

@@ -1,0 +1,208 @@
+"""The bodies' matrices side by side in the 3 x 3 blocks of their nodes (PETSc's BAIJ).
+
+They are filled from the bodies' AIJ matrices block by block: by way of a nest and PETSc's
+conversions a new layout of the elements would cost as much as several Newton iterations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.interaction.points import of_nodes
+
+IntArray = npt.NDArray[np.signedinteger[Any]]
+#: Nodes at a time.
+_CHUNK = 500
+#: Name by which a matrix knows its pattern.
+_PATTERN = "dolfinx_nts_pattern"
+#: Of each part of a body's matrix: where its block rows begin, and the nodes in their columns.
+Pattern = list[tuple[IntArray, IntArray]]
+
+
+def patterns(bodies: Sequence[Any]) -> list[Pattern] | None:
+    """Block rows of the bodies' matrices, None unless all consist of whole blocks. Collective.
+
+    Bodies of the user's own may have any coordinates. PETSc has no incomplete
+    factorisation in blocks of a matrix without rows.
+    """
+    nodes = all(a.getBlockSize() == 3 and a.getType() in {"seqaij", "mpiaij"} for a in bodies)
+    nodes &= any(a.getLocalSize()[0] for a in bodies)
+    here = [_pattern(a) for a in bodies] if nodes else [None]
+    found = [p for p in here if p is not None]
+    everywhere = bodies[0].comm.tompi4py().allreduce(len(found) == len(bodies), op=MPI.LAND)
+    return found if everywhere else None
+
+
+def _pattern(a: Any) -> Pattern | None:
+    """Block rows of this rank's parts of an AIJ matrix, if its entries are whole blocks.
+
+    The matrix keeps it: elements have a new layout much more often than a body has.
+    """
+    known: Pattern | None = a.getAttr(_PATTERN)
+    if known is None:
+        known = _find_pattern(a)
+        a.setAttr(_PATTERN, known)
+    return known
+
+
+def _find_pattern(a: Any) -> Pattern | None:
+    parts = []
+    for pointer, column, number, _ in compat.csr_parts(a):
+        length = np.diff(pointer).reshape(-1, 3)
+        if len(number) % 3 or (length % 3).any() or (length != length[:, :1]).any():
+            return None
+        node = number[::3] // 3
+        if (number.reshape(-1, 3) != of_nodes(node)).any():
+            return None
+        start, blocks = pointer[::3] // 9, [np.empty(0, column.dtype)]
+        for chunk in _chunks(start):
+            block = _blocks(start, column, chunk)
+            blocks.append(block[:, 0, 0] // 3)
+            if (block != 3 * blocks[-1][:, None, None] + np.arange(3, dtype=column.dtype)).any():
+                return None
+        parts.append((start, node[np.concatenate(blocks)]))
+    return parts
+
+
+def _chunks(start: IntArray) -> list[slice]:
+    """Ranges of block rows, so small that temporary arrays stay in the processor's cache."""
+    stop = len(start) - 1
+    return [slice(k, min(k + _CHUNK, stop)) for k in range(0, stop, _CHUNK)]
+
+
+def _blocks(start: IntArray, entries: npt.NDArray[Any], chunk: slice) -> npt.NDArray[Any]:
+    """Entries of an AIJ matrix, which come row by row, block by block.
+
+    Args:
+        start: Where its block rows begin, in blocks.
+        entries: Its columns or values.
+        chunk: Range of block rows.
+
+    Returns:
+        Shape (blocks, 3, 3).
+    """
+    start = start[chunk.start : chunk.stop + 1].astype(np.intp)
+    count = np.diff(start)
+    # Of the first axis; a node's other rows follow after as many triples as it has blocks.
+    triple = np.arange(start[0], start[-1]) + np.repeat(2 * start[:-1], count)
+    rows = triple[:, None] + np.repeat(count, count)[:, None] * np.arange(3)
+    blocks: npt.NDArray[Any] = np.take(entries.reshape(-1, 3), rows, axis=0)
+    return blocks
+
+
+class NodeBlocks:
+    """What a BAIJ matrix of all bodies, with room for elements between their nodes, is made of.
+
+    Args:
+        bodies: Their PETSc matrices.
+        found: What `patterns` says of them.
+        to_whole: (body, numbers in it) -> numbers in the new matrix.
+        elements: Of each batch the numbers in the new matrix, three to a node, shape (n, 3 nodes);
+            negative ones are left out.
+
+    Attributes:
+        size: Rows on this rank.
+        room: Blocks in each of its block rows, at most: in its own columns, in those of others.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Any],
+        found: Sequence[Pattern],
+        to_whole: Callable[[int, IntArray], IntArray],
+        elements: Sequence[IntArray],
+    ) -> None:
+        comm, index = bodies[0].comm.tompi4py(), PETSc.IntType
+        self._bodies, self._rows, self._patterns = list(bodies), [], []
+        local = sum(a.getLocalSize()[0] for a in bodies) // 3
+        first = np.cumsum([0, *comm.allgather(local)])
+        blocks = np.zeros((local, 2), dtype=np.int64)
+        for k, (a, parts) in enumerate(zip(bodies, found, strict=True)):
+            start, stop = (i // 3 for i in a.getOwnershipRange())
+            rows = to_whole(k, 3 * np.arange(start, stop)) // 3
+            for i, (pointer, _) in enumerate(parts):
+                blocks[rows - first[comm.rank], i] = np.diff(pointer)
+            self._rows.append(rows.astype(index))
+            self._patterns.append(
+                [(p, (to_whole(k, 3 * n.astype(np.int64)) // 3).astype(index)) for p, n in parts]
+            )
+        blocks += _most_couplings(comm, first, elements)
+        np.minimum(blocks, (local, first[-1] - local), out=blocks)
+        self.size = 3 * local
+        self.room = [b.astype(index) for b in np.ascontiguousarray(blocks.T)]
+
+    def fill(self, matrix: Any) -> None:
+        """Replace all values by those of the bodies, to which others may be added. Collective."""
+        if matrix.assembled:
+            matrix.zeroEntries()
+        for a, rows, parts in zip(self._bodies, self._rows, self._patterns, strict=True):
+            csr = compat.csr_parts(a)
+            for (start, node), (*_, values) in zip(parts, csr, strict=True):
+                for chunk in _chunks(start):
+                    here = start[chunk.start : chunk.stop + 1]
+                    matrix.setValuesBlockedIJV(
+                        here - here[0],
+                        node[here[0] : here[-1]],
+                        _blocks(start, values, chunk),
+                        rowmap=rows[chunk],
+                    )
+        matrix.assemble(PETSc.Mat.AssemblyType.FLUSH)
+
+
+def add(matrix: Any, numbers: IntArray, values: npt.NDArray[np.float64]) -> None:
+    """Add blocks of elements to a BAIJ matrix, to be assembled.
+
+    Args:
+        matrix: The matrix.
+        numbers: Of the elements' coordinates in the matrix, three to a node, shape (n, 3 nodes);
+            negative ones are left out.
+        values: Shape (n, 3 nodes, 3 nodes).
+    """
+    n, count = len(numbers), numbers.shape[1] // 3
+    out = numbers < 0
+    if out.any():
+        values = np.where(out[:, :, None] | out[:, None], 0.0, values)
+    node = (numbers.reshape(n, count, 3).max(axis=2) // 3).astype(PETSc.IntType)
+    matrix.setValuesBlockedIJV(
+        np.arange(n * count + 1, dtype=PETSc.IntType) * count,
+        np.repeat(node, count, axis=0),
+        # petsc4py reads an array in Fortran's order as it lies in memory.
+        np.ascontiguousarray(values.reshape(n, count, 3, count, 3).transpose(0, 1, 3, 2, 4)),
+        addv=PETSc.InsertMode.ADD_VALUES,
+        rowmap=node,
+    )
+
+
+def _most_couplings(comm: Any, first: IntArray, elements: Sequence[IntArray]) -> IntArray:
+    """Upper bound of the blocks that elements need in each of this rank's rows. Collective.
+
+    Args:
+        comm: MPI communicator.
+        first: First node of each rank, and the number of all.
+        elements: As of `NodeBlocks`.
+
+    Returns:
+        In the rank's own columns and in those of others, shape (nodes, 2).
+    """
+    local = int(first[comm.rank + 1] - first[comm.rank])
+    count = PETSc.Vec().createMPI((2 * local, None), comm=comm)
+    for numbers in elements:
+        node = numbers.reshape(len(numbers), numbers.shape[1] // 3, 3).max(axis=2) // 3
+        row, col = np.broadcast_arrays(node[:, :, None], node[:, None, :])
+        kept = (row >= 0) & (col >= 0) & (row != col)
+        row, col = row[kept], col[kept]
+        away = np.searchsorted(first, row, "right") != np.searchsorted(first, col, "right")
+        where = (2 * row + away).astype(PETSc.IntType)
+        count.setValues(where, np.ones(len(where)), addv=PETSc.InsertMode.ADD_VALUES)
+    count.assemble()
+    most: IntArray = count.array_r.reshape(-1, 2).astype(np.int64)
+    count.destroy()
+    return most

@@ -1,0 +1,466 @@
+"""The equations of one step: residual and tangents of bodies.
+
+What couples bodies comes as `Elements`, of whatever kind they are.
+
+The momentum equation is multiplied by h/2 and the multipliers are h^2/2 lambda (theory section 8),
+which makes the condition number independent of h. Equilibrium has a factor 1 for h^2/2 and no
+inertia: its equations are in [N] where [kg m] stands here, its matrix in [N/m]. Evaluations are
+pure: nothing here changes a State, and history changes only when a step is accepted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.equations.couplings import Couplings
+from dolfinx_nts.equations.lengths import Lengths
+from dolfinx_nts.equations.loads import Loads
+from dolfinx_nts.equations.rounding import Rounding
+from dolfinx_nts.equations.shared_weight import SharedWeight
+from dolfinx_nts.equations.sleep import Sleepers
+from dolfinx_nts.equations.stabilization import Stabilization
+from dolfinx_nts.equations.stiffness_between import stiffness_between
+from dolfinx_nts.equations.supports import Supports
+from dolfinx_nts.equations.unknowns import Unknowns
+from dolfinx_nts.interaction.elements import Step, evaluate_together
+from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, Moment, free
+from dolfinx_nts.parallel import everywhere, global_max
+from dolfinx_nts.state import State
+from dolfinx_nts.system import System
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class StepProblem:
+    """Equations of one step of a system; `begin` fixes the step.
+
+    Args:
+        system: The scene.
+        integrator: Rules of the step, or `Static()`.
+        rtol: Residual of a block that counts as solved, relative to the forces or motions of the
+            step.
+        condense: Eliminate (d, f) and their multipliers pair by pair.
+        sleep: Leave out bodies that nothing moves.
+
+    Attributes:
+        awake: Numbers of the bodies that are in the step; the others stay exactly where they are.
+        couplings: All that makes elements.
+        unknowns: Their layout; made anew whenever the elements' coordinates change.
+        version: Changes whenever `unknowns` does.
+        dives: Whether free flight presses bodies deep into each other, after `begin`.
+        lent: Share of the stiffness around each coordinate that is added to matrices, see
+            `LentStiffness`.
+        factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
+        rtol: As given.
+        rounding: What part of the forces on bodies is rounding.
+        stabilization: In statics, what holds each node at t_n.
+        lengths: Lengths of the scene, and of the step after `begin`.
+        loads: When the step takes which loads.
+        supports: Prescribed coordinates in the step.
+        flight: M (u_1 - u_0) of each body in free flight [kg m], after `begin`; zero in statics.
+    """
+
+    def __init__(
+        self, system: System, integrator: Any, *, rtol: float, condense: bool, sleep: bool = False
+    ) -> None:
+        self.system, self.integrator = system, integrator
+        self.rtol, self.condense = rtol, condense
+        self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
+        self._asleep: dict[int, BodyTerms] = {}
+        self._evaluated: dict[int, tuple[FloatArray, ...]] = {}
+        # What batches contribute that have no element on any rank: nothing, at every iterate.
+        self._of_none: tuple[Any, ...] | None = None
+        self.awake: tuple[int, ...] = ()
+        self._numbers: tuple[Any, ...] | None = None
+        self.couplings = Couplings(system)
+        self._shared = SharedWeight(system.comm, system.contacts)
+        self.unknowns: Unknowns | None = None
+        self.version, self.dives, self.lent = 0, False, 0.0
+        self._again: Evaluation | None = None
+        self.lengths, self.loads = Lengths(system), Loads(system, integrator)
+        self.supports = Supports(system, integrator)
+        lengths = self.lengths
+        self.stabilization = Stabilization(
+            system, lengths.radius or lengths.director, lengths.director or lengths.radius,
+            self.loads.largest,
+        )  # fmt: skip
+        self.rounding = Rounding(
+            system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self.stiffness_between
+        )
+
+    # ---- set-up of a step
+    def begin(
+        self,
+        state: State,
+        dt: float,
+        again: Evaluation | None = None,
+        *,
+        search: bool = True,
+        sleep: bool = True,
+        moments: Sequence[Moment] | None = None,
+    ) -> None:
+        """Fix the state at t_n and the step: loads, candidates, layout, first guess.
+
+        Args:
+            state: State at t_n.
+            dt: Step [s].
+            again: Solution of this step whose motion the elements did not cover, see `misses`:
+                contact is sought along that motion in place of the one that velocities predict.
+            search: Seek contacts; False keeps the candidates of the last step, for statics only.
+            sleep: Leave out bodies at rest, if the run does; else all constraints are in the step.
+            moments: Where the forces on each body are taken; None: as the integrator's step has it.
+        """
+        self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
+        self._evaluated = {}
+        self.loads.begin(state, dt, moments)
+        at_rest = self._fly()
+        lengths, way = self.lengths, [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
+        if again is not None:
+            lengths.motion = np.maximum(lengths.motion, lengths.motion_of(again))
+            way = [terms.du for terms in again.bodies]
+        # Bodies at rest may fall.
+        length = lengths.displaced(dt**2 * float(np.linalg.norm(self.loads.gravity)))
+        self.rounding.begin(self.factor, length, lengths.moved, lengths.extent)
+        step = Step(
+            state, dt, self.factor, self.integrator, self.condense, self.first, way,
+            lengths.motion, length, self.stabilization.stiffness, self.loads.moments,
+            self.rounding.of,
+        )  # fmt: skip
+        self.couplings.begin(step, again, search)
+        self._asleep = self._find_asleep(at_rest & (lengths.motion == 0.0)) if sleep else {}
+        self._lay_out(again)
+
+    def _fly(self) -> BoolArray:
+        """Set `first`, `flight` and `lengths`, the step without forces. Collective.
+
+        Returns:
+            Whether each body starts without speed, shape (bodies,).
+        """
+        bodies, state, dt = self.system.bodies, self.state, self.dt
+        ahead = [
+            self.integrator.ahead(v, state.acceleration(k), dt) for k, v in enumerate(state.v)
+        ]
+        self.first = [u + du for u, du in zip(state.u, ahead, strict=True)]
+        for body, u1 in zip(bodies, self.first, strict=True):
+            u1[body.fixed] = body.prescribed(state.time + dt)
+        self.supports.begin(state, self.first, dt)
+        speed = self.lengths.begin(state, self.first, dt)
+        # In statics v only predicts the first guess.
+        moves = (speed > 0.0) & self.integrator.inertia
+        moving = self.supports.moving
+        self.flight = [
+            self._inertial(b, self.supports.ahead(k, du, self.first[k]))
+            if moves[k] or k in moving else np.zeros_like(du)
+            for k, (b, du) in enumerate(zip(bodies, ahead, strict=True))
+        ]  # fmt: skip
+        return speed == 0.0
+
+    @property
+    def elements(self) -> list[Any]:
+        """Batches of elements in the step."""
+        return self.couplings.elements
+
+    def forget_forces(self) -> None:
+        """Take no body's forces from an earlier step: parameters of materials have changed."""
+        if self._sleepers is not None:
+            self._sleepers.forget()
+
+    def wake(self, e: Evaluation) -> bool:
+        """Whether a solved step asks for more elements, and is to be solved again. Collective.
+
+        Args:
+            e: Solution of the step without them.
+        """
+        if not self.couplings.wake(e):
+            return False
+        self._rouse(self._asleep.keys() & self.couplings.touched())
+        self._lay_out(e)
+        return True
+
+    def misses(self, e: Evaluation) -> bool:
+        """Whether a solved step may have passed by something. Collective.
+
+        If so, `begin` is to be called again with it.
+
+        Raises:
+            StepFailedError: Only a shorter step helps.
+        """
+        return self.couplings.misses(e, self.lengths.motion_of(e))
+
+    def _lay_out(self, again: Evaluation | None) -> None:
+        """Layout of the unknowns, kept while no rank's elements change, and a first guess.
+
+        Args:
+            again: Solution of this step with fewer elements, which the next one goes on from.
+        """
+        system = self.system
+        if len(self._asleep) == len(system.bodies):
+            # SNES needs an unknown; at rest it takes no iteration.
+            self._rouse({0})
+        self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
+        elements = self.elements
+        widths = np.array([list(c.widths.values()) for c in elements])
+        numbers = (np.array(self.awake), widths, *(a for c in elements for a in c.points()))
+        if not everywhere(system.comm, _equal(numbers, self._numbers)):
+            self.destroy()
+            sizes = {k: system.bodies[k].num_owned for k in self.awake}
+            of = self.couplings.bodies
+            self.unknowns = Unknowns(system.comm, sizes, elements, of)
+            self.version += 1
+            self._numbers = numbers
+        self._of_none = None
+        # From bodies that free flight has pressed deep into each other iterates may not find back.
+        self.dives = self.integrator.inertia and self.couplings.contacts.dives()
+        self._again = again
+        self.first_guess()
+
+    def first_guess(self) -> None:
+        """Write into `x` what the iterations of the step begin with."""
+        self.guess(flight=not self.dives, forces=True, again=self._again)
+
+    @property
+    def x(self) -> Any:
+        """PETSc vector of the unknowns, holding the first guess after `begin`."""
+        return self.laid.x
+
+    def of_body(self, k: int) -> slice:
+        """Where a body that is awake stands among this rank's unknowns."""
+        return self.laid.of_body(k)
+
+    @property
+    def of_constraints(self) -> slice:
+        """Where the elements' multipliers stand among this rank's unknowns."""
+        return self.laid.of_elements("constraints")
+
+    @property
+    def laid(self) -> Unknowns:
+        """The layout, after `begin`."""
+        assert self.unknowns is not None, "begin comes first"
+        return self.unknowns
+
+    def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
+        """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
+        if self._sleepers is None:
+            return {}
+        chosen = sorted(set(np.flatnonzero(rest).tolist()) - self.couplings.touched())
+        u, f = self.state.u, self.factor
+        found = self._sleepers.find(chosen, u, self.loads.gravity, self.rounding.at_rest)
+        self.couplings.rest(found)
+        none = {k: np.zeros_like(u[k]) for k in found}
+        return {
+            k: BodyTerms(u[k], none[k], f * a, f * b, none[k], f * (a - b))
+            for k, (a, b) in found.items()
+        }
+
+    def _rouse(self, bodies: Set[int]) -> None:
+        """Take bodies into the step that were left out."""
+        for k in bodies:
+            del self._asleep[k]
+        self.couplings.rouse(bodies)
+
+    def _inertial(self, body: Any, du: FloatArray) -> FloatArray:
+        """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
+        if self.integrator.inertia:
+            force: FloatArray = body.inertia(du)
+            return force
+        return self.stabilization.of(body) * du
+
+    def guess(
+        self,
+        *,
+        flight: bool,
+        forces: bool,
+        carried: bool = False,
+        again: Evaluation | None = None,
+    ) -> None:
+        """Write a first guess into `x`: motion, contact forces, d and f that fit the positions.
+
+        Args:
+            flight: Free flight from t_n; else the positions of t_n, which free flight of a fast
+                turning or vibrating body may invert. Prescribed coordinates are at t_{n+1}.
+            forces: The contact forces of the last step; else none, but in statics.
+            carried: Take these forces unchanged, even where they are a poor guess.
+            again: Solution of this step with fewer elements: its motion and contact forces are
+                taken in place of these.
+        """
+        laid, elements = self.laid, self.elements
+        with self.x as x:
+            x[:] = 0.0
+            for k in self.awake:
+                fixed, u1 = self.system.bodies[k].fixed, self.first[k]
+                start = u1 if flight else self.state.u[k].copy()
+                if again is not None:
+                    start = again.bodies[k].u1.copy()
+                start[fixed] = u1[fixed]
+                x[laid.of_body(k)] = start
+        if "constraints" in laid.own and (forces or not self.integrator.inertia):
+            found = self.couplings.guess(laid.positions(self.x, elements), carried=carried)
+            with self.x as x:
+                x[laid.of_elements("constraints")] = found
+        if "augmented" in laid.own:
+            positions = laid.positions(self.x, elements)
+            guess = [c.initial_guess(p).ravel() for c, p in zip(elements, positions, strict=True)]
+            with self.x as x:
+                x[laid.of_elements("augmented")] = np.concatenate(guess)
+
+    # ---- iterates
+    def evaluate(self, x: Any) -> Evaluation:
+        """The step equations at an iterate; no state changes. Every rank must call it.
+
+        Args:
+            x: PETSc vector of the unknowns.
+        """
+        values, laid = x.array_r.copy(), self.laid
+        if laid.blocks or self._of_none is None:
+            parts = self._parts_of_elements(x, values)
+            self._of_none = None if laid.blocks else parts
+        else:
+            parts = self._of_none
+        force = laid.forces(self.elements, parts) if laid.blocks else np.zeros(len(values))
+        # Most often bodies at rest before something hits them stay where the last iterate had them.
+        for k in self.elsewhere(values, {k: terms[0] for k, terms in self._evaluated.items()}):
+            self._evaluated[k] = self._without_elements(k, values[laid.of_body(k)])
+        bodies = dict(self._asleep)
+        for k in self.awake:
+            u1, du, internal, external, total = self._evaluated[k]
+            coupling = force[laid.of_body(k)]
+            bodies[k] = BodyTerms(u1, du, internal, external, coupling, total + coupling)
+        return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
+
+    def _parts_of_elements(self, x: Any, values: FloatArray) -> tuple[Any, ...]:
+        """What each batch of elements contributes at an iterate. Collective.
+
+        Args:
+            x: PETSc vector of the unknowns.
+            values: This rank's part of it.
+        """
+        laid, elements = self.laid, self.elements
+        positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
+        own = laid.own_values(values, elements)
+        parts = evaluate_together(self.system.comm, elements, positions, own)
+        contacts, touching = self.couplings.contacts, len(self.couplings.contacts.elements)
+        self._shared.divide(
+            contacts.elements, contacts.bodies, parts[:touching], positions[:touching],
+            self._closed,
+        )  # fmt: skip
+        return parts
+
+    def _without_elements(self, k: int, u1: FloatArray) -> tuple[FloatArray, ...]:
+        """`BodyTerms` of a body at a displacement, but for those of elements. Collective.
+
+        Returns:
+            u1, du, internal and external forces, and the equation without elements.
+        """
+        body, du = self.system.bodies[k], u1 - self.state.u[k]
+        internal = self.factor * body.internal(u1)
+        external = self.factor * body.external(u1, self.loads.gravity)
+        total = self._inertial(body, du) - self.flight[k] + internal - external
+        return u1, du, internal, external, total
+
+    def elsewhere(self, values: FloatArray, known: Mapping[int, FloatArray]) -> list[int]:
+        """Bodies that are awake and not where they are known to have been. Collective.
+
+        Args:
+            values: This rank's unknowns.
+            known: Displacements there [m] by the body's number; a body without one is elsewhere.
+        """
+        here = [
+            k not in known or not np.array_equal(values[self.laid.of_body(k)], known[k])
+            for k in self.awake
+        ]
+        anywhere = global_max(self.system.comm, np.array(here, dtype=np.float64))
+        return [k for k, moves in zip(self.awake, anywhere.tolist(), strict=True) if moves]
+
+    def _closed(self, batch: ContactElements) -> float:
+        """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
+        motion, moved = (float(a.max()) for a in (self.lengths.motion, self.lengths.moved))
+        limits = batch.ratios(np.array([0.0, 1.0, 0.0, 0.0]), motion, motion + moved, self.rtol)
+        return 1.0 / limits[f"{batch.name} constraints"]
+
+    def residual(self, e: Evaluation) -> FloatArray:
+        """This rank's part of the residual, zero at prescribed coordinates."""
+        laid = self.laid
+        out = np.zeros(len(e.x))
+        for k in self.awake:
+            out[laid.of_body(k)] = free(self.system.bodies[k], e.bodies[k].residual)
+        for name in laid.own:
+            rows = [c.rows(p, name).ravel() for c, p in zip(self.elements, e.parts, strict=True)]
+            out[laid.of_elements(name)] = np.concatenate(rows)
+        return out
+
+    def body_tangents(self, e: Evaluation) -> list[Any]:
+        """PETSc matrices of the bodies that are awake at an iterate, without contact."""
+        tangents = [self.body_tangent(k, e.bodies[k].u1) for k in self.awake]
+        if self.lent:
+            for k, a in zip(self.awake, tangents, strict=True):
+                _add_to_diagonal(a, self.lent * self.stabilization.stiffness(self.system.bodies[k]))
+        return tangents
+
+    def body_tangent(self, k: int, u1: FloatArray) -> Any:
+        """PETSc matrix of a body at a displacement, without contact."""
+        mass = 1.0 if self.integrator.inertia else 0.0
+        a = self.system.bodies[k].tangent(u1, mass, self.factor)
+        if self.stabilization.share:
+            _add_to_diagonal(a, self.stabilization.of(self.system.bodies[k]))
+        return a
+
+    @property
+    def rounding_is_known(self) -> bool:
+        """Whether the rounding of all forces has been measured, of springs in this step."""
+        springs = any(not any(batch.widths.values()) for batch in self.elements)
+        return self.rounding.is_known(self.awake, springs=springs)
+
+    def measure_rounding(self, e: Evaluation) -> None:
+        """Measure the rounding of the forces anew, at an iterate's motion. Collective.
+
+        Args:
+            e: Iterate whose motion is longer than the one that was predicted, at most the extent.
+        """
+        self.rounding.length = np.maximum(self.rounding.length, self.lengths.displacement_of(e))
+        self.rounding.measure(self.awake)
+        self.rounding.measure_springs()
+
+    def stiffness_between(self) -> FloatArray:
+        """Norm of the stiffness at t_n of elements without unknowns, of each body. Collective."""
+        u = {k: self.state.u[k] for k in self.awake}
+        return stiffness_between(
+            self.laid, self.elements, self.couplings.bodies, u, len(self.system.bodies)
+        )
+
+    @property
+    def momentum_rounding(self) -> float:
+        """Change of momentum in the step that is rounding [kg m/s]."""
+        rate = self.integrator.rate(self.dt)
+        return float(self.rounding.forces.sum() * np.sqrt(self.system.size) * rate)
+
+    @property
+    def rounded_length(self) -> float:
+        """Largest length whose rounding enters forces and gaps [m]. Collective."""
+        local = max([self.lengths.span, *(c.extent for c in self.elements)])
+        return float(global_max(self.system.comm, np.array([local]))[0])
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, which Python's collector does not."""
+        if self.unknowns is not None:
+            self.unknowns.destroy()
+        self.unknowns, self._numbers = None, None
+
+
+def _add_to_diagonal(a: Any, values: FloatArray) -> None:
+    held = a.createVecLeft()
+    held.array_w[:] = values
+    a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
+    held.destroy()
+
+
+def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:
+    if b is None or len(a) != len(b):
+        return False
+    return all(x is y or np.array_equal(x, y) for x, y in zip(a, b, strict=True))

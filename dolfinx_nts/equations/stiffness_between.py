@@ -1,0 +1,58 @@
+"""How stiff what acts between bodies is, such as springs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.equations.unknowns import Unknowns
+from dolfinx_nts.interaction.elements import evaluate_together
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def stiffness_between(
+    laid: Unknowns,
+    elements: Sequence[Any],
+    bodies: Sequence[tuple[int, ...]],
+    u: Mapping[int, FloatArray],
+    count: int,
+) -> FloatArray:
+    """Norm of the stiffness of elements without own unknowns, of each body [kg]. Collective.
+
+    Args:
+        laid: Layout of the unknowns.
+        elements: Batches of elements.
+        bodies: Numbers of the bodies of each batch.
+        u: Owned displacements of each body that is awake [m].
+        count: Number of bodies.
+
+    Returns:
+        Shape (bodies,); [N/m] in statics.
+    """
+    local, start = np.zeros(count), laid.x.duplicate()
+    start.set(0.0)
+    for k, values in u.items():
+        start.array_w[laid.of_body(k)] = values
+    positions = laid.positions(start, elements)
+    own = laid.own_values(start.array_r, elements)
+    start.destroy()
+    chosen = [i for i, batch in enumerate(elements) if not any(batch.widths.values())]
+    parts = evaluate_together(
+        laid.layout.comm,
+        [elements[i] for i in chosen],
+        [positions[i] for i in chosen],
+        [own[i] for i in chosen],
+    )
+    for i, part in zip(chosen, parts, strict=True):
+        first = 0
+        for k, dofs in zip(bodies[i], elements[i].dofs(), strict=True):
+            stop = first + dofs.shape[1]
+            along = part.tangent[:, first:stop, first:stop].diagonal(axis1=1, axis2=2)
+            local[k] += float(np.square(along[dofs >= 0]).sum())
+            first = stop
+    found: FloatArray = np.sqrt(laid.layout.comm.allreduce(local))
+    return found

@@ -1,0 +1,172 @@
+"""Where the unknowns of a step stand, and how elements read them and add forces to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from dolfinx_nts.equations.layout import ElementBlocks, Layout
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+#: Fields of the elements' own unknowns; the first is left out where nobody has any.
+_OWN = ("augmented", "constraints")
+
+
+class Unknowns:
+    """Layout of the unknowns: bodies first, then those that elements have of their own.
+
+    Args:
+        comm: MPI communicator.
+        sizes: Of each body in the step, its number -> coordinates on this rank.
+        elements: Batches of elements.
+        bodies: Numbers of the bodies of each batch.
+
+    Attributes:
+        layout: Fields of the unknowns.
+        own: Fields of the elements' own unknowns by name; empty if they have none.
+        blocks: Unknowns of each batch of elements; empty if there are no elements on any rank.
+        x: PETSc vector of the unknowns.
+    """
+
+    def __init__(
+        self,
+        comm: Any,
+        sizes: Mapping[int, int],
+        elements: Sequence[Any],
+        bodies: Sequence[tuple[int, ...]],
+    ) -> None:
+        self._field = {k: f for f, k in enumerate(sizes)}
+        counts = list(sizes.values())
+        local = [sum(c.num_elements * c.widths[name] for c in elements) for name in _OWN]
+        there = comm.allreduce(np.array([*local, sum(c.num_elements for c in elements)]))
+        self.own: dict[str, int] = {}
+        for name, size, total in zip(_OWN, local, there[:-1], strict=True):
+            if total:
+                self.own[name] = len(counts)
+                counts.append(size)
+        self.layout = Layout(comm, counts)
+        self.blocks = self._blocks(elements, bodies) if there[-1] else []
+        index, owners = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+        for c, numbers in zip(elements, bodies, strict=True):
+            if c.num_elements:
+                both = list(zip(numbers, c.points(), strict=True))
+                parts = [self.layout.to_system(self._field[b], p) for b, p in both]
+                index.append(np.concatenate(parts, axis=1).ravel())
+                of = [np.full(p.shape, b) for b, p in both]
+                owners.append(np.concatenate(of, axis=1).ravel())
+        self._body_of_row = np.concatenate(owners)
+        needed = np.concatenate(index).astype(PETSc.IntType)
+        self.x = PETSc.Vec().createMPI((self.layout.num_owned, None), comm=comm)
+        self._forces = self.x.duplicate()
+        self._local = PETSc.Vec().createSeq(len(needed), comm=PETSc.COMM_SELF)
+        source = PETSc.IS().createGeneral(needed, comm=PETSc.COMM_SELF)
+        self._scatter = PETSc.Scatter().create(self.x, source, self._local, None)
+        source.destroy()
+
+    def _blocks(
+        self, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]]
+    ) -> list[ElementBlocks]:
+        """Numbers of the elements' unknowns in their fields."""
+        blocks = []
+        offset = {name: self.layout.start(f) for name, f in self.own.items()}
+        for c, of in zip(elements, bodies, strict=True):
+            if not all(b in self._field for b in of):
+                blocks.append(ElementBlocks((), (), (), np.empty((0, 0), dtype=bool)))
+                continue
+            numbers = list(c.dofs())
+            for name in self.own:
+                shape = c.num_elements, c.widths[name]
+                new = offset[name] + np.arange(shape[0] * shape[1])
+                numbers.append(new.reshape(shape))
+                offset[name] += new.size
+            widths = [n.shape[1] for n in numbers]
+            stops = np.cumsum(widths)
+            pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
+            if "constraints" in self.own:
+                pattern[stops[-2] :, stops[-2] :] = c.pattern
+            columns = tuple(slice(int(b - w), int(b)) for w, b in zip(widths, stops, strict=True))
+            fields = (*(self._field[b] for b in of), *self.own.values())
+            blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
+        return blocks
+
+    def of_body(self, k: int) -> slice:
+        """Where a body's coordinates stand among this rank's unknowns."""
+        return self.layout.owned(self._field[k])
+
+    def of_elements(self, name: str) -> slice:
+        """Where a field of the elements' own unknowns stands among this rank's unknowns."""
+        return self.layout.owned(self.own[name])
+
+    def positions(self, x: Any, elements: Sequence[Any]) -> list[FloatArray]:
+        """Positions that each batch depends on [m], see `Elements.evaluate`. Collective."""
+        both = zip([c.reference() for c in elements], self.at_elements(x, elements), strict=True)
+        return [reference + u.reshape(reference.shape) for reference, u in both]
+
+    def at_elements(self, x: Any, elements: Sequence[Any]) -> list[FloatArray]:
+        """A vector's values at the coordinates of each batch, shape (n, columns). Collective."""
+        self._scatter.scatter(x, self._local, mode=PETSc.ScatterMode.FORWARD)
+        values, start, out = self._local.array_r.copy(), 0, []
+        for c in elements:
+            stop = start + c.num_elements * c.num_coordinates
+            out.append(values[start:stop].reshape(c.num_elements, c.num_coordinates))
+            start = stop
+        return out
+
+    def own_values(
+        self, values: FloatArray, elements: Sequence[Any]
+    ) -> list[dict[str, FloatArray]]:
+        """Own unknowns of each batch by field, shape (n, width), from this rank's unknowns."""
+        out: list[dict[str, FloatArray]] = [{} for _ in elements]
+        for name in _OWN:
+            of_field = values[self.of_elements(name)] if name in self.own else None
+            start = 0
+            for own, c in zip(out, elements, strict=True):
+                shape = c.num_elements, c.widths[name]
+                stop = start + shape[0] * shape[1]
+                own[name] = (
+                    np.zeros(shape) if of_field is None else of_field[start:stop].reshape(shape)
+                )
+                start = stop
+        return out
+
+    def gross_forces(
+        self, elements: Sequence[Any], parts: Sequence[Any], bodies: int
+    ) -> FloatArray:
+        """Sum of the squares of all elements' forces on each body on this rank, shape (bodies,).
+
+        Forces that cancel each other count in full.
+        """
+        if not self.blocks:
+            return np.zeros(bodies)
+        squares: FloatArray = np.square(_coordinate_rows(elements, parts))
+        found: Any = np.bincount(self._body_of_row, squares, minlength=bodies)
+        return found
+
+    def forces(self, elements: Sequence[Any], parts: Sequence[Any]) -> FloatArray:
+        """Rows of coordinates of all elements, summed up at this rank's unknowns. Collective."""
+        self._local.array_w[:] = _coordinate_rows(elements, parts)
+        self._forces.set(0.0)
+        add, reverse = PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE
+        self._scatter.scatter(self._local, self._forces, addv=add, mode=reverse)
+        force: FloatArray = self._forces.array_r.copy()
+        return force
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, which Python's collector does not."""
+        for a in (self.x, self._forces, self._local, self._scatter):
+            a.destroy()
+
+
+def _coordinate_rows(elements: Sequence[Any], parts: Sequence[Any]) -> FloatArray:
+    """Residuals of the coordinates of all elements, one after the other [kg m]."""
+    rows = [
+        part.residual[:, : c.num_coordinates].ravel()
+        for c, part in zip(elements, parts, strict=True)
+    ]
+    return np.concatenate([np.empty(0), *rows])

@@ -1,0 +1,1 @@
+"""What a solved step is worth: momenta, energies, resultants, contact fields, impacts."""

@@ -1,0 +1,311 @@
+"""The ledger (theory section 7): momenta, energy and its changes, from states and steps alone."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.bodies.solid.inversion import smallest_dets
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.state import State
+from dolfinx_nts.system import System
+
+if TYPE_CHECKING:
+    from dolfinx_nts.equations.problem import StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Columns of the balance table; momenta have three components.
+COLUMNS = (
+    "time",
+    "kinetic",
+    "potential",
+    "energy",
+    "external_work",
+    "friction_dissipation",
+    "contact_defect",
+    "massless_defect",
+    "impact_restored",
+    "material_change",
+    "interference_work",
+    "ledger_residual",
+    "linear_momentum",
+    "angular_momentum",
+    "active",
+    "stick",
+    "slip",
+    "min_gap",
+    "min_det",
+    "newton_iterations",
+)
+
+
+
+def columns(system: System) -> tuple[str, ...]:
+    """Columns of a system's balance table: `COLUMNS`, and what its joints add."""
+    return COLUMNS + tuple(dict.fromkeys(name for j in system.joints for name in j.losses))
+
+
+#: Columns that add up over the steps, and those that count in a step.
+WORKS = ("external_work", "friction_dissipation", "contact_defect", "massless_defect")
+COUNTS = ("active", "stick", "slip")
+#: Columns that add up what else changes the energy.
+CHANGES = ("impact_restored", "material_change", "interference_work")
+
+
+class Switch(NamedTuple):
+    """An active node that went over to another facet at the start of a step.
+
+    Attributes:
+        time: End of the step [s].
+        contact: Name of the contact.
+        node: Input number of the slave node.
+        facets: Numbers of the master's facets before and after.
+        defect: What the change adds to contact_defect [J]; negative where it brings energy.
+    """
+
+    time: float
+    contact: str
+    node: int
+    facets: tuple[int, int]
+    defect: float
+
+
+class Switches(Sequence[Switch]):
+    """The newest changes of facet of a run, at most `KEPT` of them, and sums over all.
+
+    Attributes:
+        number: How many there were.
+        defect: What all of them add to contact_defect [J].
+        size: The same of absolute values [J].
+        worst: The one with the largest absolute value, the first of several.
+    """
+
+    #: How many are kept; a run of a million steps may have many millions.
+    KEPT = 10_000
+
+    def __init__(self) -> None:
+        self._newest: deque[Switch] = deque(maxlen=self.KEPT)
+        self.number = 0
+        self.defect = self.size = 0.0
+        self.worst: Switch | None = None
+
+    def extend(self, found: Iterable[Switch]) -> None:
+        """Add changes of facet in the order in which they came."""
+        for switch in found:
+            self._newest.append(switch)
+            self.number += 1
+            self.defect += switch.defect
+            self.size += abs(switch.defect)
+            if self.worst is None or abs(switch.defect) > abs(self.worst.defect):
+                self.worst = switch
+
+    def __len__(self) -> int:
+        return len(self._newest)
+
+    @overload
+    def __getitem__(self, index: int) -> Switch: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Switch]: ...
+    def __getitem__(self, index: int | slice) -> Switch | list[Switch]:
+        return list(self._newest)[index] if isinstance(index, slice) else self._newest[index]
+
+
+#: Of a body: u and v, and its part of the energies and momenta on this rank, shape (8,).
+Measured = tuple[FloatArray, FloatArray, FloatArray]
+
+
+def measure(
+    system: System, state: State, known: dict[str, Measured] | None = None
+) -> dict[str, Any]:
+    """Energies [J] and momenta [kg m/s, kg m^2/s] of a state, the same on all ranks.
+
+    Args:
+        system: Its bodies.
+        state: The state.
+        known: Of each body's name what was measured last, which holds while its arrays are the
+            same objects; brought up to date.
+
+    Returns:
+        kinetic, potential, linear_momentum (3,), angular_momentum (3,).
+    """
+    local, known = np.zeros(8), {} if known is None else known
+    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+        last = known.get(body.name)
+        if last is None or last[0] is not u or last[1] is not v:
+            known[body.name] = last = u, v, _of_body(body, u, v)
+        local += last[2]
+    joints = zip(system.joints, system.joint_bodies, state.joints, strict=True)
+    for joint, bodies, history in joints:
+        local[1] += joint.potential([state.u[b] for b in bodies], history)
+    total = np.empty_like(local)
+    system.comm.Allreduce(local, total, op=MPI.SUM)
+    return {
+        "kinetic": float(total[0]),
+        "potential": float(total[1]),
+        "linear_momentum": total[2:5],
+        "angular_momentum": total[5:],
+    }
+
+
+def momenta(system: System, state: State) -> dict[str, FloatArray]:
+    """Momenta of a state [kg m/s, kg m^2/s], as `measure` has them. Collective."""
+    local = np.zeros(6)
+    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+        local += np.concatenate(_momenta(body, u, body.inertia(v)))
+    total = np.empty_like(local)
+    system.comm.Allreduce(local, total, op=MPI.SUM)
+    return {"linear_momentum": total[:3], "angular_momentum": total[3:]}
+
+
+def _of_body(body: Any, u: FloatArray, v: FloatArray) -> FloatArray:
+    """This rank's part of a body's energies and momenta, shape (8,)."""
+    momentum = body.inertia(v)
+    energies = [0.5 * float(v @ momentum), body.potential(u)]
+    return np.concatenate([energies, *_momenta(body, u, momentum)])
+
+
+def _momenta(body: Any, u: FloatArray, momentum: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """This rank's part of a body's linear and angular momentum."""
+    return body.linear_momentum(momentum), body.angular_momentum(u, momentum)
+
+
+def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
+    """Works and counts of an accepted step, the same on all ranks. Collective.
+
+    Loads and supports do external work; what elements add, they name, see `Elements.ledger`.
+
+    Returns:
+        By columns of the balance table: works [J] and counts of the step, min_gap [m] (infinite
+        without candidates), min_det (infinite without flexible bodies; see `Body.smallest_det`).
+    """
+    scale = 1.0 / problem.factor
+    losses = (name for joint in problem.system.joints for name in joint.losses)
+    sums, smallest = dict.fromkeys((*WORKS, *COUNTS, *losses), 0.0), {"min_gap": np.inf}
+    added = problem.loads.work_at_ends(step)
+    for k, (terms, more) in enumerate(zip(step.bodies, added, strict=True)):
+        work = scale * float(terms.external @ terms.du + more)
+        sums["external_work"] += work + problem.supports.work(k, terms, problem.factor)
+    for elements, part in zip(problem.elements, step.parts, strict=True):
+        for name, value in elements.ledger(part, problem.factor).items():
+            sums[name] += value
+    for coupling, parts in problem.couplings.each(step):
+        for name, value in coupling.smallest(parts).items():
+            smallest[name] = min(smallest[name], value)
+    comm = problem.system.comm
+    total = global_sum(comm, np.array(list(sums.values())))
+    least = np.array(list(smallest.values()))
+    comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+    return {
+        **dict(zip(sums, total.tolist(), strict=True)),
+        **dict(zip(smallest, least.tolist(), strict=True)),
+        "min_det": step.min_det,
+    }
+
+
+def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
+    """External work of an accepted step by the elements of each joint on this rank [J], (joints,).
+
+    Args:
+        problem: Equations of the step.
+        step: Their solution.
+    """
+    work = np.zeros(len(problem.couplings.joints))
+    for k, (coupling, parts) in enumerate(problem.couplings.of_joints(step)):
+        for batch, part in zip(coupling.elements, parts, strict=True):
+            work[k] += batch.ledger(part, problem.factor).get("external_work", 0.0)
+    return work
+
+
+def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch]:
+    """Changes of facet in an accepted step, the same on all ranks. Every rank must call it.
+
+    Args:
+        problem: Equations of the step.
+        step: Its solution.
+        time: End of the step [s].
+    """
+    if not problem.system.contacts:
+        return []
+    found = []
+    for contact, part, old in problem.couplings.touching(step):
+        c = contact.candidates
+        before, gain = old.facet[c.node], contact.gains(part, problem.factor)
+        stayed = (old.force[c.node] > 0.0) & part.active
+        for i in np.flatnonzero(stayed & (before >= 0) & (before != c.facet)):
+            facets = (int(before[i]), int(c.facet[i]))
+            node = contact.input_node(i)
+            found.append(Switch(time, contact.name, node, facets, -float(gain[i])))
+    gathered = problem.system.comm.allgather(found)
+    return sorted((s for part in gathered for s in part), key=lambda s: s[:3])
+
+
+def expelled(problem: StepProblem, step: Evaluation) -> str:
+    """The node that brings most energy in by starting behind its facet. Every rank must call it."""
+    best = (0.0, "")
+    for contact, part, _ in problem.couplings.touching(step):
+        gain = contact.gains(part, problem.factor)
+        if len(gain) and gain.max() > best[0]:
+            i = int(gain.argmax())
+            where = f"node {contact.input_node(i)} of {contact.name!r}"
+            text = f"{gain[i]:.3g} by {where}, deep by {-contact.candidates.gap[i]:.3g}"
+            best = float(gain[i]), text
+    return max(problem.system.comm.allgather(best))[1]
+
+
+def first_row(system: System, state: State) -> dict[str, Any]:
+    """Balance table row of the state a run starts from."""
+    row: dict[str, Any] = dict.fromkeys(columns(system), 0.0)
+    row |= measure(system, state)
+    row |= {"time": state.time, "energy": row["kinetic"] + row["potential"]}
+    local = np.zeros(len(COUNTS))
+    for pair, old in zip(system.contacts, state.contacts, strict=True):
+        on = old.force > 0.0
+        slips = (on & ~old.stick).sum() if pair.friction else 0
+        local += on.sum(), (on & old.stick).sum(), slips
+    row |= dict(zip(COUNTS, system.comm.allreduce(local).tolist(), strict=True))
+    smallest = min((float(c.gap.min(initial=np.inf)) for c in state.contacts), default=np.inf)
+    row["min_gap"] = float(system.comm.allreduce(smallest, op=MPI.MIN))
+    return row | {"min_det": float(smallest_dets(system, state.u).min())}
+
+
+def unknown_row(system: System) -> dict[str, Any]:
+    """Balance table row of a step without a ledger."""
+    row: dict[str, Any] = dict.fromkeys(columns(system), np.nan)
+    return row | dict.fromkeys(("linear_momentum", "angular_momentum"), np.full(3, np.nan))
+
+
+def next_row(
+    first: float, last: Mapping[str, Any], measured: Mapping[str, Any], terms: Mapping[str, float]
+) -> dict[str, Any]:
+    """Row of an accepted step; work, dissipation, defect and ledger residual are cumulative.
+
+    Args:
+        first: Energy that the ledger is opened with [J].
+        last: Row before the step.
+        measured: `measure` of the new state.
+        terms: `step_terms` of the step.
+    """
+    row = {**last, **measured, **terms}
+    losses = [name for name in terms if name not in COLUMNS]
+    for name in (*WORKS, *CHANGES, *losses):
+        row[name] = last[name] + terms.get(name, 0.0)
+    row["energy"] = row["kinetic"] + row["potential"]
+    row["ledger_residual"] = (
+        row["energy"]
+        - first
+        - row["external_work"]
+        - sum(row[name] for name in CHANGES)
+        + row["friction_dissipation"]
+        + row["contact_defect"]
+        + row["massless_defect"]
+        + sum(row[name] for name in losses)
+    )
+    return row

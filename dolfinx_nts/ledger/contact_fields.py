@@ -1,0 +1,157 @@
+"""Results of contacts at the nodes of a body's mesh: forces, pressure, gap, slip, status."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.state import State
+from dolfinx_nts.system import System
+
+if TYPE_CHECKING:
+    from dolfinx_nts.equations.problem import StepProblem
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class ContactLoads(NamedTuple):
+    """Contact forces of a step, as its elements have them.
+
+    Attributes:
+        elements: Those of each contact.
+        parts: Their solution.
+        factor: What the step equations multiply forces by [s^2].
+    """
+
+    elements: tuple[Any, ...]
+    parts: tuple[Any, ...]
+    factor: float
+
+    @classmethod
+    def of_step(cls, problem: StepProblem, step: Evaluation) -> ContactLoads:
+        """Of a solved step; its tangents are not kept."""
+        both = problem.couplings.touching(step)
+        parts = tuple(part._replace(tangent=np.empty(0)) for _, part, _ in both)
+        return cls(tuple(elements for elements, _, _ in both), parts, problem.factor)
+
+    def on(self, k: int) -> list[tuple[Surface, FloatArray]]:
+        """Forces of a contact on the points of its surfaces [N], (p, 3) each. Collective."""
+        contact, found = self.elements[k], []
+        surfaces = (contact.pair.slave, contact.pair.master)
+        # An obstacle has no points.
+        for surface, force in zip(surfaces, contact.nodal_forces(self.parts[k]), strict=False):
+            surface.body.comm.Allreduce(MPI.IN_PLACE, force, op=MPI.SUM)
+            found.append((surface, force / self.factor))
+        return found
+
+
+def labels(system: System) -> list[str]:
+    """Names of the contacts for fields: those of the same name are numbered."""
+    names = [re.sub(r"^\.+|[^\w.-]+", "_", pair.name) for pair in system.contacts]
+    return [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
+
+
+def at_nodes(
+    system: System, state: State, loads: ContactLoads | None, body: Any
+) -> dict[str, FloatArray]:
+    """Contact fields at the nodes of a body's mesh that this rank owns. Collective.
+
+    Args:
+        system: The scene.
+        state: Last accepted state.
+        loads: Contact forces of the step that led there; None before the first one.
+        body: Body with a mesh.
+
+    Returns:
+        By name, see `Solution.contact_fields`, shape (nodes,) or (nodes, 3).
+    """
+    fields: dict[str, FloatArray] = {}
+    for k, (label, pair) in enumerate(zip(labels(system), system.contacts, strict=True)):
+        if not any(b is body for b in pair.bodies):
+            continue
+        load = np.zeros((body.space.dofmap.index_map.size_local, 3))
+        for surface, force in [] if loads is None else loads.on(k):
+            if surface.body is body:
+                np.add.at(load, surface.rows, surface.owned(force))
+        fields[f"contact_load_{label}"] = load
+        if pair.slave.body is body:
+            own = state.contacts[k]
+            first = np.where(own.force > 0.0, own.force, -own.gap)
+            area = system.slave_areas[k][pair.slave.share]
+            for name, (elsewhere, values) in _of_slave(pair, state, k, area).items():
+                fields[f"{name}_{label}"] = spread(pair.slave, elsewhere, values, first)
+    return fields
+
+
+def spread(
+    slave: Surface, elsewhere: float, values: FloatArray, order: FloatArray | None = None
+) -> FloatArray:
+    """Values at this rank's share of a slave's points, at the nodes it owns. Collective.
+
+    Args:
+        slave: The slave.
+        elsewhere: Value at other nodes.
+        values: At the points.
+        order: Of several points at a node, as of beams, that with the largest counts.
+    """
+    owned = slave.body.space.dofmap.index_map.size_local
+    nodal = np.full((owned, *values.shape[1:]), elsewhere)
+    own, rows = slave.at_own(values), slave.rows
+    if order is not None and not slave.material.are_nodes:
+        last = np.argsort(slave.at_own(order), kind="stable")
+        own, rows = own[last], rows[last]
+        first = np.unique(rows[::-1], return_index=True)[1]
+        own, rows = own[::-1][first], rows[::-1][first]
+    nodal[rows] = own
+    return nodal
+
+
+def _of_slave(
+    pair: ContactPair, state: State, k: int, area: FloatArray
+) -> dict[str, tuple[float, FloatArray]]:
+    """Name -> value elsewhere and values at this rank's slave nodes of these areas [m^2]."""
+    own = state.contacts[k]
+    force, gap = own.force, own.gap
+    near = np.isfinite(gap)
+    fields = {
+        "contact_force": (0.0, force),
+        "contact_pressure": (0.0, force / area),
+        "contact_gap": (np.nan, np.where(near, gap, np.nan)),
+        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + own.stick),
+    }
+    if pair.friction:
+        fields["contact_friction"] = (0.0, own.tangential)
+        fields["contact_slip"] = (0.0, own.slip)
+    return fields
+
+
+def functions(body: Any, fields: dict[str, FloatArray]) -> dict[str, Any]:
+    """DOLFINx Functions of nodal fields on the body's mesh, of its degree. Collective.
+
+    Args:
+        body: The body.
+        fields: As of `at_nodes`.
+    """
+    scalars, of_vector = body.space.sub(0).collapse()
+    # Its nodes may have other owners than those of the vectors.
+    first = fem.Function(body.space)
+    found = {}
+    for name, values in fields.items():
+        vector = values.ndim == 2
+        found[name] = function = fem.Function(body.space if vector else scalars)
+        function.name = re.sub(r"\W", "_", name, flags=re.ASCII)
+        carrier, each = (function, 1) if vector else (first, 3)
+        carrier.x.array[: each * values.size : each] = values.ravel()
+        carrier.x.scatter_forward()
+        if not vector:
+            function.x.array[:] = first.x.array[of_vector]
+    return found

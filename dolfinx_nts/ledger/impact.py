@@ -1,0 +1,237 @@
+"""Velocities restored after nodes come into contact (theory section 7; Laursen and Love 2002).
+
+A node that comes into contact within a step is stopped at the surface, and the energy of its
+normal motion is lost. An impulse along the forces that stopped it gives the energy back, or the
+part of it that a coefficient of restitution e leaves. The energy of bodies that touch or are joined
+is a parabola in the multiple of these impulses. Its minimum is a plastic impact; what lies above it
+is scaled by e^2. The impulses on slave and master are opposite and act at one place, so they
+change neither momentum. They act along the normals alone, also where there is friction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.equations.assembly import StepMatrix
+from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.equations.unknowns import Unknowns
+from dolfinx_nts.interaction.constraints import SHIFT
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.state import State
+from dolfinx_nts.validation import StepFailedError
+
+FloatArray = npt.NDArray[np.float64]
+
+#: What `simulate(impact=...)` may be.
+IMPACTS = ("published", "restored")
+#: Solves with constraints, each of which leaves the square root of rounding of what they miss.
+_SOLVES = 3
+
+
+class Impact(NamedTuple):
+    """What restoring did in a step.
+
+    Attributes:
+        state: With the velocities after it.
+        energy: What it gave back [J]; negative where the rebound was too high.
+        impulses: Of each contact on its slave body [N s] and their moments about the origin
+            [N m s], shape (2, contacts, 3).
+    """
+
+    state: State
+    energy: float
+    impulses: FloatArray
+
+
+def restored(
+    problem: StepProblem, step: Evaluation, state: State, restitution: float
+) -> Impact | None:
+    """The state after impulses on the nodes that came into contact in a step. Collective.
+
+    Args:
+        problem: Equations of the step.
+        step: Their solution.
+        state: The state it leads to.
+        restitution: e between 0 and 1.
+
+    Returns:
+        None where no node came into contact.
+    """
+    contacts = _new(problem, step)
+    system, comm = problem.system, problem.system.comm
+    local = np.array([[float(new.push.sum()), new.lost] for new in contacts]).reshape(-1, 2)
+    pushes, lost = comm.allreduce(local).T
+    if not pushes.sum() > 0.0:
+        return None
+    _refuse_moved(problem, step)
+    groups = _groups(problem, pushes > 0.0)
+    forces = _forces(problem, contacts)
+    change = _response(problem, step, forces)
+    # Not the work of the impulses alone: velocities fit the joints in the mean of two steps only.
+    momenta = [b.inertia(dv) for b, dv in zip(system.bodies, change, strict=True)]
+    local = np.array([
+        [float(p @ v), float(p @ dv)] for p, v, dv in zip(momenta, state.v, change, strict=True)
+    ])  # fmt: skip
+    works = comm.allreduce(local)
+    shares, energy = np.zeros(len(groups)), 0.0
+    for group in np.unique(groups):
+        speed, ease = works[groups == group].sum(axis=0)
+        if not ease > 0.0:
+            continue
+        own = [_group(groups, bodies) == group for bodies in system.contact_bodies]
+        plastic = -speed / ease
+        above = max(2.0 * float(lost[own].sum()) / ease + plastic**2, 0.0)
+        share = plastic + restitution * math.sqrt(above)
+        shares[groups == group] = share
+        energy += share * (speed + 0.5 * share * ease)
+    v = tuple(a + share * dv for a, share, dv in zip(state.v, shares, change, strict=True))
+    impulses = np.zeros((2, len(contacts), 3))
+    for k, (new, bodies) in enumerate(zip(contacts, system.contact_bodies, strict=True)):
+        of = _group(groups, bodies)
+        share = float(shares[groups == of].max()) if of >= 0 else 0.0
+        push = share * new.push[:, None] * new.normal
+        impulses[:, k] = push.sum(axis=0), cross(new.place, push).sum(axis=0)
+    comm.Allreduce(MPI.IN_PLACE, impulses, op=MPI.SUM)
+    return Impact(replace(state, v=v), energy, impulses)
+
+
+def _refuse_moved(problem: StepProblem, step: Evaluation) -> None:
+    """Raise where prescribed coordinates move in a step with an impact: their work is unknown."""
+    bodies = problem.system.bodies
+    moved = [terms.du[b.fixed].any() for b, terms in zip(bodies, step.bodies, strict=True)]
+    moves = problem.system.comm.allreduce(np.array(moved, dtype=int))
+    if moves.any():
+        name = bodies[int(np.argmax(moves))].name
+        raise StepFailedError(
+            f"step from t={problem.state.time:.6g}: coordinates of body {name!r} move as "
+            "prescribed in an impact; use impact='published', or supports at rest",
+            advises=True,
+        )
+
+
+def _groups(problem: StepProblem, touched: Sequence[bool]) -> npt.NDArray[np.int_]:
+    """Bodies that new touches or joints link have one number; -1: nothing moves freely."""
+    system = problem.system
+    free = np.array([body.num_owned - body.fixed.size for body in system.bodies])
+    groups = np.where(system.comm.allreduce(free) > 0, np.arange(len(free)), -1)
+    both = zip(system.contact_bodies, touched, strict=True)
+    links = [bodies for bodies, new in both if new] + list(system.joint_bodies)
+    for bodies in links:
+        linked = {int(groups[b]) for b in bodies} - {-1}
+        if linked:
+            groups[np.isin(groups, list(linked))] = min(linked)
+    return groups
+
+
+def _group(groups: npt.NDArray[np.int_], bodies: Sequence[int]) -> int:
+    """Number of the group that a contact belongs to."""
+    return max(int(groups[b]) for b in bodies)
+
+
+class _New(NamedTuple):
+    """Nodes of a contact that came to touch in a step, and zeros for the others.
+
+    Attributes:
+        batch: Elements of the contact.
+        gradient: Of the gaps at t_{n+1} by the nodes' coordinates, shape (n, coordinates).
+        push: Impulse of the step on the slaves along the normal [N s], shape (n,).
+        place: Of the slaves [m], shape (n, 3).
+        normal: Of the surface there, shape (n, 3).
+        lost: Energy that they have lost on this rank [J].
+    """
+
+    batch: Any
+    gradient: FloatArray
+    push: FloatArray
+    place: FloatArray
+    normal: FloatArray
+    lost: float
+
+
+def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
+    """What came to touch in a step, of each contact."""
+    found, rate = [], problem.integrator.rate(problem.dt)
+    for batch, part, old in problem.couplings.touching(step):
+        new = part.active & ~(old.force[batch.candidates.node] > 0.0)
+        force = np.where(new, -part.multiplier[:, 0], 0.0)
+        lost = float(force @ batch.candidates.gap) / problem.factor
+        gradient, normal = batch.gap_slopes(part)
+        place = batch.pair.origin + part.place
+        found.append(_New(batch, gradient, rate * force, place, normal, lost))
+    return found
+
+
+def _forces(problem: StepProblem, contacts: Sequence[_New]) -> list[FloatArray]:
+    """Impulses of all contacts on the owned coordinates of each body [N s]."""
+    pushed = {id(new.batch): new.push[:, None] * new.gradient for new in contacts}
+    parts = []
+    for batch in problem.elements:
+        nothing = np.zeros((batch.num_elements, batch.num_coordinates))
+        parts.append(SimpleNamespace(residual=pushed.get(id(batch), nothing)))
+    assert problem.unknowns is not None
+    force = problem.unknowns.forces(problem.elements, parts)
+    out = []
+    for k, body in enumerate(problem.system.bodies):
+        own = force[problem.of_body(k)] if k in problem.awake else np.zeros(body.num_owned)
+        own[body.fixed] = 0.0
+        out.append(own)
+    return out
+
+
+def _response(
+    problem: StepProblem, step: Evaluation, impulses: Sequence[FloatArray]
+) -> tuple[FloatArray, ...]:
+    """Change of velocities by impulses [m/s], as joints allow it."""
+    system = problem.system
+    chosen: list[tuple[Any, Any, tuple[int, ...]]] = [
+        (batch, part, of)
+        for batch, part, of in zip(
+            problem.elements, step.parts, problem.couplings.bodies, strict=True
+        )
+        if batch.bilateral and batch.widths["constraints"]
+    ]
+    if not chosen:
+        return tuple(solve_mass(b, f) for b, f in zip(system.bodies, impulses, strict=True))
+    masses = [b.tangent(t.u1, 1.0, 0.0) for b, t in zip(system.bodies, step.bodies, strict=True)]
+    elements, bodies = [batch for batch, _, _ in chosen], [of for _, _, of in chosen]
+    sizes = {k: body.num_owned for k, body in enumerate(system.bodies)}
+    laid = Unknowns(system.comm, sizes, elements, bodies)
+    tangents, lent = [], []
+    for batch, part, _ in chosen:
+        stop, width = batch.num_coordinates, batch.widths["constraints"]
+        slope = part.tangent[:, -width:, :stop]
+        tangent = np.zeros_like(part.tangent)
+        tangent[:, -width:, :stop], tangent[:, :stop, -width:] = slope, slope.transpose(0, 2, 1)
+        lend = SHIFT * np.abs(slope).max(axis=2, initial=0.0)
+        tangent[:, range(-width, 0), range(-width, 0)] = -lend
+        tangents.append(tangent)
+        lent.append(lend.ravel())
+    matrix = StepMatrix(laid.layout, masses, laid.blocks)
+    matrix.assemble(tangents)
+    right, rows = np.zeros(laid.layout.num_owned), laid.of_elements("constraints")
+    for k, impulse in enumerate(impulses):
+        right[laid.of_body(k)] = impulse
+    saddle = Saddle(matrix.operator)
+    for _ in range(_SOLVES):
+        solution = saddle.solve(right)
+        right[rows] = -np.concatenate(lent) * solution[rows]
+    out = []
+    for k, body in enumerate(system.bodies):
+        change = solution[laid.of_body(k)].copy()
+        change[body.fixed] = 0.0
+        out.append(change)
+    saddle.destroy()
+    matrix.destroy()
+    laid.destroy()
+    return tuple(out)

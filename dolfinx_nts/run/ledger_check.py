@@ -1,0 +1,192 @@
+"""What a run promises of its energy, held against every accepted step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.ledger import balance
+from dolfinx_nts.parallel import global_max
+from dolfinx_nts.run.solution import Solution
+from dolfinx_nts.solve.accuracy import EXACT
+
+#: What the ledger may miss of the energy, over the tolerance of Newton's method ...
+_PER_TOLERANCE = 10.0
+#: ... and at least, as rounding adds up over the steps.
+_LEAST = 1e-11
+#: Part of the energy whose loss from the ledger makes a result doubtful, with a rule that closes
+#: it and with one that does not.
+_DOUBTFUL, _OPEN = 1e-3, 1e-2
+#: Part of the energy that contact may bring, in a step or in a run, without a warning.
+_GAIN = 0.01
+#: Part of the energy that contact may take over a run without a word.
+_LOSS = 0.1
+_EPS = float(np.finfo(float).eps)
+#: Rounding of a step's energy over that of its forces times its motion.
+_ROUNDING = 10.0
+#: What a run says of an energy without a value.
+NOT_FINITE = (
+    "the energy is not finite: that of a material, a form or a spring may not be defined for its "
+    "deformation"
+)
+
+
+class Promises:
+    """Compares the ledger of a run with what its integrator and its accuracy promise.
+
+    Args:
+        solution: Where warnings go.
+        integrator: Of the run.
+        rtol: Tolerance of Newton's method.
+    """
+
+    def __init__(self, solution: Solution, integrator: Integrator, rtol: float) -> None:
+        self._solution, self._closes = solution, integrator.closes_ledger
+        self._remedy = "use a smaller dt" if rtol <= EXACT else 'pass accuracy="exact"'
+        self._remedy += integrator.ledger_remedy
+        self._open = f"use EnergyMomentum(){integrator.ledger_remedy}"
+        self._promise = max(_PER_TOLERANCE * rtol, _LEAST) if self._closes else _OPEN
+        self._largest, self._whole, self._rounding = 0.0, 0.0, 0.0
+        # Of bodies whose motion is prescribed: which they are, and their kinetic energy at first.
+        self._driven: list[int] | None = None
+        self._first = 0.0
+
+    @property
+    def memory(self) -> tuple[float, float, float, float]:
+        """Largest energies, rounding and energy of driven bodies [J], for a run that goes on."""
+        return self._largest, self._whole, self._rounding, self._first
+
+    def resume(self, memory: Sequence[float]) -> None:
+        """Go on from another run's memory."""
+        self._largest, self._whole, self._rounding, self._first = memory
+
+    def hold(
+        self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
+        row: Mapping[str, Any], impulses: float,
+    ) -> None:  # fmt: skip
+        """Warn if a step's ledger misses too much, or contact brought energy. Collective.
+
+        Args:
+            problem: Equations of the step.
+            step: Their solution.
+            before: Row of the balance table before it.
+            row: Row of the step.
+            impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
+        """
+        energy = self._measure(problem, step, before, row)
+        squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
+        problem.system.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
+        moved = np.sqrt(squares)
+        self._rounding += _ROUNDING * float(problem.rounding.forces @ moved) / problem.factor
+        # Forces do some work even where nothing moves, as gaps are solved to 8 eps of positions:
+        # the 2,450 N at each corner of a box at rest act over 1.7e-15 m.
+        self._rounding += _ROUNDING * _EPS * impulses / problem.dt * problem.rounded_length
+        self._tell_gain(problem, step, before, row, energy)
+        missing = abs(row["ledger_residual"])
+        promise = max(self._promise * self._largest, _LEAST * self._whole)
+        if missing <= promise + self._rounding:
+            return
+        part = self._part(missing)
+        if self._closes:
+            text = (
+                f"the ledger misses {missing:.3g}, {part:.2g} of the largest energy, where this "
+                f"accuracy promises {self._promise:.0e}; {self._remedy}"
+            )
+        else:
+            text = (
+                f"the energy has changed by {missing:.3g}, {part:.2g} of the largest, more than "
+                f"work, friction and contact account for; this integrator does not keep it: "
+                f"{self._open}"
+            )
+        if not np.isfinite(missing):
+            text = NOT_FINITE
+        doubtful = not part <= (_DOUBTFUL if self._closes else _OPEN)
+        self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
+
+    def _measure(
+        self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
+        row: Mapping[str, Any],
+    ) -> float:  # fmt: skip
+        """Note the largest energies; return that at the end of the step [J]. Collective.
+
+        What bodies have whose motion is prescribed counts only for rounding: a heavy plate that
+        drives past would hide what a body on it gains.
+        """
+        names = ("kinetic", "potential", "external_work", "friction_dissipation")
+        sizes = [abs(one[name]) for one in (before, row) for name in names]
+        self._whole, driven = max(self._whole, *sizes), [0.0, 0.0]
+        bodies, comm = problem.system.bodies, problem.system.comm
+        if self._driven is None and problem.integrator.inertia:
+            free = [float(len(body.fixed) < body.num_owned) for body in bodies]
+            self._driven = np.flatnonzero(global_max(comm, np.array(free)) == 0.0).tolist()
+        if self._driven:
+            local = np.zeros(2)
+            for k in self._driven:
+                after, _ = problem.supports.advance(k, step.bodies[k].du)
+                speeds = problem.state.v[k], after
+                local += [0.5 * float(v @ bodies[k].inertia(v)) for v in speeds]
+            driven = comm.allreduce(local).tolist()
+            # The first row is that of the start, unless the run goes on.
+            self._first = self._first if len(self._solution.rows) > 2 else driven[0]
+            sizes = [abs(one[name]) for one in (before, row) for name in names[1::2]]
+            for one, own in zip((before, row), driven, strict=True):
+                work = abs(one["external_work"] - own + self._first)
+                sizes += [one["kinetic"] - own, work]
+        self._largest = max(self._largest, *sizes)
+        return abs(float(row["energy"]) - driven[1])
+
+    def _part(self, energy: float) -> float:
+        """An energy over the largest one."""
+        return energy / self._largest if self._largest else np.inf
+
+    def _tell_gain(
+        self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
+        row: Mapping[str, Any], energy: float,
+    ) -> None:  # fmt: skip
+        """Warn if contact has brought energy, in this step or in all. Collective."""
+        total = row["impact_restored"] - row["contact_defect"]
+        gain = total - before["impact_restored"] + before["contact_defect"]
+        massless = -row["massless_defect"]
+        if massless > _GAIN * self._largest + self._rounding:
+            self._solution.warn(
+                "energy from massless nodes", row["time"], massless,
+                "nodes without mass that leave within steps have brought an energy of "
+                f"{massless:.3g}, {self._part(massless):.2g} of the largest energy; "
+                "use a smaller dt",
+                grave=True,
+            )  # fmt: skip
+        remedy = (
+            "use a finer or smoother master, or a smaller, constant dt; where faces of the master "
+            "meet at an inner edge, declare a contact for each"
+        )
+        if gain > _GAIN * energy + self._rounding:
+            where = balance.expelled(problem, step)
+            text = (
+                f"nodes that start behind their facets bring an energy of {gain:.3g} to "
+                f"{before['energy']:.3g}, most {where}; after changes of facet {remedy}"
+            )
+        elif gain > 0.0 and total > _GAIN * self._largest + self._rounding:
+            gain, text = total, (
+                "nodes that start steps behind their facets have brought an energy of "
+                f"{total:.3g} in all, {self._part(total):.2g} of the largest energy; {remedy}"
+            )
+        else:
+            # What a coefficient of restitution takes is asked for.
+            asked, lost = row["impact_restored"] != 0.0, -total - massless
+            if not asked and lost > _LOSS * self._largest + self._rounding:
+                self._solution.warn(
+                    "energy lost to contact", row["time"], lost,
+                    f"nodes that touch or leave in mid step have taken an energy of {lost:.3g}, "
+                    f"{self._part(lost):.2g} of the largest energy: how bodies rebound may "
+                    "depend on it; compare with a smaller dt (with Adapt a smaller tolerance) "
+                    "and a finer mesh",
+                )  # fmt: skip
+            return
+        self._solution.warn("energy from behind facets", row["time"], gain, text, grave=True)

@@ -1,0 +1,1 @@
+"""How the equations of a step are solved: Newton, linear solvers, convergence, failures."""

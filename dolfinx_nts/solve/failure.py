@@ -1,0 +1,139 @@
+"""What to say of a step that is not solved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation
+from dolfinx_nts.solve.convergence import ratios
+
+
+def diagnosis(
+    problem: StepProblem, e: Evaluation, flips: Sequence[Any], why: str, iterations: int
+) -> str:
+    """One sentence that names the block that failed, and where. Collective.
+
+    Args:
+        problem: The step.
+        e: The last iterate.
+        flips: Of each batch of elements how often its elements changed their status.
+        why: Reason that the solver gives.
+        iterations: Newton iterations.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = ratios(problem, e)
+    ratio = {k: r if np.isfinite(r) else np.inf for k, r in found.items()}
+    worst = max(ratio, key=lambda name: ratio[name])
+    notes = [
+        (c.name, *c.describe(part, flipped))
+        for c, part, flipped in zip(problem.elements, e.parts, flips, strict=True)
+        if c.num_elements
+    ]
+    bodies = list(zip(problem.system.bodies, e.bodies, strict=True))
+    notes += [_body_note(body, terms) for body, terms in bodies if body.num_owned]
+    gathered = [n for part in problem.system.comm.allgather(notes) for n in part]
+    # Of each body and contact the rank with the largest residual speaks, the worst one first.
+    best = {name: text for name, _, text in sorted(gathered, key=lambda n: n[1])}
+    trouble = {
+        name: max((r for k, r in ratio.items() if f"{k} ".startswith(f"{name} ")), default=0.0)
+        for name in best
+    }
+    top = [best[name] for name in sorted(best, key=lambda name: -trouble[name])[:4]]
+    kinds = {
+        "internal": "the energy of its material or form may not be defined for this deformation",
+        "external": "check its loads and its extra_form for NaN",
+    }
+    for kind, hint in kinds.items():
+        endless = [
+            body.name
+            for body, terms in bodies
+            if not problem.system.comm.allreduce(
+                bool(np.isfinite(getattr(terms, kind)).all()), op=MPI.LAND
+            )
+        ]
+        if endless:
+            names = ", ".join(map(repr, endless))
+            why += f"; the {kind} forces of {names} are not finite: {hint}"
+    top += _held_twice(problem, e)
+    finite = ratio[worst] < np.inf
+    size = f"at {ratio[worst]:.3g} times its tolerance" if finite else "is not finite"
+    return (
+        f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
+        f"{iterations} iterations ({why}); worst block {worst!r} {size}; {'; '.join(top)}"
+    )
+
+
+def contact_on(problem: StepProblem, e: Evaluation, flips: Sequence[Any], body: int) -> str:
+    """The contact that may have crushed a body, to be told before its cell, or nothing. Collective.
+
+    Args:
+        problem: The step.
+        e: The last iterate.
+        flips: As of `diagnosis`.
+        body: Number of the body with a cell that is inside out or nearly so.
+    """
+    found = []
+    both = zip(problem.couplings.touching(e), problem.couplings.bodies, flips, strict=False)
+    for (contact, part, _), bodies, changes in both:
+        if body not in bodies or not contact.num_elements:
+            continue
+        # What flips most, else what carries.
+        times = changes.sum(axis=0) + part.active
+        i = int(times.argmax())
+        how = f"flips {changes[:, i].sum()} times" if changes[:, i].any() else "carries"
+        found.append((int(times[i]), f"contact {contact.name!r} {how} at {contact.place(i)}"))
+    most, text = max(f for part in problem.system.comm.allgather([(0, ""), *found]) for f in part)
+    if not most:
+        return ""
+    return (
+        f"{text}, on the body that is named next: look there first, and if these should not "
+        "touch, leave them out of the contact's surfaces; "
+    )
+
+
+def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:
+    """Name, weight and text of where the body's equation is worst solved."""
+    r = np.nan_to_num(np.abs(terms.residual), nan=np.inf)
+    r[body.fixed] = 0.0
+    worst = int(np.argmax(r)) // 3
+    # Directors follow the place of their node.
+    place = int(np.flatnonzero(body.places[: worst + 1])[-1])
+    of = f"of director {worst - place} " if worst > place else ""
+    x = ", ".join(f"{c:.4g}" for c in body.reference.reshape(-1, 3)[place])
+    return body.name, float(r.max()), f"body {body.name!r}: largest residual {of}at X = ({x})"
+
+
+def _held_twice(problem: StepProblem, e: Evaluation) -> list[str]:
+    """Which contacts push nodes that others push, too, or none that could move. Collective."""
+    names, pushed, stuck = [], [], []
+    # A rigid body's directors are pushed by all that touches it.
+    nodal = [not body.oriented for body in problem.system.bodies]
+    for c, bodies, part in zip(problem.elements, problem.couplings.bodies, e.parts, strict=True):
+        if c.bilateral or not c.widths["constraints"] or not all(nodal[k] for k in bodies):
+            continue
+        force = np.abs(part.residual[:, : c.num_coordinates]) > 0.0
+        free = np.concatenate(c.dofs(), axis=1) >= 0
+        points, moved = c.points(), force & free
+        of = [np.full_like(p, k) for k, p in zip(bodies, points, strict=True)]
+        both = (np.concatenate(arrays, axis=1)[moved] for arrays in (of, points))
+        names.append(c.name)
+        pushed.append(set(zip(*(a.tolist() for a in both), strict=True)))
+        stuck.append(bool((force.any(axis=1) & ~moved.any(axis=1)).any()))
+    ranks = problem.system.comm.allgather((pushed, stuck))
+    everywhere = [set().union(*(nodes[k] for nodes, _ in ranks)) for k in range(len(names))]
+    found = [
+        f"{names[i]!r} and {names[j]!r}"
+        for i, j in combinations(range(len(names)), 2)
+        if everywhere[i] & everywhere[j]
+    ]
+    found += [
+        f"{name!r} and a support" for k, name in enumerate(names) if any(s[k] for _, s in ranks)
+    ]
+    return [f"{both} may hold the same nodes" for both in found]

@@ -1,0 +1,171 @@
+"""The iterates of a step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.contact.coulomb import Rub
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.parallel import anywhere, everywhere, global_max, global_sum
+
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+#: Iterations in a row without fewer changes of the active set before one changes at a time.
+_PATIENCE = 4
+#: Changes of an element's status from which on it goes to and fro.
+_TO_AND_FRO = 4
+#: Iterations at most in which nodes hardly rub.
+_SLIDING = 8
+
+
+class Iterates:
+    """Evaluates the iterates of a step and counts how often elements change their status.
+
+    Args:
+        problem: Equations of the step.
+
+    Attributes:
+        last: Evaluation of the last iterate.
+        flips: Of each batch of elements how often each has changed its status.
+        imposed: Whether the last iterate was evaluated with contacts that its laws would change.
+        runs_away: Whether nodes that hardly rub slid so far that friction must be what holds them.
+    """
+
+    def __init__(self, problem: StepProblem) -> None:
+        self._problem, self._sliding = problem, 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all iterates, as a step begins."""
+        self.last: Evaluation | None = None
+        self.flips: list[IntArray] = []
+        self.imposed, self._settled, self._pivots = False, True, False
+        self._fewest, self._patience = np.inf, _PATIENCE
+        self.runs_away = False
+        self._rub_by_law()
+
+    def slide_first(self) -> None:
+        """Let nodes hardly rub until it is settled which ones touch, and slip from there on.
+
+        See `Rub`. What friction alone holds runs away.
+        """
+        self.last, self._sliding = None, _SLIDING
+        self._problem.couplings.contacts.rub(Rub.HARDLY)
+
+    def try_again(self, *, pivots: bool) -> None:
+        """Forget the last iterate, as another attempt at the same step begins.
+
+        Args:
+            pivots: Whether contacts change one at a time in it where changing all at once leads
+                nowhere. On a linear problem without friction this ends (block pivoting with single
+                pivots, Judice and Pires 1994), where the plain active set may cycle. In statics it
+                is the state that cycles, see `LentStiffness`.
+        """
+        self._rub_by_law()
+        self.last, self.imposed, self.runs_away = None, False, False
+        self._pivots = pivots and self._problem.integrator.inertia
+        self._fewest, self._patience = np.inf, _PATIENCE
+
+    def at(self, x: Any) -> Evaluation:
+        """Evaluation at an iterate, reused while SNES asks for the same one. Collective.
+
+        Args:
+            x: PETSc vector of the unknowns.
+        """
+        last = self.last
+        same = last is not None and np.array_equal(last.x, x.array_r)
+        if everywhere(self._problem.system.comm, same):
+            assert last is not None
+            return last
+        # A diverging iterate may overflow; the convergence test sees it.
+        with np.errstate(over="ignore", invalid="ignore"):
+            new = self._problem.evaluate(x)
+        self.imposed = False
+        if last is not None and self._pivots:
+            new = self._pivoted(last, new, x)
+        if self._sliding:
+            new = self._slid(last, new, x)
+        self._settled = not self.imposed
+        if last is None:
+            self.flips = [np.zeros(part.status.shape, dtype=int) for part in new.parts]
+        else:
+            for k, (a, b) in enumerate(zip(last.parts, new.parts, strict=True)):
+                if self.flips[k].size:
+                    changes = a.status != b.status
+                    self.flips[k] += changes
+                    self._settled &= not changes.any()
+        self.last = new
+        return new
+
+    def _slid(self, last: Evaluation | None, new: Evaluation, x: Any) -> Evaluation:
+        """The new iterate of nodes that hardly rub, or slip once it is settled which touch.
+
+        Collective.
+        """
+        contacts, comm = self._problem.couplings.contacts, self._problem.system.comm
+        parts = new.parts[: len(contacts.elements)]
+        far = [
+            (part.distance > c.candidates.length).any()
+            for c, part in zip(contacts.elements, parts, strict=True)
+        ]
+        before = [] if last is None else last.parts[: len(parts)]
+        changes = [(a.active != b.active).any() for a, b in zip(before, parts, strict=False)]
+        # Inertia holds what slides, and what is fast slides far.
+        self.runs_away = anywhere(comm, any(far)) and not self._problem.integrator.inertia
+        left = self._sliding - 1
+        self.imposed = True
+        if (last is not None and not anywhere(comm, any(changes))) or left == 0:
+            contacts.rub(Rub.SLIDES)
+            with np.errstate(over="ignore", invalid="ignore"):
+                new = self._problem.evaluate(x)
+            self._rub_by_law()
+        else:
+            self._sliding = left
+        return new
+
+    def _rub_by_law(self) -> None:
+        if self._sliding:
+            self._sliding = 0
+            self._problem.couplings.contacts.rub(Rub.LAW)
+
+    def _pivoted(self, last: Evaluation, new: Evaluation, x: Any) -> Evaluation:
+        """The new iterate, with one change of the last one's active set if all do not settle.
+
+        Collective.
+        """
+        contacts, comm = self._problem.couplings.contacts, self._problem.system.comm
+        before, after = (
+            [part.active for part in e.parts[: len(contacts.elements)]] for e in (last, new)
+        )
+        changes = [a != b for a, b in zip(before, after, strict=True)]
+        count = float(global_sum(comm, np.array([float(c.sum()) for c in changes])).sum())
+        if count < self._fewest:
+            self._fewest, self._patience = count, _PATIENCE
+        if count <= 1.0 or self._patience > 0:
+            self._patience -= 1
+            return new
+        # The last one of the last batch and rank: an order that is the same in every iteration.
+        own = [k * comm.size + comm.rank for k, c in enumerate(changes) if c.any()]
+        k, rank = divmod(int(global_max(comm, np.array([max(own, default=-1.0)]))[0]), comm.size)
+        if rank == comm.rank:
+            only = np.flatnonzero(changes[k])[-1]
+            before[k] = before[k].copy()
+            before[k][only] = after[k][only]
+        self.imposed = True
+        with contacts.imposed(before), np.errstate(over="ignore", invalid="ignore"):
+            return self._problem.evaluate(x)
+
+    @property
+    def settled(self) -> bool:
+        """Whether no element changed its status in the last iteration. Collective."""
+        return everywhere(self._problem.system.comm, self._settled)
+
+    @property
+    def cycles(self) -> bool:
+        """Whether an element goes to and fro between two states. Collective."""
+        often = any(bool((flips >= _TO_AND_FRO).any()) for flips in self.flips)
+        return anywhere(self._problem.system.comm, often)

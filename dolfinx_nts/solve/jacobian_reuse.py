@@ -1,0 +1,61 @@
+"""Matrices of the bodies, which a run keeps over iterations and steps while that pays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.parallel import anywhere
+
+#: Relative difference of the factors of two equal steps of a caller whose lengths are rounded.
+_EQUAL = 1e-6
+
+
+class KeptTangents:
+    """Assembles the matrices of a step's bodies when they are due, see `Newton.reuse`.
+
+    All runs of a body share its matrix. If another run has changed it, which PETSc counts, this run
+    assembles it again: two runs in turns differ by what reuse leaves, without reuse by nothing.
+
+    Args:
+        problem: Equations of the step.
+        reuse: Tells whether iterations may use matrices of an earlier iterate now.
+
+    Attributes:
+        due: Whether the matrices are to be made anew at the next iterate.
+    """
+
+    def __init__(self, problem: StepProblem, reuse: Callable[[], bool]) -> None:
+        self._problem, self._reuse = problem, reuse
+        self.due, self._factor = True, 0.0
+        self._matrices: dict[int, Any] = {}
+        self._states: dict[int, int] = {}
+
+    def begin(self) -> None:
+        """Begin a step: matrices of another step size are of no use."""
+        factor = self._problem.factor
+        changed = abs(factor / self._factor - 1.0) > _EQUAL if self._factor else True
+        self.due |= changed or not self._reuse()
+        self._factor = factor
+
+    def at(self, e: Evaluation) -> tuple[list[Any], bool]:
+        """Matrices of the bodies that are awake, and whether they are those of an iterate.
+
+        Collective.
+        """
+        awake = self._problem.awake
+        changed = any(a.stateGet() != self._states[k] for k, a in self._matrices.items())
+        fresh = anywhere(self._problem.system.comm, self.due or changed)
+        if fresh:
+            self._matrices = dict(zip(awake, self._problem.body_tangents(e), strict=True))
+            self.due = not self._reuse()
+        for k in awake:
+            if k not in self._matrices:
+                self._matrices[k] = self._problem.body_tangent(k, e.bodies[k].u1)
+        return [self._matrices[k] for k in awake], fresh
+
+    def remember(self) -> None:
+        """Take the matrices as they are for those of this run."""
+        self._states = {k: a.stateGet() for k, a in self._matrices.items()}

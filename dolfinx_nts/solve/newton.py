@@ -1,0 +1,453 @@
+"""PETSc SNES for a step: Jacobian, convergence per block."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.contact.contact_elements import UNSETTLED
+from dolfinx_nts.equations.assembly import StepMatrix
+from dolfinx_nts.equations.least_norm import NullSpace, form_tree
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.solve.accuracy import EXACT, Newton
+from dolfinx_nts.solve.augmented import AugmentedMatrix
+from dolfinx_nts.solve.convergence import leaves_work, ratios
+from dolfinx_nts.solve.failure import contact_on, diagnosis
+from dolfinx_nts.solve.inversion_guard import Upright
+from dolfinx_nts.solve.iterates import Iterates
+from dolfinx_nts.solve.jacobian_reuse import KeptTangents
+from dolfinx_nts.solve.lent_stiffness import LentStiffness
+from dolfinx_nts.solve.linear_solver import keep_bodies, set_schur, take_bodies
+from dolfinx_nts.solve.presets import Presets
+from dolfinx_nts.validation import StepFailedError
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
+
+#: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
+_SLOW = 0.05
+#: A residual that keeps more than this part of itself in an iteration ...
+_STALLED = 0.5
+#: ... and is at most this many tolerances large may be the rounding of forces that have grown since
+#: rounding was measured.
+_NEAR = 1e4
+#: In every so many-th iteration an iterate that is inside out ends the attempt: Newton's method
+#: hardly ever comes back, and most steps never get there.
+_INSIDE_OUT = 8
+#: Iterations before an attempt whose contacts go to and fro ends, where another way is left.
+_CYCLING = 8
+#: Where residuals add up over steps, one above this part of its tolerance gets one more iteration.
+_SURE = 0.05
+#: The part of the tolerance by which work may be left where it has either sign.
+_EITHER_SIGN = 0.02
+
+
+class StepSolver:
+    """SNES for a `StepProblem`; PETSc objects live as long as the layout of the unknowns.
+
+    Args:
+        problem: Equations; `problem.begin` comes before each `solve`.
+        newton: Tolerances.
+        preset: Of the linear solver, to begin with.
+        petsc_options: PETSc options of the SNES without prefix; they override the preset.
+
+    Attributes:
+        iterates: Iterates of the step.
+        matrix: Jacobian as SNES sees it, after `assemble`.
+        snes: The PETSc SNES, after `prepare`.
+    """
+
+    def __init__(
+        self, problem: StepProblem, newton: Newton, preset: str, petsc_options: Mapping[str, Any]
+    ) -> None:
+        self.problem, self.newton = problem, newton
+        self._presets = Presets(
+            problem.system, newton, preset, petsc_options, problem.condense,
+            problem.integrator.inertia,
+        )  # fmt: skip
+        self._tangents = KeptTangents(problem, lambda: self._presets.keeps)
+        self.iterates, self._upright = Iterates(problem), Upright(problem)
+        self._lent, self._wanders = LentStiffness(problem), False
+        self._assembled: Evaluation | None = None
+        self._passed: Evaluation | None = None
+        self._version, self._solved, self._patient = -1, False, True
+        self._raised: StepFailedError | None = None
+        joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
+        self._independent: bool | None = True if form_tree(joints) else None
+        self.matrix: StepMatrix | None = None
+        self._augmented: AugmentedMatrix | None = None
+        self.snes: Any = None
+
+    @property
+    def memory(self) -> tuple[Any, ...]:
+        """What the next step takes from those before it, for a run that goes on.
+
+        Of `Presets`, and whether constraints of joints repeat each other, as the first step found.
+        """
+        return *self._presets.memory, self._independent
+
+    def resume(self, memory: Sequence[Any]) -> None:
+        """Go on from another run's memory, before the first step."""
+        *of_presets, self._independent = memory
+        self._presets.resume(of_presets)
+
+    def forget(self) -> None:
+        """Make all matrices anew in the next step, as a run does that goes on from here."""
+        self._tangents.due = True
+        self._presets.forget()
+
+    def solve(self) -> Evaluation:
+        """Solve the step that `problem.begin` fixed.
+
+        Raises:
+            StepFailedError: Not converged; names the worst block, node, facet and flips.
+            ValueError: PETSc does not know an option or its value.
+        """
+        iterations = 0
+        if self._presets.first_is_due():
+            self.destroy()
+            self._presets.use(0)
+        while True:
+            last = self._attempt()
+            iterations += last.iterations
+            if not self.problem.wake(last):
+                return replace(self._of_least_norm(last), iterations=iterations)
+
+    def _attempt(self) -> Evaluation:
+        """Solve the step with the candidates that have unknowns."""
+        self.prepare()
+        assert self.matrix is not None
+        iterations, unsolved = 0, False
+        couplings, moves = self.problem.couplings, self.problem.integrator.inertia
+        may_slip = couplings.may_slip
+        # Inertia passes on the forces that sticking nodes keep from each other in statics.
+        first = 0 if moves or not may_slip or couplings.contacts.carried_any() else -1
+        # Without friction there is nothing to let slip.
+        for retry in range(first, 3 if may_slip else 2):
+            if first < 0 == retry and not self.iterates.runs_away:
+                continue
+            slides = may_slip and retry == (-1 if first < 0 else 1)
+            self._patient = moves or not may_slip or retry != 0 or first < 0
+            self._begin(retry, slides=slides, again=retry > first, unsolved=unsolved)
+            try:
+                self._raised = None
+                self._presets.options.check(self.snes, self.matrix.operator, self._source.operator)
+                self.snes.solve(None, self.problem.x)
+            except PETSc.Error as error:
+                # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
+                self._tangents.due = True
+                iterations += self.snes.getIterationNumber()
+                self.destroy()
+                if self._raised is not None:
+                    # Newer versions of petsc4py put an error of their own in its place.
+                    raise self._raised from error
+                if (preset := self._presets.alternative()) is not None:
+                    return self._attempt_otherwise(preset, iterations)
+                state = self.problem.state
+                raise StepFailedError(
+                    f"step from t={state.time:.6g} with dt={self.problem.dt:.3g}: PETSc stopped "
+                    f"with error {error.ierr}{self._presets.with_options}; two contacts, or a "
+                    "contact and a support, may hold the same nodes"
+                ) from error
+            self._lent.begin()
+            last = self._passed or self.iterates.at(self.problem.x)
+            iterations += self.snes.getIterationNumber()
+            # A solver of the user's may stop SNES by its own tests; ours decide.
+            solved = last is self._passed or self._worst(last) <= 1.0
+            reason = self.snes.getConvergedReason()
+            if solved and reason > 0:
+                dets = self._upright.smallest(last.x)
+                if self._upright.accepts(dets):
+                    return replace(last, iterations=iterations, min_det=float(dets.min()))
+                reason = PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN
+            unsolved = reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
+            if unsolved and (preset := self._presets.alternative(self.snes)) is not None:
+                return self._attempt_otherwise(preset, iterations)
+        self._tangents.due = True
+        failure = self._failure(last, reason, iterations)
+        if unsolved:
+            self.destroy()
+        raise failure
+
+    def _begin(self, retry: int, *, slides: bool, again: bool, unsolved: bool) -> None:
+        """Begin an attempt at the step; every rank must call it.
+
+        Args:
+            retry: Number of the attempt; -1 comes before 0 where statics with friction begin.
+            slides: Whether nodes slide in it before they rub.
+            again: Whether there was another one before.
+            unsolved: Whether the linear solver failed in that.
+        """
+        self._upright.begin(careful=retry > 0 or self.problem.dives)
+        if again:
+            self._tangents.due, self._passed = True, None
+            if retry == 2:
+                self.problem.couplings.let_slip()
+            if retry == 0:
+                self.problem.first_guess()
+            else:
+                self.problem.couplings.contacts.forget_solution()
+                self.problem.guess(flight=False, forces=False)
+            if unsolved:
+                # What failed to factorise once fails from then on.
+                self.destroy()
+                self.prepare()
+            self.iterates.try_again(pivots=retry > 0)
+        if slides:
+            self.iterates.slide_first()
+
+    def _of_least_norm(self, solved: Evaluation) -> Evaluation:
+        """The solution with multipliers of least norm, where constraints repeat each other."""
+        problem = self.problem
+        if self._independent:
+            return solved
+        bodies = problem.couplings.bodies
+        space = NullSpace(problem.system.comm, problem.elements, bodies, solved.parts)
+        if self._independent is None:
+            self._independent = space.is_empty()
+            if self._independent:
+                return solved
+        here = problem.of_constraints
+        with problem.x as x:
+            x[here] = solved.x[here] - space.part(solved.x[here])
+        e = problem.evaluate(problem.x)
+        # An element of the user's own may have a compliance.
+        return replace(e, min_det=solved.min_det) if self._worst(e) <= 1.0 else solved
+
+    def _attempt_otherwise(self, preset: int, iterations: int) -> Evaluation:
+        """Solve the step anew, after the linear solver failed or took too long.
+
+        Args:
+            preset: Number of what is to solve it, see `Presets.alternative`.
+            iterations: Iterations that were in vain.
+        """
+        self._tangents.due = True
+        self.destroy()
+        before = self._presets.name
+        self._presets.use(preset)
+        if self._presets.name != before:
+            name, time = self._presets.name, self.problem.state.time
+            logger.info("t=%.6g: linear solver %r for the next steps", time, name)
+        self.problem.first_guess()
+        last = self._attempt()
+        return replace(last, iterations=iterations + last.iterations)
+
+    def prepare(self) -> None:
+        """Make SNES and matrices ready for the current step."""
+        self.iterates.restart()
+        self._passed, self._measured, self._before = None, False, np.inf
+        self._lent.begin()
+        self._wanders = False
+        self._tangents.begin()
+        if self._version != self.problem.version:
+            self.destroy()
+            self.assemble(self.iterates.at(self.problem.x))
+            self._configure()
+            self._version = self.problem.version
+
+    def assemble(self, e: Evaluation) -> StepMatrix:
+        """Jacobian at an iterate, as SNES sees it. Every rank must call it.
+
+        The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
+        """
+        bodies, fresh = self._tangents.at(e)
+        new, options = self.matrix is None, self._presets.options
+        if self.matrix is None:
+            self.matrix = StepMatrix(
+                self.problem.laid.layout,
+                bodies,
+                self.problem.laid.blocks,
+                split=options.split,
+                blocked=options.blocked,
+            )
+            if options.augmented:
+                self._augmented = AugmentedMatrix(self.problem, bodies)
+        elif self._solved and self.problem.laid.own and not options.augmented:
+            # Of an augmented matrix contacts that close change the bodies' part.
+            keep_bodies(self.snes, not fresh)
+        if fresh or new or self.problem.laid.blocks:
+            tangents = [part.tangent for part in e.parts] if self.problem.laid.blocks else []
+            self.matrix.assemble(tangents, fresh=fresh)
+            if self._augmented is not None:
+                self._augmented.assemble(tangents, fresh=fresh)
+        self._tangents.remember()
+        if self.snes is not None:
+            self._refresh_schur()
+        self._assembled = e
+        return self.matrix
+
+    @property
+    def _source(self) -> StepMatrix:
+        """What the preconditioner is made of."""
+        assert self.matrix is not None
+        return self.matrix if self._augmented is None else self._augmented.matrix
+
+    def _configure(self) -> None:
+        assert self.matrix is not None
+        compat.free_dropped(self.problem.system.comm)  # what earlier runs left
+        self.snes = PETSc.SNES().create(self.problem.system.comm)
+        self._f = self.problem.x.duplicate()
+        self.snes.setFunction(self._function, self._f)
+        self.snes.setJacobian(self._jacobian, self.matrix.operator, self._source.operator)
+        self.snes.setConvergenceTest(self._converged)
+        self.snes.setLineSearchPreCheck(self._check_update)
+        self.snes.setTolerances(max_it=self.newton.max_iterations)
+        split = self.matrix if self.problem.laid.own else None
+        self._solved = False
+        options = self._presets.options
+        ours = options.by_rank and self.problem.system.comm.size > 1
+        bodies = self.matrix.whole_bodies() if ours else None
+        whole = bodies is not None
+        mixed = self._augmented is not None and self._augmented.mixed
+        options.configure(self.snes, split, len(self.problem.awake), whole=whole, mixed=mixed)
+        self._refresh_schur()
+        if self._augmented is not None and mixed:
+            self._augmented.split_bodies(self.snes, self.matrix.operator)
+        if bodies is not None:
+            take_bodies(self.snes, self.matrix.operator, bodies, split is not None)
+
+    def _refresh_schur(self) -> None:
+        """Give the preset's field split the Schur complement of the matrix as it is now."""
+        if self.problem.laid.own and self._presets.options.schur:
+            assert self.matrix is not None
+            set_schur(self.snes, self.matrix.schur())
+
+    # ---- SNES callbacks
+    def _function(self, _snes: Any, x: Any, f: Any) -> None:
+        try:
+            f.array_w[:] = self.problem.residual(self.iterates.at(x))
+        except StepFailedError as error:
+            self._raised = error
+            raise
+
+    def _jacobian(self, _snes: Any, x: Any, _j: Any, _p: Any) -> None:
+        e = self.iterates.at(x)
+        if e is not self._assembled:
+            if self._lent.at(e, wanders=self._wanders):
+                self._tangents.due = True
+            self.assemble(e)
+
+    def _check_update(self, x: Any, y: Any) -> bool:
+        """Hold prescribed coordinates, which a multigrid moves a little, and shorten updates."""
+        for k in self.problem.awake:
+            y.array_w[self.problem.of_body(k)][self.problem.system.bodies[k].fixed] = 0.0
+        return self._upright.shorten(x, y)
+
+    def _worst(self, e: Evaluation) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            worst = max(ratios(self.problem, e).values())
+        # What contacts satisfy that are held as they are not is no solution.
+        return max(worst, 2.0) if e is self.iterates.last and self.iterates.imposed else worst
+
+    def _converged(self, _snes: Any, iteration: int, norms: tuple[float, float, float]) -> Any:
+        last = self.iterates.last
+        assert last is not None
+        reasons = PETSc.SNES.ConvergedReason
+        worst = self._worst(last)
+        if not np.isfinite(norms[2]) or not np.isfinite(worst):
+            return reasons.DIVERGED_FNORM_NAN
+        unchanged = self.iterates.settled
+        stalls = iteration > 0 and worst > max(1.0, _STALLED * self._before)
+        if stalls and not self._measured:
+            # An active set that still changes stalls by itself, not by rounding.
+            if worst < _NEAR or (unchanged and not self.problem.rounding_is_known):
+                self.problem.measure_rounding(last)
+                self._measured = True
+                worst = self._worst(last)
+        self._solved |= iteration > 0
+        self._tangents.due |= unchanged and worst > max(1.0, _SLOW * self._before)
+        if iteration > 0 and unchanged:
+            self._presets.learn(worst, self._before)
+        self._wanders = iteration > 0 and (not unchanged or worst > self._before)
+        self._before = worst
+        if worst <= 1.0:
+            enough = self._passed is not None or iteration >= self.newton.max_iterations
+            self._passed = last
+            if enough or worst <= _SURE or not self._adds_up(last):
+                return reasons.CONVERGED_FNORM_RELATIVE
+        elif self._passed is not None:
+            # One more iteration left rounding only: what it started from is the solution.
+            return reasons.CONVERGED_FNORM_RELATIVE
+        late = iteration > 0 and iteration % _INSIDE_OUT == 0
+        in_vain = self.iterates.runs_away or self._upright.gives_up
+        # In statics what slides first hardly ever fails.
+        in_vain |= not self._patient and iteration >= _CYCLING and self.iterates.cycles
+        if in_vain or (late and self._is_inside_out(last)):
+            return reasons.DIVERGED_FUNCTION_DOMAIN
+        if iteration >= self.newton.max_iterations:
+            return reasons.DIVERGED_MAX_IT
+        self._presets.aim(self.snes, worst)
+        return reasons.ITERATING
+
+    def _is_inside_out(self, e: Evaluation) -> bool:
+        return not self._upright.accepts(self._upright.smallest(e.x))
+
+    def _adds_up(self, e: Evaluation) -> bool:
+        """Whether what an iteration leaves adds up over steps; every rank must call it.
+
+        Kept matrices leave the same part of a smooth motion in each step, whose work has one sign;
+        where contact acts, the parts differ, and only what is much in one step counts.
+        """
+        problem, rtol = self.problem, self.newton.rtol
+        acts = any(bool(part.status.any()) for part in e.parts)
+        if self._presets.keeps and (rtol <= EXACT or not anywhere(problem.system.comm, acts)):
+            return True
+        # Where nothing has inertia there is no ledger.
+        return problem.integrator.inertia and leaves_work(problem, e, _EITHER_SIGN * rtol)
+
+    # ---- failure
+    def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:
+        """What failed, and where a body is inside out or nearly so; every rank must call it."""
+        problem = self.problem
+        if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
+            worst, text = self._upright.describe_inverted(e.x)
+            text = contact_on(problem, e, self.iterates.flips, worst) + text
+            return StepFailedError(
+                f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
+                f"{iterations} iterations: {text}",
+                advises=True,
+            )
+        why, advises = self._presets.why_failed(self.snes, reason)
+        message = diagnosis(problem, e, self.iterates.flips, why, iterations)
+        return self.with_flat(message, e, advises=advises or UNSETTLED in message)
+
+    def with_flat(self, message: str, e: Evaluation, *, advises: bool = False) -> StepFailedError:
+        """A failure that also names the cell that is nearly inside out, if one is. Collective.
+
+        Args:
+            message: What failed.
+            e: Where.
+            advises: Whether that tells what to do.
+        """
+        flat = self._upright.describe_flat(e.x)
+        if flat:
+            worst, text, sure = flat
+            text = contact_on(self.problem, e, self.iterates.flips, worst) + text
+            return StepFailedError(f"{message}; {text}", advises=advises or sure)
+        return StepFailedError(message, advises=advises)
+
+    def destroy(self) -> None:
+        """Free the PETSc objects, which Python's collector does not."""
+        self._presets.options.remove()
+        if self.matrix is not None:
+            self.matrix.destroy()
+            self.matrix = None
+        if self._augmented is not None:
+            self._augmented.destroy()
+            self._augmented = None
+        if self.snes is not None:
+            self.snes.destroy()
+            self._f.destroy()
+            self.snes = None
+        self._version = -1

@@ -1,0 +1,1 @@
+"""What a run or an equilibrium begins with: consistent velocities, first contact forces."""

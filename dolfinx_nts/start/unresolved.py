@@ -1,0 +1,218 @@
+"""Springs and dampers too fast for the steps of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.interaction.coupling import Slopes
+from dolfinx_nts.interaction.kinematics import has_constraints
+from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.start import consistent
+from dolfinx_nts.state import State
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Largest omega h that counts as resolved: its phase comes out short by 7 %.
+_PHASE = 1.0
+#: Largest c h/m: a velocity that decays faster changes its sign in each step.
+_DECAY = 2.0
+#: Rates that turn round in each step: the smallest of three over the largest. What is pulled from
+#: rest by a stiff damper has every second one near zero, with right places.
+_TURNS = 0.1
+#: Ways in a step over the size of what moves that are more than rounding.
+_NOISE = 1e-10
+
+
+class _Fast(NamedTuple):
+    """A spring that may be too fast.
+
+    Attributes:
+        limit: Largest of what it can be times the step, over what counts as resolved.
+        joint: The spring.
+        gradient: Of its coordinate, by the owned coordinates of each body of the system.
+        slopes: Of its force.
+    """
+
+    limit: float
+    joint: Any
+    gradient: list[FloatArray]
+    slopes: Slopes
+
+
+def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[float, str] | None:
+    """The spring that is too fast by most for a step, if there is any. Collective.
+
+    It is judged alone, by its `slopes` at the start and by the mass that it moves along its
+    coordinate in bodies and joints. On flexible bodies, also behind joints, none is: the mass that
+    moves depends on how fast it moves.
+
+    Args:
+        problem: Equations of the run.
+        state: At the start.
+        dt: First step [s].
+
+    Returns:
+        How many times it is too fast, and a sentence with a remedy.
+    """
+    each = zip(problem.system.joints, problem.system.joint_bodies, state.joints, strict=True)
+    slopes = [joint.slopes([state.u[k] for k in of], history) for joint, of, history in each]
+    if not any(slopes):
+        return None
+    still = tuple(np.zeros_like(v) for v in state.v)
+    problem.begin(replace(state, a=state.a or still), dt)
+    worst, text = 1.0, ""
+    for fast in sorted(_suspects(problem, slopes, dt), key=lambda f: f.limit, reverse=True):
+        # Joints hold bodies, so that the mass is at least that of the limit.
+        if fast.limit <= worst:
+            break
+        mobility = consistent.mobility(problem, state, fast.gradient, dt)
+        size = _sizes(fast.slopes, mobility, dt)[0]
+        if size > worst:
+            worst, text = size, _of_spring(fast, mobility, size, dt)
+    return (worst, text) if text else None
+
+
+def _suspects(
+    problem: StepProblem, of_joints: Iterable[Slopes | None], dt: float
+) -> list[_Fast]:
+    """Springs that would be too fast if no constraint held the bodies. Collective."""
+    found, system = [], problem.system
+    for joint, bodies, slopes in zip(
+        system.joints, system.joint_bodies, of_joints, strict=True
+    ):
+        if slopes is None or not all(system.bodies[k].rigid for k in _joined(problem, bodies)):
+            continue
+        gradient = [np.zeros(body.num_owned) for body in system.bodies]
+        mobility = 0.0
+        for k, g in zip(bodies, slopes.gradients, strict=True):
+            gradient[k] = g
+            free = np.flatnonzero(g)
+            with np.errstate(divide="ignore"):
+                mobility += float((g[free] ** 2 / system.bodies[k].nodal_mass[free]).sum())
+        limit = _sizes(slopes, system.comm.allreduce(mobility), dt)[0]
+        found.append(_Fast(limit, joint, gradient, slopes))
+    return found
+
+
+def _joined(problem: StepProblem, bodies: Iterable[int]) -> set[int]:
+    """Bodies that constraints of joints hold to some bodies, with these; after `begin`."""
+    held = [
+        set(of)
+        for coupling in problem.couplings.joints
+        for batch, of in zip(coupling.elements, coupling.bodies, strict=True)
+        if has_constraints(batch)
+    ]
+    reached, more = set(bodies), set(bodies)
+    while more:
+        more = set().union(*(of for of in held if of & reached)) - reached
+        reached |= more
+    return reached
+
+
+def _sizes(slopes: Slopes, mobility: float, dt: float) -> tuple[float, float]:
+    """How many times a spring and a damper are too fast for a step."""
+    stiffness, damping = slopes.stiffness, slopes.damping
+    # A mobility without mass is infinite, and nothing times that no number.
+    phase = float(np.sqrt(stiffness * mobility)) * dt if stiffness > 0.0 else 0.0
+    decay = damping * mobility * dt if damping > 0.0 else 0.0
+    return phase / _PHASE, decay / _DECAY
+
+
+def _of_spring(fast: _Fast, mobility: float, size: float, dt: float) -> str:
+    return (
+        f"spring {fast.joint.name!r} of stiffness {fast.slopes.stiffness:.3g} on "
+        f"{_mass(fast.slopes, mobility)} is not resolved, omega h = {_PHASE * size:.3g}: where it "
+        "vibrates, it does so too slowly, though energy may be kept; use a dt below "
+        f"{dt / size:.2g} if that matters"
+    )
+
+
+def _mass(slopes: Slopes, mobility: float) -> str:
+    return f"{'an inertia' if slopes.about else 'a mass'} of {1.0 / mobility:.3g}"
+
+
+class DamperWatch:
+    """Looks for dampers that turn a velocity round in each step, where it should be gone.
+
+    What they hold back from rest, or only slowly drag along, has the right places and forces
+    however stiff they are, so that only what happens tells.
+
+    Args:
+        problem: Equations of the run.
+    """
+
+    def __init__(self, problem: StepProblem) -> None:
+        self._problem = problem
+        self._rates: dict[int, list[float]] | None = None
+
+    def look(self, state: State) -> tuple[float, str] | None:
+        """Look at a solved step, before the next one begins. Collective.
+
+        Args:
+            state: At its end.
+
+        Returns:
+            As of `tell_unresolved`.
+        """
+        problem, found = self._problem, None
+        if not problem.integrator.inertia:
+            return None
+        if self._rates is None:
+            self._rates = self._begin()
+        for k, rates in self._rates.items():
+            slopes, rate, size = self._motion(k, state)
+            rates[:] = [*rates[-2:], rate]
+            if not (_alternate(rates) and max(map(abs, rates)) * problem.dt > _NOISE * size):
+                continue
+            gradient = [np.zeros(body.num_owned) for body in problem.system.bodies]
+            for body, g in zip(problem.system.joint_bodies[k], slopes.gradients, strict=True):
+                gradient[body] = g
+            mobility = consistent.mobility(problem, state, gradient, problem.dt)
+            decay = _sizes(slopes, mobility, problem.dt)[1]
+            if decay > (found[0] if found else 1.0):
+                name = problem.system.joints[k].name
+                found = decay, (
+                    f"damper {name!r} of {slopes.damping:.3g} on {_mass(slopes, mobility)} is not "
+                    f"resolved, c h/m = {_DECAY * decay:.3g}: the velocity changes its sign in "
+                    f"each step where it should be gone; use a dt below {problem.dt / decay:.2g}"
+                )
+        return found
+
+    def _begin(self) -> dict[int, list[float]]:
+        """Rates at t_n of the dampers between rigid bodies, by their numbers. Collective."""
+        problem, rates = self._problem, {}
+        system, state = problem.system, problem.state
+        for k, (joint, of) in enumerate(zip(system.joints, system.joint_bodies, strict=True)):
+            slopes = joint.slopes([state.u[b] for b in of], state.joints[k])
+            if slopes is None or not slopes.damping > 0.0:
+                continue
+            if all(system.bodies[b].rigid for b in _joined(problem, of)):
+                rates[k] = [self._motion(k, state)[1]]
+        return rates
+
+    def _motion(self, k: int, state: State) -> tuple[Slopes, float, float]:
+        """Slopes of a damper, the rate of its coordinate, and what that may be at most."""
+        system = self._problem.system
+        of = system.joint_bodies[k]
+        slopes = system.joints[k].slopes([state.u[b] for b in of], state.joints[k])
+        local = np.zeros(2)
+        for b, g in zip(of, slopes.gradients, strict=True):
+            place = np.abs(system.bodies[b].reference + state.u[b]).max(initial=0.0)
+            local += [g @ state.v[b], np.abs(g).sum() * place]
+        rate, size = global_sum(system.comm, local).tolist()
+        return slopes, rate, size
+
+
+def _alternate(rates: list[float]) -> bool:
+    """Whether three rates in a row have turned round twice, each as large as the others."""
+    if len(rates) < 3:
+        return False
+    a, b, c = rates
+    sizes = [abs(r) for r in rates]
+    return a * b < 0.0 and b * c < 0.0 and min(sizes) > _TURNS * max(sizes)
