@@ -53,6 +53,18 @@ def test_a_whole_mesh_on_every_rank_is_refused(kind, copied):
         compat.create_mesh(COMM, cells, PLACES, kind)
 
 
+@SEVERAL
+@pytest.mark.mpi
+@pytest.mark.parametrize("kind", CELLS)
+def test_a_whole_mesh_on_every_rank_is_refused_in_a_mesh_of_dolfinx(kind, monkeypatch):
+    """DOLFINx's own create_mesh takes it, with copies of all points, and twice the mass."""
+    monkeypatch.setattr(compat, "_refuse_whole", lambda *_: None)
+    copied = CELLS[kind] + COMM.rank * len(PLACES)
+    for make in bodies(compat.create_mesh(COMM, copied, PLACES, kind)):
+        with pytest.raises(ValueError, match=f"^mesh of 'body': 2 cells are there {COMM.size}"):
+            make()
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", CELLS)
 def test_each_cell_given_once_is_no_matter(kind):

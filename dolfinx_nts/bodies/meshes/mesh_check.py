@@ -86,8 +86,9 @@ def check_any_mesh(mesh: Any, name: str, degree: int = 1) -> None:
 def refuse_repeated(mesh: Any, name: str) -> None:
     """Raise on every rank if cells are there twice, as where each rank gives the whole mesh.
 
-    In 3D cells are the same that have the same places; surfaces and lines may lie on each other,
-    and are the same if they have the same nodes.
+    Cells are the same that have the same places. Surfaces and lines may lie on each other, so that
+    theirs are the same if they have the same nodes, or if all of them lie on others on several
+    ranks.
 
     Args:
         mesh: DOLFINx mesh.
@@ -98,15 +99,16 @@ def refuse_repeated(mesh: Any, name: str) -> None:
     """
     dim = mesh.topology.dim
     cells = compat.geometry_dofmap(mesh)[: mesh.topology.index_map(dim).size_local]
-    if dim == 3:
-        # As bits, as lattices put many a sum of coordinates twice; 0.0 takes signs of zeros away.
-        x = _hashed((mesh.geometry.x + 0.0).view(np.uint64))
-        of_node = _hashed(x[:, 0] + _hashed(x[:, 1] + _hashed(x[:, 2])))
-    else:
-        of_node = _hashed(np.asarray(mesh.geometry.input_global_indices, dtype=np.uint64))
+    # As bits, as lattices put many a sum of coordinates twice; 0.0 takes signs of zeros away.
+    x = _hashed((mesh.geometry.x + 0.0).view(np.uint64))
+    places = _hashed(x[:, 0] + _hashed(x[:, 1] + _hashed(x[:, 2])))
     # Whatever their order.
-    of_cell = of_node[cells].sum(axis=1)
+    of_cell = places[cells].sum(axis=1)
     found, count = np.unique(gather_rows(mesh.comm, of_cell), return_counts=True)
+    if dim < 3 and (mesh.comm.size == 1 or (count == 1).any()):
+        nodes = _hashed(np.asarray(mesh.geometry.input_global_indices, dtype=np.uint64))
+        of_cell = nodes[cells].sum(axis=1)
+        found, count = np.unique(gather_rows(mesh.comm, of_cell), return_counts=True)
     if (count == 1).all():
         return
     twice = np.flatnonzero(np.isin(of_cell, found[count > 1]))
