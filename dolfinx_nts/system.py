@@ -26,6 +26,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Part of a body's coordinates by which a start may differ from prescribed displacements.
 _ON_SUPPORT = 1e-9
+#: Overlap over the sag of facets up to which these alone may be its cause.
+_SAGS = 1.1
 
 
 def is_like(one: Joint, other: Joint) -> bool:
@@ -390,11 +392,24 @@ def _refuse_deep(pair: ContactPair, depth: FloatArray, limit: float, remedy: str
     """Raise a ValueError if a contact's slaves (points,) are deeper inside than a limit."""
     deep = depth > limit
     if deep.any():
+        remedy = cut_off(pair, depth) or remedy
         raise ValueError(
             f"contact {pair.name!r}: {deep.sum()} slave nodes start inside the master, up to "
             f"{depth.max():.3g} of a facet (allowed {limit}), nodes "
             f"{np.sort(pair.slave.original[deep])[:10].tolist()}; {remedy}"
         )
+
+
+def cut_off(pair: ContactPair, depth: FloatArray) -> str:
+    """What to say of slaves (points,) no deeper than flat facets cut off a curve, or nothing."""
+    if not 0.0 < depth.max(initial=0.0) <= _SAGS * pair.sag:
+        return ""
+    name = pair.master.body.name
+    return (
+        f"that is no more than the flat facets of {name!r} cut off its curved surface: pass "
+        "smoothing=True to its surface, or take a finer mesh; interference=\"resolve\" would "
+        "press the bodies as if they overlapped by that much"
+    )
 
 
 def _missing(body: Body, names: Sequence[str]) -> str:

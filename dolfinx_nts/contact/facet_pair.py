@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,21 @@ class FacetPair(ContactPair, master=Surface):
         self._joined = patches.neighbours(master.facets, corners)
         self._beside = patches.neighbours(master.facets, corners, sharp=-np.inf)
         self._sharp = ((self._beside >= 0) & (self._joined < 0)).any(axis=1)
+
+    @cached_property
+    def sag(self) -> float:
+        """As of `ContactPair`: s^2/(8 r) of facets that turn by s/r from one to the next."""
+        if self.master.weights is not None or not len(self.master.facets):
+            return 0.0
+        corners = self.master.reference[self.master.facets]
+        middle = np.full((len(corners), 2), 1.0 / 3.0 if corners.shape[1] == 3 else 0.0)
+        place, _, normal = facets.frame(corners, middle)
+        one, edge = np.nonzero(self._joined >= 0)
+        two = self._joined[one, edge] // corners.shape[1]
+        cosine = np.einsum("ni,ni->n", normal[one], normal[two])
+        way = np.linalg.norm(place[one] - place[two], axis=1) / facets.size(corners)[one]
+        sags: FloatArray = way * np.arccos(np.clip(cosine, -1.0, 1.0)) / 8.0
+        return float(sags.max(initial=0.0))
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:

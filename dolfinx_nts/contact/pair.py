@@ -196,6 +196,11 @@ class ContactPair:
         """Check the master and prepare the search."""
 
     @property
+    def sag(self) -> float:
+        """How deep the master's flat facets cut into a curved surface, in facet sizes."""
+        return 0.0
+
+    @property
     def driven(self) -> bool:
         """Whether its master moves as prescribed by a function of time, apart from bodies."""
         return False

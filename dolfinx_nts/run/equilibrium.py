@@ -31,7 +31,7 @@ from dolfinx_nts.solve.convergence import unrest
 from dolfinx_nts.solve.instability import releasing_motions
 from dolfinx_nts.start.free_motion import free_motion
 from dolfinx_nts.state import State
-from dolfinx_nts.system import System
+from dolfinx_nts.system import System, cut_off
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -128,6 +128,7 @@ class _LoadStepper(Stepper):
         self._call_before(dt)
         self._materials.changed()
         self._ledger.open(self.state, self._start)
+        self._tell_cut_off()
         self._started = True
 
     def _step(self, dt: float, time: float) -> None:
@@ -269,6 +270,20 @@ class _LoadStepper(Stepper):
         both = zip(self.system.contacts, self.state.contacts, strict=True)
         slip = any(p.friction and bool(((c.force > 0.0) & ~c.stick).any()) for p, c in both)
         return anywhere(self.system.comm, slip)
+
+    def _tell_cut_off(self) -> None:
+        """Warn if an overlap that is to be resolved may be that of flat facets alone."""
+        contacts = self.system.contacts
+        if all(pair.interference != "resolve" for pair in contacts):
+            return
+        for pair, depth in zip(contacts, self.system.penetration(self.state), strict=True):
+            if pair.interference == "resolve" and (text := cut_off(pair, depth)):
+                deep = float(depth.max())
+                self.solution.warn(
+                    "flat facets", self.state.time, deep,
+                    f"contact {pair.name!r}: nodes start up to {deep:.3g} of a facet inside; {text}",
+                    about=(pair.name,),
+                )  # fmt: skip
 
     def _tell_part_of_loads(self) -> None:
         """Warn if the load steps were asked to end before all of the constant loads act."""
