@@ -15,7 +15,7 @@ WAYS = ("published", "velocity, e = 0", "velocity, e = 1", "averaged", "massless
 
 
 def bar(elements, massless):
-    """Mass and stiffness; a massless first node hands its mass on, as in `bodies/solid/massless.py`."""
+    """Mass and stiffness; a massless first node hands its mass on, see `bodies/solid/massless`."""
     dx, n = LENGTH / elements, elements + 1
     mass, stiffness = np.zeros((n, n)), np.zeros((n, n))
     for e in range(elements):

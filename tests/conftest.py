@@ -8,6 +8,7 @@ Under mpirun every rank runs the same tests. After each test the ranks exchange 
   rank waits `PATIENCE` seconds, prints what it knows and aborts the whole run.
 """
 
+import datetime
 import gc
 import io
 import os
@@ -37,8 +38,10 @@ if threading.current_thread() is not threading.main_thread():
     # which sets a handler of signals, cannot be imported there.
     signal.signal = lambda number, _handler: signal.getsignal(number)
 #: On several ranks so many cases of a fast test and of a slow one run at most, spread over its
-#: parameters. All of them run in serial, and what ranks do seldom depends on the case.
+#: parameters, and others in the next week. All of them run in serial, and what ranks do seldom
+#: depends on the case.
 CASES_ON_RANKS = 3, 1
+WEEK = datetime.date.today().isocalendar().week
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
 
@@ -78,9 +81,10 @@ def pytest_addoption(parser):
 
 
 def pytest_report_header(config):
+    lines = [f"cases on ranks: those of week {WEEK}"] if COMM.size > 1 else []
     if kind := config.option.noise:
-        return f"noise: {kind}, seed {config.option.noise_seed}"
-    return None
+        lines.append(f"noise: {kind}, seed {config.option.noise_seed}")
+    return lines
 
 
 @pytest.hookimpl(trylast=True)
@@ -155,7 +159,8 @@ def _drop_cases(config, items) -> None:
         cases.setdefault((item.nodeid.split("[")[0], slow), []).append(item)
     dropped = set()
     for (_, slow), of_test in cases.items():
-        kept = of_test[:: -(-len(of_test) // CASES_ON_RANKS[slow])]
+        apart = -(-len(of_test) // CASES_ON_RANKS[slow])
+        kept = of_test[WEEK % apart :: apart]
         dropped.update(item for item in of_test if item not in kept)
     items[:] = [item for item in items if item not in dropped]
     config.hook.pytest_deselected(items=list(dropped))

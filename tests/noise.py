@@ -17,6 +17,7 @@ import zlib
 import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.parallel import global_max
 
 KINDS = ("residual", "forces", "both")
 _EPS = float(np.finfo(float).eps)
@@ -37,7 +38,7 @@ def install(kind: str, seed: int, change=setattr) -> None:
 
     def noisy_forces(self, k, u1):
         u1, du, internal, external, total = without_elements(self, k, u1)
-        top = float(np.abs(internal).max(initial=0.0))
+        top = global_max(self.system.comm, np.array([np.abs(internal).max(initial=0.0)]))[0]
         noise = _EPS * top * _uniform(seed, internal)
         return u1, du, internal + noise, external, total + noise
 

@@ -271,7 +271,7 @@ class ContactElements(ContactLaws):
         gaps = self.rows(part, "constraints") / self.scale[:, None]
         arrays = (self.rows(part, "augmented"), gaps, part.multiplier, self.scale)
         found = [float(np.abs(a).max(initial=0.0)) for a in arrays]
-        # Rows of gaps that repeat each other miss what no motion closes, see `equations.shared_weight`.
+        # Rows of gaps that repeat each other miss what no motion closes, see `shared_weight`.
         found[1] = max(found[1], float(np.abs(part.gap[part.active]).max(initial=0.0)))
         return found
 

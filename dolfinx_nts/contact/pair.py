@@ -113,8 +113,8 @@ class ContactPair:
             in a hundred of a facet. "refuse" them, or "resolve" it, as for a press fit: the load
             steps of `equilibrium` press nodes out that start up to half a facet deep, in proportion
             to the pseudo time, until none is left at 1; the work of that is `interference_work` in
-            the balance. `simulate` starts from its result. Any overlap that a start has is resolved
-            so in equilibrium, also what "refuse" lets pass.
+            the balance. `simulate` starts from its result. Equilibrium presses out any overlap in
+            this way, also the small one that "refuse" allows.
 
     Attributes:
         origin: Point of space that positions are relative to [m], shape (3,).
@@ -313,7 +313,7 @@ class ContactPair:
         reach: float,
         held: IntArray,
     ) -> IntArray | None:
-        """Facet that each slave of the rank ends at by another way than its own, or -1. Collective.
+        """For each slave of the rank the facet that should hold it, not its own, or -1. Collective.
 
         It has come through it unseen, or is held in the plane of another one, beside the body.
 

@@ -281,7 +281,8 @@ class _LoadStepper(Stepper):
                 deep = float(depth.max())
                 self.solution.warn(
                     "flat facets", self.state.time, deep,
-                    f"contact {pair.name!r}: nodes start up to {deep:.3g} of a facet inside; {text}",
+                    f"contact {pair.name!r}: nodes start inside by up to {deep:.3g} of a facet; "
+                    + text,
                     about=(pair.name,),
                 )  # fmt: skip
 

@@ -136,7 +136,7 @@ class Record:
             lines.append(
                 f"energy {first['energy']:.6g} + external work {last['external_work']:.6g} - "
                 f"friction {last['friction_dissipation']:.6g} - contact "
-                f"{last['contact_defect']:.6g} {more} = {last['energy']:.6g}, "
+                f"{last['contact_defect']:.6g}{more} = {last['energy']:.6g}, "
                 f"but for {last['ledger_residual']:.2g}"
             )
         if self.exceeded:

@@ -93,8 +93,8 @@ def contact_on(problem: StepProblem, e: Evaluation, flips: Sequence[Any], body: 
     if not most:
         return ""
     return (
-        f"{text}, on the body that is named next: look there first, and if these should not "
-        "touch, leave them out of the contact's surfaces; "
+        f"{text} and may have crushed the body that is named next: look there first; if these "
+        "should not touch, leave them out of the contact's surfaces; "
     )
 
 

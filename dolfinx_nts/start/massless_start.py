@@ -119,10 +119,10 @@ def thick_layer(system: System) -> tuple[float, str]:
         if thickness * speeds > worst:
             worst = thickness * speeds
             text = (
-                f"{body.name!r} has nodes without mass and friction, contact {name!r}, and "
-                f"{1.0 / thickness:.2g} of their cells from side to side; its pressure waves are "
-                f"{speeds:.2g} times as fast as its shear waves, for which an impact takes "
-                f"{speeds / _SLOW:.2g} cells. With fewer, friction turns the body too little, and "
-                "too much with mass='consistent': compare both, or take thinner cells there"
+                f"{body.name!r} is {1.0 / thickness:.2g} cells thick behind contact {name!r}, "
+                "whose nodes have no mass; friction in an impact needs about "
+                f"{speeds / _SLOW:.2g}, as its pressure waves are {speeds:.2g} times as fast as "
+                "its shear waves. The rebound turns too little, and too much with "
+                "mass='consistent': use thinner cells there, or compare both"
             )
     return worst, text
