@@ -246,7 +246,7 @@ def corner(y):
 def test_a_solid_buckles_however_slender(slender):
     """Of degree 2, which does not lock."""
     side = 1.0 / slender
-    for part, expected in ((0.97, 0), (1.02, 2)):
+    for part, expected in ((0.98, 0), (1.02, 2)):
         push = nts.Traction(at(0, 1.0), (-part * euler(side) / side**2, 0, 0))
         body = nts.Continuum(
             box([0, 0, 0], [1, side, side], (20, 1, 1)), nts.NeoHookean(STEEL, 0.0), degree=2,
@@ -265,6 +265,6 @@ def test_a_cantilever_strip_buckles_sideways(high):
     torsion = nts.Rectangle(thin, high).section(young=STEEL, poisson=0.3, density=1.0).GJ
     assert torsion == pytest.approx(4.0 * shear * inertia, rel=0.06)  # (1 - 0.63/12)
     prandtl = 4.013 * np.sqrt(STEEL * inertia * torsion)
-    for part, expected in ((0.97, 0), (1.03, 1)):
+    for part, expected in ((0.98, 0), (1.02, 1)):
         run = beam((thin, high), (0, 0, -part * prandtl), n=32)
         assert told(run) == expected, part

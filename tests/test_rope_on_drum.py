@@ -79,8 +79,8 @@ def test_tension_in_equilibrium(n, mu, shape):
     assert run.status == "completed" and run.retries == 0
     held = np.linalg.norm(run.reactions["rope"][1:, 0], axis=1)
     np.testing.assert_allclose(held, tension(n, mu) * PULL * np.arange(1, 5) / 4, rtol=5e-3)
-    # All nodes slip towards the load.
-    assert run.balance["slip"][-1] >= n - 1 and run.balance["stick"][-1] == 0
+    # Without `stabilization`; of 25 that a load step may take.
+    assert run.balance["newton_iterations"].max() < 20
 
 
 @pytest.mark.slow
