@@ -1,0 +1,219 @@
+"""Scenes of all bodies, couplings and laws, small and short, each seen in any frame.
+
+A new body, coupling or law needs a scene here: what holds for all is then held for it.
+"""
+
+import numpy as np
+from scenes import green, saint_venant
+
+import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
+
+RUBBER = {"young": 1e5, "poisson": 0.3}
+DENSITY = 1e3
+
+
+def _solid(frame, kind, low, high, cells, name, material=nts.NeoHookean, **options):
+    law = material(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+    mesh = frame.grid(kind, low, high, cells)
+    return nts.Continuum(mesh, law, density=DENSITY, name=name, **options)
+
+
+def _rigid(frame, low, high, name, spin=(0, 0, 0), velocity=(0, 0, 0), cells=(2, 2, 2)):
+    return nts.RigidBody(
+        frame.grid("hexahedron", low, high, cells), density=DENSITY, name=name,
+        velocity=frame.place(velocity), angular_velocity=frame.axis(*spin),
+    )  # fmt: skip
+
+
+def _face(frame, body, axis, value):
+    return body.surface(frame.where(lambda x: np.abs(x[:, axis] - value) < 1e-6))
+
+
+def _plane(frame, height=0.0):
+    return nts.Plane(frame.place(0, 0, height), frame.axis(0, 0, 1))
+
+
+def _gravity(frame):
+    return frame.place(0, 0, -9.81)
+
+
+def two_blocks(frame):
+    """Hexahedra on tetrahedra, that meet with friction."""
+    lower = _solid(frame, "tetrahedron", (0, 0, 0), (1, 1, 0.6), (2, 2, 1), "lower")
+    upper = _solid(
+        frame, "hexahedron", (0.21, 0.17, 0.602), (0.83, 0.77, 1.2), (2, 2, 2), "upper",
+        velocity=frame.place(0.4, 0.1, -0.9),
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        _face(frame, upper, 2, 0.602), _face(frame, lower, 2, 0.6), friction=0.3
+    )
+    return nts.System([lower, upper], contacts=[pair])
+
+
+def block_on_a_plane(frame):
+    """St. Venant-Kirchhoff's law; slides and settles."""
+    block = _solid(
+        frame, "hexahedron", (0, 0, 0), (1, 0.5, 0.4), (3, 2, 2), "block",
+        nts.StVenantKirchhoff, velocity=frame.place(1.0, 0.2, 0),
+    )  # fmt: skip
+    pair = nts.ContactPair(_face(frame, block, 2, 0.0), _plane(frame), friction=0.2)
+    return nts.System([block], contacts=[pair], gravity=_gravity(frame))
+
+
+def rigid_on_rubber(frame):
+    """A spinning rigid brick falls on a block of tetrahedra that stands on supports."""
+    mesh = frame.grid("tetrahedron", (0, 0, 0), (1, 1, 0.5), (2, 2, 1))
+    below = frame.where(lambda x: x[:, 2] < 1e-6)
+    law = nts.NeoHookean(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+    block = nts.Continuum(mesh, law, density=DENSITY, bcs=[nts.Dirichlet(below)], name="block")
+    brick = _rigid(
+        frame, (0.31, 0.28, 0.501), (0.68, 0.59, 0.7), "brick", spin=(0, 0, 3),
+        velocity=(0.3, 0, -0.6), cells=(2, 2, 1),
+    )  # fmt: skip
+    pair = nts.ContactPair(
+        _face(frame, brick, 2, 0.501), _face(frame, block, 2, 0.5), friction=0.4
+    )
+    return nts.System([block, brick], contacts=[pair], gravity=_gravity(frame))
+
+
+def mechanism(frame):
+    """Three rigid links: a hinge, a ball joint, a slider; a spring and a damper."""
+    links = [
+        _rigid(frame, (k, -0.1, -0.1), (k + 1, 0.1, 0.1), f"link {k}", cells=(1, 1, 1))
+        for k in range(3)
+    ]
+    joints = [
+        nts.Revolute(None, links[0], point=frame.place(0, 0, 0), axis=frame.axis(0, 1, 0)),
+        nts.Spherical(links[0], links[1], point=frame.place(1, 0, 0)),
+        nts.Cylindrical(links[1], links[2], point=frame.place(2, 0, 0), axis=frame.axis(1, 1, 0)),
+        nts.Spring(
+            links[1], links[2], [frame.place(1.5, 0, 0.1), frame.place(2.5, 0.1, 0)],
+            stiffness=frame.size(2e3, 3), length=frame.size(0.8, 1), name="spring",
+        ),
+        nts.Damper(
+            None, links[2], [frame.place(2, 1, 1), frame.place(3, 0, 0)],
+            damping=frame.size(50.0, 3), name="damper",
+        ),
+    ]  # fmt: skip
+    return nts.System(links, joints=joints, gravity=_gravity(frame))
+
+
+def tied(frame):
+    """A rigid head tied to a rubber rod, both turning about the rod's end as if they were rigid."""
+    spin = np.array([0.5, 0.0, 3.0])
+
+    def turning(x):
+        return np.transpose([frame.place(*v) for v in np.cross(spin, frame.back(x.T))])
+
+    rod = _solid(
+        frame, "hexahedron", (0, 0, 0), (1.2, 0.3, 0.3), (4, 1, 1), "rod", velocity=turning
+    )
+    head = _rigid(
+        frame, (1.2, -0.1, -0.1), (1.6, 0.4, 0.4), "head", spin=spin,
+        velocity=np.cross(spin, (1.4, 0.15, 0.15)), cells=(1, 1, 1),
+    )  # fmt: skip
+    tie = nts.Tie(head, _face(frame, rod, 0, 1.2), name="tie")
+    return nts.System([rod, head], joints=[tie])
+
+
+def _beam(frame, low, high, cells, **options):
+    section = nts.Rectangle(frame.size(0.05, 1), frame.size(0.08, 1)).section(
+        young=frame.size(1e8, 2), poisson=0.3, density=DENSITY
+    )
+    mesh = frame.grid("interval", low, high, (cells,))
+    return nts.Beam(mesh, section, direction=frame.axis(0, 1, 0), **options)
+
+
+def beam(frame):
+    """A clamped beam with a rigid weight on a ball joint at its end."""
+    clamp = nts.Clamp(frame.where(lambda x: x[:, 0] < 1e-6))
+    rod = _beam(frame, (0, 0, 0), (2, 0, 0), 4, bcs=[clamp], name="rod")
+    weight = _rigid(frame, (1.9, -0.1, -0.3), (2.1, 0.1, -0.1), "weight", cells=(1, 1, 1))
+    joint = nts.Spherical(rod, weight, point=frame.place(2, 0, 0), name="eye")
+    return nts.System([rod, weight], joints=[joint], gravity=_gravity(frame))
+
+
+def shell(frame):
+    """A plate that falls on a sphere with friction."""
+    mesh = frame.grid("quadrilateral", (0, 0, 0), (1, 1, 0), (4, 4))
+    plate = nts.Shell(
+        mesh, young=frame.size(1e7, 2), poisson=0.3, thickness=frame.size(0.03, 1),
+        density=DENSITY, velocity=frame.place(0.2, 0, -1.0), name="plate",
+        angular_velocity=frame.axis(0, 0, 1.0),
+    )  # fmt: skip
+    ball = nts.Sphere(frame.place(0.45, 0.52, -0.517), frame.size(0.5, 1))
+    side = plate.surface(frame.where(lambda x: np.full(len(x), True)), side="bottom")
+    pair = nts.ContactPair(side, ball, friction=0.3)
+    return nts.System([plate], contacts=[pair])
+
+
+def more_joints(frame):
+    """Five links from a slider on: a cross, a weld, a rod to a plane, a hinge with a spring."""
+    links = [
+        _rigid(frame, (k, -0.1, -0.1), (k + 1, 0.1, 0.1), f"link {k}", cells=(1, 1, 1))
+        for k in range(5)
+    ]
+    axis, place = frame.axis, frame.place
+    joints = [
+        nts.Prismatic(None, links[0], point=place(0, 0, 0), axis=axis(1, 0, -1)),
+        nts.Universal(
+            links[0], links[1], point=place(1, 0, 0), axes=(axis(0, 1, 0), axis(0, 0, 1))
+        ),
+        nts.Fixed(links[1], links[2], point=place(2, 0, 0)),
+        nts.Distance(links[2], links[3], points=[place(2.9, 0, 0.1), place(3.1, 0, -0.4)]),
+        nts.Planar(None, links[3], point=place(3.5, 0, 0), axis=axis(0, 1, 2)),
+        nts.Revolute(links[3], links[4], point=place(4, 0, 0), axis=axis(0, 1, 0)),
+        nts.TorsionSpring(
+            links[3], links[4], axis=axis(0, 1, 0), stiffness=frame.size(50.0, 5), name="spring"
+        ),
+        nts.TorsionDamper(
+            links[3], links[4], axis=axis(0, 1, 0), damping=frame.size(1.0, 5), name="damper"
+        ),
+    ]
+    return nts.System(links, joints=joints, gravity=_gravity(frame))
+
+
+def sewn(frame):
+    """Two shells that meet at right angles in a seam, one of them clamped."""
+    given = {
+        "young": frame.size(1e7, 2), "poisson": 0.3, "thickness": frame.size(0.03, 1),
+        "density": DENSITY,
+    }  # fmt: skip
+    clamp = nts.Clamp(frame.where(lambda x: x[:, 0] < 1e-6))
+    mesh = frame.grid("quadrilateral", (0, 0, 0), (1, 0.5, 0), (4, 2))
+    flange = nts.Shell(mesh, bcs=[clamp], name="flange", **given)
+    mesh = frame.grid("quadrilateral", (0, 0, 0.5), (0.5, 0.4, 0.5), (2, 2), axes=(1, 2, 0))
+    web = nts.Shell(mesh, name="web", **given)
+    edge = web.surface(frame.where(lambda x: x[:, 2] < 1e-6), side="edge")
+    return nts.System([flange, web], joints=[nts.Seam(flange, edge)], gravity=_gravity(frame))
+
+
+def in_a_bore(frame):
+    """A block of Mooney's rubber and one of the user's own energy, each in a bore."""
+    modulus = frame.size(RUBBER["young"], 2)
+    mesh = frame.grid("hexahedron", (0, 0, 0), (0.6, 0.3, 0.3), (2, 2, 2))
+    law = nts.MooneyRivlin(a=0.2 * modulus, b=0.05 * modulus, c=modulus)
+    block = nts.Continuum(
+        mesh, law, density=DENSITY, velocity=frame.place(0.3, 0, -1.2), name="block"
+    )
+    space = compat.vector_space(frame.grid("tetrahedron", (2, 0, 0), (2.4, 0.3, 0.3), (1, 1, 1)), 1)
+    stored = saint_venant(modulus, RUBBER["poisson"])
+    own = nts.FormBody(
+        space, energy=lambda e: stored(e), strain=green, density=DENSITY,
+        velocity=frame.place(0, 1.0, -1.0), name="own",
+    )  # fmt: skip
+    bore = nts.Cylinder(
+        frame.place(0, 0.15, 0.152), frame.axis(1, 0, 0), frame.size(0.215, 1), inside=True
+    )
+    pairs = [
+        nts.ContactPair(_face(frame, body, 2, 0.0), bore, friction=0.3) for body in (block, own)
+    ]
+    return nts.System([block, own], contacts=pairs)
+
+
+#: Step [s] of each scene.
+SCENES = {
+    two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
+    beam: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
+}  # fmt: skip

@@ -1,0 +1,165 @@
+"""What holds for every scene: ledger, momenta, order; no frame, rank or pause matters."""
+
+from functools import cache
+
+from mpi4py import MPI
+
+import noise
+import numpy as np
+import pytest
+from conformance_scenes import SCENES, mechanism, tied, two_blocks
+from frames import Frame
+from integrators import INTEGRATORS, MID_STEP
+from rotations import rotation
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+STEPS = 12
+RULE = nts.EnergyMomentum()
+TURN = rotation(1.1, (1, 2, -0.5))
+#: Frames that must not matter.
+FRAMES = {
+    "millimetres": Frame(unit=1e3), "micrometres": Frame(unit=1e-6), "turned": Frame(turn=TURN),
+    "renumbered": Frame(shuffle=3),
+}  # fmt: skip
+#: Part of the scene's size by which places may differ: the solver's tolerance, and what contacts
+#: make of it in so few steps.
+ALIKE = 1e-7
+scenes = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
+
+
+def places(body, frame):
+    """The scene's places of a body's nodes (n, 3), in the order of the reference, on all ranks."""
+    for name in ("centreline", "midsurface"):
+        if hasattr(body, name):
+            before, now = getattr(body, name)()
+            break
+    else:
+        owned = body.space.dofmap.index_map.size_local
+        before = body.space.tabulate_dof_coordinates()[:owned]
+        now = before + body.u.x.array.reshape(-1, 3)[:owned]
+        before, now = (np.concatenate(frame.comm.allgather(a)) for a in (before, now))
+    order = np.lexsort(frame.back(before).round(6).T)
+    return frame.back(now)[order]
+
+
+def end(run, frame):
+    """Places of all bodies, one below the other."""
+    return np.concatenate([places(body, frame) for body in run.system.bodies])
+
+
+def run_of(scene, frame, rule=RULE, *, steps=STEPS, dt=None, **options):
+    """The scene's run; places of all bodies at its end, and its balance."""
+    dt = SCENES[scene] if dt is None else dt
+    with options.pop("system", None) or scene(frame) as system:
+        run = nts.simulate(
+            system, rule, dt=dt, t_end=steps * dt, accuracy="exact", **options
+        )
+        assert run.status.startswith("completed"), run.status
+        return end(run, frame), run.balance
+
+
+@cache
+def plain(scene, name="energy-momentum"):
+    return run_of(scene, Frame(), INTEGRATORS[name])
+
+
+def assert_alike(found, expected):
+    size = np.ptp(expected, axis=0).max()
+    assert np.abs(found - expected).max() < ALIKE * size
+
+
+def test_each_body_coupling_and_law_of_the_package_has_a_scene():
+    seen = set()
+    for scene in SCENES:
+        system = scene(Frame())
+        things = [*system.bodies, *system.joints, *(pair.master for pair in system.contacts)]
+        things += [body.material for body in system.bodies if isinstance(body, nts.Continuum)]
+        seen |= {type(thing) for thing in things}
+    kinds = nts.Body, nts.Joint, nts.Obstacle, nts.Isotropic
+    wanted = {
+        kind for kind in vars(nts).values()
+        if isinstance(kind, type) and issubclass(kind, kinds) and kind not in kinds
+    }  # fmt: skip
+    assert not wanted - seen
+
+
+@pytest.mark.mpi
+@scenes
+def test_the_ledger_closes(scene):
+    """And in each scene something is moved, stored, or pressed."""
+    _, table = plain(scene)
+    top = max(np.abs(table[name]).max() for name in ("kinetic", "potential", "external_work"))
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * top
+    assert np.all(np.diff(table["friction_dissipation"]) >= -1e-12 * top)
+    assert table["active"].any() == bool(scene(Frame()).contacts)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", MID_STEP)
+@pytest.mark.parametrize("scene", [two_blocks, tied], ids=["two_blocks", "tied"])
+def test_free_bodies_keep_their_momenta(scene, name):
+    _, table = plain(scene, name)
+    for column in ("linear_momentum", "angular_momentum"):
+        values = table[column]
+        assert np.abs(values - values[0]).max() < 1e-11 * np.abs(values).max()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("frame", FRAMES.values(), ids=FRAMES)
+@scenes
+def test_no_frame_matters(scene, frame):
+    found, table = run_of(scene, frame)
+    expected, before = plain(scene)
+    assert_alike(found, expected)
+    top = np.abs(before["energy"]).max()
+    assert np.allclose(table["energy"] / frame.unit**5, before["energy"], rtol=0, atol=1e-7 * top)
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+@scenes
+@pytest.mark.slow
+def test_no_frame_matters_to_any_integrator(scene, name):
+    found, _ = run_of(scene, Frame(unit=1e3, turn=TURN, shuffle=5), INTEGRATORS[name])
+    assert_alike(found, plain(scene, name)[0])
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="compares ranks")
+@pytest.mark.mpi
+def test_no_rank_matters():
+    for scene in SCENES:
+        assert_alike(run_of(scene, Frame(comm=MPI.COMM_SELF))[0], plain(scene)[0])
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+@scenes
+def test_a_run_goes_on_where_a_checkpoint_was_written(scene, name, tmp_path):
+    path, half, dt, rule = tmp_path / "run.h5", STEPS // 2, SCENES[scene], INTEGRATORS[name]
+    written = nts.Checkpoint(path, every=half)
+    run_of(scene, Frame(), rule, steps=half, checkpoint=written)
+    system = scene(Frame())
+    found, table = run_of(
+        scene, Frame(), rule, system=system, start=nts.restart(path, system), dt=dt
+    )
+    expected, before = plain(scene, name)
+    assert len(table["time"]) == STEPS + 1
+    assert np.abs(found - expected).max() < 1e-9 * np.ptp(expected, axis=0).max()
+    assert np.allclose(table["energy"], before["energy"], rtol=1e-9)
+
+
+@scenes
+def test_no_rounding_matters(scene, monkeypatch):
+    noise.install("both", 1, monkeypatch.setattr)
+    assert_alike(run_of(scene, Frame())[0], plain.__wrapped__(scene)[0])
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_smooth_scenes_converge_by_the_second_order(name):
+    """Of a mechanism, by halving the step twice."""
+    ends = [
+        run_of(mechanism, Frame(), INTEGRATORS[name], steps=8 * n, dt=2e-2 / n)[0]
+        for n in (1, 2, 4)
+    ]
+    coarse, fine = (np.linalg.norm(a - b) for a, b in zip(ends, ends[1:], strict=False))
+    assert np.log2(coarse / fine) == pytest.approx(2.0, abs=0.1)
