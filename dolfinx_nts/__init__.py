@@ -48,6 +48,7 @@ from dolfinx_nts.joints import (
     Tie,
     Universal,
 )
+from dolfinx_nts.joints.laws import JointFriction
 from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.strain_energy import Isotropic
@@ -97,6 +98,7 @@ __all__ = [
     "Isotropic",
     "Joint",
     "JointCoupling",
+    "JointFriction",
     "LineForce",
     "LineMoment",
     "Midpoint",

@@ -58,7 +58,7 @@ class System:
 
     Attributes:
         size: Coordinates of all bodies.
-        declared_joints: As given.
+        declared_joints: As given, each followed by its parts.
         joints: These, then those that bodies bring, such as what keeps a rigid body rigid.
 
     Raises:
@@ -83,7 +83,8 @@ class System:
             "contacts", contacts, lambda c: isinstance(c, ContactPair), "ContactPair"
         )
         wanted = "joints; the class of a joint of your own inherits from nts.Joint"
-        self.joints = items("joints", joints, is_joint, wanted)
+        given_joints = items("joints", joints, is_joint, wanted)
+        self.joints = tuple(part for joint in given_joints for part in (joint, *joint.parts))
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
         self.comm = self.bodies[0].comm

@@ -71,6 +71,8 @@ class Joint:
             remembers nothing that a checkpoint keeps.
         driven: Whether it moves bodies as prescribed by a function of time, which impacts that give
             their energy back refuse.
+        parts: Joints beside it that come with it, such as its friction.
+        mid_step: Whether it asks for an integrator that carries no accelerations.
     """
 
     name: str
@@ -78,6 +80,8 @@ class Joint:
     losses: tuple[str, ...] = ()
     numbers: IntArray | None = None
     driven: bool = False
+    parts: tuple[Any, ...] = ()
+    mid_step: bool = False
 
     @cached_property
     def settings(self) -> Mapping[str, Any]:

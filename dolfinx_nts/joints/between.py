@@ -89,6 +89,7 @@ class Between(Joint, ABC):
         name: As given or made.
         ends: A and B, None for the ground.
         bodies: Its bodies without the ground.
+        sides: Nodes of both, on which its vectors depend.
         p_a: Its point of A, or of the ground; p_b alike.
         length: What makes a length of a product of two directions [m].
         motion: What is prescribed, see `drive`.
@@ -123,7 +124,7 @@ class Between(Joint, ABC):
             None if body is None else points_of(f"{argument} of {self.name!r}", body, x)
             for body, x in zip((a, b), places, strict=True)
         ]
-        self._sides = [side for side in held if side is not None]
+        self.sides = [side for side in held if side is not None]
         widths = [0 if side is None else side.nodes.shape[1] for side in held]
         self._slots = slice(0, widths[0]), slice(widths[0], None)
         self._nodes = sum(widths)
@@ -243,7 +244,7 @@ class Between(Joint, ABC):
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run. Collective."""
-        sides = [side.part(slice(self._here)) for side in self._sides]
+        sides = [side.part(slice(self._here)) for side in self.sides]
         equations, _ = self._in_step((0.0,))
         arm = self.arm()
         return Constraints(

@@ -23,6 +23,7 @@ from dolfinx_nts.joints.between import (
     direction,
     triad,
 )
+from dolfinx_nts.joints.laws import JointFriction, Motor, laws_on
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -124,6 +125,10 @@ class Revolute(_WithAxis):
         axis: n at the start, of any length.
         angle: Function of time, the angle about n by which A turns relative to B [rad]; None: free.
             A step in which it changes by half a turn or more is cut, or the run stops.
+        friction: `JointFriction`, or None.
+        limits: Smallest and largest angle from the start [rad], around 0; None: none.
+        motor: Torque [N m] on A of time, angle and its rate, such as a controller's; None: none.
+            Its work is external work.
         name: In messages and files; default: kind and bodies.
 
     Raises:
@@ -139,11 +144,15 @@ class Revolute(_WithAxis):
         point: Any,
         axis: Any,
         angle: Number | None = None,
+        friction: JointFriction | None = None,
+        limits: Any = None,
+        motor: Motor | None = None,
         name: str | None = None,
     ) -> None:
         super().__init__(a, b, point=point, axis=axis, name=name)
         if angle is not None:
             self.drive("angle", angle, "rad", number_at)
+        self.parts = laws_on(self, friction, limits, motor, turns=True)
 
     def products(self, times: Times) -> Iterator[Product]:
         """Spherical, parallel axes, and the angle.
@@ -195,6 +204,10 @@ class Prismatic(_WithAxis):
         point: On the axis at the start [m].
         axis: n at the start, of any length.
         displacement: Function of time, that of A relative to B along n [m]; None: free.
+        friction: `JointFriction`, or None.
+        limits: Smallest and largest way from the start [m], around 0; None: none.
+        motor: Force [N] on A of time, way and its rate, such as a controller's; None: none.
+            Its work is external work.
         name: In messages and files; default: kind and bodies.
 
     Raises:
@@ -210,11 +223,15 @@ class Prismatic(_WithAxis):
         point: Any,
         axis: Any,
         displacement: Number | None = None,
+        friction: JointFriction | None = None,
+        limits: Any = None,
+        motor: Motor | None = None,
         name: str | None = None,
     ) -> None:
         super().__init__(a, b, point=point, axis=axis, name=name)
         if displacement is not None:
             self.drive("displacement", displacement, "m", number_at)
+        self.parts = laws_on(self, friction, limits, motor, turns=False)
 
     def products(self, times: Times) -> Iterator[Product]:
         """Cylindrical, m1_A . m2_B = 0, and n_A . (p_A - p_B) = c where it is prescribed."""

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.joints.forces import AboutAxis, Between, BetweenPoints, Stiff, Viscous
-from dolfinx_nts.kernels import springs as kernel
+from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import (
     call_together,
@@ -29,23 +29,23 @@ _COMPARED, _ALIKE = 1e-2, 0.1
 class _Stores(Between):
     """What stores energy."""
 
-    _force: Stiff
+    law: Stiff
 
     def potential(self, u: Sequence[FloatArray], history: FloatArray) -> float:
         """Stored energy on this rank [J]. Collective."""
-        return self._force.stored(self._at(u, history)[1])
+        return self.law.stored(self._at(u, history)[1])
 
     def _by_stiffness(self, stiffness: Any, rest: float, unit: str) -> None:
         require_positive("stiffness", stiffness, unit)
         linear = kernel.Linear(float(stiffness), rest)
-        self._force = Stiff(linear, lambda function, *arrays: function(*arrays))
+        self.law = Stiff(linear, lambda function, *arrays: function(*arrays))
 
     def _by_energy(self, energy: Any, force: Any, start: float) -> None:
         """Take a user's V, after a look at it and at its derivative near the start. Collective."""
         for name, value in (("energy", energy), ("force", force)):
             if not (callable(value) or (value is None and name == "force")):
                 raise TypeError(f"{name}={value!r}: pass a function of an array")
-        stored = kernel.Stored(energy, force, self._way.coordinate.unit)
+        stored = kernel.Stored(energy, force, self.measure.kind.unit)
         label = f"energy of {self.name!r}"
         shown = energy if force is None else (energy, force)
 
@@ -53,7 +53,7 @@ class _Stores(Between):
             return call_together(self.comm, label, function, *arrays, shown=shown)
 
         raise_together(self.comm, ask(_unlike, stored, start, label))
-        self._force = Stiff(stored, ask)
+        self.law = Stiff(stored, ask)
 
 
 def _unlike(stored: kernel.Stored, start: float, label: str) -> str | None:
@@ -160,6 +160,7 @@ class Damper(BetweenPoints):
     """
 
     losses = ("damping_dissipation",)
+    entry = ("damping_dissipation", 1.0)
 
     def __init__(
         self, a: Any, b: Any, points: Any, *, damping: float, name: str | None = None
@@ -168,7 +169,7 @@ class Damper(BetweenPoints):
         require_positive("damping", damping, "N s/m")
         if self._between((a, b), points) == 0.0:
             raise self._undirected("a damper has no direction there")
-        self._force = Viscous(float(damping))
+        self.law = Viscous(float(damping))
 
 
 @known_options
@@ -237,6 +238,7 @@ class TorsionDamper(AboutAxis):
     """
 
     losses = ("damping_dissipation",)
+    entry = ("damping_dissipation", 1.0)
 
     def __init__(
         self, a: Any, b: Any, *, axis: Any, damping: float, name: str | None = None
@@ -244,4 +246,4 @@ class TorsionDamper(AboutAxis):
         super().__init__((a, b), name)
         require_positive("damping", damping, "N m s")
         self._about((a, b), axis)
-        self._force = Viscous(float(damping))
+        self.law = Viscous(float(damping))

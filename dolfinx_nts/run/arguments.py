@@ -34,6 +34,12 @@ def check_scheme(system: Any, integrator: Any, newton: Any, petsc_options: Any) 
             f"integrator={integrator!r}: pass EnergyMomentum(), Midpoint() or another one with "
             "the Integrator protocol"
         )
+    for joint in system.joints:
+        if joint.mid_step and integrator.accelerations:
+            raise ValueError(
+                f"integrator={integrator!r}: {joint.name!r} may hold and let go, which the "
+                "accelerations that it carries do not follow; use EnergyMomentum() or Midpoint()"
+            )
     if not isinstance(newton, Newton | None):
         raise TypeError(f"newton={newton!r}: pass Newton(rtol=...)")
     given = {} if petsc_options is None else petsc_options

@@ -1,9 +1,9 @@
-"""Lengths, angles, stored energies of springs, and their discrete gradients (theory section 14).
+"""Lengths, ways and angles, energies of springs, and their discrete gradients (theory section 14).
 
-A coordinate xi, a length or an angle, is a function of v vectors that are linear in the bodies'
-coordinates, such as r = p_A - p_B. Its discrete gradient D between two ends a and b satisfies
-D . (p_b - p_a) = xi_b - xi_a exactly, and is the gradient where the ends are one; it is the same if
-they change places. Axis 0 = element.
+A measure xi, such as a length or an angle, is a function of v vectors that are linear in the
+bodies' coordinates, such as r = p_A - p_B. Its discrete gradient D between two ends a and b
+satisfies D . (p_b - p_a) = xi_b - xi_a exactly, and is the gradient where the ends are one; it is
+the same if they change places. Axis 0 = element.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _APART = float(np.finfo(float).eps) ** (1 / 3)
 
 
 class Gradient(NamedTuple):
-    """A coordinate between two ends, by the components of its vectors.
+    """A measure between two ends, by the components of its vectors.
 
     Attributes:
         mean: Its discrete gradient, shape (n, 3 v).
@@ -63,6 +63,31 @@ class Length:
         mean, end = (a + b)[:, 0] / both, b[:, 0] / at_b[:, None]
         change = (np.eye(3) - mean[:, :, None] * end[:, None]) / both[:, :, None]
         return Gradient(mean, change, end)
+
+
+class Along:
+    """The way n . r along a direction n of the difference r of two points [m], vectors n and r.
+
+    Attributes:
+        unit: As of `Length`.
+    """
+
+    unit = 0.0
+
+    @staticmethod
+    def value(p: FloatArray, near: FloatArray) -> FloatArray:
+        """Its value [m], shape (n,), of vectors (n, 2, 3); `near` plays no part."""
+        found: FloatArray = np.einsum("ni,ni->n", p[:, 0], p[:, 1])
+        return found
+
+    @staticmethod
+    def gradient(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
+        """That in the middle: it is quadratic."""
+        n = len(a)
+        change = np.zeros((n, 2, 3, 2, 3))
+        change[:, 0, :, 1] = change[:, 1, :, 0] = 0.5 * np.eye(3)
+        mean, end = (p[:, ::-1].reshape(n, 6) for p in (0.5 * (a + b), b))
+        return Gradient(mean, change.reshape(n, 6, 6), end)
 
 
 class Angle:
@@ -165,7 +190,7 @@ class Stored:
     Args:
         energy: V [J] of an array.
         force: V' [N] or [N m] of an array; None: by complex step, for which V takes complex arrays.
-        unit: Size of the coordinate below which its own is not what counts.
+        unit: Size of the measure below which its own is not what counts.
     """
 
     def __init__(

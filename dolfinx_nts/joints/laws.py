@@ -1,0 +1,225 @@
+"""Friction, limits and motors of joints: laws on the angle or the way of a joint (section 22).
+
+A joint knows none of them. Each is a joint of its own beside it, with its own column of reactions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx_nts.interaction.measured import Move, Row, holds
+from dolfinx_nts.joints.forces import Between
+from dolfinx_nts.kernels import measures as kernel
+from dolfinx_nts.validation import (
+    call_together,
+    is_finite,
+    known_options,
+    require_positive,
+    require_same,
+)
+
+FloatArray = npt.NDArray[np.float64]
+#: Torque [N m] or force [N] on a of time, angle or way, and its rate.
+Motor = Callable[[float, float, float], float]
+
+#: Part of a measure or a rate by which a motor is asked for its slopes.
+_APART = float(np.finfo(float).eps) ** (1 / 3)
+
+
+@known_options
+@dataclass(frozen=True, kw_only=True)
+class JointFriction:
+    """Dry friction in a joint, whatever the joint carries.
+
+    Attributes:
+        bound: Torque [N m], or force [N] along a prismatic joint's axis, up to which it sticks.
+
+    Raises:
+        ValueError: bound is not positive.
+    """
+
+    bound: float
+
+    def __post_init__(self) -> None:
+        require_positive("bound", self.bound, "N m or N")
+
+
+class Bound(NamedTuple):
+    """The measure rests while |D| <= bound, else D = bound against its motion."""
+
+    bound: float
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """The bound."""
+        return self._asdict()
+
+    def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: float) -> Row:
+        """Stick c_1 = c_0, or D = bound sign(c_1 - c_0), by the trial D + c_1 - c_0."""
+        slip, most = end - start, self.bound / unit
+        trial = force + slip
+        stick = np.abs(trial) <= most
+        slides = force - most * np.sign(trial)
+        on, off = stick.astype(float), (~stick).astype(float)
+        return Row(np.where(stick, slip, slides), on, off, stick)
+
+
+class Limits(NamedTuple):
+    """low <= c <= high, by a force that pushes only [m]."""
+
+    low: float
+    high: float
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Both."""
+        return self._asdict()
+
+    def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: float) -> Row:
+        """c_1 = high where D + c_1 - high > 0, c_1 = low where D + c_1 - low < 0, else D = 0."""
+        high, low = force + end - self.high > 0.0, force + end - self.low < 0.0
+        held = high | low
+        value = np.where(high, end - self.high, np.where(low, end - self.low, force))
+        return Row(value, held.astype(float), (~held).astype(float), held)
+
+
+class Driven:
+    """D = -T(t, c, dc/dt) of a user's function T, such as a controller's.
+
+    Args:
+        ask: Calls T with arrays of measures and rates. Collective.
+        unit: Size of the measure below which its own is not what counts.
+    """
+
+    settings: Mapping[str, Any] = {}
+
+    def __init__(self, ask: Callable[..., FloatArray], unit: float) -> None:
+        self._ask, self._unit = ask, unit
+
+    def pull(self, move: Move) -> tuple[FloatArray, FloatArray]:
+        """At the middle and with the mean rate of the step, or where forces are taken."""
+        gradient, (start, end) = move.gradient, move.ends
+        if move.time is not None:
+            at, rate = 0.5 * (start + end), (end - start) / move.time
+            to_at, to_rate = 0.5 * gradient.end, gradient.end / move.time
+        else:
+            at, rate = end, np.einsum("nz,nz->n", gradient.mean, move.speed)
+            to_at = 0.5 * move.share * gradient.mean
+            bend = move.share * np.einsum("nz,nzy->ny", move.speed, gradient.change)
+            to_rate = bend + move.rate * gradient.mean
+        step = _APART * (np.abs(at) + self._unit)
+        fast = _APART * (np.abs(rate) + self._unit * (move.rate or 1.0 / (move.time or 1.0)))
+        torque, more, less, ahead, behind = self._ask(
+            move.when, np.array([at, at + step, at - step, at, at]),
+            np.array([rate, rate, rate, rate + fast, rate - fast]),
+        )  # fmt: skip
+        by_at, by_rate = (more - less) / (2.0 * step), (ahead - behind) / (2.0 * fast)
+        return -torque, -(by_at[:, None] * to_at + by_rate[:, None] * to_rate)
+
+    def slopes(self, at: FloatArray) -> tuple[float, float]:
+        """Nothing is known of a user's function in general."""
+        return 0.0, 0.0
+
+
+class OnJoint(Between):
+    """A law on the angle by which A turns relative to B about a joint's axis, or on its way along.
+
+    Args:
+        joint: A joint with an axis.
+        word: What it is, for its name.
+        law: The law, from what makes a length of the measure [m].
+        entry: As of `Between`.
+        turns: Whether on the angle.
+    """
+
+    def __init__(
+        self,
+        joint: Any,
+        word: str,
+        law: Callable[[float], Any],
+        entry: tuple[str, float],
+        *,
+        turns: bool,
+    ) -> None:
+        super().__init__(joint.ends, f"{joint.name} {word}")
+        if turns:
+            self._on(joint, kernel.Angle, (joint.m1_b, joint.m2_b, joint.m1_a), joint.length)
+        else:
+            self._on(joint, kernel.Along, (joint.n_a, joint.p_a - joint.p_b), 1.0)
+        self.law, self.entry = law(self.measure.length), entry
+        self.mid_step = holds(self.law)
+
+    def _on(self, joint: Any, kind: Any, vectors: tuple[Any, ...], length: float) -> None:
+        """Set the measure of the joint's vectors."""
+        self._lay(kind, joint.sides, [(v.weights, v.constant) for v in vectors], length)
+
+
+def laws_on(
+    joint: Any, friction: Any, limits: Any, motor: Motor | None, *, turns: bool
+) -> tuple[OnJoint, ...]:
+    """Friction, limits and motor of a joint, those that are given. Collective.
+
+    Args:
+        joint: A joint with an axis.
+        friction: `JointFriction`, or None.
+        limits: Smallest and largest angle [rad] or way [m] from the start, or None.
+        motor: Torque [N m] or force [N] on A of time, angle or way, and rate, or None.
+        turns: Whether they act on the angle; else on the way along the axis.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: limits are not two numbers around 0 in this order.
+    """
+    require_same(joint.comm, friction=friction, limits=limits)
+    found: list[tuple[str, Callable[[float], Any], tuple[str, float]]] = []
+    if friction is not None:
+        if not isinstance(friction, JointFriction):
+            raise TypeError(f"friction={friction!r}: pass nts.JointFriction(bound=...)")
+        bound = Bound(float(friction.bound))
+        found.append(("friction", lambda _: bound, ("friction_dissipation", 1.0)))
+    if limits is not None:
+        both = np.array(_both(limits))
+        found.append(("limits", lambda length: Limits(*length * both), ("contact_defect", 1.0)))
+    if motor is not None:
+        if not callable(motor):
+            raise TypeError(f"motor={motor!r}: pass a function of time, angle or way, and rate")
+        driven = Driven(_asking(joint, motor), 1.0 if turns else joint.length)
+        found.append(("motor", lambda _: driven, ("external_work", -1.0)))
+    return tuple(OnJoint(joint, *each, turns=turns) for each in found)
+
+
+def _both(limits: Any) -> tuple[float, float]:
+    try:
+        low, high = (float(limit) for limit in limits)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    if not (low <= 0.0 <= high and (is_finite(low) or is_finite(high))):
+        raise ValueError(
+            f"limits={limits!r}: pass the smallest and the largest angle [rad] or way [m] from the "
+            "start, around 0, e.g. (-1.0, 0.5); infinite is no limit"
+        )
+    return low, high
+
+
+def _asking(joint: Any, motor: Motor) -> Callable[..., FloatArray]:
+    """Calls a motor's function for arrays of measures and rates. Collective."""
+
+    def of(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
+        pairs = zip(at.ravel(), rate.ravel(), strict=True)
+        found = np.array([float(motor(time, float(a), float(r))) for a, r in pairs])
+        if not np.isfinite(found).all():
+            raise ValueError(f"is not finite: {found.tolist()}")
+        return found.reshape(at.shape)
+
+    def ask(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
+        found: FloatArray = call_together(
+            joint.comm, f"motor of {joint.name!r}", of, time, at, rate, shown=motor
+        )
+        return found
+
+    return ask

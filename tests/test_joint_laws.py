@@ -1,0 +1,187 @@
+"""Friction, limits and motors of joints against closed forms; see theory section 22."""
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from integrators import ACCELERATED, MID_STEP
+from scipy.optimize import brentq
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+G = 9.81
+MASS, ARM, INERTIA = 1.5, 0.5, 0.2
+rules = pytest.mark.parametrize("rule", MID_STEP.values(), ids=MID_STEP)
+pytestmark = pytest.mark.mpi
+
+
+def disc(spin, unit=1.0, **laws):
+    """It turns about z."""
+    inertia = np.array([0.1, 0.1, INERTIA]) * unit**5
+    body = nts.RigidBody.from_inertia(
+        unit**3, inertia, name="disc", angular_velocity=(0, 0, spin)
+    )
+    hinge = nts.Revolute(body, None, point=(0, 0, 0), axis=(0, 0, 1), name="hinge", **laws)
+    return body, nts.System([body], joints=[hinge])
+
+
+def pendulum(**laws):
+    """Horizontal at the start, about y; its weight turns it by positive angles."""
+    body = nts.RigidBody.from_inertia(
+        MASS, (0.01, 0.1, 0.1), centre=(ARM, 0, 0), name="arm"
+    )
+    hinge = nts.Revolute(body, None, point=(0, 0, 0), axis=(0, 1, 0), name="hinge", **laws)
+    return body, nts.System([body], joints=[hinge], gravity=(0, 0, -G))
+
+
+def slider(tilt, speed=0.0, **laws):
+    """On a slope along x, turned by `tilt` about y."""
+    axis = np.array([np.cos(tilt), 0, -np.sin(tilt)])
+    body = nts.RigidBody.from_inertia(MASS, (1, 1, 1), name="slider", velocity=speed * axis)
+    rail = nts.Prismatic(body, None, point=(0, 0, 0), axis=axis, name="rail", **laws)
+    return body, axis, nts.System([body], joints=[rail], gravity=(0, 0, -G))
+
+
+def angle(body):
+    """Of a pendulum."""
+    return -np.arctan2(body.position[2], body.position[0])
+
+
+def assert_closed(run):
+    table = run.balance
+    top = max(np.abs(table[name]).max() for name in ("kinetic", "potential", "external_work"))
+    assert run.status == "completed"
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * top
+    assert (np.diff(table["friction_dissipation"]) >= -1e-14 * top).all()
+
+
+@rules
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_friction_stops_a_disc(rule, unit):
+    """omega = omega_0 - b t/I, until it stands; all of its energy is dissipated."""
+    bound, spin = 0.3 * unit**5, 5.0
+    body, system = disc(spin, unit, friction=nts.JointFriction(bound=bound))
+    run = nts.simulate(system, rule, dt=0.02, t_end=4.0)
+    assert_closed(run)
+    time, energy = run.balance["time"], run.balance["kinetic"]
+    omega = spin - bound * time / (INERTIA * unit**5)
+    assert np.allclose(energy / unit**5, 0.5 * INERTIA * np.maximum(omega, 0) ** 2, atol=2e-3)
+    assert run.balance["friction_dissipation"][-1] == pytest.approx(energy[0], rel=1e-3)
+    # It stands, and what the scheme leaves of the last step's speed alternates.
+    turned = body.rotation @ np.eye(3)
+    nts.simulate(system, rule, dt=0.02, t_end=4.1, start=run)
+    assert np.allclose(body.rotation, turned, atol=1e-12)
+
+
+@rules
+def test_friction_holds_a_pendulum(rule):
+    """A bound above the moment of the weight: it rests, and friction carries that moment."""
+    moment = MASS * G * ARM
+    body, system = pendulum(friction=nts.JointFriction(bound=1.01 * moment))
+    run = nts.simulate(system, rule, dt=0.01, t_end=0.1)
+    assert run.status == "completed" and abs(angle(body)) < 1e-12
+    assert np.allclose(run.reactions["hinge friction"][1:, 1], [0, -moment, 0], atol=1e-9)
+    body, system = pendulum(friction=nts.JointFriction(bound=0.99 * moment))
+    nts.simulate(system, rule, dt=0.01, t_end=0.1)
+    assert angle(body) > 1e-6
+
+
+def test_a_pendulum_rests_on_its_limit():
+    """In equilibrium, with the moment of its weight."""
+    body, system = pendulum(limits=(-0.2, 0.0))
+    rest = nts.equilibrium(system, load_steps=2)
+    assert rest.status == "completed" and abs(angle(body)) < 1e-12
+    moment = MASS * G * ARM
+    assert rest.reactions["hinge limits"][-1, 1, 1] == pytest.approx(-moment, rel=1e-9)
+
+
+@rules
+def test_a_pendulum_bounces_on_its_limit_until_friction_has_it(rule):
+    """It never passes the limit, and gains nothing there; at rest, friction and limit carry it."""
+    seen = []
+    body, system = pendulum(limits=(-np.inf, 0.5), friction=nts.JointFriction(bound=1.0))
+    stepper = nts.Stepper(system, rule)
+    for _ in range(250):
+        stepper.advance(1e-2)
+        seen.append(angle(body))
+    assert max(seen) < 0.5 + 1e-10 and max(seen[:40]) > 0.45
+    assert seen[-1] == pytest.approx(0.5, abs=1e-3)
+    assert np.ptp(seen[-20:]) < 1e-3
+    table = stepper.solution.balance
+    assert (np.diff(table["contact_defect"]) >= -1e-12).all()
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["external_work"].max()
+
+
+@rules
+def test_a_slider_with_friction_and_an_end(rule):
+    """It slides v^2/(2 b/m) on the level; on a slope it ends at its limit."""
+    body, axis, system = slider(0.0, 2.0, friction=nts.JointFriction(bound=3.0))
+    run = nts.simulate(system, rule, dt=0.01, t_end=2.0)
+    assert_closed(run)
+    assert body.position @ axis == pytest.approx(2.0**2 / (2 * 3.0 / MASS), rel=1e-4)
+    body, axis, system = slider(0.4, limits=(-0.1, 0.3))
+    run = nts.simulate(system, rule, dt=0.01, t_end=1.0)
+    assert_closed(run)
+    assert body.position @ axis == pytest.approx(0.3, abs=1e-11)
+
+
+@pytest.mark.parametrize("rule", (MID_STEP | ACCELERATED).values(), ids=MID_STEP | ACCELERATED)
+def test_a_controller_holds_an_angle(rule):
+    """T = -k (a - a_0) - d da/dt rests where k (a - a_0) is the moment of the weight."""
+    stiff, damping, wanted = 50.0, 10.0, 0.3
+    body, system = pendulum(motor=lambda t, a, rate: -stiff * (a - wanted) - damping * rate)
+    run = nts.simulate(system, rule, dt=0.01, t_end=4.0)
+    rest = brentq(lambda a: stiff * (a - wanted) - MASS * G * ARM * np.cos(a), 0.0, 1.0)
+    assert angle(body) == pytest.approx(rest, abs=1e-6)
+    if rule in MID_STEP.values():
+        assert_closed(run)
+
+
+def test_a_motor_does_work():
+    """A constant torque on a disc: w = T t/I, and its work is the energy."""
+    _, system = disc(0.0, motor=lambda t, a, rate: 0.4)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=1.0)
+    assert_closed(run)
+    energy = 0.5 * (0.4 * 1.0) ** 2 / INERTIA
+    assert run.balance["external_work"][-1] == pytest.approx(energy, rel=1e-4)
+    assert run.balance["kinetic"][-1] == pytest.approx(energy, rel=1e-4)
+
+
+def test_a_run_goes_on_with_laws_from_a_checkpoint(tmp_path):
+    laws = {"friction": nts.JointFriction(bound=1.0), "limits": (-1.0, 0.4)}
+    path = COMM.bcast(tmp_path) / "run.h5"
+    body, system = pendulum(**laws)
+    whole = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.6)
+    end = angle(body)
+    _, system = pendulum(**laws)
+    written = nts.Checkpoint(path, every=20)
+    nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.2, checkpoint=written)
+    body, system = pendulum(**laws)
+    start = nts.restart(path, system)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=0.01, t_end=0.6, start=start)
+    assert angle(body) == pytest.approx(end, abs=1e-10)
+    assert np.allclose(run.balance["energy"], whole.balance["energy"], atol=1e-10)
+
+
+@pytest.mark.parametrize("rule", ACCELERATED.values(), ids=ACCELERATED)
+def test_laws_that_let_go_ask_for_another_integrator(rule):
+    _, system = disc(1.0, friction=nts.JointFriction(bound=0.1))
+    with pytest.raises(ValueError, match="'hinge friction' may hold and let go.*EnergyMomentum"):
+        nts.Stepper(system, rule)
+
+
+@pytest.mark.parametrize(
+    ("laws", "error", "text"),
+    [
+        ({"friction": 0.3}, TypeError, r"friction=0\.3: pass nts\.JointFriction"),
+        ({"limits": (0.2, 0.5)}, ValueError, r"limits=\(0\.2, 0\.5\): pass the smallest"),
+        ({"limits": 1.0}, ValueError, r"limits=1\.0: pass the smallest"),
+        ({"motor": 2.0}, TypeError, r"motor=2\.0: pass a function of time"),
+    ],
+)
+def test_wrong_laws(laws, error, text):
+    with pytest.raises(error, match=text):
+        disc(0.0, **laws)
+    with pytest.raises(ValueError, match="bound=0.0: must be"):
+        nts.JointFriction(bound=0.0)
