@@ -7,7 +7,6 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from integrators import INTEGRATORS
 from lines import arc, interval_mesh, straight
 from scenes import UNITS
 from scipy.optimize import brentq
@@ -238,26 +237,10 @@ def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
     assert off(coarse)[0] > 0.05 and "does not keep it" in coarse.status
 
 
-@pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.slow
-def test_the_order_in_time_is_two(rule):
-    coarse, middle, fine = (fly(rule, dt, 0.08)[1] for dt in (2e-3, 1e-3, 5e-4))
-    ratio = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)
-    assert np.log2(ratio) == pytest.approx(2, abs=0.1)
-
-
 def test_millimetres_take_the_same_iterations():
     (metres, x), (millimetres, y) = (fly(EM, 0.1, 1, s) for s in (1, UNITS[0]))
     assert np.abs(y / UNITS[0] - x).max() < 1e-11 * np.abs(x).max()
     assert (millimetres.balance["newton_iterations"] == metres.balance["newton_iterations"]).all()
-
-
-@pytest.mark.mpi
-def test_ranks_give_the_motion_of_one():
-    several, x = fly(EM, 0.1, 1)
-    alone, y = fly(EM, 0.1, 1, comm=MPI.COMM_SELF)
-    assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
-    assert several.balance["energy"] == pytest.approx(alone.balance["energy"], rel=1e-12)
 
 
 @pytest.mark.mpi
@@ -482,16 +465,3 @@ def test_a_section_must_be_positive(wrong):
         nts.Section(**good | wrong)
 
 
-@pytest.mark.mpi
-def test_a_run_goes_on_from_a_checkpoint(tmp_path):
-    """As if nothing had stopped it."""
-    comm = MPI.COMM_WORLD
-    path, rule = comm.bcast(tmp_path) / "beam.h5", nts.EnergyMomentum()
-    whole = flying(1.0, comm)
-    nts.simulate(nts.System([whole]), rule, dt=0.05, t_end=0.5)
-    first, second = nts.System([flying(1.0, comm)]), nts.System([flying(1.0, comm)])
-    nts.simulate(first, rule, dt=0.05, t_end=0.25, checkpoint=nts.Checkpoint(path, every=5))
-    start = nts.restart(path, second)
-    nts.simulate(second, rule, dt=0.05, t_end=0.5, start=start)
-    places = [body.centreline()[1] for body in (whole, second.bodies[0])]
-    assert places[1] == pytest.approx(places[0], abs=1e-11)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
-from measures import COLUMNS, difference
-from scenes import CELLS, UNITS, box, rubbing_blocks
+from measures import difference
+from scenes import CELLS, box, rubbing_blocks
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact import coulomb
@@ -228,17 +228,6 @@ def test_result_does_not_depend_on_the_numbering_of_facets(integrator):
     assert difference(reference(integrator), table) < 1e-9
 
 
-@pytest.mark.parametrize("metre", UNITS)
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.slow
-def test_units_change_nothing(integrator, metre):
-    a, b = reference(integrator), run(rubbing_blocks(0.3, metre=metre), integrator).balance
-    assert np.array_equal(a["newton_iterations"], b["newton_iterations"])
-    for name in COLUMNS:
-        b[name] = b[name] / metre**2
-    assert difference(a, b) < 1e-9
-
-
 @pytest.mark.slow
 @pytest.mark.mpi
 def test_condensing_changes_nothing():
@@ -247,32 +236,6 @@ def test_condensing_changes_nothing():
         for condense in (False, True)
     )
     assert difference(a, b) < 1e-11
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.fast("energy-momentum")
-@pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
-def test_ranks_change_nothing(integrator):
-    """The scene of this many ranks against the one that every rank computes alone."""
-    global COMM
-    world, tables = COMM, []
-    for comm in (world, MPI.COMM_SELF):
-        COMM = comm
-        # Half of it after the contact has closed.
-        tables.append(run(rubbing_blocks(0.3), integrator, t_end=0.05).balance)
-    COMM = world
-    together, alone = tables
-    assert alone["slip"].max() > 0
-    assert difference(alone, together) < 1e-9
-
-
-@pytest.mark.parametrize("ranks", [3, 4])
-def test_more_ranks_change_nothing(on_ranks, ranks):
-    on_ranks(
-        ranks, "-m", "pytest", "-q", "-p", "no:cacheprovider",
-        f"{__file__}::test_ranks_change_nothing[energy-momentum]",
-    )  # fmt: skip
 
 
 # ---- prescribed coordinates and nodal results

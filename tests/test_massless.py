@@ -281,22 +281,6 @@ def test_massless_nodes_do_not_alternate():
     assert off[1] < 1e-3 and off[0] / off[1] > 3.5
 
 
-@pytest.mark.slow
-def test_units():
-    """m, mm and um: the same iterations."""
-    runs = [
-        impact(
-            nts.EnergyMomentum(), metre=m, density=1e3 / m**3, friction=0.3, t_end=0.1,
-            material=nts.NeoHookean(young=1e6 / m, poisson=0.3),
-        )[0]
-        for m in (1.0, *UNITS)
-    ]  # fmt: skip
-    for run, metre in zip(runs[1:], UNITS, strict=True):
-        assert np.array_equal(run["newton_iterations"], runs[0]["newton_iterations"])
-        assert np.array_equal(run["active"], runs[0]["active"])
-        assert np.allclose(run["energy"] / metre**2, runs[0]["energy"], rtol=1e-9, atol=0)
-
-
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 @pytest.mark.parametrize("rule", MID_STEP.values(), ids=MID_STEP)

@@ -10,7 +10,6 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import STENCIL
 from point_mass import MASS, STEP, turn
-from scenes import UNITS
 from scenes_obstacles import (
     ACCELERATION,
     CENTRE,
@@ -240,33 +239,6 @@ def test_ledger(name, bounce):
     assert np.abs(rows["ledger_residual"]).max() < 1e-12 * top
     assert (np.diff(rows["friction_dissipation"]) >= -1e-13 * top).all()
     assert (np.diff(rows["contact_defect"]) >= -1e-12 * top).all()
-
-
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.parametrize("name", OBSTACLES)
-@pytest.mark.fast("sphere-energy-momentum")
-def test_rotation(name, integrator):
-    x, v, rows = shaken(name, integrator=integrator)
-    top = np.abs(rows["energy"]).max()
-    for scene in (turn(0.4), turn(-1.9) @ np.diag([1.0, -1.0, -1.0])):
-        y, w, turned = shaken(name, scene, integrator=integrator)
-        assert np.abs(x - y).max() < 1e-10
-        assert np.abs(v - w).max() < 1e-9
-        for column in ("energy", "friction_dissipation", "external_work"):
-            assert np.abs(rows[column] - turned[column]).max() < 1e-10 * top, column
-
-
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.parametrize("name", OBSTACLES)
-@pytest.mark.slow
-def test_units(name, integrator):
-    x, v, rows = shaken(name, integrator=integrator)
-    for metre in UNITS:
-        y, w, other = shaken(name, None, metre, integrator)
-        for column in ("newton_iterations", "active", "stick", "slip"):
-            assert np.array_equal(other[column], rows[column]), column
-        assert np.abs(x - y).max() < 1e-10
-        assert np.abs(v - w).max() < 1e-9
 
 
 # ---- bodies

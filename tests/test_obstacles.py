@@ -10,7 +10,6 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import STENCIL, differences
 from point_mass import MASS, SPEED, STEP, PointMass, PointSurface, wall
-from scenes import UNITS
 from scenes_obstacles import (
     ACCELERATION,
     CENTRE,
@@ -220,33 +219,6 @@ def test_small_oscillations_have_the_period_of_a_pendulum(bowl, integrator):
         errors.append(times[4] / (2.25 * exact) - 1.0)
     rates = np.log2(np.abs(errors[:-1]) / np.abs(errors[1:]))
     assert np.abs(rates - 2).max() < 0.1, (errors, rates)
-
-
-@pytest.mark.parametrize("name", OBSTACLES)
-@pytest.mark.fast("sphere")
-def test_units(name):
-    """Lengths in m, mm and um: the same iterations, as nothing is absolute."""
-    runs = []
-    for metre in (1.0, *UNITS):
-        lengths = {"point", "centre", "radius"} & set(OBSTACLES[name].__dataclass_fields__)
-        fields = {f: metre * np.asarray(getattr(OBSTACLES[name], f)) for f in lengths}
-        if "radius" in fields:
-            fields["radius"] = float(fields["radius"])
-        toward = CENTRE + TURN @ [0.3, 0.1, -0.2] - Pair.start(name)
-        if name in ("bowl", "bore"):
-            toward = np.cross(toward, TURN @ [0.5, 0.3, 0.4]) - 0.5 * toward
-        system = point_on(
-            changed(OBSTACLES[name], **fields), metre * Pair.start(name), 3.0 * metre * toward,
-            metre * np.array([0.0, 0.0, -ACCELERATION]),
-        )  # fmt: skip
-        system.contacts[0].slave.area *= metre**2
-        runs.append(advance(system, "energy-momentum", 60))
-    assert runs[0][2]["active"].any()
-    for (x, v, rows), metre in zip(runs[1:], UNITS, strict=True):
-        assert np.array_equal(rows["newton_iterations"], runs[0][2]["newton_iterations"])
-        assert np.array_equal(rows["active"], runs[0][2]["active"])
-        assert np.allclose(x / metre, runs[0][0], rtol=0, atol=1e-9)
-        assert np.allclose(v / metre, runs[0][1], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("far", [1e3, 1e6, 1e9])

@@ -1,6 +1,5 @@
 """Pressure on shells: dead, or following them; its work, tangent and balance."""
 
-from mpi4py import MPI
 
 import numpy as np
 import pytest
@@ -176,14 +175,6 @@ def test_the_work_of_constant_pressure_is_its_product_with_the_change_of_volume(
     assert np.abs(other.balance["external_work"][-1] / 500.0 / grown - 1) > 1e-6
     kept = np.ptp(other.balance["angular_momentum"], axis=0).max()
     assert kept < 1e-11 < spin
-
-
-@pytest.mark.mpi
-@pytest.mark.slow
-def test_ranks_give_the_motion_of_one():
-    _, several, _ = balloon(EM)
-    _, alone, _ = balloon(EM, comm=MPI.COMM_SELF)
-    assert several == pytest.approx(alone, abs=1e-9)
 
 
 # ---- what else is asked of it

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import INTEGRATORS
-from scenes import UNITS
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -285,24 +284,6 @@ def test_prescribed_motion_does_external_work():
     exact = 0.5 * 2.0 * 2.0**2 + 0.5 * 2.5 * 1.0**2
     assert table["energy"][-1] == pytest.approx(exact, rel=1e-3)
     assert run.reactions["rigid"][-1, 0, 0] == pytest.approx(2.0, rel=1e-8)
-
-
-def iterations_in(unit):
-    """Of a free body with lengths in this unit, which flies as it must."""
-    body = nts.RigidBody.from_inertia(
-        2.0, np.array([1.0, 2.0, 2.5]) * unit**2, velocity=np.array([1.0, 2.0, 0.5]) * unit,
-        angular_velocity=(1, 2, 3),
-    )  # fmt: skip
-    gravity = np.array([0, 0, -9.81]) * unit
-    run = nts.simulate(nts.System([body], gravity=gravity), nts.EnergyMomentum(), dt=0.05, t_end=1)
-    assert body.position / unit == pytest.approx([1, 2, 0.5 - 4.905], abs=1e-12)
-    return run.balance["newton_iterations"].tolist()
-
-
-def test_units_do_not_matter():
-    """Lengths in m, mm and um, masses in kg: the same iterations and motion."""
-    in_m, in_mm, in_um = (iterations_in(unit) for unit in (1.0, *UNITS))
-    assert in_m == in_mm == in_um
 
 
 @pytest.mark.mpi

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import MID_STEP
-from scenes import UNITS, everywhere
+from scenes import everywhere
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipk
 
@@ -308,29 +308,6 @@ def test_a_brick_tips_at_b_over_h_times_g(kind, push):
     fast = np.sqrt(1.5 * (a * b + G * h) / (b**2 + h**2))
     grown = (a * h - G * b) / (a * b + G * h) * (np.cosh(fast * run.state.time) - 1.0)
     assert angle == pytest.approx(grown, rel=0.01)
-
-
-def iterations_and_place(unit):
-    """Of a brick that slides and turns to rest, with lengths in this unit."""
-    mesh = grid((0, 0, 0), np.array([0.2, 0.1, 0.05]) * unit, (2, 2, 1))
-    body = nts.RigidBody(
-        mesh, density=1e3 / unit**3, velocity=(0.5 * unit, 0, 0), angular_velocity=(0, 0, 3)
-    )
-    slave = body.surface(lambda x: x[2] < 1e-9 * unit)
-    pair = nts.ContactPair(slave=slave, master=FLOOR, friction=0.3)
-    system = nts.System([body], contacts=[pair], gravity=(0, 0, -G * unit))
-    newton = nts.Newton(rtol=1e-10)  # far enough from rounding
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.1, newton=newton)
-    assert run.balance["slip"].max() > 0
-    return run.balance["newton_iterations"][1:].tolist(), run.retries, body.position / unit
-
-
-@pytest.mark.slow
-def test_units_do_not_matter():
-    in_m, *others = (iterations_and_place(unit) for unit in (1.0, *UNITS))
-    for other in others:
-        assert other[:2] == in_m[:2]
-        assert other[2] == pytest.approx(in_m[2], abs=1e-8)
 
 
 @pytest.mark.mpi

@@ -98,12 +98,6 @@ def test_ranks_change_nothing(scene, dt, t_end):
     assert scene is chain or b["slip"].max() > 0
 
 
-@pytest.mark.parametrize("ranks", [3, 4])
-def test_more_ranks_change_nothing(on_ranks, ranks):
-    name = f"{__file__}::test_ranks_change_nothing"
-    on_ranks(ranks, "-m", "pytest", "-q", "-p", "no:cacheprovider", name)
-
-
 @pytest.mark.parametrize("names", ["link {}", "revolute of link {} and link {}", "b{}"])
 @pytest.mark.parametrize("ranks", [2, 3, 4])
 def test_numbered_names_are_dealt_evenly(names, ranks):

@@ -9,8 +9,6 @@ import pytest
 import scipy.linalg
 from dolfinx import fem
 from dolfinx.mesh import CellType, create_box
-from integrators import INTEGRATORS
-from scenes import UNITS
 from scipy.spatial.transform import Rotation
 from shells import grid, plate, plate_nodes, surface_mesh
 
@@ -379,32 +377,6 @@ def test_the_midpoint_rule_does_not_keep_the_energy(caplog):
     assert not coarse.status.startswith("completed") and len(coarse.balance["time"]) < 20
 
 
-@pytest.mark.parametrize("rule", INTEGRATORS.values(), ids=INTEGRATORS)
-@pytest.mark.slow
-def test_the_order_in_time_is_two(rule):
-    coarse, middle, fine = (fly(rule, dt, 0.02, n=(4, 2))[1] for dt in (1e-3, 5e-4, 2.5e-4))
-    ratio = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)
-    assert np.log2(ratio) == pytest.approx(2, abs=0.1)
-
-
-@pytest.mark.parametrize("scale", UNITS)
-@pytest.mark.slow
-def test_units_of_length_take_the_same_iterations(scale):
-    (metres, x), (others, y) = (
-        fly(EM, 0.05, 0.5, nts.Newton(), scale=s) for s in (1.0, scale)
-    )
-    assert np.abs(y / scale - x).max() < 1e-10 * np.abs(x).max()
-    assert (others.balance["newton_iterations"] == metres.balance["newton_iterations"]).all()
-
-
-@pytest.mark.mpi
-def test_ranks_give_the_motion_of_one():
-    several, x = fly(EM, 0.05, 0.25)
-    alone, y = fly(EM, 0.05, 0.25, comm=MPI.COMM_SELF)
-    assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
-    assert several.balance["energy"] == pytest.approx(alone.balance["energy"], rel=1e-12)
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize("kind", ["shell", "beam"])
 @pytest.mark.fast_on_ranks()
@@ -424,42 +396,6 @@ def test_one_cell_on_any_ranks(kind):
     energy = run.balance["energy"] - run.balance["external_work"]
     assert energy == pytest.approx(expected, rel=1e-12)
     assert set(body.resultants()) == {"force", "moment"}
-
-
-@pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path):
-    """As if nothing had stopped it."""
-    path = mpi_tmp_path / "shell.h5"
-    whole = flying(n=(4, 2))
-    nts.simulate(nts.System([whole]), EM, dt=0.05, t_end=0.3)
-    first, second = (nts.System([flying(n=(4, 2))]) for _ in range(2))
-    nts.simulate(first, EM, dt=0.05, t_end=0.15, checkpoint=nts.Checkpoint(path, every=3))
-    start = nts.restart(path, second)
-    nts.simulate(second, EM, dt=0.05, t_end=0.3, start=start)
-    assert second.bodies[0].midsurface()[1] == pytest.approx(whole.midsurface()[1], abs=1e-11)
-
-
-@pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
-def test_the_order_and_the_directions_of_cells_do_not_matter():
-    """Of a cylinder whose cells are shuffled, and every third seen from its other side."""
-    a, z = np.meshgrid(np.linspace(0, 2, 7), np.linspace(0, 1, 4), indexing="ij")
-    x = np.stack([np.cos(a), np.sin(a), z], axis=-1).reshape(-1, 3)
-    ends = []
-    for turned in (False, True):
-        cells = grid(6, 3)
-        if turned:
-            cells[1::3] = cells[1::3][:, [2, 3, 0, 1]]
-            cells = np.random.default_rng(0).permutation(cells)
-        body = nts.Shell(
-            surface_mesh(x, cells), **RUBBER, bcs=[nts.Clamp(at(2, 0.0))],
-            forces=[nts.PointForce(lambda x: (x[0] > 1 - 1e-9) & (x[2] > 1 - 1e-9), (3, 1, 2))],
-        )  # fmt: skip
-        nts.equilibrium(nts.System([body]), load_steps=2)
-        ends.append(moved(body))
-    assert np.abs(ends[0]).max() > 1e-3
-    assert ends[1] == pytest.approx(ends[0], abs=1e-10)
 
 
 # ---- joints

@@ -291,34 +291,6 @@ def test_an_angle_counts_turns_from_where_a_run_goes_on():
     assert abs(stored[0] - stored[1]) < 1e-12 * stored[0]
 
 
-@pytest.mark.slow
-def test_any_units():
-    """m, mm and um: the same iterations, energies by the square of the length."""
-    found = [in_units(size) for size in (1.0, *UNITS)]
-    assert found[0][0] == found[1][0] == found[2][0]
-    energies = [energy for _, energy in found]
-    assert np.ptp(energies) < 1e-11 * energies[0]
-
-
-def in_units(size):
-    a = nts.RigidBody.from_inertia(2.0, np.array([1.0, 2.0, 2.5]) * size**2,
-                                   angular_velocity=(3.0, 1.0, 2.0), name="a")  # fmt: skip
-    b = nts.RigidBody.from_inertia(1.0, np.array([0.5, 0.6, 0.7]) * size**2,
-                                   (3.0 * size, 0.5 * size, 0.0), name="b")  # fmt: skip
-    points = np.array(POINTS) * size
-    joints = [
-        nts.Spring(a, b, points, energy=lambda x: 20.0 * size**2 * np.exp(-((x / size) ** 2))),
-        nts.Spring(a, None, points, stiffness=4.0),
-        nts.Damper(a, b, points, damping=2.0),
-    ]
-    run = nts.simulate(nts.System([a, b], joints=joints), INTEGRATORS["energy-momentum"],
-                       dt=0.01, t_end=0.5)  # fmt: skip
-    table = run.balance
-    assert run.status == "completed"
-    assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][0]
-    return table["newton_iterations"].tolist(), table["energy"][-1] / size**2
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize("law", ["stiffness", "energy"])
 @pytest.mark.fast_on_ranks("energy")

@@ -7,7 +7,6 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from scenes import UNITS
 from shells import grid, plate_nodes, surface_mesh
 
 import dolfinx_nts as nts
@@ -245,21 +244,6 @@ def test_skins_are_closed_and_as_large_as_their_bodies():
         assert part.area.sum() == pytest.approx(1.0)
     chosen = shell().surface(lambda x: x[0] < 0.5 + 1e-9, side="top")
     assert chosen.area.sum() == pytest.approx(0.5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
-def test_units_of_length_take_the_same_iterations(case):
-    """Metres, millimetres and micrometres."""
-    iterations, motions = [], []
-    for scale in (1.0, *UNITS):
-        bodies, run = impact(case, scale)
-        assert run.status == "completed"
-        motions.append(np.concatenate([body.last_accepted()[0] for body in bodies]) / scale)
-        iterations.append(run.balance["newton_iterations"])
-    for n, u in zip(iterations[1:], motions[1:], strict=True):
-        assert (n == iterations[0]).all()
-        assert u == pytest.approx(motions[0], abs=1e-10)
 
 
 @pytest.mark.mpi

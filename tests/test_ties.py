@@ -5,7 +5,6 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
-from scenes import UNITS
 from scipy.optimize import brentq
 from shells import grid, plate_nodes, surface_mesh
 
@@ -223,15 +222,6 @@ def test_joined_bodies_in_flight_keep_what_is_kept(kind):
         assert np.abs(balance[name] - balance[name][0]).max() < 1e-12 * size
     _, alone = flight(kind, comm=MPI.COMM_SELF)
     assert np.abs(x - alone).max() < 1e-9
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scale", [1 / UNITS[1], *UNITS])
-@pytest.mark.parametrize("kind", FLIGHTS)
-def test_units_of_length_take_the_same_iterations(kind, scale):
-    (metres, x), (others, y) = (flight(kind, s) for s in (1.0, scale))
-    assert y == pytest.approx(x, abs=1e-10)
-    assert (others.balance["newton_iterations"] == metres.balance["newton_iterations"]).all()
 
 
 # ---- bad input

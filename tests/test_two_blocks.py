@@ -149,49 +149,6 @@ def test_metres_millimetres_micrometres(integrator):
             assert np.abs(run[name] / scale - before).max() <= 1e-9 * np.abs(before).max(), name
 
 
-def history(comm, integrator, t_end, **scene):
-    """Contact forces of every step by the node's input number, (steps, nodes); the balance."""
-    stepper = nts.Stepper(two_blocks.scene(comm, **scene), integrator)
-    force = []
-    for _ in range(round(t_end / 2e-3)):
-        state = stepper.advance(2e-3)
-        surface = stepper.system.contacts[0].slave
-        mine = surface.original[surface.share], state.contacts[0].force
-        nodes, forces = (np.concatenate(comm.allgather(a)) for a in mine)
-        force.append(forces[np.argsort(nodes)])
-    table = stepper.solution.balance
-    stepper.close()
-    return np.array(force), table
-
-
-def assert_same_as_serial(integrator, t_end, **scene):
-    force, table = history(COMM, integrator, t_end, **scene)
-    alone, serial = history(MPI.COMM_SELF, integrator, t_end, **scene)
-    assert alone.max() > 0.0 and np.abs(force - alone).max() <= 1e-8 * alone.max()
-    energy = serial["energy"][0]
-    for name in ("kinetic", "potential", "energy", "contact_defect", "ledger_residual"):
-        assert np.abs(table[name] - serial[name]).max() <= 1e-9 * energy, name
-    near = np.isfinite(serial["min_gap"])
-    assert np.array_equal(near, np.isfinite(table["min_gap"]))
-    assert np.abs(table["min_gap"][near] - serial["min_gap"][near]).max() <= 1e-9
-    for name in ("linear_momentum", "angular_momentum"):
-        assert np.abs(table[name] - serial[name]).max() <= 1e-9 * np.abs(serial[name]).max(), name
-
-
-@pytest.mark.slow
-@pytest.mark.mpi
-@pytest.mark.skipif(COMM.size == 1, reason="compares ranks with a serial run")
-@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-def test_ranks_agree_with_a_serial_run(integrator):
-    assert_same_as_serial(integrator, 0.2)
-
-
-@pytest.mark.parametrize("ranks", [3, 4])
-def test_more_ranks_agree_with_a_serial_run(on_ranks, ranks):
-    """On 3 ranks one owns no slave node, on 4 the contact zone is cut by the partition."""
-    assert on_ranks(ranks, __file__).count("same as serial") == ranks
-
-
 @pytest.mark.slow
 @pytest.mark.mpi
 def test_condensation_changes_nothing():
@@ -271,9 +228,3 @@ def test_krylov_in_metres_and_micrometres():
     assert np.array_equal(runs[0]["newton_iterations"], runs[1]["newton_iterations"])
     assert np.array_equal(runs[0]["active"], runs[1]["active"])
     assert np.allclose(runs[1]["energy"] / UNITS[1] ** 2, runs[0]["energy"], rtol=1e-9, atol=0)
-
-
-if __name__ == "__main__":
-    for scheme in (nts.Midpoint(), ENERGY_MOMENTUM):
-        assert_same_as_serial(scheme, 0.2)
-    print("same as serial", flush=True)

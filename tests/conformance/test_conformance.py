@@ -132,6 +132,13 @@ def test_no_rank_matters():
         assert_alike(run_of(scene, Frame(comm=MPI.COMM_SELF))[0], plain(scene)[0])
 
 
+@pytest.mark.parametrize("ranks", [3, 4])
+def test_no_number_of_ranks_matters(on_ranks, ranks):
+    """On 3 ranks some own no slave node, on 4 the contact zone is cut by the partition."""
+    name = f"{__file__}::test_no_rank_matters"
+    on_ranks(ranks, "-m", "pytest", "-q", "-p", "no:cacheprovider", name)
+
+
 @pytest.mark.parametrize("name", INTEGRATORS)
 @scenes
 def test_a_run_goes_on_where_a_checkpoint_was_written(scene, name, tmp_path):
