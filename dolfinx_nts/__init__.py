@@ -52,7 +52,6 @@ from dolfinx_nts.point_elements import EveryStep, PointElements, PointPart
 from dolfinx_nts.points import Points
 from dolfinx_nts.run.checkpoint import Checkpoint, restart
 from dolfinx_nts.run.equilibrium import equilibrium
-from dolfinx_nts.run.intercept import intercept
 from dolfinx_nts.run.saved import Saved, load
 from dolfinx_nts.run.simulate import simulate
 from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
@@ -151,7 +150,6 @@ __all__ = [
     "cauchy_stress",
     "equilibrium",
     "extrude",
-    "intercept",
     "linear",
     "load",
     "motion_of",
