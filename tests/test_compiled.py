@@ -57,15 +57,13 @@ def test_elements_are_those_of_numpy(nc, friction):
             assert relative(found, expected) < 1e-13
 
 
-#: Friction, whether pairs share nodes, and what may slip rather than leave or has a bound.
+#: Friction, and what it does.
 LAWS = {
     "frictionless": (0.0, {}),
     "friction": (0.3, {}),
-    "lets slip": (0.3, {"lets_slip": True}),
     "rubs hardly": (0.3, {"rubs": Rub.HARDLY}),
     "strong": (3.0, {}),
     "endless": (np.inf, {}),
-    "bounded": (np.inf, {"bounded": True}),
 }
 
 

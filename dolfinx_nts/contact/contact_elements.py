@@ -445,5 +445,7 @@ class ContactElements(ContactLaws):
             if not self._free[i, 0].any():
                 # Several such nodes on one facet share the little that its nodes can give way.
                 remedy = "its motion is prescribed, so make its surface the master"
+            elif np.isinf(self.pair.friction):
+                remedy = "infinite friction may let it neither stick nor leave: try friction=1e4"
             text += f": it flips between {states} and {UNSETTLED}{remedy}"
         return float(weight[i]), text

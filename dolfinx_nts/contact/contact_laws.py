@@ -14,7 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.constraints import SHIFT
-from dolfinx_nts.contact.coulomb import HARDLY, STRONG, UNEVEN, Coulomb, Rub, Slip, Together
+from dolfinx_nts.contact.coulomb import (
+    HARDLY,
+    NO_PULL,
+    STRONG,
+    UNEVEN,
+    Coulomb,
+    Rub,
+    Slip,
+    Together,
+)
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.parallel import gather_rows
@@ -83,8 +92,6 @@ class ContactLaws:
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
         rounding: Gap [m] that counts as none.
         force_rounding: Contact force [kg m] that counts as none.
-        bounded: Whether infinite friction has a bound.
-        lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
         imposed: Which pairs are active, whatever their forces and gaps say, shape (n,); None: those
             that the law says.
         overlap: How deep the slaves may lie behind their facets at t_{n+1} [m], shape (n,).
@@ -103,8 +110,6 @@ class ContactLaws:
     overlap: FloatArray | float = 0.0
     rounding: float = 0.0
     force_rounding: float = 0.0
-    bounded: bool = False
-    lets_slip: bool = False
     imposed: BoolArray | None = None
     rubs: Rub = Rub.LAW
     before: FloatArray | None = None
@@ -245,7 +250,6 @@ class ContactLaws:
             friction=self.pair.friction,
             yields=self.pair.yields,
             redundant=self.pair.redundant,
-            bounded=self.bounded,
             x0=self.x0,
             foot=self.foot,
             normal=self.candidates.normal,
@@ -272,7 +276,7 @@ class ContactLaws:
                 strong=self.strong,
                 redundant=coulomb.redundant,
                 coefficient=coulomb.coefficient,
-                pull=coulomb.let_slip if self.lets_slip or coulomb.endless else 0.0,
+                pull=NO_PULL if coulomb.endless else 0.0,
                 hardly=HARDLY if self.rubs is Rub.HARDLY and not coulomb.endless else 0.0,
                 uneven=UNEVEN,
                 tangential_scale=coulomb.tangential_scale,
@@ -333,8 +337,7 @@ class ContactLaws:
 
         A touch without force has rounding in both, and with strong friction more than one solution
         (Painleve's paradox): so nodes carry where free motion would close their gaps, or did so in
-        the last step. If no step comes of that (`lets_slip`), a small pull on a node that sticks
-        lets it slip. A solved step never ends in such a state, so this adds no solution.
+        the last step.
         """
         if self.imposed is not None:
             return np.where(self.imposed, -np.inf, np.inf)

@@ -22,15 +22,13 @@ TANGENTIAL_SCALE = 0.05
 #: The same where all points share nodes, as of rigid bodies, whose mass is divided among them.
 _OF_SHARED = 0.5
 #: Largest coefficient of friction in numbers: larger ones are this one, but for infinite friction.
-_LARGEST = 1e8
-#: Coefficient of infinite friction where it has a bound: sticking by more would be rounding's.
-_BOUND = 1e4
-#: Pull over friction that counts as none.
-_NO_PULL = 1e-8
+#: Sticking by more would be rounding's.
+_LARGEST = 1e6
+#: Pull over friction that counts as none: without bound a node may stick by no normal force at all,
+#: whose rounding has any sign.
+NO_PULL = 1e-8
 #: Coefficient above which friction may hold a node that free motion lets go (Painleve's paradox).
 STRONG = 1.0
-#: Pull over friction up to which a node that sticks is let slip before it is let go.
-_PULL = 0.01
 #: Square of the part of a motion that counts as none.
 _IMMOVABLE = 1e-12
 #: Slip over the size of the facet that counts as none.
@@ -83,7 +81,7 @@ class Together(NamedTuple):
 
 def no_pull(friction: FloatArray) -> FloatArray:
     """Contact force that counts as none beside these friction forces (n, 3), in their unit."""
-    none: FloatArray = _NO_PULL * np.linalg.norm(friction, axis=1)
+    none: FloatArray = NO_PULL * np.linalg.norm(friction, axis=1)
     return none
 
 
@@ -97,7 +95,6 @@ class Coulomb:
         friction: Coefficient; `math.inf` sticks.
         yields: As of `ContactPair`.
         redundant: As of `ContactPair`.
-        bounded: Whether infinite friction has a bound.
         x0: Slave, and what the master is interpolated from, at t_n [m], (n, control + 1, 3).
         foot: Weights of the control points in the foot at t_n, shape (n, nc).
         normal: Of the master at t_n, shape (n, 3).
@@ -113,7 +110,6 @@ class Coulomb:
     friction: float
     yields: bool
     redundant: bool
-    bounded: bool
     x0: FloatArray
     foot: FloatArray
     normal: FloatArray
@@ -126,7 +122,7 @@ class Coulomb:
     @property
     def endless(self) -> bool:
         """Whether friction has no bound."""
-        return bool(np.isinf(self.friction)) and not self.bounded
+        return bool(np.isinf(self.friction))
 
     @property
     def still(self) -> FloatArray:
@@ -136,13 +132,7 @@ class Coulomb:
     @property
     def coefficient(self) -> float:
         """That of the equations, which is a number."""
-        return min(self.friction, _BOUND if np.isinf(self.friction) else _LARGEST)
-
-    @property
-    def let_slip(self) -> float:
-        """Pull over friction up to which a node that sticks is let slip before it is let go."""
-        # Without bound a node may stick by no normal force at all, whose rounding has any sign.
-        return _NO_PULL if self.endless else _PULL
+        return min(self.friction, _LARGEST)
 
     @cached_property
     def tangential_scale(self) -> FloatArray:

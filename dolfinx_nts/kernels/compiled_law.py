@@ -28,7 +28,7 @@ class Law(NamedTuple):
         strong: Whether it may hold a node that free motion lets go.
         redundant: As of `ContactPair`.
         coefficient: Of friction [-].
-        pull: Pull over friction up to which a node that sticks is let slip before it is let go.
+        pull: Pull over friction up to which a node that sticks is not let go.
         uneven: Largest ratio of normal forces by which friction is divided.
         opening: Part of `yielding` by which a gap that is open counts against a force.
         hardly: Stiffness against sliding of pairs that hardly rub, over `yielding`; 0: they do as

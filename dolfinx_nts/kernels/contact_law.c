@@ -47,8 +47,7 @@ static double distance_of(const Slip *slip)
 
 static int any(const double *a) { return a && (a[0] != 0.0 || a[1] != 0.0 || a[2] != 0.0 || a[3] != 0.0); }
 
-/* Pull up to which a node that sticks is let slip before it is let go: by the law continued beyond zero force,
-   since letting the node go would close its gap again. */
+/* Pull up to which a node that sticks is not let go. */
 static double pull_of(const Law *law, const Slip *slip, double c, const double *t, const double *unmoved)
 {
     double friction = length(slip->metric, t);

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dolfinx_nts.contact.contact_laws import _OPENING
-from dolfinx_nts.contact.coulomb import HARDLY, STRONG, UNEVEN, Rub
+from dolfinx_nts.contact.coulomb import HARDLY, NO_PULL, STRONG, UNEVEN, Rub
 from dolfinx_nts.kernels.compiled_law import Obeyed
 from twins.friction import length, return_map
 
@@ -15,7 +15,7 @@ def laws(elements, x, residual, tangent, gap, slip, multiplier, together):
     force, row = end[:, 0], residual.shape[1] - elements.num_constraints
     opens = np.where(gap > 0.0, _OPENING, 1.0)
     none = elements._no_force
-    if slip is not None and (elements.lets_slip or elements.coulomb.endless):
+    if slip is not None and elements.coulomb.endless:
         none = none - pull(elements.coulomb, slip, end)
     active = -force - elements._yielding * opens * gap > none
     off = ~active
@@ -54,12 +54,12 @@ def at_end(elements, multiplier):
 
 
 def pull(law, slip, multiplier):
-    """Pull [kg m] up to which a node that sticks is let slip before it is let go, shape (n,)."""
+    """Pull [kg m] up to which a node that sticks is not let go, shape (n,)."""
     t, s = multiplier[:, -2:], law.tangential_scale[:, None] * slip.value
     friction = length(slip.metric, t)
     resists = friction**2 + np.einsum("na,na->n", t, s) > 0.0
     resists &= ~law.unmoved.any(axis=(1, 2))
-    return np.where(resists, law.let_slip * friction, 0.0)
+    return np.where(resists, NO_PULL * friction, 0.0)
 
 
 def return_scale(law, slip, bound, held):
