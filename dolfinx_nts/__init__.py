@@ -54,7 +54,6 @@ from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.strain_energy import Isotropic
 from dolfinx_nts.run.checkpoint import Checkpoint, restart
 from dolfinx_nts.run.equilibrium import equilibrium
-from dolfinx_nts.run.intercept import intercept
 from dolfinx_nts.run.run_file import Saved, load
 from dolfinx_nts.run.simulate import simulate
 from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
@@ -153,7 +152,6 @@ __all__ = [
     "cauchy_stress",
     "equilibrium",
     "extrude",
-    "intercept",
     "linear",
     "load",
     "motion_of",

@@ -118,11 +118,15 @@ def write_on_root(comm: Any, what: str, action: Callable[[], Any]) -> Any:
     ) from cause
 
 
-def same_kernels(comm: Any) -> None:
-    """Take compiled kernels on all ranks or on none: what ranks decide must not differ by rounding.
+def need_kernels(comm: Any) -> None:
+    """Compile the kernels of contact where they are not there. Collective.
 
-    Rank 0 compiles them for all that share its cache.
+    Raises:
+        RuntimeError: On all ranks, if one of them cannot.
     """
-    on_root(comm, library.is_there)
-    if not all(comm.allgather(library.is_there())):
-        library.leave_out()
+    problem = None
+    try:
+        library.load()
+    except library.NotMadeError as error:
+        problem = str(error)
+    raise_together(comm, problem, RuntimeError)

@@ -18,7 +18,7 @@ from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
 from dolfinx_nts.contact.shared_nodes import areas, check_shared
 from dolfinx_nts.interaction.coupling import Joint, is_joint
-from dolfinx_nts.parallel import raise_together, same_kernels
+from dolfinx_nts.parallel import need_kernels, raise_together
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.validation import items, known_options, require_same, vector
 
@@ -112,7 +112,7 @@ class System:
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
         check_shared(self.contacts)
         if self.contacts:
-            same_kernels(self.comm)
+            need_kernels(self.comm)
         start = self.initial_state()
         depths = self.penetration(start)
         for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):

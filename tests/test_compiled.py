@@ -1,6 +1,5 @@
-"""The compiled kernels against their twins in NumPy, and runs without a compiler."""
+"""The compiled kernels against their twins in NumPy, and what is told without a compiler."""
 
-import logging
 import types
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -11,15 +10,15 @@ import numpy as np
 import pytest
 from facet_kinds import CENTRE, FLAT, KINDS
 from measures import relative
+from twins import closest, laws, obstacle, points
 
 import dolfinx_nts as nts
-from dolfinx_nts.contact import contact_elements
-from dolfinx_nts.contact.coulomb import Together
+from dolfinx_nts.contact.coulomb import Rub, Together
 from dolfinx_nts.contact.facet_elements import FacetElements
 from dolfinx_nts.contact.obstacle_elements import ObstacleElements
 from dolfinx_nts.kernels import compiled, compiled_law, facets, library
 from dolfinx_nts.kernels.nts_element import Gap
-from dolfinx_nts.parallel import same_kernels
+from dolfinx_nts.parallel import need_kernels
 
 N = 40
 
@@ -45,17 +44,11 @@ def pairs(nc, friction, rule, condense=True):
     return elements, x1, rng.normal(size=(N, elements.num_constraints))
 
 
-def test_the_library_is_there():
-    assert library.is_there()
-
-
-@pytest.mark.parametrize("rule", ["mean-value", "gonzalez", "direct"])
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("nc", KINDS)
-def test_elements_are_those_of_numpy(nc, friction, rule, monkeypatch):
-    elements, x, multiplier = pairs(nc, friction, rule)
-    here = elements._element(x, None, multiplier)
-    there = without_compiler(monkeypatch, elements._element, x, None, multiplier)
+def test_elements_are_those_of_numpy(nc, friction):
+    elements, x, multiplier = pairs(nc, friction, "mean-value")
+    here, there = elements._compiled(x, multiplier), elements._condensed(x, multiplier)
     for found, expected in zip(here[:3], there[:3], strict=True):
         assert relative(found, expected) < 1e-13
     assert (here[3] is None) == (there[3] is None) == (not friction)
@@ -64,20 +57,13 @@ def test_elements_are_those_of_numpy(nc, friction, rule, monkeypatch):
             assert relative(found, expected) < 1e-13
 
 
-def without_compiler(monkeypatch, function, *arguments):
-    with monkeypatch.context() as patch:
-        patch.setattr(library, "load", lambda: None)
-        return function(*arguments)
-
-
-#: Friction, whether pairs share nodes, and what may slip rather than leave or has a bound.
+#: Friction, and what it does.
 LAWS = {
     "frictionless": (0.0, {}),
     "friction": (0.3, {}),
-    "lets slip": (0.3, {"lets_slip": True}),
+    "rubs hardly": (0.3, {"rubs": Rub.HARDLY}),
     "strong": (3.0, {}),
     "endless": (np.inf, {}),
-    "bounded": (np.inf, {"bounded": True}),
 }
 
 
@@ -115,7 +101,7 @@ def batches(law, *, shared, prescribed, massless):
 @pytest.mark.parametrize("prescribed", [False, True])
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("law", LAWS)
-def test_laws_are_those_of_numpy(law, shared, prescribed, massless, monkeypatch):
+def test_laws_are_those_of_numpy(law, shared, prescribed, massless):
     elements, x, multiplier = batches(
         law, shared=shared, prescribed=prescribed, massless=massless
     )
@@ -124,12 +110,12 @@ def test_laws_are_those_of_numpy(law, shared, prescribed, massless, monkeypatch)
     residual, tangent, gap, slip = elements._element(x, None, multiplier)
     gap[::3] = residual[::3, -elements.num_constraints] = 0.0
 
-    def laws():
-        arrays = residual.copy(), tangent.copy(), gap, slip, multiplier
-        return elements._laws(x, *arrays, together)
+    def arrays():
+        return residual.copy(), tangent.copy(), gap, slip, multiplier, together
 
-    here, there = laws(), without_compiler(monkeypatch, laws)
-    for found, expected in zip(here, there, strict=True):
+    here, there = elements._laws(x, *arrays()), laws.laws(elements, x, *arrays())
+    for name, expected in there._asdict().items():
+        found = getattr(here, name)
         if expected.dtype == bool:
             assert (found == expected).all()
         elif expected.size:
@@ -138,7 +124,7 @@ def test_laws_are_those_of_numpy(law, shared, prescribed, massless, monkeypatch)
             assert (error <= 1e-13 * size).all()
     assert here.active.any() and not here.active.all()
     assert np.isfinite(here.residual).all() and np.isfinite(here.tangent).all()
-    if elements.num_tangential:
+    if elements.num_tangential and law != "rubs hardly":
         assert (here.active & here.stick).any()
         assert (here.active & ~here.stick).any() or np.isinf(elements.pair.friction)
 
@@ -146,9 +132,9 @@ def test_laws_are_those_of_numpy(law, shared, prescribed, massless, monkeypatch)
 @pytest.mark.parametrize("rule", ["mean-value", "direct"])
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("shape", ["plane", "sphere", "cylinder"])
-def test_obstacles_are_those_of_numpy(shape, friction, rule, monkeypatch):
+def test_obstacles_are_those_of_numpy(shape, friction, rule):
     rng = np.random.default_rng(9)
-    obstacle = {
+    master = {
         "plane": nts.Plane((0, 0.1, 0), (1, 2, 3)),
         "sphere": nts.Sphere((0, 0, 0), 0.8),
         "cylinder": nts.Cylinder((0.1, 0, 0), (0.1, 0.2, 1), 0.8, inside=True),
@@ -156,23 +142,22 @@ def test_obstacles_are_those_of_numpy(shape, friction, rule, monkeypatch):
     x0 = rng.normal(size=(N, 1, 3))
     x = x0 + 0.1 * rng.normal(size=x0.shape)
     candidates = types.SimpleNamespace(
-        node=np.arange(N), normal=obstacle.gap(x0[:, 0]).gradient[:, 0]
+        node=np.arange(N), normal=master.gap(x0[:, 0]).gradient[:, 0]
     )
     elements = ObstacleElements(
         pair=types.SimpleNamespace(friction=friction), candidates=candidates,
         contact_gradient=rule, condense=False, x0=x0, scale=np.ones(N), theta=0.5,
-        obstacle=obstacle, displacement=np.zeros((2, 3)),
+        obstacle=master, displacement=np.zeros((2, 3)),
     )  # fmt: skip
     multiplier = rng.normal(size=(N, elements.num_constraints))
-    here = elements._element(x, None, multiplier)
-    there = without_compiler(monkeypatch, elements._element, x, None, multiplier)
+    here, there = elements._element(x, None, multiplier), obstacle.element(elements, x, multiplier)
     assert (here[3] is None) == (there[3] is None) == (not friction)
     pairs = zip([*here[:3], *(here[3] or ())], [*there[:3], *(there[3] or ())], strict=True)
     for found, expected in pairs:
         assert np.abs(found - expected).max() <= 1e-13 * max(1.0, np.abs(expected).max())
 
 
-def test_an_obstacle_of_the_users_own_may_have_numbers_of_any_kind(monkeypatch):
+def test_an_obstacle_of_the_users_own_may_have_numbers_of_any_kind():
     elements = ObstacleElements(
         pair=types.SimpleNamespace(friction=0.3),
         candidates=types.SimpleNamespace(node=np.arange(3), normal=np.tile([0.0, 0, 1], (3, 1))),
@@ -180,8 +165,7 @@ def test_an_obstacle_of_the_users_own_may_have_numbers_of_any_kind(monkeypatch):
         theta=0.5, obstacle=Table(), displacement=np.zeros((2, 3)),
     )  # fmt: skip
     x, multiplier = 1.1 * elements.x0, np.arange(9.0).reshape(3, 3)
-    here = elements._element(x, None, multiplier)
-    there = without_compiler(monkeypatch, elements._element, x, None, multiplier)
+    here, there = elements._element(x, None, multiplier), obstacle.element(elements, x, multiplier)
     for found, expected in zip([*here[:3], *here[3]], [*there[:3], *there[3]], strict=True):
         assert np.abs(found - expected).max() < 1e-14
     assert elements._normal(x).dtype == np.float64
@@ -196,18 +180,15 @@ class Table(nts.Obstacle):
         return Gap(x[:, 2].astype(np.float32), np.tile(up, (n, 1, 1)), np.zeros((n, 3, 3), int))
 
 
-@pytest.mark.parametrize("points", [1, 5])
-def test_forces_of_points_are_those_of_nodes(points, monkeypatch):
+@pytest.mark.parametrize("number", [1, 5])
+def test_forces_of_points_are_those_of_nodes(number):
     rng, nodes, rest = np.random.default_rng(10), 6, 3
-    weights = rng.normal(size=(N, points, nodes))
+    weights = rng.normal(size=(N, number, nodes))
     weights[rng.uniform(size=weights.shape) < 0.3] = 0.0
-    elements, _, _ = pairs(4, 0.3, "mean-value")
-    elements = replace(elements, x0=np.zeros((N, points, 3)))
-    monkeypatch.setattr(FacetElements, "num_coordinates", 3 * nodes)
-    residual = rng.normal(size=(N, 3 * points + rest))
+    residual = rng.normal(size=(N, 3 * number + rest))
     tangent = rng.normal(size=(N, *residual.shape[1:] * 2))
     here = compiled_law.to_nodes(weights, residual, tangent)
-    for found, expected in zip(here, elements._spread(weights, residual, tangent), strict=True):
+    for found, expected in zip(here, points.to_nodes(weights, residual, tangent), strict=True):
         assert np.abs(found - expected).max() < 1e-13
 
 
@@ -217,7 +198,7 @@ def test_wrenches_are_those_of_numpy():
     places, fixed = rng.uniform(size=(N, 5)) < 0.5, rng.uniform(size=(N, 5, 3)) < 0.3
     places[:, 3] = True
     found = compiled_law.wrenches(y, push, places, fixed)
-    assert np.abs(found - contact_elements._wrench(y, push, places, fixed)).max() < 1e-13
+    assert np.abs(found - points.wrenches(y, push, places, fixed)).max() < 1e-13
 
 
 def test_arrays_that_may_not_be_written_or_are_not_contiguous_are_read():
@@ -227,12 +208,6 @@ def test_arrays_that_may_not_be_written_or_are_not_contiguous_are_read():
     points.flags.writeable = corners.flags.writeable = False
     for found, right in zip(compiled.closest_point(points, corners[::2]), expected, strict=True):
         assert np.array_equal(found, right)
-
-
-@pytest.mark.parametrize("nc", KINDS)
-def test_condensed_is_compiled_for_the_mean_value(nc):
-    elements, x, multiplier = pairs(nc, 0.3, "mean-value")
-    assert elements._compiled(x, multiplier) is not None
 
 
 @pytest.mark.parametrize("far", [0.01, 0.3, 3.0])
@@ -266,22 +241,22 @@ def test_projections_near_the_facet_need_no_numpy(monkeypatch):
 
 @pytest.mark.parametrize("warp", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("nc", [3, 4])
-def test_closest_points_are_those_of_numpy(nc, warp, monkeypatch):
+def test_closest_points_are_those_of_numpy(nc, warp):
     rng = np.random.default_rng(6)
     corners = FLAT[nc] + warp * rng.uniform(-1, 1, (3000, nc, 3))
-    points = rng.uniform(-2, 3, (3000, 3)) * [1, 1, 0.5]
+    places = rng.uniform(-2, 3, (3000, 3)) * [1, 1, 0.5]
     # Far from the origin, in small units, and on the facets themselves.
-    corners[:500], points[:500] = corners[:500] + 1e3, points[:500] + 1e3
-    corners[500:1000], points[500:1000] = 1e-6 * corners[500:1000], 1e-6 * points[500:1000]
-    points[1000:1500] = facets.frame(corners[1000:1500], rng.uniform(0, 0.5, (500, 2)))[0]
-    xi, distance = compiled.closest_point(points, corners)
-    there, expected = facets.closest_point(points, corners)
+    corners[:500], places[:500] = corners[:500] + 1e3, places[:500] + 1e3
+    corners[500:1000], places[500:1000] = 1e-6 * corners[500:1000], 1e-6 * places[500:1000]
+    places[1000:1500] = facets.frame(corners[1000:1500], rng.uniform(0, 0.5, (500, 2)))[0]
+    xi, distance = compiled.closest_point(places, corners)
+    there, expected = closest.closest_point(places, corners)
     size = facets.size(corners)
     assert (np.abs(distance - expected) < 1e-13 * (size + expected)).all()
     # Where two points are equally close, either may be told.
     assert (np.abs(xi - there).max(axis=1) < 1e-9).mean() > 0.999
     on = facets.shape(xi, nc)[0]
-    found = np.linalg.norm(np.einsum("ni,nij->nj", on, corners) - points, axis=1)
+    found = np.linalg.norm(np.einsum("ni,nij->nj", on, corners) - places, axis=1)
     assert (np.abs(found - distance) < 1e-12 * (size + expected + 1e3 * (size > 1e-4))).all()
 
 
@@ -289,10 +264,10 @@ def test_closest_points_of_facets_without_area_are_those_of_numpy():
     corners = np.zeros((3, 4, 3))
     corners[1, 1:3, 0] = 1.0
     corners[2, 2:, 1] = 2.0
-    points = np.array([[0.0, 0, 1], [0.5, 1, 0], [3, 4, 0]])
+    places = np.array([[0.0, 0, 1], [0.5, 1, 0], [3, 4, 0]])
     for nc in (3, 4):
-        found = compiled.closest_point(points, corners[:, :nc])[1]
-        assert np.array_equal(found, facets.closest_point(points, corners[:, :nc])[1])
+        found = compiled.closest_point(places, corners[:, :nc])[1]
+        assert np.array_equal(found, closest.closest_point(places, corners[:, :nc])[1])
 
 
 def test_where_there_is_no_foot_nothing_is_solved():
@@ -302,22 +277,20 @@ def test_where_there_is_no_foot_nothing_is_solved():
     assert np.isnan(residual[0]).any() and np.isfinite(residual[1:]).all()
 
 
-def test_without_compiler_numpy_does(monkeypatch, tmp_path, caplog):
+def test_without_compiler_it_is_said_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("CC", "no-such-compiler")
-    with caplog.at_level(logging.WARNING):
-        assert library.load.__wrapped__() is None
-    assert len(caplog.records) == 1 and "no-such-compiler" in caplog.text
-    monkeypatch.setenv("CC", "false")
-    assert library.load.__wrapped__() is None
+    for compiler, why in (("no-such-compiler", "No such file"), ("false", "status 1")):
+        monkeypatch.setenv("CC", compiler)
+        with pytest.raises(library.NotMadeError, match=f"{compiler}.*ziglang") as raised:
+            library.load.__wrapped__()
+        assert "kernels of contact" in str(raised.value) and why in str(raised.value)
 
 
-def test_without_cache_numpy_does(monkeypatch, tmp_path, caplog):
+def test_without_cache_it_is_said_what_to_set(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with caplog.at_level(logging.WARNING):
-        assert library.load.__wrapped__() is None
-    assert len(caplog.records) == 1
+    with pytest.raises(library.NotMadeError, match="set XDG_CACHE_HOME"):
+        library.load.__wrapped__()
 
 
 @pytest.mark.slow
@@ -331,11 +304,14 @@ def test_several_may_compile_at_once(monkeypatch, tmp_path):
 
 
 @pytest.mark.mpi
-def test_ranks_have_the_same_kernels(monkeypatch):
+def test_what_a_rank_lacks_is_told_on_all(monkeypatch):
     comm, last = MPI.COMM_WORLD, MPI.COMM_WORLD.size - 1
-    same_kernels(comm)
-    assert library.is_there()
-    real = library.load
-    monkeypatch.setattr(library, "load", lambda: None if comm.rank == last else real())
-    same_kernels(comm)
-    assert not library.is_there()
+    need_kernels(comm)
+
+    def fail():
+        raise library.NotMadeError("no compiler")
+
+    if comm.rank == last:
+        monkeypatch.setattr(library, "load", fail)
+    with pytest.raises(RuntimeError, match="no compiler"):
+        need_kernels(comm)

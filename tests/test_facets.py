@@ -5,7 +5,9 @@ import pytest
 from facet_kinds import FLAT
 from rotations import random_rotation
 from scipy.optimize import minimize
+from twins import closest
 
+from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
 
 KINDS = (3, 4)
@@ -62,7 +64,7 @@ def test_other_facets_are_refused():
         lambda: fc.shape(np.zeros((1, 2)), 8),
         lambda: fc.edge_excess(np.zeros((1, 2)), 6),
         lambda: fc.areas(np.zeros((1, 2, 3))),
-        lambda: fc.closest_point(np.zeros((1, 3)), np.zeros((1, 5, 3))),
+        lambda: compiled.closest_point(np.zeros((1, 3)), np.zeros((1, 5, 3))),
     ):
         with pytest.raises(ValueError, match="3 .triangle. or 4 .quadrilateral."):
             call()
@@ -150,7 +152,7 @@ def test_no_facets(nc):
     assert np.array_equal(fc.tributary_areas(np.empty((0, nc), dtype=int), none, 3), np.zeros(3))
     assert fc.areas(none).shape == fc.size(none).shape == (0,)
     assert fc.project(np.empty((0, 3)), none, np.empty((0, 2)))[0].shape == (0, 2)
-    xi, distance = fc.closest_point(np.empty((0, 3)), none)
+    xi, distance = compiled.closest_point(np.empty((0, 3)), none)
     assert xi.shape == (0, 2) and distance.shape == (0,)
 
 
@@ -219,7 +221,7 @@ def test_closest_point_against_dense_sampling(nc, warp):
     rng = np.random.default_rng(11)
     n = 400
     corners, points = random_facets(rng, n, nc, warp), rng.uniform(-1, 2, (n, 3))
-    xi, distance = fc.closest_point(points, corners)
+    xi, distance = compiled.closest_point(points, corners)
     grid = fc.shape(samples(nc, 41), nc)[0]
     sampled = np.linalg.norm(np.einsum("gi,nij->ngj", grid, corners) - points[:, None], axis=2)
     assert (distance <= sampled.min(axis=1) + 1e-14).all()
@@ -234,7 +236,7 @@ def test_closest_point_against_dense_sampling(nc, warp):
 def test_closest_point_against_bounded_minimisation(warp):
     rng = np.random.default_rng(12)
     corners, points = random_facets(rng, 25, 4, warp), rng.uniform(-0.5, 1.5, (25, 3))
-    _, distance = fc.closest_point(points, corners)
+    _, distance = compiled.closest_point(points, corners)
     for x, facet, found in zip(points, corners, distance, strict=True):
 
         def square(xi, x=x, facet=facet):
@@ -255,7 +257,7 @@ def test_closest_point_inside_is_the_projection(nc):
     corners, xi = random_facets(rng, 500, nc, 0.1), 0.99 * inside(rng, 500, nc)
     point, _, normal = fc.frame(corners, xi)
     gap = rng.uniform(-0.1, 0.1, 500)
-    found, distance = fc.closest_point(point + gap[:, None] * normal, corners)
+    found, distance = compiled.closest_point(point + gap[:, None] * normal, corners)
     interior = excess(xi + 0.0, nc) == 0.0
     assert np.allclose(found[interior], xi[interior], rtol=0, atol=1e-13)
     assert np.allclose(distance, np.abs(gap), rtol=0, atol=1e-14)
@@ -266,12 +268,12 @@ def test_closest_point_on_edges_and_corners(nc):
     facet = FLAT[nc]
     outward = facet - facet.mean(axis=0)
     beyond_corners = facet + outward + [0.0, 0.0, 0.3]
-    xi, _ = fc.closest_point(beyond_corners, np.tile(facet, (nc, 1, 1)))
+    xi, _ = compiled.closest_point(beyond_corners, np.tile(facet, (nc, 1, 1)))
     assert np.allclose(fc.shape(xi, nc)[0], np.eye(nc), rtol=0, atol=1e-15)
     middle = 0.5 * (facet + np.roll(facet, -1, axis=0))
     edge = np.roll(facet, -1, axis=0) - facet
     normal = np.cross(edge, [0.0, 0.0, 1.0]) / np.linalg.norm(edge, axis=1, keepdims=True)
-    xi, distance = fc.closest_point(middle + 0.7 * normal, np.tile(facet, (nc, 1, 1)))
+    xi, distance = compiled.closest_point(middle + 0.7 * normal, np.tile(facet, (nc, 1, 1)))
     expected = 0.5 * (np.eye(nc) + np.roll(np.eye(nc), -1, axis=0))
     assert np.allclose(fc.shape(xi, nc)[0], expected, rtol=0, atol=1e-15)
     assert np.allclose(distance, 0.7, rtol=1e-14)
@@ -281,7 +283,7 @@ def test_closest_point_of_a_saddle_seen_from_its_axis():
     corners = np.array([[[-1.0, -1, 1], [1, -1, -1], [1, 1, 1], [-1, 1, -1]]])
     for height in (-3.0, -1.5, 1.5, 3.0):
         points = np.array([[0.0, 0.0, height]])
-        _, distance = fc.closest_point(points, corners)
+        _, distance = compiled.closest_point(points, corners)
         grid = surface_point(np.repeat(corners, 161**2, 0), samples(4, 161))
         sampled = np.linalg.norm(grid - points, axis=1).min()
         assert distance[0] < abs(height) and np.isclose(distance[0], sampled, rtol=1e-3)
@@ -296,7 +298,7 @@ def test_closest_point_of_triangles_without_area():
     points = rng.normal(size=(1000, 3))
     t = np.einsum("ni,ni->n", points - start, along) / np.einsum("ni,ni->n", along, along)
     foot = start + t.clip(at[:, 0], at[:, 2])[:, None] * along
-    _, distance = fc.closest_point(points, corners)
+    _, distance = compiled.closest_point(points, corners)
     assert np.allclose(distance, np.linalg.norm(points - foot, axis=1), rtol=1e-9, atol=0)
 
 
@@ -304,10 +306,10 @@ def test_both_ways_to_the_closest_point_agree():
     rng = np.random.default_rng(14)
     corners, points = random_facets(rng, 1000, 4, 0.15), rng.uniform(-1, 2, (1000, 3))
     local = fc._local(points, corners)
-    convex = fc._is_convex(fc._gram(*local))
+    convex = closest._is_convex(closest._gram(*local))
     assert 0.5 < convex.mean() < 1.0
-    xi, _ = fc.closest_point(points, corners)
-    enumerated = fc._closest_warped(*local)
+    xi, _ = compiled.closest_point(points, corners)
+    enumerated = closest._closest_warped(*local)
     assert np.allclose(enumerated, xi, rtol=0, atol=1e-12)
 
 
@@ -316,13 +318,14 @@ def test_both_ways_to_the_closest_point_agree():
 def test_closest_point_does_not_depend_on_units_or_motion(nc, warp):
     rng = np.random.default_rng(15)
     corners, points = random_facets(rng, 300, nc, warp), rng.uniform(-1, 2, (300, 3))
-    xi, distance = fc.closest_point(points, corners)
+    xi, distance = compiled.closest_point(points, corners)
     for unit in (1e-9, 1e6):
-        scaled, scaled_distance = fc.closest_point(unit * points, unit * corners)
+        scaled, scaled_distance = compiled.closest_point(unit * points, unit * corners)
         assert np.allclose(scaled, xi, rtol=0, atol=1e-10)
         assert np.allclose(scaled_distance, unit * distance, rtol=1e-12)
     rotation, shift = random_rotation(rng).T, rng.normal(size=3)
-    moved, moved_distance = fc.closest_point(points @ rotation + shift, corners @ rotation + shift)
+    turned = points @ rotation + shift, corners @ rotation + shift
+    moved, moved_distance = compiled.closest_point(*turned)
     assert np.allclose(moved, xi, rtol=0, atol=1e-10)
     assert np.allclose(moved_distance, distance, rtol=1e-12)
 
@@ -330,7 +333,7 @@ def test_closest_point_does_not_depend_on_units_or_motion(nc, warp):
 def test_far_points_keep_their_digits():
     corners = random_facets(np.random.default_rng(16), 1, 4, 0.0)
     for height in (1e3, 1e6):
-        xi, distance = fc.closest_point(np.array([[0.3, 0.6, height]]), corners)
+        xi, distance = compiled.closest_point(np.array([[0.3, 0.6, height]]), corners)
         assert np.allclose(xi, [[-0.4, 0.2]], rtol=0, atol=1e-14)
         assert np.isclose(distance[0], height, rtol=1e-15)
 
@@ -340,10 +343,10 @@ def test_collapsed_facets():
     line = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]])
     dot = np.zeros((4, 3))
     points = np.array([[0.7, 0.2, 0.5], [0.5, 0.0, 2.0], [0.0, 3.0, 4.0]])
-    xi, distance = fc.closest_point(points, np.stack([triangle, line, dot]))
+    xi, distance = compiled.closest_point(points, np.stack([triangle, line, dot]))
     assert np.isfinite(xi).all()
     assert np.allclose(distance, [0.5, 2.0, 5.0], rtol=1e-14)
-    xi, distance = fc.closest_point(points[1:], np.stack([line, dot])[:, :3])
+    xi, distance = compiled.closest_point(points[1:], np.stack([line, dot])[:, :3])
     assert np.isfinite(xi).all()
     assert np.allclose(distance, [2.0, 5.0], rtol=1e-14)
 
@@ -352,5 +355,5 @@ def test_point_on_the_surface_has_no_distance():
     rng = np.random.default_rng(17)
     for nc in KINDS:
         corners, xi = random_facets(rng, 200, nc, 0.3), inside(rng, 200, nc)
-        _, distance = fc.closest_point(surface_point(corners, xi), corners)
+        _, distance = compiled.closest_point(surface_point(corners, xi), corners)
         assert distance.max() < 1e-15

@@ -57,7 +57,6 @@ def test_frames_of_a_run(mpi_tmp_path):
     [
         ({"path": "run.png"}, "path='run.png': pass a file that ends with .gif"),
         ({"every": 0}, "every=0: pass a whole number of steps >= 1"),
-        ({"frames_per_second": -1.0}, "frames_per_second=-1.0: must be positive"),
     ],
 )
 def test_wrong_options_are_named(options, message):

@@ -12,11 +12,11 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from integrators import CONTACT_RULES
 from measures import difference
 from scenes import CELLS, box, rubbing_blocks
+from twins.friction import return_map
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact import coulomb
 from dolfinx_nts.kernels import facets
-from dolfinx_nts.kernels.friction import return_map
 from dolfinx_nts.kernels.nts_element import invariants, metric, projection
 from dolfinx_nts.solve.convergence import ratios
 

@@ -18,7 +18,7 @@ from scipy import ndimage
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact import crossings, intrusion, obstacle_crossings, overlap
-from dolfinx_nts.kernels import facets
+from dolfinx_nts.kernels import compiled
 
 COMM = MPI.COMM_WORLD
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
@@ -608,7 +608,7 @@ def obstacles(rng):
     radius, far = rng.uniform(0.2, 2.0), 5.0
 
     def from_centre(corners):
-        return facets.closest_point(np.tile(centre, (len(corners), 1)), corners)[1]
+        return compiled.closest_point(np.tile(centre, (len(corners), 1)), corners)[1]
 
     def sampled(corners, distance):
         s, t = (a.ravel()[:, None] for a in np.meshgrid(*[np.linspace(-1, 1, 201)] * 2))

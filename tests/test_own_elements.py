@@ -697,9 +697,7 @@ def test_constraints_that_nobody_can_follow_are_refused():
 
 
 class Telling(nts.EveryStep):
-    """Warns of bodies that have moved by 12.5 mm when a step begins, and gives way once."""
-
-    firm = True
+    """Warns of bodies that have moved by 12.5 mm when a step begins."""
 
     def warnings(self, parts):
         x = self.step.state.u
@@ -707,13 +705,9 @@ class Telling(nts.EveryStep):
         told = nts.StepWarning("way", way, f"a body has moved by {way:.3g} m", ("a",))
         return [told] if way > 0.0125 else []
 
-    def give_way(self):
-        was, self.firm = self.firm, False
-        return was
-
 
 @pytest.mark.mpi
-def test_a_coupling_of_ones_own_warns_and_gives_way():
+def test_a_coupling_of_ones_own_warns():
     body, x = cube((0, 0, 0), "a", velocity=(1.0, 0.0, 0.0)), np.array([0.3, 0.4, 0.6])
 
     class Told(Drive):
@@ -727,8 +721,6 @@ def test_a_coupling_of_ones_own_warns_and_gives_way():
     (found,) = stepper.solution.warnings.values()
     assert (found.kind, found.count, found.about) == ("way", 2, ("a",))
     assert found.worst == pytest.approx(0.02, abs=1e-9)
-    problem = stepper.problem
-    assert [problem.couplings.give_way() for _ in range(2)] == [True, False]
     stepper.close()
 
 

@@ -8,6 +8,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from scenes import RUBBER
 
 import dolfinx_nts as nts
+from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
 
 COMM = MPI.COMM_WORLD
@@ -99,7 +100,7 @@ def entered(slave, master, u_slave, u_master):
     x, corners = master.positions(u_master), slave.positions(u_slave)[slave.facets]
     deepest = 0.0
     for point in x:
-        xi, distance = fc.closest_point(np.tile(point, (len(corners), 1)), corners)
+        xi, distance = compiled.closest_point(np.tile(point, (len(corners), 1)), corners)
         nearest = distance.argmin()
         foot, _, normal = fc.frame(corners[[nearest]], xi[[nearest]])
         deepest = max(deepest, float((foot[0] - point) @ normal[0]))

@@ -168,14 +168,14 @@ def test_a_bead_at_the_side_of_a_ring_hangs_by_infinite_friction(name, integrato
 def test_strong_friction_has_a_limit(integrator):
     """A soft disc released at the side of a ring, whose nodes press next to nothing there."""
 
-    runs = [_disc(mu, integrator) for mu in (1e4, 1e6, 1e8, np.inf)]
+    runs = [_disc(mu, integrator) for mu in (1e4, 1e5, 1e6)]
     for run in runs:
-        assert run.status == "completed"
-    near, nearer, limit, endless = (run.balance["energy"][-1] for run in runs)
+        assert run.status == "completed" and not run.warnings
+    near, nearer, limit = (run.balance["energy"][-1] for run in runs)
     assert abs(near - limit) < 2e-2 * limit and abs(nearer - limit) < 2e-2 * limit
-    assert abs(endless - limit) < 2e-2 * limit
-    # Where a node neither sticks nor leaves, the run says that it slips.
-    assert list(runs[-1].warnings) == ["slip"] and not runs[-1].warnings["slip"].grave
+    # Without a limit a node neither sticks, by a pull, nor leaves, as it would enter the ring.
+    endless = _disc(np.inf, integrator).status
+    assert "infinite friction may let it neither stick nor leave: try friction=1e4" in endless
 
 
 def _disc(friction, integrator):

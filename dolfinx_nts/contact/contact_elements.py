@@ -183,26 +183,8 @@ class ContactElements(ContactLaws):
         """The transpose of `_control`: forces and tangents of nodes from those of points."""
         if self._map is None:
             return part
-        found = compiled_law.to_nodes(self._map, part.residual, part.tangent)
-        residual, tangent = found or self._spread(self._map, part.residual, part.tangent)
+        residual, tangent = compiled_law.to_nodes(self._map, part.residual, part.tangent)
         return part._replace(residual=residual, tangent=tangent)
-
-    def _spread(
-        self, weights: FloatArray, residual: FloatArray, tangent: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """`_to_nodes`, as `compiled_law.to_nodes` does it."""
-        n, size = residual.shape
-        points, turned = slice(self._num_places), weights.transpose(0, 2, 1)
-        places, width = (self.num_control + 1, 3), self.num_coordinates
-        force = np.matmul(turned, residual[:, points].reshape(n, *places)).reshape(n, width)
-        residual = np.concatenate([force, residual[:, self._num_places :]], axis=1)
-        columns = tangent[:, :, points].reshape(n, size, *places)
-        columns = np.matmul(turned[:, None], columns).reshape(n, size, width)
-        tangent = np.concatenate([columns, tangent[:, :, self._num_places :]], axis=2)
-        wide = tangent.shape[2]
-        rows = np.matmul(turned, tangent[:, points].reshape(n, places[0], 3 * wide))
-        rows = rows.reshape(n, width, wide)
-        return residual, np.concatenate([rows, tangent[:, self._num_places :]], axis=1)
 
     def input_node(self, i: int) -> int:
         """Number of a pair's slave node in the user's mesh."""
@@ -377,8 +359,7 @@ class ContactElements(ContactLaws):
         for side in self._nodes:
             here = slice(start, start + side.nodes.shape[1])
             given = y[:, here], force[:, here], side.places[on], side.fixed[on]
-            wrench = compiled_law.wrenches(*given)
-            found.append(_wrench(*given) if wrench is None else wrench)
+            found.append(compiled_law.wrenches(*given))
             start = here.stop
         return found
 
@@ -464,16 +445,7 @@ class ContactElements(ContactLaws):
             if not self._free[i, 0].any():
                 # Several such nodes on one facet share the little that its nodes can give way.
                 remedy = "its motion is prescribed, so make its surface the master"
+            elif np.isinf(self.pair.friction):
+                remedy = "infinite friction may let it neither stick nor leave: try friction=1e4"
             text += f": it flips between {states} and {UNSETTLED}{remedy}"
         return float(weight[i]), text
-
-
-def _wrench(
-    y: FloatArray, push: FloatArray, places: BoolArray, fixed: BoolArray
-) -> FloatArray:
-    """Do as `compiled_law.wrenches`."""
-    number = places.astype(float)
-    push = np.where(fixed, 0.0, push)
-    middle = np.einsum("nk,nki->ni", number, y) / number.sum(axis=1)[:, None]
-    moment = cross(y - middle[:, None] * number[:, :, None], push).sum(axis=1)
-    return np.column_stack([np.einsum("nk,nki->ni", number, push), moment])

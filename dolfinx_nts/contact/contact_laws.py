@@ -13,7 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.contact.coulomb import STRONG, UNEVEN, Coulomb, Rub, Slip, Together
+from dolfinx_nts.contact.coulomb import (
+    HARDLY,
+    NO_PULL,
+    STRONG,
+    UNEVEN,
+    Coulomb,
+    Rub,
+    Slip,
+    Together,
+)
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.interaction.constraints import SHIFT
 from dolfinx_nts.kernels import compiled_law
@@ -83,8 +92,6 @@ class ContactLaws:
         theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
         rounding: Gap [m] that counts as none.
         force_rounding: Contact force [kg m] that counts as none.
-        bounded: Whether infinite friction has a bound.
-        lets_slip: Whether a node that sticks and pulls a little is let slip before it is let go.
         imposed: Which pairs are active, whatever their forces and gaps say, shape (n,); None: those
             that the law says.
         overlap: How deep the slaves may lie behind their facets at t_{n+1} [m], shape (n,).
@@ -103,8 +110,6 @@ class ContactLaws:
     overlap: FloatArray | float = 0.0
     rounding: float = 0.0
     force_rounding: float = 0.0
-    bounded: bool = False
-    lets_slip: bool = False
     imposed: BoolArray | None = None
     rubs: Rub = Rub.LAW
     before: FloatArray | None = None
@@ -245,16 +250,13 @@ class ContactLaws:
             friction=self.pair.friction,
             yields=self.pair.yields,
             redundant=self.pair.redundant,
-            bounded=self.bounded,
             x0=self.x0,
             foot=self.foot,
             normal=self.candidates.normal,
             tangents=self._tangents,
             size=self.candidates.length,
             free=free / square.sum(axis=1)[:, None],
-            scale=self.scale,
             yielding=self._yielding,
-            of_end=self._of_end,
             rubs=self.rubs,
         )
 
@@ -274,7 +276,8 @@ class ContactLaws:
                 strong=self.strong,
                 redundant=coulomb.redundant,
                 coefficient=coulomb.coefficient,
-                pull=coulomb.let_slip if self._may_pull else 0.0,
+                pull=NO_PULL if coulomb.endless else 0.0,
+                hardly=HARDLY if self.rubs is Rub.HARDLY and not coulomb.endless else 0.0,
                 uneven=UNEVEN,
                 tangential_scale=coulomb.tangential_scale,
                 unmoved=coulomb.unmoved if coulomb.prescribes else None,
@@ -304,11 +307,6 @@ class ContactLaws:
         found = compiled_law.laws(
             self._law, together, residual, tangent, gap, slip, multiplier, held, normal
         )
-        if found is None:
-            found = self._write(x, residual, tangent, gap, slip, multiplier, together, normal)
-        if slip is not None and self.rubs is Rub.HARDLY and not self.coulomb.endless:
-            self.coulomb.rub_hardly(found.residual, found.tangent, slip, found.end, found.active)
-            found.stick[found.active] = False
         return Contribution(
             found.residual,
             found.tangent,
@@ -325,45 +323,6 @@ class ContactLaws:
             end=found.end,
         )
 
-    def _write(
-        self,
-        x: FloatArray,
-        residual: FloatArray,
-        tangent: FloatArray,
-        gap: FloatArray,
-        slip: Slip | None,
-        multiplier: FloatArray,
-        together: Together,
-        normal: FloatArray | None,
-    ) -> compiled_law.Obeyed:
-        """Write the laws into the pairs' rows, as `compiled_law.laws` does."""
-        end, scale = self._at_end(multiplier), self.scale
-        force = end[:, 0]
-        opens = np.where(gap > 0.0, _OPENING, 1.0)
-        active = -force - self._yielding * opens * gap > self._none(slip, end)
-        off = ~active
-        row = residual.shape[1] - self.num_constraints
-        residual[off, row] = force[off] / scale[off]
-        tangent[off, row] = 0.0
-        tangent[off, row, row] = self._of_end[off] / scale[off]
-        tangent[active, row, row] -= together.normal / scale[active]
-        stick, distance = np.zeros_like(active), np.zeros(self.num_elements)
-        on_slave, tangential = -residual[:, :3], np.zeros((self.num_elements, 3))
-        if slip is not None:
-            assert normal is not None
-            stick = self.coulomb.write(x, residual, tangent, slip, end, active, together)
-            square = np.einsum("na,nab,nb->n", slip.value, slip.metric, slip.value)
-            distance[active] = np.sqrt(square[active])
-            along = np.einsum("ni,ni->n", on_slave, normal)
-            tangential = on_slave - along[:, None] * normal
-        # With mass in rows and columns the whole matrix is in kg, whatever the size of the scene.
-        residual[:, row:] *= scale[:, None]
-        tangent[:, row:] *= scale[:, None, None]
-        tangent[:, :, row:] *= scale[:, None, None]
-        return compiled_law.Obeyed(
-            residual, tangent, end, active, stick, distance, on_slave, tangential
-        )
-
     @cached_property
     def _massless(self) -> BoolArray:
         """Which slaves are massless nodes, shape (n,)."""
@@ -373,45 +332,13 @@ class ContactLaws:
         return massless
 
     @property
-    def _of_end(self) -> FloatArray:
-        """Derivative of the multipliers at t_{n+1} by those of the step, shape (n,)."""
-        return 1.0 + self._massless
-
-    def _at_end(self, multiplier: FloatArray) -> FloatArray:
-        """Multipliers at t_{n+1} from those of the step, of which they are half at massless nodes.
-
-        Those of the augmented constraints are not looked at.
-        """
-        if self.before is None:
-            return multiplier
-        some, end = self._massless, multiplier.copy()
-        end[some] *= 2.0
-        end[some, 0] -= self.before[some, 0]
-        if self.num_tangential:
-            end[some, -2:] -= self.before[some, 1:]
-        return end
-
-    @property
-    def _may_pull(self) -> bool:
-        """Whether a small pull on a node that sticks lets it slip."""
-        return self.lets_slip or self.coulomb.endless
-
-    @property
     def _no_force(self) -> FloatArray:
-        """Contact force that counts as none before friction has a say [kg m], shape (n,)."""
-        if self.imposed is not None:
-            return np.where(self.imposed, -np.inf, np.inf)
-        return self._yielding * self.gap_rounding
-
-    def _none(self, slip: Slip | None, multiplier: FloatArray) -> FloatArray:
-        """Contact force that counts as none [kg m], shape (n,).
+        """Contact force that counts as none before friction has a say [kg m], shape (n,).
 
         A touch without force has rounding in both, and with strong friction more than one solution
         (Painleve's paradox): so nodes carry where free motion would close their gaps, or did so in
-        the last step. If no step comes of that (`lets_slip`), a small pull on a node that sticks
-        lets it slip. A solved step never ends in such a state, so this adds no solution.
+        the last step.
         """
-        none = self._no_force
-        if slip is None or not self._may_pull:
-            return none
-        return none - self.coulomb.pull(slip, multiplier)
+        if self.imposed is not None:
+            return np.where(self.imposed, -np.inf, np.inf)
+        return self._yielding * self.gap_rounding

@@ -59,7 +59,6 @@ class ContactSearch:
         idle_gaps: Gaps [m] of the idle candidates of each contact in the last solution.
         beside: Of each contact, how deep in facet sizes the deepest of this rank's nodes that
             passed the surface's edge lies behind it at t_n, and its input number.
-        bounded: Whether infinite friction has a bound, where nothing else solves a step.
     """
 
     def __init__(
@@ -70,7 +69,6 @@ class ContactSearch:
         self.elements: list[ContactElements] = []
         self.idle: list[ContactElements] = []
         self.idle_gaps: list[FloatArray] = []
-        self.bounded = False
         self.beside = [(0.0, -1)] * len(contacts)
         self._cover = [0.0] * len(contacts)
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
@@ -90,9 +88,9 @@ class ContactSearch:
             has[c.candidates.node] = True
         return found
 
-    def resume(self, had: Sequence[BoolArray], bounded: bool) -> None:
-        """Go on from another run's `had_unknowns` and `bounded`, before the first step."""
-        self._had, self.bounded = list(had), bounded
+    def resume(self, had: Sequence[BoolArray]) -> None:
+        """Go on from another run's `had_unknowns`, before the first step."""
+        self._had = list(had)
 
     # ---- elements of a step
     def begin(
@@ -123,8 +121,6 @@ class ContactSearch:
         """Give unknowns to the candidates that are awake."""
         both = list(zip(self._found, self._with_unknowns, strict=True))
         self.elements, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
-        if self.bounded:
-            self.elements = [replace(c, bounded=True) for c in self.elements]
         self.idle_gaps = [np.empty(0) for _ in self.idle]
         watching = any(c.num_elements for c in self.idle)
         self._watching = anywhere(self._comm, watching)
@@ -330,8 +326,8 @@ class ContactSearch:
         return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
 
     def warnings(self, parts: Sequence[Contribution]) -> list[StepWarning]:
-        """Nodes that an accepted step leaves beside or behind a surface, or lets slip after all."""
-        return [*self._beside(), *self._unheld(parts), *self._slips(parts)]
+        """Nodes that an accepted step leaves beside or behind a surface."""
+        return [*self._beside(), *self._unheld(parts)]
 
     def _beside(self) -> Iterator[StepWarning]:
         """Nodes that have passed by a surface's edge and lie behind it. Collective."""
@@ -368,28 +364,7 @@ class ContactSearch:
                 )
                 yield StepWarning("contact below rounding", float(depth), text, (pair.name,), True)
 
-    def _slips(self, parts: Sequence[Contribution]) -> Iterator[StepWarning]:
-        """Nodes that slip in spite of infinite friction. Collective.
-
-        They may slip in the next step, too, if any does.
-        """
-        both = zip(self.elements, parts, strict=True)
-        endless = [(c.pair.name, part) for c, part in both if np.isinf(c.pair.friction)]
-        if not (endless and self.bounded):
-            return
-        slips = [part.distance[part.active & ~part.stick].max(initial=0.0) for _, part in endless]
-        farthest = global_max(self._comm, np.array(slips))
-        self.bounded = bool(farthest.max() > 0.0)
-        for (name, _), slip in zip(endless, farthest, strict=True):
-            if slip > 0.0:
-                text = (
-                    f"nodes of contact {name!r} would pull if they stuck and would enter the "
-                    "master if they left: in spite of infinite friction they slip, by up to "
-                    f"{slip:.3g} in a step; a finite coefficient may be meant"
-                )
-                yield StepWarning("slip", float(slip), text, (name,))
-
-    # ---- first guesses, and what else solves a step
+    # ---- first guesses, and what leads to a solution
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the contact forces of the last step, shape (n, constraints).
 
@@ -421,16 +396,11 @@ class ContactSearch:
     @property
     def may_slip(self) -> bool:
         """Whether any contact has friction with a bound."""
-        coefficients = [pair.friction for pair in self._pairs]
-        return any(mu > 0.0 and (self.bounded or np.isfinite(mu)) for mu in coefficients)
+        return any(0.0 < pair.friction < np.inf for pair in self._pairs)
 
     def carried_any(self) -> bool:
         """Whether any node pressed at t_n. Collective."""
         return anywhere(self._comm, any((old.force > 0.0).any() for old in self._old))
-
-    def let_slip(self) -> None:
-        """Solve this step with nodes that slip rather than leave, see `ContactElements`."""
-        self.elements = [replace(c, lets_slip=True) for c in self.elements]
 
     @contextmanager
     def imposed(self, active: Sequence[BoolArray]) -> Iterator[None]:
@@ -449,13 +419,6 @@ class ContactSearch:
     def rub(self, how: Rub) -> None:
         """What candidates with friction that touch obey from the next iterate on."""
         self.elements = [replace(c, rubs=how) for c in self.elements]
-
-    def give_way(self) -> bool:
-        """Let infinite friction have a bound."""
-        endless = any(np.isinf(pair.friction) for pair in self._pairs)
-        new = endless and not self.bounded
-        self.bounded |= new
-        return new
 
     def flight_gaps(self) -> list[FloatArray]:
         """Gaps of each contact's candidates after free flight over the step [m]. Collective."""

@@ -140,8 +140,8 @@ class FacetElements(ContactElements):
         if self.direct:
             return self._direct(x, multiplier)
         if self.condense:
-            found = self._compiled(x, multiplier) if self.contact_gradient == "mean-value" else None
-            return found or self._condensed(x, multiplier)
+            mean = self.contact_gradient == "mean-value"
+            return (self._compiled if mean else self._condensed)(x, multiplier)
         return self._invariants(x, augmented, multiplier)
 
     def _direct(
@@ -258,12 +258,10 @@ class FacetElements(ContactElements):
 
     def _compiled(
         self, x: FloatArray, multiplier: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None] | None:
-        """`_condensed` of the mean value where it is compiled."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
+        """`_condensed` of the mean value."""
         c, xi = self.candidates, self._projection(x)
         k = compiled.condensed(self.x0, x, c.normal, c.xi, xi, c.length, multiplier)
-        if k is None:
-            return None
         slip = None
         if self.num_tangential:
             value = c.length[:, None] * (xi - c.xi)

@@ -118,67 +118,9 @@ class ObstacleElements(ContactElements):
             rule = middle.gradient[:, 0], self.theta * middle.hessian
         else:
             rule = master.discrete_gradient(self.x0[:, 0], x[:, 0])
-        found = compiled_law.obstacle(
+        residual, tangent, *slip = compiled_law.obstacle(
             self.theta, rule, (end.value, end.gradient[:, 0]),
             (middle.gradient[:, 0], middle.hessian),
             self.candidates.normal, self._tangents, (x - self.x0)[:, 0], multiplier,
         )  # fmt: skip
-        if found is None:
-            return self._assembled(rule, end, middle, x, multiplier)
-        residual, tangent, *slip = found
         return residual, tangent, residual[:, 3].copy(), Slip(*slip) if slip else None
-
-    def _assembled(
-        self,
-        rule: tuple[FloatArray, FloatArray],
-        end: Gap,
-        middle: Gap,
-        x: FloatArray,
-        multiplier: FloatArray,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, Slip | None]:
-        """`_element` of the gap and its derivatives, as `compiled_law.obstacle` does it."""
-        normal, (gradient, slope) = multiplier[:, :1], rule
-        residual = np.zeros((self.num_elements, 3 + self.num_constraints))
-        tangent = np.zeros((*residual.shape, residual.shape[1]))
-        residual[:, :3], residual[:, 3] = normal * gradient, end.value
-        tangent[:, :3, :3] = normal[:, :, None] * slope
-        tangent[:, :3, 3], tangent[:, 3, :3] = gradient, end.gradient[:, 0]
-        slip = None
-        if self.num_tangential:
-            slip = self._add_friction(residual, tangent, middle, x, multiplier)
-        return residual, tangent, end.value, slip
-
-    def _add_friction(
-        self,
-        residual: FloatArray,
-        tangent: FloatArray,
-        middle: Gap,
-        x: FloatArray,
-        multiplier: FloatArray,
-    ) -> Slip:
-        """Add lambda_T t^a to the rows of x; returns the slip Df^a = t^a . (x_1 - x_0).
-
-        t_a are the directions e_a of `_tangents` less their part along the normal n where the force
-        acts. Dual to them are t^a = e_a - n_0 (n . e_a) / (n . n_0), which lie along the surface,
-        too, and t^a . t_b = t^a . e_b = 1 or 0, because n_0 . e_b = 0.
-        """
-        motion, e = (x - self.x0)[:, 0], self._tangents
-        normal, n0, t = middle.gradient[:, 0], self.candidates.normal, multiplier[:, -2:]
-        part, turn = np.einsum("nai,ni->na", e, normal), self.theta * np.matmul(e, middle.hessian)
-        per_height = inverse(np.einsum("ni,ni->n", normal, n0))[:, None]
-        tilt = part * per_height
-        n0_turn = self.theta * np.einsum("ni,nij->nj", n0, middle.hessian)
-        tilt_gradient = (turn - tilt[:, :, None] * n0_turn[:, None]) * per_height[:, :, None]
-        dual = e - tilt[:, :, None] * n0[:, None]
-
-        residual[:, :3] += np.einsum("na,nai->ni", t, dual)
-        tangent[:, :3, :3] -= n0[:, :, None] * np.einsum("na,naj->nj", t, tilt_gradient)[:, None]
-        tangent[:, :3, -2:] = dual.transpose(0, 2, 1)
-        gradient = np.zeros((self.num_elements, 2, residual.shape[1]))
-        rise = np.einsum("ni,ni->n", n0, motion)[:, None, None]
-        gradient[..., :3] = dual - rise * tilt_gradient
-        metric_gradient = np.zeros((self.num_elements, 2, 2, residual.shape[1]))
-        half = -part[:, :, None, None] * turn[:, None]
-        metric_gradient[..., :3] = half + half.transpose(0, 2, 1, 3)
-        metric = np.eye(2) - part[:, :, None] * part[:, None]
-        return Slip(np.einsum("nai,ni->na", dual, motion), gradient, metric, metric_gradient)

@@ -107,8 +107,8 @@ class ContactPair:
     Args:
         slave: Surface whose nodes are kept outside.
         master: Surface whose facets keep them outside, or a `Plane`, `Sphere` or `Cylinder`.
-        friction: Coulomb's coefficient mu [-], >= 0; infinite: nodes in contact stick, but for
-            those that no step holds or lets go, which a warning tells.
+        friction: Coulomb's coefficient mu [-], >= 0; above 1e6 it counts as 1e6, but infinite:
+            nodes in contact stick.
         interference: What becomes of slave nodes that start inside the master by more than one part
             in a hundred of a facet. "refuse" them, or "resolve" it, as for a press fit: the load
             steps of `equilibrium` press nodes out that start up to half a facet deep, in proportion

@@ -150,20 +150,6 @@ class Couplings:
         """Whether a solved step may have passed by something, see `Coupling.misses`. Collective."""
         return any([coupling.misses(e, parts, motion) for coupling, parts in self.each(e)])
 
-    @property
-    def may_slip(self) -> bool:
-        """Whether `let_slip` changes anything."""
-        return any(coupling.may_slip for coupling in self._all)
-
-    def let_slip(self) -> None:
-        """Let sticking nodes slip under a slight pull in the iterations; no solution changes."""
-        for coupling in self._all:
-            coupling.let_slip()
-
-    def give_way(self) -> bool:
-        """From the next step on, limit forces that had no limit; return whether there was one."""
-        return any([coupling.give_way() for coupling in self._all])
-
 
 def _linked(of: Sequence[tuple[int, ...]]) -> list[int]:
     """Number of the mechanism of each joint, whose bodies' numbers are given."""

@@ -174,25 +174,6 @@ class Coupling(Protocol):
             x: Positions of the first guess, as of `Elements.evaluate`.
         """
 
-    @property
-    def may_slip(self) -> bool:
-        """Whether `let_slip` changes anything."""
-
-    def let_slip(self) -> None:
-        """Let sticking nodes slip under a slight pull in Newton's iterations of this step.
-
-        Every solution of the step stays one, and no other is added.
-        """
-
-    def give_way(self) -> bool:
-        """Limit a force that had no limit (friction=inf) from the next step on.
-
-        The run asks for it where shorter steps do not help.
-
-        Returns:
-            Whether there is such a thing that had none yet, the same on all ranks.
-        """
-
     def warnings(self, parts: Sequence[Any]) -> list[StepWarning]:
         """Return what an accepted step did that its user may not have meant. Collective.
 

@@ -217,13 +217,6 @@ class EveryStep:
         batch = self.elements[k]
         return np.zeros((batch.num_elements, batch.widths["constraints"]))
 
-    def let_slip(self) -> None:
-        """Nothing slips."""
-
-    def give_way(self) -> bool:
-        """Nothing yields."""
-        return False
-
     def warnings(self, parts: Sequence[Any]) -> list[StepWarning]:
         """Nothing to warn of."""
         return []

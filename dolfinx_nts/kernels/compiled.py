@@ -1,8 +1,7 @@
-"""The kernels of `facets.c` and `nts_element.c`, or NumPy's where they cannot be compiled.
+"""The kernels of `facets.c` and `nts_element.c`.
 
 For the few pairs of a small scene the calls of NumPy cost more than what they compute, for many
-pairs its arrays go through memory again and again. Each function here is named like its twin in
-NumPy, which it calls for what it does not do itself.
+pairs its arrays go through memory again and again.
 """
 
 from __future__ import annotations
@@ -26,6 +25,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
 BoolArray = npt.NDArray[np.bool_]
 
+#: Squared sine of an angle between two edges that is rounding only.
+COLLINEAR = 1e-14
 #: Points times facets up to which all pairs' boxes are compared.
 _MOST_PAIRS = 1 << 20
 
@@ -86,8 +87,8 @@ def _facet(nc: int) -> tuple[Any, FloatArray]:
 
 @lru_cache
 def _limits() -> Any:
-    """Return the limits that NumPy's kernels have, too."""
-    return library.Limits(facets.LAST_STEP, 1e3 * facets.EPS, facets.COLLINEAR)
+    """Where projections end."""
+    return library.Limits(facets.LAST_STEP, 1e3 * facets.EPS, COLLINEAR)
 
 
 def project(
@@ -98,8 +99,6 @@ def project(
     found, done = np.array(xi, dtype=np.float64), np.empty(n, dtype=bool)
     if not n:
         return found, done
-    if kernels is None:
-        return facets.project(points, corners, xi)
     library.run(kernels.project, _facet(nc)[0], _limits(), n, points, corners, found, done)
     rest = ~done
     if rest.any():
@@ -108,13 +107,23 @@ def project(
 
 
 def closest_point(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`facets.closest_point`."""
+    """Global closest point of each bounded facet, edges and corners included.
+
+    Triangles are solved directly. A quadrilateral whose squared distance is convex over the
+    reference square (proved per pair by exact bounds of its Hessian) has one minimum, found by a
+    bracketed Newton method; for all others every stationary point is enumerated.
+
+    Args:
+        points: Points x [m], shape (n, 3).
+        corners: Facet corners [m], shape (n, nc, 3).
+
+    Returns:
+        Coordinates in the closed reference facet [-], shape (n, 2), and distances [m], shape (n,).
+    """
     kernels, (n, nc) = library.load(), corners.shape[:2]
     xi, distance = np.empty((n, 2)), np.empty(n)
     if not n:
         return xi, distance
-    if kernels is None:
-        return facets.closest_point(points, corners)
     library.run(kernels.closest_point, _facet(nc)[0], _limits(), n, points, corners, xi, distance)
     return xi, distance
 
@@ -138,10 +147,10 @@ def closest_facets(
         out: Facet, coordinates and distance as of `search.Closest`, written where there is one.
 
     Returns:
-        Whether it was done: there are not too many, and the kernels are compiled.
+        Whether it was done: there are not too many.
     """
     kernels, (n, m, nc) = library.load(), (len(points), *corners.shape[:2])
-    if kernels is None or n * m > _MOST_PAIRS:
+    if n * m > _MOST_PAIRS:
         return False
     pairs = n, points, limit, m, corners, sizes, rounding
     return bool(library.run(kernels.closest_facets, _facet(nc)[0], _limits(), *pairs, *out))
@@ -155,7 +164,7 @@ def condensed(
     xi1: FloatArray,
     length: FloatArray,
     multiplier: FloatArray,
-) -> Condensed | None:
+) -> Condensed:
     """The mean-value element where (d, f) and the multipliers that hold them are eliminated.
 
     Args:
@@ -166,13 +175,7 @@ def condensed(
         xi1: The projection at t_{n+1}.
         length: Facet sizes [m], shape (n,).
         multiplier: lambda_N, or lambda_N and lambda_T, [kg m], shape (n, 1) or (n, 3).
-
-    Returns:
-        The contribution; None where nothing is compiled.
     """
-    kernels = library.load()
-    if kernels is None:
-        return None
     n, nc = len(x0), x0.shape[1] - 1
     size = 3 * nc + 3 + multiplier.shape[1]
     shapes = (size,), (size, size), (), (2, size), (2, 2), (2, 2, size)
@@ -181,5 +184,5 @@ def condensed(
     rule = points, *discrete_gradient.gauss(points)
     tangential = multiplier.shape[1] - 1
     pairs = x0, x1, normal0, xi0, xi1, length, multiplier
-    library.run(kernels.condensed, _facet(nc)[0], *rule, tangential, n, *pairs, *out)
+    library.run(library.load().condensed, _facet(nc)[0], *rule, tangential, n, *pairs, *out)
     return out

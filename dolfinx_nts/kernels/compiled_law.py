@@ -1,4 +1,4 @@
-"""The kernels of `contact_law.c`, where they are compiled: see `compiled`."""
+"""The kernels of `contact_law.c`: the laws of contact and friction, and what is around them."""
 
 from __future__ import annotations
 
@@ -28,9 +28,11 @@ class Law(NamedTuple):
         strong: Whether it may hold a node that free motion lets go.
         redundant: As of `ContactPair`.
         coefficient: Of friction [-].
-        pull: Pull over friction up to which a node that sticks is let slip before it is let go.
+        pull: Pull over friction up to which a node that sticks is not let go.
         uneven: Largest ratio of normal forces by which friction is divided.
         opening: Part of `yielding` by which a gap that is open counts against a force.
+        hardly: Stiffness against sliding of pairs that hardly rub, over `yielding`; 0: they do as
+            Coulomb's law says.
         tangential_scale: Algorithmic scale of the return map, shape (n,).
         unmoved: Projector on what of lambda_T acts on prescribed coordinates only, shape
             (n, 2, 2); None: nothing is prescribed.
@@ -50,6 +52,7 @@ class Law(NamedTuple):
     pull: float = 0.0
     uneven: float = 1.0
     opening: float = 1.0
+    hardly: float = 0.0
     tangential_scale: FloatArray | None = None
     unmoved: FloatArray | None = None
 
@@ -85,7 +88,7 @@ def laws(
     multiplier: FloatArray,
     held: FloatArray | None,
     normal: FloatArray | None,
-) -> Obeyed | None:
+) -> Obeyed:
     """Write the laws of contact and friction into the rows of pairs.
 
     Args:
@@ -100,11 +103,8 @@ def laws(
         normal: Where the contact force acts, shape (n, 3), or None without friction.
 
     Returns:
-        The rows, and what follows; None where nothing is compiled.
+        The rows, and what follows.
     """
-    kernels = library.load()
-    if kernels is None:
-        return None
     n = len(residual)
     out = Obeyed(
         np.ascontiguousarray(residual), np.ascontiguousarray(tangent), np.empty(multiplier.shape),
@@ -113,7 +113,7 @@ def laws(
     )  # fmt: skip
     both = slip or (None,) * 4
     given = gap, *both, multiplier, held, normal
-    library.run(kernels.laws, law[0], library.Together(*together), n, *given, *out)
+    library.run(library.load().laws, law[0], library.Together(*together), n, *given, *out)
     return out
 
 
@@ -142,11 +142,8 @@ def obstacle(
 
     Returns:
         Residual (n, r) and tangent (n, r, r), and value, gradient, metric and its gradient of the
-        slip as of `Slip`, of no use without friction; None where nothing is compiled.
+        slip as of `Slip`, of no use without friction.
     """
-    kernels = library.load()
-    if kernels is None:
-        return None
     n, constraints = multiplier.shape
     size = 3 + constraints
     shapes = (size,), (size, size), (2,), (2, size), (2, 2), (2, 2, size)
@@ -159,7 +156,7 @@ def obstacle(
     # An obstacle of a user's may have numbers of any kind, and arrays of a wrong shape.
     read = [np.ascontiguousarray(_shaped(a, shape), dtype=float) for a, shape in given]
     pairs = normal0, tangents, motion, multiplier
-    library.run(kernels.obstacle, constraints, theta, n, *read, *pairs, *out[:2], *slip)
+    library.run(library.load().obstacle, constraints, theta, n, *read, *pairs, *out[:2], *slip)
     return out
 
 
@@ -169,7 +166,7 @@ def _shaped(a: FloatArray, shape: tuple[int, ...]) -> FloatArray:
 
 def to_nodes(
     weights: FloatArray, residual: FloatArray, tangent: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
+) -> tuple[FloatArray, FloatArray]:
     """Residual and tangent by points as those by the nodes that these are made of.
 
     Args:
@@ -178,24 +175,20 @@ def to_nodes(
         tangent: Its derivative.
 
     Returns:
-        Rows of the nodes first, shape (n, 3 nodes + rest), and the derivative; None where nothing
-        is compiled.
+        Rows of the nodes first, shape (n, 3 nodes + rest), and the derivative.
     """
-    kernels = library.load()
-    if kernels is None:
-        return None
     n, points, nodes = weights.shape
     rest = residual.shape[1] - 3 * points
     width = 3 * nodes + rest
     out = np.empty((n, width)), np.empty((n, width, width))
-    work = np.empty((residual.shape[1], width))
-    library.run(kernels.to_nodes, points, nodes, rest, n, weights, residual, tangent, work, *out)
+    given = weights, residual, tangent, np.empty((residual.shape[1], width))
+    library.run(library.load().to_nodes, points, nodes, rest, n, *given, *out)
     return out
 
 
 def wrenches(
     y: FloatArray, push: FloatArray, places: BoolArray, fixed: BoolArray
-) -> FloatArray | None:
+) -> FloatArray:
     """Force and moment about the middle of their places of forces on nodes, shape (n, 6).
 
     Args:
@@ -203,14 +196,8 @@ def wrenches(
         push: Forces on them, shape (n, k, 3).
         places: Whether they are places, shape (n, k).
         fixed: Where forces do not count, shape (n, k, 3).
-
-    Returns:
-        None where nothing is compiled.
     """
-    kernels = library.load()
-    if kernels is None:
-        return None
     n, nodes, _ = y.shape
     out = np.empty((n, 6))
-    library.run(kernels.wrenches, nodes, n, y, push, places, fixed, out)
+    library.run(library.load().wrenches, nodes, n, y, push, places, fixed, out)
     return out

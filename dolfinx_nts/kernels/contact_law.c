@@ -1,9 +1,6 @@
 /* The laws of contact and friction, pair after pair, and what stands before and after them.
 
-   `laws` is contact/contact_laws.py, _write, with contact/coulomb.py, write, and kernels/friction.py,
-   return_map; `obstacle` is contact/obstacle_elements.py, _assembled; `to_nodes` and `wrenches` are
-   contact/contact_elements.py, _spread and _wrench. These have the formulas, stand in where there is no compiler,
-   and are compared with this by tests/test_compiled.py. */
+   tests/twins has the same in NumPy, which tests/test_compiled.py compares with this. */
 
 #include "facets.h"
 
@@ -14,7 +11,7 @@
 typedef struct {
     const double *scale, *yielding, *none, *before;
     int size, row, friction, endless, strong, redundant;
-    double coefficient, pull, uneven, opening;
+    double coefficient, pull, uneven, opening, hardly;
     const double *tangential_scale, *unmoved;
 } Law;
 
@@ -50,7 +47,7 @@ static double distance_of(const Slip *slip)
 
 static int any(const double *a) { return a && (a[0] != 0.0 || a[1] != 0.0 || a[2] != 0.0 || a[3] != 0.0); }
 
-/* Pull up to which a node that sticks is let slip before it is let go. */
+/* Pull up to which a node that sticks is not let go. */
 static double pull_of(const Law *law, const Slip *slip, double c, const double *t, const double *unmoved)
 {
     double friction = length(slip->metric, t);
@@ -58,7 +55,8 @@ static double pull_of(const Law *law, const Slip *slip, double c, const double *
     return resists && !any(unmoved) ? law->pull * friction : 0.0;
 }
 
-/* Compliance lent to a pair that sticks. */
+/* Compliance lent to a pair that sticks, so that friction divides as normal forces do: a brick at rest on a slope
+   just below the limit needs that of all its nodes. */
 static double lent(const Law *law, const Together *together, double force, double scale)
 {
     double part = law->uneven;
@@ -103,7 +101,29 @@ static void slide(int size, const Slip *slip, const double *t, const double *tri
     }
 }
 
-/* The rows of lambda_T of an active pair; whether it sticks. */
+/* The rows of lambda_T [kg m] of a pair that touches as if it hardly rubbed. */
+static void rub_hardly(const Law *law, const Slip *slip, const double *end, double of_end, double scale,
+                       double yielding, double *residual, double *tangent)
+{
+    const double *t = end + (law->size - law->row) - 2, *m = slip->metric, *s = slip->value;
+    double stiffness = law->hardly * yielding;
+    int size = law->size, last = size - 2;
+    for (int a = 0; a < 2; a++) {
+        double *row = tangent + (last + a) * size;
+        residual[last + a] = (t[a] - stiffness * (m[2 * a] * s[0] + m[2 * a + 1] * s[1])) / scale;
+        for (int z = 0; z < size; z++)
+            row[z] = -stiffness / scale * (m[2 * a] * slip->gradient[z] + m[2 * a + 1] * slip->gradient[size + z]);
+        row[last + a] += of_end / scale;
+    }
+}
+
+/* The rows of lambda_T of an active pair by Coulomb's law for the trial t + c m s (theory 6): it sticks within the
+   bound, else it slips along the trial. Returned is whether it sticks.
+
+   For a pair without force yet under strong friction, and for rigid bodies, the bound is mu times the force that the
+   gap asks for, as in the active set. With a bound of zero the pair would have to slip at first, by the slope of the
+   bound, which is mu for all active pairs. Points of a rigid body that rest would go on so, by rounding and against
+   each other. */
 static int rub(const Law *law, const Together *together, const Slip *slip, const double *end, double of_end,
                double scale, double yielding, double c, const double *unmoved, const double *held, double *residual,
                double *tangent)
@@ -126,6 +146,7 @@ static int rub(const Law *law, const Together *together, const Slip *slip, const
     for (int a = 0; a < 2; a++)
         less[a] = loose[2 * a] * t[0] + loose[2 * a + 1] * t[1];
     if (!law->endless && any(unmoved) && !any(held)) {
+        /* What is made to slip cannot stick. Where solved, trial and slip are parallel, whatever c: no slope of c. */
         double made = 2.0 * bound / distance_of(slip);
         c = made <= c ? c : made;
     }
@@ -163,8 +184,13 @@ static int rub(const Law *law, const Together *together, const Slip *slip, const
     return stick;
 }
 
-/* Residual (n, size), tangent (n, size, size) and slip come as of the element, and leave as of the
-   step; `held` and `normal` may be NULL as `unmoved` and the slip. */
+/* Semi-smooth laws of contact (theory 9) and friction: g_N = 0 where active, else lambda_N = 0; there Coulomb's law,
+   else lambda_T = 0. These are the forces of the step, but at massless nodes those of its end: theirs of the step are
+   the mean of both ends (theory 16). With mass in rows and columns the whole matrix is in kg, whatever the size of the
+   scene.
+
+   Residual (n, size), tangent (n, size, size) and slip come as of the element, and leave as of the step; `held`
+   and `normal` may be NULL as `unmoved` and the slip. */
 void laws(const Law *law, const Together *together, long n, const double *gap, const double *value,
           const double *gradient, const double *metric, const double *metric_gradient, const double *multiplier,
           const double *held, const double *normal, double *residual, double *tangent, double *end,
@@ -200,7 +226,9 @@ void laws(const Law *law, const Together *together, long n, const double *gap, c
         distance[i] = active[i] && law->friction ? distance_of(&slip) : 0.0;
         if (active[i]) {
             gap_row[row] -= together->normal / scale;
-            if (law->friction)
+            if (law->hardly > 0.0)
+                rub_hardly(law, &slip, last, of_end, scale, law->yielding[i], r, k);
+            else if (law->friction)
                 stick[i] = rub(law, together, &slip, last, of_end, scale, law->yielding[i], c, unmoved,
                                unmoved ? held + 4 * i : NULL, r, k);
         } else {
@@ -232,7 +260,11 @@ void laws(const Law *law, const Together *together, long n, const double *gap, c
 
 /* ---- the element without a facet */
 
-/* Of each pair the rule's gradient of the gap and its derivative, the gap and its gradient at the end,
+/* The directions t_a are `directions` e_a less their part along the normal n where the force acts. Dual to them are
+   t^a = e_a - n_0 (n . e_a) / (n . n_0), which lie along the surface, too, and t^a . t_b = t^a . e_b = 1 or 0, because
+   n_0 . e_b = 0. The slip is t^a . (x_1 - x_0).
+
+   Of each pair the rule's gradient of the gap and its derivative, the gap and its gradient at the end,
    gradient and curvature where the force acts, the normal and two directions along the surface at the
    start, motion and multipliers. Arrays that are written come as zeros. */
 void obstacle(int constraints, double theta, long n, const double *gradient, const double *slope, const double *gap,

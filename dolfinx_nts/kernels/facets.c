@@ -1,8 +1,7 @@
 /* Projections onto facets and closest points of them.
 
-   `project` and `closest_point` are those of kernels/facets.py, `closest_facets` is that of
-   contact/search.py, which stand in where there is no compiler, take what is not done here, and are
-   compared with these by tests/test_compiled.py and tests/test_search.py. */
+   `project` leaves to kernels/facets.py, and `closest_facets` to contact/search.py, what they do not do.
+   tests/test_compiled.py compares both with these and with tests/twins. */
 
 #include <float.h>
 #include <stdlib.h>

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import hashlib
-import logging
 import os
 import platform
 import shlex
@@ -19,8 +18,6 @@ from threading import Thread
 from typing import Any
 
 import numpy as np
-
-logger = logging.getLogger(__name__)
 
 _NAMES = "facets.h", "facets.c", "nts_element.c", "contact_law.c"
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
@@ -58,7 +55,7 @@ class Law(ctypes.Structure):
     _fields_ = [  # noqa: RUF012
         *((name, _ARRAY) for name in ("scale", "yielding", "none", "before")),
         *((name, _INT) for name in ("size", "row", "friction", "endless", "strong", "redundant")),
-        *((name, _REAL) for name in ("coefficient", "pull", "uneven", "opening")),
+        *((name, _REAL) for name in ("coefficient", "pull", "uneven", "opening", "hardly")),
         *((name, _ARRAY) for name in ("tangential_scale", "unmoved")),
     ]
 
@@ -98,7 +95,7 @@ _KERNELS = {
 
 
 class NotMadeError(Exception):
-    """A library cannot be made; says why in a line."""
+    """A library cannot be made; says why and what to do in a line."""
 
 
 class Beside:
@@ -186,9 +183,10 @@ def made(name: str, command: Callable[[Path], list[str]], folder: Path | None = 
     except subprocess.CalledProcessError as error:
         lines = (line.partition("error: ")[2] for line in error.stderr.splitlines())
         why = next(filter(None, lines), f"{error.cmd[0]} ends with status {error.returncode}")
-        raise NotMadeError(why) from error
+        raise NotMadeError(f"{why}; {COMPILER}") from error
     except (OSError, RuntimeError) as error:  # pathlib's, without a home
-        raise NotMadeError(str(error)) from error
+        where = "set XDG_CACHE_HOME to a folder that can be written"
+        raise NotMadeError(f"{error}; {where}") from error
 
 
 def _make(target: Path, command: Callable[[Path], list[str]]) -> None:
@@ -205,28 +203,20 @@ def _make(target: Path, command: Callable[[Path], list[str]]) -> None:
 
 @lru_cache
 def load() -> Any:
-    """The library, or None where it can be neither found nor made."""
+    """The library.
+
+    Raises:
+        NotMadeError: It can be neither found nor made.
+    """
     of = key(" ".join(_FLAGS), *(source.read_text() for source in _SOURCES))
     try:
         library = made(of, lambda _: [*_FLAGS, *map(str, _SOURCES[1:])])
     except NotMadeError as error:
-        logger.warning("Contact kernels are not compiled (%s): contact takes longer", error)
-        return None
+        raise NotMadeError(f"the kernels of contact cannot be compiled ({error})") from error
     for name, arguments in _KERNELS.items():
         kernel = getattr(library, name)
         kernel.argtypes = arguments
     return library
-
-
-def is_there() -> bool:
-    """Return whether the kernels are compiled, which is done here if it can be."""
-    return load() is not None
-
-
-def leave_out() -> None:
-    """Use NumPy's from now on."""
-    global load  # noqa: PLW0603
-    load = lru_cache(lambda: None)
 
 
 def plain(value: Any) -> Any:

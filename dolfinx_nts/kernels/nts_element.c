@@ -1,8 +1,8 @@
 /* The element of node-to-surface contact, pair after pair.
 
    `condensed` is contact/facet_elements.py, _condensed, with kernels/nts_element.py, element, of the
-   mean-value rule, which have the numbers of the formulas, stand in where there is no compiler, and
-   are compared with this by tests/test_compiled.py. */
+   mean-value rule, which have the numbers of the formulas and are compared with this by
+   tests/test_compiled.py. */
 
 #include "facets.h"
 

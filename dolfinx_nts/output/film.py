@@ -24,7 +24,7 @@ from dolfinx_nts.output.pictures import (
 from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
-from dolfinx_nts.validation import StrPath, as_path, require_bool, require_positive
+from dolfinx_nts.validation import StrPath, as_path, require_bool
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -32,6 +32,8 @@ FloatArray = npt.NDArray[np.float64]
 #: largest are left out.
 _LONGEST, _LEAST = 0.2, 0.02
 _COLOUR = "crimson"
+#: Frames per second.
+_PACE = 15.0
 
 
 class _Frame(NamedTuple):
@@ -64,7 +66,6 @@ class Film:
         every: A frame after every `every`-th step, >= 1; the first and the last state are in it.
         interval: Instead of `every`: a frame after the first step that reaches each multiple of
             this time [s].
-        frames_per_second: Of the film.
         forces: Whether to draw contact forces.
         colour: As of `pictures.picture`, as are the next ones.
         view: Elevation and azimuth of the viewer [degrees].
@@ -82,7 +83,6 @@ class Film:
         *,
         every: int = 1,
         interval: float | None = None,
-        frames_per_second: float = 15.0,
         forces: bool = True,
         colour: str = "speed",
         view: tuple[float, float] = (22.0, -60.0),
@@ -93,9 +93,8 @@ class Film:
         if self.path.suffix.lower() != ".gif":
             raise ValueError(f"path={str(path)!r}: pass a file that ends with .gif")
         self._cadence = Cadence(every, interval)
-        require_positive("frames_per_second", frames_per_second, "1/s")
         require_bool("forces", forces)
-        self.pace, self.forces = frames_per_second, forces
+        self.forces = forces
         self._look: tuple[Any, ...] = (colour, view, limits, width)
         self._frames: list[_Frame] = []
 
@@ -154,7 +153,7 @@ class Film:
         file = io.BytesIO()
         images[0].save(
             file, "GIF", save_all=True, append_images=images[1:], loop=0,
-            duration=1e3 / self.pace, disposal=2,
+            duration=1e3 / _PACE, disposal=2,
         )  # fmt: skip
         replace_file(self.path, file.getvalue())
 

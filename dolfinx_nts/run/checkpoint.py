@@ -13,7 +13,6 @@ The file is described in `dolfinx_nts.output.state_file`; of its `notes` the run
 - `last`: start and length of the last step [s], or null;
 - `promised`: largest energies and rounding that the ledger is held against, and kinetic energy at
   the start of bodies whose motion is prescribed [J];
-- `bounded`: whether nodes that infinite friction holds may slip;
 - `measured`: of each body, diagonals of its matrix and factors, from which rounding is judged;
 - `pace`: what `Adapt` remembers, see `PaceMemory`, but its accelerations, which are
   `bodies/K/acceleration`; or null;
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 #: Notes that are the stepper's.
-_MEMORY = ("last", "promised", "bounded", "measured", "recent", "solver")
+_MEMORY = ("last", "promised", "measured", "recent", "solver")
 
 
 @known_options

@@ -9,7 +9,6 @@ from typing import Any
 
 from dolfinx_nts.parallel import first_problem
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
-from dolfinx_nts.run.intercept import interceptable
 from dolfinx_nts.run.interrupts import Interrupts
 from dolfinx_nts.run.progress import progress_bar
 from dolfinx_nts.run.rank_agreement import same_run
@@ -41,7 +40,6 @@ def _is_writer(item: Any) -> bool:
 
 
 @known_options
-@interceptable
 def simulate(
     system: System,
     integrator: Any,

@@ -67,8 +67,6 @@ FloatArray = npt.NDArray[np.float64]
 _CUT = 0.4
 #: First steps whose failure may come from how the run starts.
 _FIRST = 2
-#: Cuts of a step before nodes that infinite friction holds may slip.
-_CUTS = 3
 #: Part of the energies by which a restart may differ from its checkpoint, as sums of other ranks
 #: do.
 _SAME = 1e-10
@@ -186,13 +184,12 @@ class Stepper:
         """What a checkpoint keeps beside state and solution: numbers and tuples of them.
 
         last: start and length of the last step [s], or None; promised: see `Promises.memory`;
-        bounded: whether nodes that infinite friction holds may slip; measured: see `Rounding`;
-        recent: lengths of the last two steps [s]; solver: see `StepSolver.memory`.
+        measured: see `Rounding`; recent: lengths of the last two steps [s]; solver: see
+        `StepSolver.memory`.
         """
         return {
             "last": self._last_steps.last,
             "promised": self._promises.memory,
-            "bounded": self.problem.couplings.contacts.bounded,
             "measured": self.problem.rounding.measured,
             "recent": self._last_steps.lengths,
             "solver": self.solver.memory,
@@ -213,7 +210,7 @@ class Stepper:
         """Begin where a checkpoint was written, with the materials of its last step."""
         memory, nodal = restart.memory, restart.nodal_memory
         self._last_steps.resume(memory, nodal, self.state)
-        self.problem.couplings.contacts.resume(nodal["unknowns"], memory["bounded"])
+        self.problem.couplings.contacts.resume(nodal["unknowns"])
         self._promises.resume(memory["promised"])
         self.problem.rounding.measured = memory["measured"]
         self.solver.resume(memory["solver"])
@@ -279,16 +276,12 @@ class Stepper:
                 retries += 1
                 self.solution.retries += 1
                 # An odd number: halves of halves would end where one of them has failed.
-                parts = 1 if self._bind(retries) else 2 * parts + 1
+                parts = 2 * parts + 1
                 dt = (end - self.state.time) / parts
                 logger.info("%s; retrying with dt=%.3g", failure, dt)
             else:
                 parts -= 1
                 yield not parts
-
-    def _bind(self, retries: int) -> bool:
-        """After enough cuts, let couplings give way; return whether one newly does."""
-        return retries >= _CUTS and self.problem.couplings.give_way()
 
     def paced(self, pace: Pace, end: float) -> Iterator[None]:
         """Advance in steps of a pace, stopping after each.
@@ -322,7 +315,7 @@ class Stepper:
                     raise
                 retries += 1
                 self.solution.retries += 1
-                pace.dt = dt if self._bind(retries) else _CUT * dt
+                pace.dt = _CUT * dt
                 logger.info("%s; retrying with dt=%.3g", failure, pace.dt)
                 continue
             if not pace.accepts(self.problem, trial.step):

@@ -130,11 +130,10 @@ class StepSolver:
         assert self.matrix is not None
         iterations, unsolved = 0, False
         couplings, moves = self.problem.couplings, self.problem.integrator.inertia
-        may_slip = couplings.may_slip
+        may_slip = couplings.contacts.may_slip
         # Inertia passes on the forces that sticking nodes keep from each other in statics.
         first = 0 if moves or not may_slip or couplings.contacts.carried_any() else -1
-        # Without friction there is nothing to let slip.
-        for retry in range(first, 3 if may_slip else 2):
+        for retry in range(first, 2):
             if first < 0 == retry and not self.iterates.runs_away:
                 continue
             slides = may_slip and retry == (-1 if first < 0 else 1)
@@ -192,8 +191,6 @@ class StepSolver:
         self._upright.begin(careful=retry > 0 or self.problem.dives)
         if again:
             self._tangents.due, self._passed = True, None
-            if retry == 2:
-                self.problem.couplings.let_slip()
             if retry == 0:
                 self.problem.first_guess()
             else:

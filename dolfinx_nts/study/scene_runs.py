@@ -9,8 +9,10 @@ import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from mpi4py import MPI
 
@@ -287,10 +289,11 @@ def measure(scene: str, choices: Mapping[str, Any], comm: Any) -> Run:
         raise _MeasuredError
 
     try:
-        main = load(scene).main
-        taken = set(inspect.signature(main).parameters)
-        rest = {k: v for k, v in choices.items() if k not in taken}
-        with nts.intercept(instead):
+        # The script is executed anew, so that it may have imported `simulate` by name, too.
+        with patch.object(nts, "simulate", partial(instead, nts.simulate)):
+            main = load(scene).main
+            taken = set(inspect.signature(main).parameters)
+            rest = {k: v for k, v in choices.items() if k not in taken}
             main(**{k: v for k, v in choices.items() if k in taken})
     except _MeasuredError:
         pass

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -16,13 +15,10 @@ import numpy.typing as npt
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, load
-
-logger = logging.getLogger(__name__)
+from dolfinx_nts.parallel import raise_together
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Cells that NumPy takes at once, few enough for their derivatives to stay in the cache.
-_CELLS = 1024
 #: det(dx/dxi) at the points of a cell, from its nodes' positions, as FFCx would write it.
 _KERNEL = """
 void tabulate_tensor_det(double* restrict A, const double* restrict w)
@@ -69,42 +65,36 @@ class Determinants:
         points = points[:1] if constant else np.concatenate([basix.geometry(kind), points])
         variant = basix.LagrangeVariant.gll_warped
         element = basix.create_element(basix.ElementFamily.P, kind, degree, variant)
-        #: Derivatives of the shape functions, shape (3, points, nodes).
-        self._table = np.ascontiguousarray(element.tabulate(1, points)[1:, :, :, 0])
+        derivatives = element.tabulate(1, points)[1:, :, :, 0]
         nodes = space.tabulate_dof_coordinates()
         # About a node of their own: differences of far positions would lose digits.
         self._origin = nodes[:1].sum(axis=0)
         self._reference = (nodes - self._origin).ravel()
         self._cells = compat.cell_dofs(space)[: space.mesh.topology.index_map(3).size_local]
-        _, count, of_cell = self._table.shape
-        table = str(self._table.tolist()).translate(str.maketrans("[]", "{}"))
+        _, count, of_cell = derivatives.shape
+        table = str(derivatives.tolist()).translate(str.maketrans("[]", "{}"))
         code = _KERNEL.format(points=count, nodes=of_cell, table=table)
-        shape = Shape(3, 3 * of_cell, count, count)
+        self._comm, self._shape = space.mesh.comm, Shape(3, 3 * of_cell, count, count)
         self._loop = library.Beside(
-            load, code, shape, compat.cache_folder(), compat.chosen_flags()
+            load, code, self._shape, compat.cache_folder(), compat.chosen_flags()
         )
 
     @cached_property
-    def _batches(self) -> CellBatches | None:
-        """What takes several cells at once; None where it is not compiled."""
-        number = np.arange(len(self._cells))[:, None]
+    def _batches(self) -> CellBatches:
+        """What takes several cells at once. Collective.
+
+        Raises:
+            RuntimeError: On all ranks, if one of them cannot compile it.
+        """
+        loop = None
         try:
-            loop = self._loop.result()
+            loop, problem = self._loop.result(), None
         except library.NotMadeError as error:
-            logger.info("the kernel of det F is not used, but NumPy: %s", error)
-            return None
+            problem = f"the kernel of det F cannot be compiled ({error})"
+        raise_together(self._comm, problem, RuntimeError)
         self._x = np.empty_like(self._reference)
-        x = Field(self._x, self._cells, 3)
-        batches = CellBatches(loop, np.zeros_like(number), np.zeros((1, 3)), number, [x])
-        self._x[:] = self._reference
-        found = np.zeros((len(self._cells), self._table.shape[1]))
-        batches.add(np.empty(0), found.reshape(-1))
-        expected = self._of_cells(self._reference.reshape(-1, 3)[self._cells[:_CELLS]])
-        limit = 1e-8 * np.abs(expected).max()
-        if not np.allclose(found[:_CELLS], expected, rtol=0.0, atol=limit):
-            logger.warning("det F differs for several cells at once; it is taken by NumPy")
-            return None
-        return batches
+        number, x = np.arange(len(self._cells))[:, None], Field(self._x, self._cells, 3)
+        return CellBatches(loop, np.zeros_like(number), np.zeros((1, 3)), number, [x])
 
     @cached_property
     def _inverse(self) -> FloatArray:
@@ -114,25 +104,14 @@ class Determinants:
 
     def _dets(self, x: FloatArray) -> FloatArray:
         """det(dx/dxi) of nodes' positions x [m^3], shape (cells, points)."""
-        out = np.zeros((len(self._cells), self._table.shape[1]))
-        if self._batches is None:
-            for first in range(0, len(out), _CELLS):
-                here = slice(first, first + _CELLS)
-                out[here] = self._of_cells(x.reshape(-1, 3)[self._cells[here]])
-        else:
-            self._x[:] = x
-            self._batches.add(np.empty(0), out.reshape(-1))
+        out = np.zeros((len(self._cells), self._shape.entries))
+        batches, self._x[:] = self._batches, x
+        batches.add(np.empty(0), out.reshape(-1))
         return out
-
-    def _of_cells(self, x: FloatArray) -> FloatArray:
-        """The same of cells with their nodes' positions, (n, nodes, 3) -> (n, points)."""
-        a, b, c = np.einsum("dpi,nik->dnpk", self._table, x)
-        det: FloatArray = (a * np.cross(b, c)).sum(axis=-1)
-        return det
 
     @np.errstate(over="ignore", invalid="ignore")  # an iterate may run off
     def smallest(self, u: FloatArray) -> tuple[float, FloatArray]:
-        """The smallest det F on this rank and the middle X of its cell [m], shape (3,).
+        """The smallest det F on this rank and the middle X of its cell [m], shape (3,). Collective.
 
         Args:
             u: Displacements of this rank's nodes and its ghosts [m], shape (coordinates,).
@@ -140,10 +119,9 @@ class Determinants:
         Returns:
             A det that is not finite is -inf; without cells it is inf.
         """
-        if not len(self._cells):
+        det = self._dets(self._reference + u) * self._inverse
+        if not len(det):
             return np.inf, np.full(3, np.nan)
-        det = self._dets(self._reference + u)
-        det *= self._inverse
         i = int(det.argmin())  # the first NaN, if there is one
         least, nodes = float(det.flat[i]), self._cells[i // det.shape[1]]
         middle = self._origin + self._reference.reshape(-1, 3)[nodes].mean(axis=0)
