@@ -98,7 +98,9 @@ class FacetElements(ContactElements):
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves and control points at t_{n+1}, (n, nc + 1, 3) -> (n,)."""
-        return nts_element.gap(x, self._projection(x)).value
+        foot, _, normal = facets.frame(x[:, 1:], self._projection(x))
+        value: FloatArray = np.einsum("ni,ni->n", x[:, 0] - foot, normal)
+        return value
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Scaled d and f that fit predicted nodes x (n, k, 3), shape (n, augmented)."""
