@@ -5,6 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
+from lines import interval_mesh, straight
 from measures import difference
 from petsc4py import PETSc
 
@@ -664,3 +665,34 @@ def test_a_second_attempt_after_a_factorisation_that_failed(monkeypatch):
         stepper.advance(1e-3)
     assert zeroed and stepper.solution.retries == 0
     stepper.close()
+
+
+# ---- chains of rigid bodies and beams
+@pytest.mark.skipif(not compat.has_solver("klu"), reason="needs KLU")
+def test_chains_are_solved_as_by_mumps():
+    """Beams and rigid bodies in joints, of which two repeat each other."""
+    ends = []
+    for options in (None, {"pc_factor_mat_solver_type": "mumps"}):
+        rod = nts.Beam(
+            interval_mesh(straight(6)),
+            nts.Circle(0.02).section(young=1e9, poisson=0.3, density=1e3), name="rod",
+        )  # fmt: skip
+        links = [
+            nts.RigidBody.from_inertia(1.0, (0.1, 0.2, 0.2), centre=(1.5 + k, 0, 0), name=f"l{k}")
+            for k in range(2)
+        ]
+        joints = [
+            nts.Revolute(None, rod, point=(0, 0, 0), axis=(0, 1, 0)),
+            nts.Spherical(rod, links[0], point=(1, 0, 0)),
+            nts.Revolute(*links, point=(2, 0, 0), axis=(0, 1, 0), name="one"),
+            nts.Revolute(*links, point=(2, 0, 0), axis=(0, 1, 0), name="again"),
+        ]
+        system = nts.System([rod, *links], joints=joints, gravity=(0, 0, -9.81))
+        stepper = nts.Stepper(system, nts.EnergyMomentum(), petsc_options=options)
+        for _ in range(10):
+            stepper.advance(5e-3)
+        kind = stepper.solver.snes.getKSP().getPC().getFactorSolverType()
+        assert kind == ("mumps" if options or COMM.size > 1 else "klu")
+        ends.append(np.array([link.position for link in links]))
+        stepper.close()
+    assert np.abs(ends[0] - ends[1]).max() < 1e-11

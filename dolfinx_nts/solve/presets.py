@@ -8,6 +8,7 @@ from typing import Any
 
 from petsc4py import PETSc
 
+from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.linear_solver import ITERATIVE, SolverOptions, most_iterations
 from dolfinx_nts.system import System
@@ -39,11 +40,16 @@ def _mumps_factors(pc: Any) -> Any:
     return pc.getFactorMatrix() if factors else None
 
 
+def _is_chain(body: Any) -> bool:
+    """Whether a body's matrix is as sparse as that of a line: rigid bodies and beams."""
+    return body.bound or (body.mesh is not None and body.mesh.topology.dim == 1)
+
+
 class Presets:
     """The presets of a run in the order in which they take over where a linear solve fails.
 
-    After "krylov" and "multigrid" comes MUMPS, and then MUMPS without equations that repeat others,
-    with which scenes begin that are likely to have some.
+    After "krylov", "multigrid" and "chains" comes MUMPS, and then MUMPS without equations that
+    repeat others, with which scenes begin that are likely to have some.
 
     Args:
         system: The scene.
@@ -82,6 +88,10 @@ class Presets:
         self._names: tuple[str, ...] = (first,)
         if first == "direct":
             self._names = mumps[:1] if own else mumps
+            chains = all(map(_is_chain, system.bodies)) and not system.contacts
+            auto = newton.linear_solver == "auto" and not given
+            if chains and auto and system.comm.size == 1 and compat.has_solver("klu"):
+                self._names = ("chains", *mumps)
         elif newton.linear_solver == "auto":
             self._names += mumps
         self.use(0)
