@@ -93,6 +93,11 @@ class Couplings:
             yield coupling, e.parts[start:stop]
             start = stop
 
+    def history(self, e: Evaluation) -> tuple[Any, tuple[Any, ...]]:
+        """What contacts, and each of `System.joints`, remember of an accepted step."""
+        contacts, *joints = (coupling.history(parts) for coupling, parts in self.each(e))
+        return contacts, tuple(joints)
+
     def touching(
         self, e: Evaluation
     ) -> list[tuple[ContactElements, Contribution, ContactHistory]]:

@@ -17,7 +17,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.equations.lengths import Lengths
+from dolfinx_nts.equations.lengths import box_of
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.state import State
@@ -240,7 +240,7 @@ def _size(system: System) -> float:
         free = np.ones(body.num_owned, dtype=bool)
         free[body.fixed] = False
         mass += float(body.nodal_mass[free].sum()) / 3.0
-    radius = Lengths(system).radius
+    radius = box_of(system)[1]
     return math.sqrt(system.comm.allreduce(mass)) * radius if radius else math.inf
 
 

@@ -545,4 +545,4 @@ class Stepper:
     def close(self) -> None:
         """Free the PETSc objects of the last step."""
         self.solver.destroy()
-        self.problem.destroy()
+        self.problem.destroy_all()

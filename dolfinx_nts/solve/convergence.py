@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.elements import over
-from dolfinx_nts.interaction.evaluation import Evaluation, free
+from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max, global_sum
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,10 +24,9 @@ def ratios(problem: StepProblem, e: Evaluation) -> dict[str, float]:
 
     Collective.
     """
-    bodies = problem.system.bodies
-    residuals = {k: free(bodies[k], e.bodies[k].residual) for k in problem.awake}
+    residuals = [terms.residual for terms in e.terms]
     of_bodies = _over_limits(problem, e, residuals, problem.rounding.forces)
-    ratio = dict(zip((b.name for b in bodies), of_bodies, strict=True))
+    ratio = dict(zip((b.name for b in problem.system.bodies), of_bodies, strict=True))
     if problem.laid.own:
         ratio |= _of_elements(problem, e)
     return ratio
@@ -38,11 +37,11 @@ def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
 
     Collective.
     """
-    bodies = problem.system.bodies
-    held = {k: problem.stabilization.of(bodies[k]) * e.bodies[k].du for k in problem.awake}
+    both = zip(problem.batches.bodies, e.terms, strict=True)
+    held = [problem.stabilization.of(body) * terms.du for body, terms in both]
     found = _over_limits(problem, e, held, problem.rounding.at(problem.lengths.displacement_of(e)))
     k = int(np.argmax(found))
-    return found[k], bodies[k].name
+    return found[k], problem.system.bodies[k].name
 
 
 def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
@@ -55,40 +54,53 @@ def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
         e: Iterate.
         share: The part, of the largest work of one kind of forces on one body.
     """
-    local = np.zeros((len(e.bodies), 6))
-    for k in problem.awake:
-        t = e.bodies[k]
-        left = free(problem.system.bodies[k], t.residual)
-        parts = (left, problem.flight[k], t.internal, t.external, t.coupling, t.du)
-        local[k] = [float(p @ t.du) for p in parts]
-    work = global_sum(problem.system.comm, local)
+    parts = _forces_on(problem, e, [terms.residual for terms in e.terms])
+    moves = [terms.du for terms in e.terms]
+    local = [
+        problem.batches.sums([a * du for a, du in zip(part, moves, strict=True)])
+        for part in (*parts, moves)
+    ]
+    work = global_sum(problem.system.comm, np.array(local)).T
     rounding = problem.rounding.forces @ np.sqrt(work[:, 5])
     return abs(work[:, 0].sum()) > share * np.abs(work[:, 1:5]).max() + rounding
 
 
 def _over_limits(
-    problem: StepProblem, e: Evaluation, forces: Mapping[int, FloatArray], rounding: FloatArray
+    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
 ) -> list[float]:
-    """A force on each body over that which counts as zero there; asleep 0. Collective.
+    """A force on each batch over that which counts as zero, by body; asleep 0. Collective.
 
     It is measured by the largest of its inertial, internal, external and coupling forces. Of
     elements' forces that cancel each other, as on a body without mass of note between two springs,
     only the rounding counts, so that strong joints loosen no tolerance.
     """
-    squares = np.zeros((len(e.bodies), 6))
+    batches = problem.batches
+    squares = [
+        batches.sums([np.square(own) for own in part]) for part in _forces_on(problem, e, forces)
+    ]
+    squares.append(problem.laid.gross_forces(problem.elements, e.parts, batches.count))
+    norms = np.sqrt(global_sum(batches.comm, np.array(squares)))
+    limits = problem.rtol * norms[1:5].max(axis=0) + _CANCELLED * norms[5] + rounding
+    found, sizes = [0.0] * batches.count, norms[0].tolist()
     for k in problem.awake:
-        t = e.bodies[k]
-        parts = (forces[k], problem.flight[k], t.internal, t.external, t.coupling)
-        squares[k, :5] = [float(p @ p) for p in parts]
-    squares[:, 5] = problem.laid.gross_forces(problem.elements, e.parts, len(e.bodies))
-    norms = np.sqrt(global_sum(problem.system.comm, squares))
-    limits = problem.rtol * norms[:, 1:5].max(axis=1) + _CANCELLED * norms[:, 5] + rounding
-    return [over(a, b) for a, b in zip(norms[:, 0], limits, strict=True)]
+        found[k] = over(sizes[k], limits[k])
+    return found
+
+
+def _forces_on(
+    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray]
+) -> list[Sequence[FloatArray]]:
+    """Given forces on each batch where they are free, then all kinds of the step's forces."""
+    left = [own.copy() for own in forces]
+    for body, own in zip(problem.batches.bodies, left, strict=True):
+        own[body.fixed] = 0.0
+    kinds = ("internal", "external", "coupling")
+    return [left, problem.flight, *([getattr(t, kind) for t in e.terms] for kind in kinds)]
 
 
 def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     """`ratios` of the elements' own unknowns."""
-    moved = max(float(np.abs(b.du).max(initial=0.0)) for b in e.bodies)
+    moved = max(float(np.abs(terms.du).max(initial=0.0)) for terms in e.terms)
     # MPI's maximum may swallow a NaN, so it travels as a flag.
     rows = np.concatenate([np.empty(0), *(p.residual.ravel() for p in e.parts)])
     local = [moved, float(np.isnan(rows).any())]

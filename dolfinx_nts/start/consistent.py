@@ -210,37 +210,34 @@ def _solve(
     Returns:
         x of each body, and G^T lambda by the id of the elements.
     """
-    system = problem.system
-    chosen = _constraints(problem, state, dt)
+    batches = problem.batches
+    chosen, pushes = _constraints(problem, state, dt), batches.join(forces)
     if not chosen:
-        both = zip(system.bodies, forces, strict=True)
-        return tuple(solve_mass(body, force) for body, force in both), {}
-    masses = [b.tangent(u, 1.0, 0.0) for b, u in zip(system.bodies, state.u, strict=True)]
+        both = zip(batches.bodies, pushes, strict=True)
+        return batches.split([solve_mass(body, push) for body, push in both]), {}
+    each = zip(batches.bodies, batches.join(state.u), strict=True)
+    masses = [body.tangent(u, 1.0, 0.0) for body, u in each]
     elements, of = [batch for batch, _, _ in chosen], [bodies for _, bodies, _ in chosen]
-    laid = Unknowns(system.comm, {k: len(u) for k, u in enumerate(state.u)}, elements, of)
+    laid = Unknowns(batches, range(batches.count), elements, of)
     tangents = [_symmetric(found) for _, _, found in chosen]
     matrix = StepMatrix(laid.layout, masses, laid.blocks)
     matrix.assemble(tangents)
     saddle = Saddle(matrix.operator)
-    total, held = [np.zeros_like(force) for force in forces], laid.of_elements("constraints")
-    multipliers = np.zeros(laid.layout.num_owned)[held]
+    unknown, held = np.zeros(laid.layout.num_owned), laid.of_elements("constraints")
+    right, total = np.zeros_like(unknown), batches.split([np.zeros_like(push) for push in pushes])
+    laid.write(pushes, right)
     # Each time less is left of what the matrix lends to constraints, see `SHIFT`.
     for _ in range(_TIMES):
         known = state.a if order else state.v
         changed = tuple(x + dx for x, dx in zip(known, total, strict=True))
         now = replace(state, a=changed) if order else replace(state, v=changed)
-        right = np.zeros(laid.layout.num_owned)
-        for k, force in enumerate(forces):
-            right[laid.of_body(k)] = force
         rows = [found.rows[1 + order].ravel() for _, _, found in _constraints(problem, now, dt)]
         right[held] = -np.concatenate(rows)
-        solution = saddle.solve(right)
-        multipliers += solution[held]
-        for k, body in enumerate(system.bodies):
-            change = solution[laid.of_body(k)].copy()
-            change[body.fixed] = 0.0
-            total[k] = total[k] + change
-        forces = [np.zeros_like(force) for force in forces]
+        unknown = unknown + saddle.solve(right)
+        unknown[laid.held] = 0.0
+        total = batches.split(laid.read(unknown, pushes))
+        right[:] = 0.0
+    multipliers = unknown[held]
     saddle.destroy()
     matrix.destroy()
     laid.destroy()
@@ -251,7 +248,7 @@ def _solve(
         first += own.size
         force = np.einsum("nma,nm->na", tangent[:, -width:, :-width], own)
         pulls[id(batch)] = PointPart(force, tangent)
-    return tuple(total), pulls
+    return total, pulls
 
 
 def _symmetric(found: Kinematics) -> FloatArray:
