@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.interaction.constraints import Constraints, Equations
+from dolfinx_nts.interaction.constraint_elements import Equations
+from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Joint
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.contact.coulomb import STRONG, UNEVEN, Coulomb, Rub, Slip, Together
 from dolfinx_nts.contact.pair import Candidates, ContactPair
-from dolfinx_nts.interaction.constraints import SHIFT
+from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.parallel import gather_rows
 

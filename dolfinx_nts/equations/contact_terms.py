@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.equations.assembly import StepMatrix
-from dolfinx_nts.equations.batches import Batches
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.integrators.static import EQUILIBRIUM
 from dolfinx_nts.interaction.elements import Step, evaluate_together

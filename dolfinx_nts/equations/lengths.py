@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.equations.batches import Batches
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.system import System
@@ -30,31 +29,34 @@ class Lengths:
         moved: Largest displacement at t_n, likewise.
     """
 
-    def __init__(self, system: System, batches: Batches) -> None:
-        self._batches = batches
+    def __init__(self, system: System) -> None:
+        self._batches = system.batches
         self.centre, self.radius, self.director = box_of(system)
         self.motion, self.extent, self.moved = np.zeros((3, len(system.bodies)))
         links = (*system.contact_bodies, *system.joint_bodies)
         self._linked = [list(bodies) for bodies in links if len(bodies) > 1]
 
     def begin(
-        self, start: Sequence[Sequence[FloatArray]], first: Sequence[FloatArray], dt: float
+        self,
+        u: Sequence[FloatArray],
+        rates: Sequence[Sequence[FloatArray]],
+        first: Sequence[FloatArray],
     ) -> FloatArray:
         """Measure a step. Collective.
 
         Args:
-            start: u [m], v [m/s] and, of schemes that carry them, a [m/s^2] of each batch at t_n.
-            first: Displacements of each batch at t_{n+1} that are predicted [m].
-            dt: Step [s].
+            u: Displacements of each batch at t_n [m].
+            rates: Velocities then and, of schemes that carry them, accelerations times the step
+                [m/s].
+            first: Displacements at t_{n+1} that are predicted [m].
 
         Returns:
             Largest speed of each body [m/s], shape (bodies,).
         """
-        batches, (u, v, *rest) = self._batches, start
+        batches = self._batches
         du = [u1 - u0 for u1, u0 in zip(first, u, strict=True)]
         places = [b.reference + u1 for b, u1 in zip(batches.bodies, first, strict=True)]
-        gained = [[dt * own for own in a] for a in rest]
-        local = [batches.motions(du), *map(batches.largest, (places, u, v, *gained))]
+        local = [batches.motions(du), *map(batches.largest, (places, u, *rates))]
         found = global_max(batches.comm, np.array(local))
         self.motion, self.extent, self.moved = found[:3]
         speed: FloatArray = found[3:].max(axis=0)

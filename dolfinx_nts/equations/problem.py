@@ -18,7 +18,6 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts.contact.contact_elements import ContactElements
-from dolfinx_nts.equations.batches import Batches
 from dolfinx_nts.equations.couplings import Couplings
 from dolfinx_nts.equations.lengths import Lengths
 from dolfinx_nts.equations.loads import Loads
@@ -76,7 +75,7 @@ class StepProblem:
         self.system, self.integrator = system, integrator
         self.rtol, self.condense = rtol, condense
         self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
-        self.batches = Batches(system.bodies)
+        self.batches = system.batches
         self._asleep: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._evaluated: dict[int, tuple[FloatArray, ...]] = {}
         # What batches contribute that have no element on any rank: nothing, at every iterate.
@@ -88,7 +87,7 @@ class StepProblem:
         self.unknowns: Unknowns | None = None
         self.version, self.dives, self.lent = 0, False, 0.0
         self._again: Evaluation | None = None
-        self.lengths, self.loads = Lengths(system, self.batches), Loads(system, integrator)
+        self.lengths, self.loads = Lengths(system), Loads(system, integrator)
         self.supports = Supports(system, integrator)
         lengths = self.lengths
         self.stabilization = Stabilization(
@@ -148,16 +147,15 @@ class StepProblem:
             Whether each body starts without speed, shape (bodies,).
         """
         state, dt, batches = self.state, self.dt, self.batches
-        start = [batches.join(values) for values in (state.u, state.v, state.a) if values]
-        no_rates = [None] * len(batches.bodies)
-        both = zip(start[1], start[2] if state.a else no_rates, strict=True)
-        ahead = [self.integrator.ahead(v, a, dt) for v, a in both]
+        v0, a0 = batches.rates(state)
+        ahead = [self.integrator.ahead(v, a, dt) for v, a in zip(v0, a0, strict=True)]
         self.first = [u + du for u, du in zip(self._u0, ahead, strict=True)]
         for body, u1 in zip(batches.bodies, self.first, strict=True):
             if body is not batches.rigid:
                 u1[body.fixed] = body.prescribed(state.time + dt)
         self.supports.begin(state, batches.split(self.first), dt)
-        speed = self.lengths.begin(start, self.first, dt)
+        rates = [v0] + [[dt * a for a in a0 if a is not None]] * bool(state.a)
+        speed = self.lengths.begin(self._u0, rates, self.first)
         # In statics v only predicts the first guess.
         moves = (speed > 0.0) & self.integrator.inertia
         moves[list(self.supports.moving)] = True
@@ -399,7 +397,8 @@ class StepProblem:
     def _closed(self, batch: ContactElements) -> float:
         """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
         motion, moved = (float(a.max()) for a in (self.lengths.motion, self.lengths.moved))
-        limits = batch.ratios(np.array([0.0, 1.0, 0.0, 0.0]), motion, motion + moved, self.rtol)
+        gap = np.array([0.0, 1.0, 0.0, 0.0])
+        limits = batch.ratios(None, gap, motion, motion + moved, self.rtol)
         return 1.0 / limits[f"{batch.name} constraints"]
 
     def residual(self, e: Evaluation) -> FloatArray:
@@ -470,11 +469,6 @@ class StepProblem:
         if self.unknowns is not None:
             self.unknowns.destroy()
         self.unknowns, self._numbers = None, None
-
-    def destroy_all(self) -> None:
-        """Free what outlives a layout, too, as the run ends."""
-        self.destroy()
-        self.batches.destroy()
 
 
 def _add_to_diagonal(a: Any, values: FloatArray) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.equations.batches import Batches
+from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import evaluate_together
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH
-from dolfinx_nts.equations.batches import Batches
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
 
 FloatArray = npt.NDArray[np.float64]
@@ -73,7 +73,7 @@ class Unknowns:
         for c, numbers in zip(elements, bodies, strict=True):
             if c.num_elements:
                 both = list(zip(numbers, c.points(), strict=True))
-                parts = [self.layout.to_system(*self._in_field(b, p)) for b, p in both]
+                parts = [self.numbers_of(b, p) for b, p in both]
                 index.append(np.concatenate(parts, axis=1).ravel())
                 of = [batches.body_of(b, p) for b, p in both]
                 owners.append(np.concatenate(of, axis=1).ravel())
@@ -92,6 +92,11 @@ class Unknowns:
         if self._renumbered is not None and j == 0:
             found = np.where(found < 0, found, self._renumbered[found])
         return self._field[j], found
+
+    def numbers_of(self, k: int, numbers: IntArray) -> IntArray:
+        """A body's coordinates -> all unknowns; negative numbers stay."""
+        field, own = self._in_field(k, numbers)
+        return np.where(own < 0, own, self.layout.to_system(field, own))
 
     def _blocks(
         self, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]]

@@ -25,7 +25,7 @@ from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.equations.unknowns import Unknowns
-from dolfinx_nts.interaction.constraints import SHIFT
+from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State

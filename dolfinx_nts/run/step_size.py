@@ -183,11 +183,12 @@ class Pace:
         Where a change of facet has left nodes behind their facets the step is taken as it is: a
         shorter one would only expel them faster.
         """
-        h = problem.dt
-        acceleration = tuple(
-            (problem.supports.advance(k, b.du)[0] - v) / h
-            for k, (b, v) in enumerate(zip(step.bodies, problem.state.v, strict=True))
-        )
+        h, batches = problem.dt, problem.batches
+        each = zip(batches.numbers, step.terms, *batches.rates(problem.state), strict=True)
+        acceleration = batches.split([
+            (problem.supports.advance(k, terms.du, v0, a0)[0] - v0) / h
+            for (k, *_), terms, v0, a0 in each
+        ])  # fmt: skip
         speed, error = self._measure(problem, acceleration)
         short = h <= self.shortest * (1 + 1e-9)
         if not error <= 1.0 and not short and not self._expels(problem, step):

@@ -440,8 +440,11 @@ class Stepper:
                 )  # fmt: skip
 
     def _accept(self, state: State) -> None:
-        for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
+        batches = self.system.batches
+        ends = (batches.join(values) for values in (state.u, state.v))
+        for body, u, v in zip(batches.bodies, *ends, strict=True):
             body.accept(u, v)
+        for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
             # A body's own `accept` need not call the base's.
             Body.accept(body, u, v)
             note_shown(body)
@@ -545,4 +548,4 @@ class Stepper:
     def close(self) -> None:
         """Free the PETSc objects of the last step."""
         self.solver.destroy()
-        self.problem.destroy_all()
+        self.problem.destroy()

@@ -82,12 +82,10 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
     """
     old, dt, batches = problem.state, problem.dt, problem.batches
     u, v, a = (list(values) for values in (old.u, old.v, old.a))
-    of_batches = [batches.join(values) for values in (old.v, old.a or old.v)]
     ends = [
-        problem.supports.advance(of[0], terms.du) if len(of) == 1
-        else problem.integrator.advance(terms.du, v0, a0 if old.a else None, dt)
-        for of, terms, v0, a0 in zip(batches.numbers, step.terms, *of_batches, strict=True)
-    ]  # fmt: skip
+        problem.supports.advance(of[0], terms.du, v0, a0)
+        for of, terms, v0, a0 in zip(batches.numbers, step.terms, *batches.rates(old), strict=True)
+    ]
     for body, terms, (v1, _) in zip(batches.bodies, step.terms, ends, strict=True):
         if body.has_massless:
             # What has no momentum has no velocity of its own either.

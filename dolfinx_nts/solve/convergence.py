@@ -55,12 +55,10 @@ def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
         share: The part, of the largest work of one kind of forces on one body.
     """
     parts = _forces_on(problem, e, [terms.residual for terms in e.terms])
-    moves = [terms.du for terms in e.terms]
-    local = [
-        problem.batches.sums([a * du for a, du in zip(part, moves, strict=True)])
-        for part in (*parts, moves)
-    ]
-    work = global_sum(problem.system.comm, np.array(local)).T
+    both = list(zip(parts, e.terms, strict=True))
+    works = problem.batches.sums([forces * terms.du for forces, terms in both])
+    squares = problem.batches.sums([np.square(terms.du) for terms in e.terms])
+    work = global_sum(problem.system.comm, np.array([*works, squares])).T
     rounding = problem.rounding.forces @ np.sqrt(work[:, 5])
     return abs(work[:, 0].sum()) > share * np.abs(work[:, 1:5]).max() + rounding
 
@@ -74,13 +72,13 @@ def _over_limits(
     elements' forces that cancel each other, as on a body without mass of note between two springs,
     only the rounding counts, so that strong joints loosen no tolerance.
     """
-    batches = problem.batches
-    squares = [
-        batches.sums([np.square(own) for own in part]) for part in _forces_on(problem, e, forces)
-    ]
-    squares.append(problem.laid.gross_forces(problem.elements, e.parts, batches.count))
-    norms = np.sqrt(global_sum(batches.comm, np.array(squares)))
+    batches, parts = problem.batches, _forces_on(problem, e, forces)
+    squares = np.empty((6, batches.count))
+    squares[:5] = batches.sums([np.square(own) for own in parts])
+    squares[5] = problem.laid.gross_forces(problem.elements, e.parts, batches.count)
+    norms = np.sqrt(global_sum(batches.comm, squares))
     limits = problem.rtol * norms[1:5].max(axis=0) + _CANCELLED * norms[5] + rounding
+    limits = limits.tolist()
     found, sizes = [0.0] * batches.count, norms[0].tolist()
     for k in problem.awake:
         found[k] = over(sizes[k], limits[k])
@@ -89,33 +87,41 @@ def _over_limits(
 
 def _forces_on(
     problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray]
-) -> list[Sequence[FloatArray]]:
-    """Given forces on each batch where they are free, then all kinds of the step's forces."""
-    left = [own.copy() for own in forces]
-    for body, own in zip(problem.batches.bodies, left, strict=True):
-        own[body.fixed] = 0.0
-    kinds = ("internal", "external", "coupling")
-    return [left, problem.flight, *([getattr(t, kind) for t in e.terms] for kind in kinds)]
+) -> list[FloatArray]:
+    """Of each batch the given forces where it is free, then all of the step's, (5, num_owned)."""
+    found = []
+    each = zip(problem.batches.bodies, forces, problem.flight, e.terms, strict=True)
+    for body, own, flight, terms in each:
+        rows = np.array([own, flight, terms.internal, terms.external, terms.coupling])
+        rows[0, body.fixed] = 0.0
+        found.append(rows)
+    return found
 
 
 def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     """`ratios` of the elements' own unknowns."""
     moved = max(float(np.abs(terms.du).max(initial=0.0)) for terms in e.terms)
+    comm, linked = problem.system.comm, problem.couplings.linked
     # MPI's maximum may swallow a NaN, so it travels as a flag.
     rows = np.concatenate([np.empty(0), *(p.residual.ravel() for p in e.parts)])
     local = [moved, float(np.isnan(rows).any())]
     for c, part in zip(problem.elements, e.parts, strict=True):
         local += c.largest(part)
-    top = global_max(problem.system.comm, np.array(local))
+    extents = np.zeros(problem.couplings.mechanisms)
+    for c, of in zip(problem.elements, linked, strict=True):
+        if of is not None:
+            np.maximum.at(extents, of, c.extents if np.ndim(of) else c.extent)
+    top = global_max(comm, np.array([*local, *extents]))
     motion = max(top[0], float(problem.lengths.motion.max()))
     rounded = motion + float(problem.lengths.moved.max())
-    sizes, ratio = top[2:].reshape(-1, 4), dict[str, float]()
-    # What rounding leaves open in a joint the linear solve passes on to all that its bodies link.
-    for of in problem.couplings.mechanisms:
-        sizes[of, 3] = sizes[of, 3].max(initial=0.0)
-    for c, largest in zip(problem.elements, sizes, strict=True):
-        broken = np.inf if top[1] else 0.0
+    extents = top[len(local) :]
+    sizes, ratio = top[2 : len(local)].reshape(-1, 4), dict[str, float]()
+    for c, part, largest, of in zip(problem.elements, e.parts, sizes, linked, strict=True):
+        # What rounding leaves open in a joint the linear solve passes on to all that its bodies
+        # link.
+        given = largest if of is None else [*largest[:3], extents[of]]
         # Several contacts of two bodies have one name.
-        for name, value in c.ratios(largest, motion, rounded, problem.rtol).items():
-            ratio[name] = max(value, broken, ratio.get(name, 0.0))
-    return ratio
+        for name, value in c.ratios(part, given, motion, rounded, problem.rtol).items():
+            ratio[name] = max(value, ratio.get(name, 0.0))
+    found = np.array(list(ratio.values())) if not top[1] else np.full(len(ratio), np.inf)
+    return dict(zip(ratio, global_max(comm, found).tolist(), strict=True))

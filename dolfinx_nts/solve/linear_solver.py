@@ -98,6 +98,10 @@ _WHOLE = _PARTS | {
     _BODIES + "sub_pc_type": "ilu",
     _BODIES + "sub_pc_factor_mat_ordering_type": "rcm",
 }
+# Scenes of rigid bodies have small, very sparse matrices, for which KLU takes half of MUMPS's time.
+PRESETS["small"] = {
+    name: value for name, value in PRESETS["direct"].items() if name != WORKSPACE
+} | {"pc_factor_mat_solver_type": "klu"}
 # Of equations that repeat others MUMPS leaves one out: a node that sticks to a floor and touches a
 # wall has more constraints than coordinates.
 PRESETS |= {"null-pivots": PRESETS["direct"] | {"mat_mumps_icntl_24": 1}}

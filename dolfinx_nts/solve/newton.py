@@ -213,7 +213,9 @@ class StepSolver:
         if self._independent:
             return solved
         bodies = problem.couplings.bodies
-        space = NullSpace(problem.system.comm, problem.elements, bodies, solved.parts)
+        space = NullSpace(
+            problem.laid, problem.system.comm, problem.elements, bodies, solved.parts
+        )
         if self._independent is None:
             self._independent = space.is_empty()
             if self._independent:

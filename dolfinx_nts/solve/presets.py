@@ -79,6 +79,9 @@ class Presets:
             mumps = ("redundant", "redundant null-pivots", "null-pivots")
             mumps = mumps if inertia and all(redundant) else mumps[1:]
         own = given.keys() & {"ksp_type", "pc_type", "pc_factor_mat_solver_type"}
+        small = not system.contacts and all(body.rigid for body in system.bodies)
+        if small and not own and system.comm.size == 1:
+            mumps = ("small", *mumps) if PETSc.Sys.hasExternalPackage("suitesparse") else mumps
         self._names: tuple[str, ...] = (first,)
         if first == "direct":
             self._names = mumps[:1] if own else mumps

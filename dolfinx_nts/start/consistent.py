@@ -67,16 +67,17 @@ def violation(
         [m/s] or [m], or None where all constraints hold.
     """
     worst, name, system = 0.0, "", problem.system
-    every = zip(system.joints, system.joint_bodies, problem.couplings.joints, strict=True)
-    for joint, of, coupling in every:
-        if driven and not _drives(joint):
+    speeds = problem.batches.largest(problem.batches.join(state.v))
+    for coupling, numbers in problem.couplings.joints:
+        if driven and not any(_drives(system.joints[k]) for k in numbers):
             continue
-        speed = max(float(np.abs(state.v[k]).max(initial=0.0)) for k in of)
+        fastest = [max(speeds[b] for b in system.joint_bodies[k]) for k in numbers]
         for found in filter(None, coupling.kinematics(state, dt)):
-            local = np.array([found.size[int(rates)], found.limit[int(rates)], speed])
-            off, limit, speed = global_max(system.comm, local).tolist()
-            if off > max(limit, part * speed) and off > worst:
-                worst, name = off, joint.name
+            both = (np.atleast_1d(values[int(rates)]) for values in (found.size, found.limit))
+            off, limit, speed = global_max(system.comm, np.array([*both, fastest]))
+            off = np.where(off > np.maximum(limit, part * speed), off, 0.0)
+            if off.max() > worst:
+                worst, name = float(off.max()), system.joints[numbers[off.argmax()]].name
     return (worst, name) if name else None
 
 
@@ -194,7 +195,7 @@ def _constraints(
     """Elements of joints with constraints that a start has to fit, and their bodies' numbers."""
     return [
         (batch, bodies, found)
-        for c in problem.couplings.joints
+        for c, _ in problem.couplings.joints
         for batch, bodies, found in zip(
             c.elements, c.bodies, c.kinematics(state, dt), strict=True
         )

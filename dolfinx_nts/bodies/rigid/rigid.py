@@ -28,11 +28,10 @@ from dolfinx_nts.bodies.solid.parameters import (
 )
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.interaction.constraints import rank_of
 from dolfinx_nts.interaction.evaluation import Moment
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross, range_of
-from dolfinx_nts.parallel import gather_rows, raise_together
+from dolfinx_nts.parallel import gather_rows, raise_together, rank_of
 from dolfinx_nts.validation import (
     UserFunctionError,
     known_options,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +22,8 @@ IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Coordinates of a rigid body.
 WIDTH = 12
+#: Values of all bodies that are kept joined: u, v and a of both ends of a step.
+_REMEMBERED = 6
 
 
 class RigidBatch(Body):
@@ -33,6 +36,7 @@ class RigidBatch(Body):
         numbers: Their numbers in the system, shape (members,).
 
     Attributes:
+        members: Numbers of all in the system, shape (members,).
         own: Numbers in the system of those that live on this rank, shape (own,).
         number_of: Number in the system of the body of each coordinate on all ranks.
         first: Number of the first coordinate of each member among those of all ranks, (members,).
@@ -48,6 +52,7 @@ class RigidBatch(Body):
         owner = np.array([body.owner for body in bodies])
         # By rank, then by number.
         order = np.argsort(owner, kind="stable")
+        self.members = numbers
         self.first = np.empty(len(bodies), dtype=np.int64)
         self.first[order] = WIDTH * np.arange(len(bodies))
         self.number_of = np.repeat(numbers[order], WIDTH)
@@ -65,13 +70,22 @@ class RigidBatch(Body):
             for name in ("reference", "nodal_mass", "lent")
         )
         self._reach = np.array([body.reach for body in self._own]).reshape(-1, 4)
+        self._places = self.own.tolist()
+        self._joined: deque[tuple[Any, FloatArray]] = deque(maxlen=_REMEMBERED)
         self._matrix: Any = None
         # Mass factor that it holds, and PETSc's count of changes since.
         self._holds: tuple[float, int] | None = None
 
     def joined(self, values: Sequence[FloatArray]) -> FloatArray:
-        """Coordinates on this rank, from those of each body of the system."""
-        return np.concatenate([np.empty(0), *(values[k] for k in self.own)])
+        """Coordinates on this rank, from those of each body of the system: not to be changed."""
+        for known, found in self._joined:
+            if known is values:
+                return found
+        found = np.concatenate([np.empty(0), *(values[k] for k in self._places)])
+        # A state's tuples never change, and a step asks for each many times.
+        if isinstance(values, tuple):
+            self._joined.append((values, found))
+        return found
 
     def motions(self, du: FloatArray) -> FloatArray:
         """`motion_of_points` of each member on this rank [m], shape (own,)."""

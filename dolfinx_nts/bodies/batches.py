@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH, RigidBatch
+from dolfinx_nts.state import State
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -86,8 +87,12 @@ class Batches:
                 out[of[0]] = own
         return tuple(out)
 
+    def rates(self, state: State) -> tuple[list[FloatArray], list[FloatArray | None]]:
+        """Velocities [m/s] of each batch and, of schemes that carry them, accelerations [m/s^2]."""
+        return self.join(state.v), [*self.join(state.a)] if state.a else [None] * len(self.bodies)
+
     def sums(self, values: Sequence[FloatArray]) -> FloatArray:
-        """Sum over the owned coordinates of each body, shape (bodies,)."""
+        """Sum of values (..., num_owned) over the owned coordinates of each body, (..., bodies)."""
         return self._reduced(np.add, values)
 
     def largest(self, values: Sequence[FloatArray]) -> FloatArray:
@@ -95,12 +100,13 @@ class Batches:
         return self._reduced(np.maximum, [np.abs(own) for own in values])
 
     def _reduced(self, how: np.ufunc, values: Sequence[FloatArray]) -> FloatArray:
-        out = np.zeros(self.count)
+        out = np.zeros((*values[0].shape[:-1], self.count))
         for body, of, own in zip(self.bodies, self.numbers, values, strict=True):
             if body is self.rigid:
-                out[body.own] = how.reduce(own.reshape(-1, WIDTH), axis=1)
+                each = own.reshape(*own.shape[:-1], len(body.own), WIDTH)
+                out[..., body.own] = how.reduce(each, axis=-1)
             else:
-                out[of[0]] = how.reduce(own, initial=0.0)
+                out[..., of[0]] = how.reduce(own, axis=-1, initial=0.0)
         return out
 
     def motions(self, du: Sequence[FloatArray]) -> FloatArray:
