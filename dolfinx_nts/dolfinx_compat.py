@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import functools
 import hashlib
 import importlib
 import logging
@@ -496,26 +495,6 @@ def create_matrix(form: Any) -> Any:
     else:
         pattern.finalize()
     return cpp.la.petsc.create_matrix(petsc_communicator(form.mesh.comm), pattern)
-
-
-@functools.cache
-def has_solver(name: str) -> bool:
-    """Whether this PETSc has a package that factorises matrices of one rank."""
-    a = PETSc.Mat().createAIJ((1, 1), nnz=1, comm=PETSc.COMM_SELF)
-    a.setValue(0, 0, 1.0)
-    a.assemble()
-    pc = PETSc.PC().create(PETSc.COMM_SELF)
-    pc.setOperators(a)
-    pc.setType("lu")
-    try:
-        pc.setFactorSolverType(name)
-        pc.setUp()
-    except PETSc.Error:
-        return False
-    finally:
-        pc.destroy()
-        a.destroy()
-    return True
 
 
 def dense_matrix(comm: Any, size: int) -> Any:

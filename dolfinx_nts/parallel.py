@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import zlib
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -14,6 +16,16 @@ from dolfinx_nts.kernels import library
 
 FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
+
+
+def rank_of(name: str, comm: Any) -> int:
+    """Rank that holds an item that lives on one rank, the same in every run.
+
+    Names that differ in their last number are dealt one by one, others by chance.
+    """
+    numbers = re.findall(r"\d+", name)
+    stem = zlib.crc32(re.sub(r"\d+", "", name).encode())
+    return (stem + int(numbers[-1] if numbers else 0)) % int(comm.size)
 
 
 def gather_rows(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:

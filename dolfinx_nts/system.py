@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.bodies.jumps import jumps
 from dolfinx_nts.contact.crossings import point
@@ -164,11 +165,17 @@ class System:
                         f"{_missing(body, names)}"
                     )
 
+    @cached_property
+    def batches(self) -> Batches:
+        """Its bodies as steps evaluate them: plain rigid ones together. Collective at first."""
+        return Batches(self.bodies)
+
     def destroy(self) -> None:
         """Free the PETSc objects of its bodies, which are of no use then. Collective.
 
         What a run has computed can still be read, saved and plotted.
         """
+        self.batches.destroy()
         for body in self.bodies:
             body.destroy()
 

@@ -153,21 +153,21 @@ def test_tangent_against_differences(kind):
     stepper = nts.Stepper(nts.System([a, b], joints=[joint]), nts.EnergyMomentum())
     stepper.advance(5e-2)
     for batch in stepper.problem.elements:
-        rng, c = np.random.default_rng(3), batch.num_coordinates
-        x = batch.reference() + 0.1 * rng.standard_normal((1, c // 3, 3))
-        own = rng.standard_normal((1, batch.widths["constraints"]))
+        rng, n, c = np.random.default_rng(3), batch.num_elements, batch.num_coordinates
+        x = batch.reference() + 0.1 * rng.standard_normal((n, c // 3, 3))
+        own = rng.standard_normal((n, batch.widths["constraints"]))
 
-        def residual(z, batch=batch, c=c):
-            x = z[:, :c].reshape(1, c // 3, 3)
-            return batch.evaluate(x, {"constraints": z[:, c:]}).residual[0]
+        def residual(z, batch=batch, n=n, c=c):
+            x = z[:, :c].reshape(n, c // 3, 3)
+            return batch.evaluate(x, {"constraints": z[:, c:]}).residual
 
-        z = np.concatenate([x.reshape(1, c), own], axis=1)
-        tangent = batch.evaluate(x, {"constraints": own}).tangent[0]
+        z = np.concatenate([x.reshape(n, c), own], axis=1)
+        tangent = batch.evaluate(x, {"constraints": own}).tangent
         # What the matrix lends to multipliers is no derivative.
-        tangent[c:, c:] = 0.0
+        tangent[:, c:, c:] = 0.0
         steps = 1e-3 * np.eye(z.shape[1])
-        found = [(residual(z + d) - residual(z - d)) / 2e-3 for d in steps]
-        assert np.abs(np.array(found).T - tangent).max() < 1e-11 * np.abs(tangent).max()
+        found = np.stack([(residual(z + d) - residual(z - d)) / 2e-3 for d in steps], axis=2)
+        assert np.abs(found - tangent).max() < 1e-11 * np.abs(tangent).max()
     stepper.close()
 
 

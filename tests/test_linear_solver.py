@@ -668,7 +668,7 @@ def test_a_second_attempt_after_a_factorisation_that_failed(monkeypatch):
 
 
 # ---- chains of rigid bodies and beams
-@pytest.mark.skipif(not compat.has_solver("klu"), reason="needs KLU")
+@pytest.mark.skipif(not PETSc.Sys.hasExternalPackage("suitesparse"), reason="needs KLU")
 def test_chains_are_solved_as_by_mumps():
     """Beams and rigid bodies in joints, of which two repeat each other."""
     ends = []

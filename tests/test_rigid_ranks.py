@@ -8,7 +8,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.interaction.constraints import rank_of
+from dolfinx_nts.parallel import rank_of
 
 COMM = MPI.COMM_WORLD
 G = 9.81

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.interaction.constraints import Constraints, Equations
+from dolfinx_nts.interaction.constraint_elements import Equations
+from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Joint
 
 if TYPE_CHECKING:
@@ -50,21 +51,32 @@ class Directors(Joint):
         triads = self._count == 3
         return Constraints(
             self.name, bodies, [self._side], self._equations, redundant=False,
-            upright=(lambda y, _: np.linalg.det(y[:, 1:])) if triads else None,
+            upright=_handedness if triads else None,
         )  # fmt: skip
 
     def largest_turn(self, y0: FloatArray, y1: FloatArray) -> float:
-        """Largest angle [rad], up to half a turn, between two places of a body on this rank.
+        """Largest of `turns_of` between two places of the body on this rank [rad]."""
+        return float(turns_of(y0, y1, self._count).max(initial=0.0))
 
-        Args:
-            y0: Nodal vectors, a place and directors of each node [m], shape (3 k n,).
-            y1: The same of the other place.
-        """
-        a, b = (y.reshape(-1, 1 + self._count, 3)[:, 1:] for y in (y0, y1))
-        if not len(a):
-            return 0.0
-        # D_i . D_i' = l^2 (1 + 2 cos) in the sum of three, without a turn 3 l^2.
-        cosine = np.einsum("nij,nij->n", a, b) / np.einsum("nij,nij->n", a, a)
-        if self._count == 3:
-            cosine = 1.5 * cosine - 0.5
-        return float(np.arccos(np.clip(cosine, -1.0, 1.0)).max())
+
+def _handedness(y: FloatArray, _: tuple[float, ...]) -> FloatArray:
+    """Determinants of triads, which turn over to negative ones, shape (n,)."""
+    found: FloatArray = np.linalg.det(y[:, 1:])
+    return found
+
+
+def turns_of(y0: FloatArray, y1: FloatArray, count: int) -> FloatArray:
+    """Angles [rad], up to half a turn, by which directors turn between two places, shape (n,).
+
+    Args:
+        y0: Nodal vectors, a place and `count` directors of each node [m], shape (3 k n,).
+        y1: The same of the other place.
+        count: 3, or 1.
+    """
+    a, b = (y.reshape(-1, 1 + count, 3)[:, 1:] for y in (y0, y1))
+    # D_i . D_i' = l^2 (1 + 2 cos) in the sum of three, without a turn 3 l^2.
+    cosine = np.einsum("nij,nij->n", a, b) / np.einsum("nij,nij->n", a, a)
+    if count == 3:
+        cosine = 1.5 * cosine - 0.5
+    found: FloatArray = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return found

@@ -110,11 +110,6 @@ class ContactElements(ContactLaws):
         return False
 
     @property
-    def alike(self) -> None:
-        """Each batch is evaluated by itself."""
-        return None
-
-    @property
     def force_scale(self) -> float:
         """Unknowns are forces."""
         return 1.0
@@ -258,11 +253,12 @@ class ContactElements(ContactLaws):
         return found
 
     def ratios(
-        self, largest: FloatArray, motion: float, rounded: float, rtol: float
+        self, part: Any, largest: Any, motion: float, rounded: float, rtol: float
     ) -> dict[str, float]:
         """Residuals of the pairs' own rows over what counts as converged.
 
         Args:
+            part: Plays no part.
             largest: `largest` over all ranks.
             motion: Largest motion of the step [m].
             rounded: Length whose rounding is in all positions [m].

@@ -24,7 +24,7 @@ from dolfinx_nts.contact.coulomb import (
     Together,
 )
 from dolfinx_nts.contact.pair import Candidates, ContactPair
-from dolfinx_nts.interaction.constraints import SHIFT
+from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.parallel import gather_rows
 

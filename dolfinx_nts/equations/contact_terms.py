@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.unknowns import Unknowns
@@ -88,8 +89,8 @@ class ContactTerms:
         self._time, self._reach = float(time), float(reach)
         self._search.begin(step, self.state.contacts, None, search=True)
         elements = self._search.elements
-        sizes = {k: len(a) for k, a in enumerate(u)}
-        self._laid = laid = Unknowns(system.comm, sizes, elements, self._search.bodies)
+        batches = Batches(system.bodies, together=False)
+        self._laid = laid = Unknowns(batches, range(len(u)), elements, self._search.bodies)
         with laid.x as x:
             for k, a in enumerate(u):
                 x[laid.of_body(k)] = a
@@ -172,7 +173,7 @@ class ContactTerms:
         both = zip(self.displacements(x), self.state.u, strict=True)
         terms = [BodyTerms(u1, u1 - u0, *4 * [np.zeros_like(u0)]) for u1, u0 in both]
         parts = self._parts(x)
-        e = Evaluation(x.array_r.copy(), tuple(terms), parts)
+        e = Evaluation(x.array_r.copy(), tuple(terms), tuple, parts)
         bodies = zip(self._system.bodies, terms, strict=True)
         local = np.array([body.motion_of_points(t.du) for body, t in bodies])
         motion = global_max(self._system.comm, local)

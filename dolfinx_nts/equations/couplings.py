@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Sequence
-from typing import Any
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.equations.least_norm import hanging
+from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Coupling, JointCoupling
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -19,6 +21,13 @@ from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
+
+
+class OfJoints(NamedTuple):
+    """What makes the elements of a joint, or of many that are alike, and their numbers."""
+
+    coupling: JointCoupling
+    numbers: list[int]
 
 
 class Couplings:
@@ -30,31 +39,36 @@ class Couplings:
     Attributes:
         contacts: What makes the elements of contacts. Used directly only for what contacts alone
             have: closing gaps, checkpoints.
-        joints: What makes those of each of `System.joints`.
+        joints: What makes those of `System.joints`.
+        mechanisms: How many groups of bodies joints link.
     """
 
     def __init__(self, system: System) -> None:
         self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
         both = zip(system.joints, system.joint_bodies, strict=True)
-        self.joints: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
-        own = slice(len(system.declared_joints), None)
-        alone = zip(self.joints[own], system.joint_bodies[own], strict=True)
+        each: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
+        _lend_less(system, each)
+        declared = len(system.declared_joints)
+        self._number = len(each)
+        self.joints = _together(each, system.joint_bodies, declared, system.batches)
         # What holds a body together may leave a step with it.
-        self._own = [(c, k) for c, (k, *_) in alone if c.rests]
+        self._own = [c for c, (k, *_) in self.joints if k >= declared]
         self._remembered: tuple[ContactHistory, ...] = ()
-        self._mechanisms = _linked(system.joint_bodies[: len(system.declared_joints)])
-        _lend_less(system, self.joints)
+        linked = _linked(system.joint_bodies[:declared])
+        self.mechanisms = max(linked, default=-1) + 1
+        self._linked = [np.array([linked[k] for k in of if k < declared]) for _, of in self.joints]
 
     @property
     def _all(self) -> list[Coupling]:
-        return [self.contacts, *self.joints]
+        return [self.contacts, *(coupling for coupling, _ in self.joints)]
 
     def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step; arguments as of `Coupling.begin`. Collective."""
         state = step.state
         self._remembered = state.contacts
-        histories: tuple[Any, ...] = (state.contacts, *state.joints)
-        for coupling, history in zip(self._all, histories, strict=True):
+        self.contacts.begin(step, state.contacts, again, search)
+        for coupling, of in self.joints:
+            history = tuple(state.joints[k] for k in of) if len(of) > 1 else state.joints[of[0]]
             coupling.begin(step, history, again, search)
 
     @property
@@ -64,34 +78,44 @@ class Couplings:
 
     @property
     def bodies(self) -> list[tuple[int, ...]]:
-        """Numbers of the bodies of each batch."""
+        """Numbers of the bodies of each batch, see `Batches.batch_of`."""
         return [of for coupling in self._all for of in coupling.bodies]
 
     @property
-    def mechanisms(self) -> list[list[int]]:
-        """Positions among `elements` of those of joints, of each mechanism that bodies link."""
-        if not self._mechanisms:
-            return []
-        found: list[list[int]] = [[] for _ in range(max(self._mechanisms, default=-1) + 1)]
-        start = len(self.contacts.elements)
-        for mechanism, coupling in zip(self._mechanisms, self.joints, strict=False):
-            stop = start + len(coupling.elements)
-            found[mechanism] += range(start, stop)
-            start = stop
+    def linked(self) -> list[Any]:
+        """Number of the mechanism of each of `elements`, (n,) of many joints; None: of none."""
+        found: list[Any] = [None] * len(self.contacts.elements)
+        for (coupling, _), linked in zip(self.joints, self._linked, strict=False):
+            for batch in coupling.elements:
+                several = len(linked) > 1
+                found.append(linked[batch.joint] if several else linked[0] if len(linked) else None)
         return found
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """All with their parts of an evaluation."""
         yield self.contacts, e.parts[: len(self.contacts.elements)]
-        yield from self.of_joints(e)
+        for coupling, _, parts in self.of_joints(e):
+            yield coupling, parts
 
-    def of_joints(self, e: Evaluation) -> Iterator[tuple[JointCoupling, tuple[Any, ...]]]:
+    def of_joints(
+        self, e: Evaluation
+    ) -> Iterator[tuple[JointCoupling, list[int], tuple[Any, ...]]]:
         """`joints` with their parts of an evaluation."""
         start = len(self.contacts.elements)
-        for coupling in self.joints:
+        for coupling, of in self.joints:
             stop = start + len(coupling.elements)
-            yield coupling, e.parts[start:stop]
+            yield coupling, of, e.parts[start:stop]
             start = stop
+
+    def history(self, e: Evaluation) -> tuple[Any, tuple[Any, ...]]:
+        """What contacts, and each of `System.joints`, remember of an accepted step."""
+        out: list[Any] = [None] * self._number
+        for coupling, of, parts in self.of_joints(e):
+            found = coupling.history(parts)
+            for k, own in zip(of, found if len(of) > 1 else [found], strict=True):
+                out[k] = own
+        contacts = self.contacts.history(e.parts[: len(self.contacts.elements)])
+        return contacts, tuple(out)
 
     def touching(
         self, e: Evaluation
@@ -127,20 +151,17 @@ class Couplings:
 
         Collective.
         """
-        own = {id(coupling) for coupling, _ in self._own}
-        return set().union(*(c.touched() for c in self._all if id(c) not in own))
+        return set().union(*(c.touched() for c in self._all if c not in self._own))
 
-    def rest(self, bodies: Container[int]) -> None:
-        """Leave out of the step what holds bodies together that are left out."""
-        for coupling, k in self._own:
-            if k in bodies:
-                coupling.rest()
+    def rest(self, bodies: Collection[int]) -> None:
+        """Leave out of the step what holds bodies together that are left out. Collective."""
+        for coupling in self._own:
+            coupling.rest(bodies)
 
-    def rouse(self, bodies: Container[int]) -> None:
-        """Take in again what `rest` left out."""
-        for coupling, k in self._own:
-            if k in bodies:
-                coupling.rouse()
+    def rouse(self, bodies: Collection[int]) -> None:
+        """Take in again what `rest` left out. Collective."""
+        for coupling in self._own:
+            coupling.rouse(bodies)
 
     def wake(self, e: Evaluation) -> bool:
         """Whether a solved step asks for more elements, which are made. Collective."""
@@ -149,6 +170,35 @@ class Couplings:
     def misses(self, e: Evaluation, motion: FloatArray) -> bool:
         """Whether a solved step may have passed by something, see `Coupling.misses`. Collective."""
         return any([coupling.misses(e, parts, motion) for coupling, parts in self.each(e)])
+
+
+def _together(
+    each: Sequence[JointCoupling],
+    bodies: Sequence[tuple[int, ...]],
+    declared: int,
+    batches: Batches,
+) -> list[OfJoints]:
+    """Joints between plain rigid bodies that are alike as one, all others one by one.
+
+    Args:
+        each: What makes the elements of each joint.
+        bodies: Numbers of the bodies of each.
+        declared: Number of those that the user has declared, which come first.
+        batches: Of the bodies.
+    """
+    groups: dict[Any, list[int]] = {}
+    plain = set(batches.numbers[0]) if batches.rigid else set()
+    for k, (coupling, of) in enumerate(zip(each, bodies, strict=True)):
+        alike = coupling.alike if type(coupling) is Constraints and plain.issuperset(of) else None
+        groups.setdefault(k if alike is None else (k < declared, alike), []).append(k)
+    out = []
+    for numbers in groups.values():
+        coupling = each[numbers[0]]
+        if len(numbers) > 1:
+            several: Any = [each[k] for k in numbers]
+            coupling = Constraints.together(several, batches.rigid, batches.count)
+        out.append(OfJoints(coupling, numbers))
+    return out
 
 
 def _linked(of: Sequence[tuple[int, ...]]) -> list[int]:

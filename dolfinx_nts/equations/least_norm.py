@@ -16,6 +16,8 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import lsqr
 
+from dolfinx_nts.equations.unknowns import Unknowns
+
 logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,8 +26,6 @@ FloatArray = npt.NDArray[np.float64]
 _RTOL = 1e-14
 #: Iterations over unknowns that least squares may take; in exact arithmetic one is enough.
 _ITERATIONS = 10
-#: Distance between the coordinate numbers of two bodies.
-_APART = 1 << 40
 #: Solves by least squares, each for what the one before has left.
 _PASSES = 2
 #: What SciPy's lsqr says where its iterations did not do.
@@ -80,6 +80,7 @@ class NullSpace:
     """Multipliers of bilateral constraints that exert no force on any body.
 
     Args:
+        laid: Layout of the unknowns.
         comm: MPI communicator.
         elements: Batches of elements.
         bodies: Numbers of the bodies of each batch.
@@ -88,6 +89,7 @@ class NullSpace:
 
     def __init__(
         self,
+        laid: Unknowns,
         comm: Any,
         elements: Sequence[Any],
         bodies: Sequence[tuple[int, ...]],
@@ -98,16 +100,16 @@ class NullSpace:
             n, m = batch.num_elements, batch.widths["constraints"]
             if batch.bilateral and n * m:
                 places.append(np.arange(start, start + n * m))
-                scale = batch.force_scale
-                scales.append(np.full(n * m, scale))
+                scale = np.broadcast_to(batch.force_scale, n)
+                scales.append(np.repeat(scale, m))
                 rows = np.arange(count, count + n * m).reshape(n, 1, m)
                 count += n * m
                 both = zip(numbers, batch.dofs(), strict=True)
-                columns = np.concatenate([np.where(d < 0, d, d + k * _APART) for k, d in both], 1)
+                columns = np.concatenate([laid.numbers_of(k, dofs) for k, dofs in both], axis=1)
                 found = np.broadcast_arrays(
                     rows,
                     columns[:, :, None],
-                    part.tangent[:, : batch.num_coordinates, -m:] / scale,
+                    part.tangent[:, : batch.num_coordinates, -m:] / scale[:, None, None],
                 )
                 some = (found[1] >= 0) & (found[2] != 0.0)
                 entries.append([array[some] for array in found])

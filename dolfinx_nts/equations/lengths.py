@@ -9,7 +9,6 @@ import numpy.typing as npt
 
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
-from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
@@ -31,34 +30,36 @@ class Lengths:
     """
 
     def __init__(self, system: System) -> None:
-        self._system = system
-        self.centre, self.radius, self.director = _box(system)
+        self._batches = system.batches
+        self.centre, self.radius, self.director = box_of(system)
         self.motion, self.extent, self.moved = np.zeros((3, len(system.bodies)))
+        links = (*system.contact_bodies, *system.joint_bodies)
+        self._linked = [list(bodies) for bodies in links if len(bodies) > 1]
 
-    def begin(self, state: State, first: Sequence[FloatArray], dt: float) -> FloatArray:
+    def begin(
+        self,
+        u: Sequence[FloatArray],
+        rates: Sequence[Sequence[FloatArray]],
+        first: Sequence[FloatArray],
+    ) -> FloatArray:
         """Measure a step. Collective.
 
         Args:
-            state: State at t_n.
-            first: Owned displacements of each body at t_{n+1} that are predicted [m].
-            dt: Step [s].
+            u: Displacements of each batch at t_n [m].
+            rates: Velocities then and, of schemes that carry them, accelerations times the step
+                [m/s].
+            first: Displacements at t_{n+1} that are predicted [m].
 
         Returns:
             Largest speed of each body [m/s], shape (bodies,).
         """
-        system = self._system
-        local = [
-            [
-                b.motion_of_points(u1 - u),
-                *(np.abs(x).max(initial=0.0) for x in (b.reference + u1, v, u)),
-            ]
-            for b, u1, u, v in zip(system.bodies, first, state.u, state.v, strict=True)
-        ]
-        found = global_max(system.comm, np.array(local)).T
-        self.motion, self.extent, speed, self.moved = found
-        if state.a:
-            local = [np.abs(dt * a).max(initial=0.0) for a in state.a]
-            speed = np.maximum(speed, global_max(system.comm, np.array(local)))
+        batches = self._batches
+        du = [u1 - u0 for u1, u0 in zip(first, u, strict=True)]
+        places = [b.reference + u1 for b, u1 in zip(batches.bodies, first, strict=True)]
+        local = [batches.motions(du), *map(batches.largest, (places, u, *rates))]
+        found = global_max(batches.comm, np.array(local))
+        self.motion, self.extent, self.moved = found[:3]
+        speed: FloatArray = found[3:].max(axis=0)
         return speed
 
     def displaced(self, fall: float) -> FloatArray:
@@ -69,9 +70,12 @@ class Lengths:
         """
         length: FloatArray = self.moved + self.motion + fall
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
-        for bodies in map(list, (*self._system.contact_bodies, *self._system.joint_bodies)):
-            length[bodies] = length[bodies].max()
-        return length
+        linked = length.tolist()  # numbers one by one are faster outside of NumPy
+        for bodies in self._linked:
+            longest = max(linked[k] for k in bodies)
+            for k in bodies:
+                linked[k] = longest
+        return np.array(linked)
 
     @property
     def span(self) -> float:
@@ -80,20 +84,18 @@ class Lengths:
 
     def motion_of(self, e: Evaluation) -> FloatArray:
         """Largest component of each body's motion in an evaluation, shape (bodies,). Collective."""
-        both = zip(self._system.bodies, e.bodies, strict=True)
-        local = [body.motion_of_points(terms.du) for body, terms in both]
-        return global_max(self._system.comm, np.array(local))
+        return global_max(self._batches.comm, self._batches.motions([t.du for t in e.terms]))
 
     def displacement_of(self, e: Evaluation) -> FloatArray:
         """Largest displacement of each body in an evaluation, shape (bodies,). Collective.
 
         An iterate that runs off excuses no more than the positions would.
         """
-        local = np.array([np.abs(terms.u1).max(initial=0.0) for terms in e.bodies])
-        return np.minimum(global_max(self._system.comm, local), self.extent + self.moved)
+        local = self._batches.largest([terms.u1 for terms in e.terms])
+        return np.minimum(global_max(self._batches.comm, local), self.extent + self.moved)
 
 
-def _box(system: System) -> tuple[FloatArray, float, float]:
+def box_of(system: System) -> tuple[FloatArray, float, float]:
     """Middle of the box around all bodies' places, half its diagonal, longest director [m].
 
     All in the reference. Collective.

@@ -41,29 +41,31 @@ class Loads:
             dt: Step [s].
             moments: Where the forces on each body are taken; None: as the integrator's step has it.
         """
-        rule, bodies = self._integrator, self._system.bodies
+        rule, batches = self._integrator, self._system.batches
         self._state, self._dt = state, dt
         when = state.time + rule.theta * dt
-        if moments is None:
-            moments = [self._moment(k, when) for k in range(len(bodies))]
-        self.moments = list(moments)
-        for body, moment in zip(bodies, moments, strict=True):
-            body.begin_step(rule, moment)
+        self.moments = list(self._moments(when) if moments is None else moments)
+        for body, (k, *_) in zip(batches.bodies, batches.numbers, strict=True):
+            body.begin_step(rule, self.moments[k])
         self.gravity = rule.ramp(when) * self._system.gravity
 
-    def _moment(self, k: int, when: float) -> Moment:
-        """What a body is told of a step whose loads act at a time [s]."""
-        rule, state, dt, drift = self._integrator, self._state, self._dt, None
+    def _moments(self, when: float) -> list[Moment]:
+        """What bodies are told of a step whose loads act at a time [s]."""
+        rule, state, dt, batches = self._integrator, self._state, self._dt, self._system.batches
+        drifts: Sequence[FloatArray | None] = [None] * len(state.u)
         if rule.accelerations:
-            v0 = state.v[k]
-            end, _ = rule.advance(np.zeros_like(v0), v0, state.acceleration(k), dt)
-            drift = (1.0 - rule.theta) * v0 + rule.theta * end
+            found = []
+            for v0, a0 in zip(*batches.rates(state), strict=True):
+                end, _ = rule.advance(np.zeros_like(v0), v0, a0, dt)
+                found.append((1.0 - rule.theta) * v0 + rule.theta * end)
+            drifts = batches.split(found)
         # Load steps of equilibrium end with some of no length.
-        rate = rule.theta * rule.rate(dt) if rule.inertia else 0.0
-        return Moment(state.u[k], when, rule.ramp(when), rate, drift)
+        rate, ramp = rule.theta * rule.rate(dt) if rule.inertia else 0.0, rule.ramp(when)
+        both = zip(state.u, drifts, strict=True)
+        return [Moment(u, when, ramp, rate, drift) for u, drift in both]
 
-    def work_at_ends(self, e: Evaluation) -> list[float]:
-        """What work of loads at both ends adds on this rank, by body, times `factor`. Collective.
+    def work_at_ends(self, e: Evaluation) -> float:
+        """What work of loads at both ends adds on this rank, times `factor`. Collective.
 
         v_0 + v_1 = 2 (u_1 - u_0)/h makes the mean of the forces at both ends do the work in the
         methods that carry accelerations, not those where the step takes them. Loads that are
@@ -74,13 +76,11 @@ class Loads:
             e: Solution of the step.
         """
         rule, state, dt = self._integrator, self._state, self._dt
-        works = [0.0] * len(e.bodies)
-        if not rule.accelerations:
-            return works
+        work, batches = 0.0, self._system.batches
         factor, ends = rule.factor(dt), (state.time, state.time + dt)
-        for k, (body, terms) in enumerate(zip(self._system.bodies, e.bodies, strict=True)):
+        for body, (k, *_), terms in zip(batches.bodies, batches.numbers, e.terms, strict=True):
             # Loads that do not change have the same mean, and users' functions are not asked.
-            if not body.loads_in_time:
+            if not (rule.accelerations and body.loads_in_time):
                 continue
             mean = np.zeros_like(terms.du)
             for time in ends:
@@ -88,8 +88,8 @@ class Loads:
                 mean += 0.5 * factor * body.external(terms.u1, self.gravity)
             body.begin_step(rule, self.moments[k])
             here = factor * body.external(terms.u1, self.gravity)
-            works[k] = float(free(body, mean - here) @ terms.du)
-        return works
+            work += float(free(body, mean - here) @ terms.du)
+        return work
 
     def largest(self) -> float:
         """Largest load but gravity on a coordinate, all of its ramp [N]. Collective."""

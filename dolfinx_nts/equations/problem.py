@@ -29,7 +29,7 @@ from dolfinx_nts.equations.stiffness_between import stiffness_between
 from dolfinx_nts.equations.supports import Supports
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import Step, evaluate_together
-from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, Moment, free
+from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, Moment
 from dolfinx_nts.parallel import everywhere, global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
@@ -64,7 +64,9 @@ class StepProblem:
         lengths: Lengths of the scene, and of the step after `begin`.
         loads: When the step takes which loads.
         supports: Prescribed coordinates in the step.
-        flight: M (u_1 - u_0) of each body in free flight [kg m], after `begin`; zero in statics.
+        batches: Which bodies it evaluates together.
+        first: Displacement of each batch of bodies at t_{n+1} without forces [m], after `begin`.
+        flight: M (u_1 - u_0) of each batch in free flight [kg m], likewise; zero in statics.
     """
 
     def __init__(
@@ -73,7 +75,8 @@ class StepProblem:
         self.system, self.integrator = system, integrator
         self.rtol, self.condense = rtol, condense
         self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
-        self._asleep: dict[int, BodyTerms] = {}
+        self.batches = system.batches
+        self._asleep: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._evaluated: dict[int, tuple[FloatArray, ...]] = {}
         # What batches contribute that have no element on any rank: nothing, at every iterate.
         self._of_none: tuple[Any, ...] | None = None
@@ -92,7 +95,7 @@ class StepProblem:
             self.loads.largest,
         )  # fmt: skip
         self.rounding = Rounding(
-            system.bodies, lambda k: self.body_tangent(k, self.state.u[k]), self.stiffness_between
+            self.batches, lambda j: self._tangent_of_batch(j, self._u0[j]), self.stiffness_between
         )
 
     # ---- set-up of a step
@@ -118,20 +121,20 @@ class StepProblem:
             moments: Where the forces on each body are taken; None: as the integrator's step has it.
         """
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
-        self._evaluated = {}
+        self._evaluated, self._u0 = {}, self.batches.join(state.u)
         self.loads.begin(state, dt, moments)
         at_rest = self._fly()
-        lengths, way = self.lengths, [u1 - u for u1, u in zip(self.first, state.u, strict=True)]
+        lengths, way = self.lengths, [a - b for a, b in zip(self.first, self._u0, strict=True)]
         if again is not None:
             lengths.motion = np.maximum(lengths.motion, lengths.motion_of(again))
-            way = [terms.du for terms in again.bodies]
+            way = [terms.du for terms in again.terms]
         # Bodies at rest may fall.
         length = lengths.displaced(dt**2 * float(np.linalg.norm(self.loads.gravity)))
         self.rounding.begin(self.factor, length, lengths.moved, lengths.extent)
         step = Step(
-            state, dt, self.factor, self.integrator, self.condense, self.first, way,
-            lengths.motion, length, self.stabilization.stiffness, self.loads.moments,
-            self.rounding.of,
+            state, dt, self.factor, self.integrator, self.condense,
+            self.batches.split(self.first), self.batches.split(way), lengths.motion, length,
+            self.stabilization.stiffness, self.loads.moments, self.rounding.of,
         )  # fmt: skip
         self.couplings.begin(step, again, search)
         self._asleep = self._find_asleep(at_rest & (lengths.motion == 0.0)) if sleep else {}
@@ -143,23 +146,27 @@ class StepProblem:
         Returns:
             Whether each body starts without speed, shape (bodies,).
         """
-        bodies, state, dt = self.system.bodies, self.state, self.dt
-        ahead = [
-            self.integrator.ahead(v, state.acceleration(k), dt) for k, v in enumerate(state.v)
-        ]
-        self.first = [u + du for u, du in zip(state.u, ahead, strict=True)]
-        for body, u1 in zip(bodies, self.first, strict=True):
-            u1[body.fixed] = body.prescribed(state.time + dt)
-        self.supports.begin(state, self.first, dt)
-        speed = self.lengths.begin(state, self.first, dt)
+        state, dt, batches = self.state, self.dt, self.batches
+        v0, a0 = batches.rates(state)
+        ahead = [self.integrator.ahead(v, a, dt) for v, a in zip(v0, a0, strict=True)]
+        self.first = [u + du for u, du in zip(self._u0, ahead, strict=True)]
+        for body, u1 in zip(batches.bodies, self.first, strict=True):
+            if body is not batches.rigid:
+                u1[body.fixed] = body.prescribed(state.time + dt)
+        self.supports.begin(state, batches.split(self.first), dt)
+        rates = [v0] + [[dt * a for a in a0 if a is not None]] * bool(state.a)
+        speed = self.lengths.begin(self._u0, rates, self.first)
         # In statics v only predicts the first guess.
         moves = (speed > 0.0) & self.integrator.inertia
-        moving = self.supports.moving
-        self.flight = [
-            self._inertial(b, self.supports.ahead(k, du, self.first[k]))
-            if moves[k] or k in moving else np.zeros_like(du)
-            for k, (b, du) in enumerate(zip(bodies, ahead, strict=True))
-        ]  # fmt: skip
+        moves[list(self.supports.moving)] = True
+        self.flight = []
+        each = zip(batches.bodies, batches.numbers, ahead, self.first, strict=True)
+        for body, of, du, u1 in each:
+            if not moves[of].any():
+                self.flight.append(np.zeros_like(du))
+                continue
+            flown = du if len(of) > 1 else self.supports.ahead(of[0], du, u1)
+            self.flight.append(self._inertial(body, flown))
         return speed == 0.0
 
     @property
@@ -210,9 +217,8 @@ class StepProblem:
         numbers = (np.array(self.awake), widths, *(a for c in elements for a in c.points()))
         if not everywhere(system.comm, _equal(numbers, self._numbers)):
             self.destroy()
-            sizes = {k: system.bodies[k].num_owned for k in self.awake}
             of = self.couplings.bodies
-            self.unknowns = Unknowns(system.comm, sizes, elements, of)
+            self.unknowns = Unknowns(self.batches, self.awake, elements, of)
             self.version += 1
             self._numbers = numbers
         self._of_none = None
@@ -245,19 +251,18 @@ class StepProblem:
         assert self.unknowns is not None, "begin comes first"
         return self.unknowns
 
-    def _find_asleep(self, rest: BoolArray) -> dict[int, BodyTerms]:
-        """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move."""
+    def _find_asleep(self, rest: BoolArray) -> dict[int, tuple[FloatArray, FloatArray]]:
+        """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move.
+
+        With their internal and external forces [N].
+        """
         if self._sleepers is None:
             return {}
         chosen = sorted(set(np.flatnonzero(rest).tolist()) - self.couplings.touched())
-        u, f = self.state.u, self.factor
-        found = self._sleepers.find(chosen, u, self.loads.gravity, self.rounding.at_rest)
+        u, gravity = self.state.u, self.loads.gravity
+        found = self._sleepers.find(chosen, u, gravity, self.rounding.at_rest)
         self.couplings.rest(found)
-        none = {k: np.zeros_like(u[k]) for k in found}
-        return {
-            k: BodyTerms(u[k], none[k], f * a, f * b, none[k], f * (a - b))
-            for k, (a, b) in found.items()
-        }
+        return found
 
     def _rouse(self, bodies: Set[int]) -> None:
         """Take bodies into the step that were left out."""
@@ -291,15 +296,15 @@ class StepProblem:
                 taken in place of these.
         """
         laid, elements = self.laid, self.elements
+        places = self.first if flight else self._u0
+        if again is not None:
+            places = [terms.u1 for terms in again.terms]
         with self.x as x:
+            laid.write(self.first, x)
+            held = x[laid.held].copy()
             x[:] = 0.0
-            for k in self.awake:
-                fixed, u1 = self.system.bodies[k].fixed, self.first[k]
-                start = u1 if flight else self.state.u[k].copy()
-                if again is not None:
-                    start = again.bodies[k].u1.copy()
-                start[fixed] = u1[fixed]
-                x[laid.of_body(k)] = start
+            laid.write(places, x)
+            x[laid.held] = held
         if "constraints" in laid.own and (forces or not self.integrator.inertia):
             found = self.couplings.guess(laid.positions(self.x, elements), carried=carried)
             with self.x as x:
@@ -325,14 +330,21 @@ class StepProblem:
             parts = self._of_none
         force = laid.forces(self.elements, parts) if laid.blocks else np.zeros(len(values))
         # Most often bodies at rest before something hits them stay where the last iterate had them.
-        for k in self.elsewhere(values, {k: terms[0] for k, terms in self._evaluated.items()}):
-            self._evaluated[k] = self._without_elements(k, values[laid.of_body(k)])
-        bodies = dict(self._asleep)
-        for k in self.awake:
-            u1, du, internal, external, total = self._evaluated[k]
-            coupling = force[laid.of_body(k)]
-            bodies[k] = BodyTerms(u1, du, internal, external, coupling, total + coupling)
-        return Evaluation(values, tuple(bodies[k] for k in sorted(bodies)), parts)
+        known = {j: terms[0] for j, terms in self._evaluated.items()}
+        places = laid.read(values, self._u0)
+        for j in self.elsewhere(places, known):
+            self._evaluated[j] = self._without_elements(j, places[j])
+        none = [np.zeros_like(u) for u in self._u0]
+        coupling, terms = laid.read(force, none), []
+        for j, of in enumerate(self.batches.numbers):
+            if j in laid.awake:
+                u1, du, internal, external, total = self._evaluated[j]
+            else:
+                internal, external = (self.factor * own for own in self._asleep[of[0]])
+                u1, du, total = self._u0[j], none[j], internal - external
+            pull = coupling[j]
+            terms.append(BodyTerms(u1, du, internal, external, pull, total + pull))
+        return Evaluation(values, tuple(terms), self.batches.split, parts)
 
     def _parts_of_elements(self, x: Any, values: FloatArray) -> tuple[Any, ...]:
         """What each batch of elements contributes at an iterate. Collective.
@@ -352,63 +364,71 @@ class StepProblem:
         )  # fmt: skip
         return parts
 
-    def _without_elements(self, k: int, u1: FloatArray) -> tuple[FloatArray, ...]:
-        """`BodyTerms` of a body at a displacement, but for those of elements. Collective.
+    def _without_elements(self, j: int, u1: FloatArray) -> tuple[FloatArray, ...]:
+        """`BodyTerms` of a batch at a displacement, but for those of elements. Collective.
 
         Returns:
             u1, du, internal and external forces, and the equation without elements.
         """
-        body, du = self.system.bodies[k], u1 - self.state.u[k]
+        body, du = self.batches.bodies[j], u1 - self._u0[j]
         internal = self.factor * body.internal(u1)
         external = self.factor * body.external(u1, self.loads.gravity)
-        total = self._inertial(body, du) - self.flight[k] + internal - external
+        total = self._inertial(body, du) - self.flight[j] + internal - external
         return u1, du, internal, external, total
 
-    def elsewhere(self, values: FloatArray, known: Mapping[int, FloatArray]) -> list[int]:
-        """Bodies that are awake and not where they are known to have been. Collective.
+    def elsewhere(
+        self, places: Sequence[FloatArray], known: Mapping[int, FloatArray]
+    ) -> list[int]:
+        """Batches with bodies awake that are not where they are known to have been. Collective.
 
         Args:
-            values: This rank's unknowns.
-            known: Displacements there [m] by the body's number; a body without one is elsewhere.
+            places: Displacements of each batch [m].
+            known: Those there by the batch's number; one without is elsewhere.
         """
-        here = [
-            k not in known or not np.array_equal(values[self.laid.of_body(k)], known[k])
-            for k in self.awake
-        ]
+        awake = self.laid.awake
+        here = [j not in known or not np.array_equal(places[j], known[j]) for j in awake]
         anywhere = global_max(self.system.comm, np.array(here, dtype=np.float64))
-        return [k for k, moves in zip(self.awake, anywhere.tolist(), strict=True) if moves]
+        return [j for j, moves in zip(awake, anywhere.tolist(), strict=True) if moves]
+
+    def displacements(self, x: FloatArray) -> list[FloatArray]:
+        """Those of each batch at an iterate [m]: this rank's part of both."""
+        return self.laid.read(x, self._u0)
 
     def _closed(self, batch: ContactElements) -> float:
         """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
         motion, moved = (float(a.max()) for a in (self.lengths.motion, self.lengths.moved))
-        limits = batch.ratios(np.array([0.0, 1.0, 0.0, 0.0]), motion, motion + moved, self.rtol)
+        gap = np.array([0.0, 1.0, 0.0, 0.0])
+        limits = batch.ratios(None, gap, motion, motion + moved, self.rtol)
         return 1.0 / limits[f"{batch.name} constraints"]
 
     def residual(self, e: Evaluation) -> FloatArray:
         """This rank's part of the residual, zero at prescribed coordinates."""
         laid = self.laid
         out = np.zeros(len(e.x))
-        for k in self.awake:
-            out[laid.of_body(k)] = free(self.system.bodies[k], e.bodies[k].residual)
+        laid.write([terms.residual for terms in e.terms], out)
+        out[laid.held] = 0.0
         for name in laid.own:
             rows = [c.rows(p, name).ravel() for c, p in zip(self.elements, e.parts, strict=True)]
             out[laid.of_elements(name)] = np.concatenate(rows)
         return out
 
     def body_tangents(self, e: Evaluation) -> list[Any]:
-        """PETSc matrices of the bodies that are awake at an iterate, without contact."""
-        tangents = [self.body_tangent(k, e.bodies[k].u1) for k in self.awake]
-        if self.lent:
-            for k, a in zip(self.awake, tangents, strict=True):
-                _add_to_diagonal(a, self.lent * self.stabilization.stiffness(self.system.bodies[k]))
-        return tangents
+        """PETSc matrices of the batches that are awake at an iterate, without contact."""
+        return [self.body_tangent(j, e.terms[j].u1) for j in self.laid.awake]
 
-    def body_tangent(self, k: int, u1: FloatArray) -> Any:
-        """PETSc matrix of a body at a displacement, without contact."""
-        mass = 1.0 if self.integrator.inertia else 0.0
-        a = self.system.bodies[k].tangent(u1, mass, self.factor)
+    def body_tangent(self, j: int, u1: FloatArray) -> Any:
+        """PETSc matrix of a batch at a displacement, without contact: its bodies in the step."""
+        a = self._tangent_of_batch(j, u1)
+        if self.lent:
+            _add_to_diagonal(a, self.lent * self.stabilization.stiffness(self.batches.bodies[j]))
+        return self.laid.part(j, a)
+
+    def _tangent_of_batch(self, j: int, u1: FloatArray) -> Any:
+        """`body_tangent` of all its bodies, with nothing lent."""
+        mass, body = 1.0 if self.integrator.inertia else 0.0, self.batches.bodies[j]
+        a = body.tangent(u1, mass, self.factor)
         if self.stabilization.share:
-            _add_to_diagonal(a, self.stabilization.of(self.system.bodies[k]))
+            _add_to_diagonal(a, self.stabilization.of(body))
         return a
 
     @property
@@ -429,10 +449,8 @@ class StepProblem:
 
     def stiffness_between(self) -> FloatArray:
         """Norm of the stiffness at t_n of elements without unknowns, of each body. Collective."""
-        u = {k: self.state.u[k] for k in self.awake}
-        return stiffness_between(
-            self.laid, self.elements, self.couplings.bodies, u, len(self.system.bodies)
-        )
+        of = self.couplings.bodies
+        return stiffness_between(self.batches, self.laid, self.elements, of, self._u0)
 
     @property
     def momentum_rounding(self) -> float:

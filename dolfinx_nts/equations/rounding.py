@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.batches import Batches
+from dolfinx_nts.parallel import global_sum
+
 FloatArray = npt.NDArray[np.float64]
 
 _EPS = float(np.finfo(float).eps)
@@ -26,8 +29,8 @@ class Rounding:
     and however large it is. Forces between bodies come from places.
 
     Args:
-        bodies: Bodies of the system.
-        tangent: PETSc matrix of a body at the start of the step, by the body's number.
+        batches: Of the bodies of the system.
+        tangent: PETSc matrix of a batch at the start of the step, by its number.
         springs: Stiffness there of what acts between bodies, of each body [kg], (bodies,).
             Collective.
 
@@ -37,14 +40,14 @@ class Rounding:
 
     def __init__(
         self,
-        bodies: Sequence[Any],
+        batches: Batches,
         tangent: Callable[[int], Any],
         springs: Callable[[], FloatArray],
     ) -> None:
-        self._bodies, self._tangent, self._springs = bodies, tangent, springs
-        self._diagonal, self._of_factor = np.zeros((2, len(bodies)))
-        self._between, self._springs_known = np.zeros(len(bodies)), False
-        self.length = self._extent = self._moved = self._beside = np.zeros(len(bodies))
+        self._batches, self._tangent, self._springs = batches, tangent, springs
+        self._diagonal, self._of_factor = np.zeros((2, batches.count))
+        self._between, self._springs_known = np.zeros(batches.count), False
+        self.length = self._extent = self._moved = self._beside = np.zeros(batches.count)
         self._factor = 1.0
 
     def begin(
@@ -59,8 +62,10 @@ class Rounding:
             extent: Largest coordinate [m], shape (bodies,).
         """
         self._factor, self.length, self._moved, self._extent = factor, length, moved, extent
-        both = zip(self._bodies, extent, strict=True)
-        self._beside = np.array([e if body.rounded is None else body.rounded for body, e in both])
+        self._beside = extent.copy()
+        for body, of in zip(self._batches.bodies, self._batches.numbers, strict=True):
+            if body.rounded is not None:
+                self._beside[of] = body.rounded
         # Of steps of other sizes the diagonal differs; until rounding matters none is needed.
         old = self._of_factor
         self._diagonal[(factor > _ANOTHER_STEP * old) | (old > _ANOTHER_STEP * factor)] = 0.0
@@ -92,20 +97,32 @@ class Rounding:
         against what turns it alone counts by that part. Positions are rounded in the forces on
         directors, too, by no more than the mean stiffness of both, as it is definite.
         """
-        for k in bodies:
-            body, diagonal = self._bodies[k], self._tangent(k).getDiagonal()
-            if body.oriented and not body.rigid:
-                each = diagonal.array_r.reshape(-1, 3)
-                # A node's place comes before its directors.
-                place = each[body.places].max(axis=1)[np.cumsum(body.places) - 1, None]
-                turns = ~body.places
-                each = each.copy()
-                each[turns] = body.length / self._extent[k] * each[turns] + np.sqrt(
-                    np.abs(each[turns] * place[turns])
-                )
-                diagonal.array_w[:] = each.ravel()
-            self._diagonal[k], self._of_factor[k] = diagonal.norm(), self._factor
+        asked = set(bodies)
+        for j, (body, of) in enumerate(
+            zip(self._batches.bodies, self._batches.numbers, strict=True)
+        ):
+            chosen = [k for k in of if k in asked]
+            if not chosen:
+                continue
+            diagonal = self._tangent(j).getDiagonal()
+            each = diagonal.array_r.copy()
             diagonal.destroy()
+            if body.oriented and not body.rigid:
+                each = self._as_rounded(body, each.reshape(-1, 3), self._extent[of[0]])
+            squares = [np.empty(0)] * len(self._batches.bodies)
+            squares[j] = np.square(each)
+            norms = np.sqrt(global_sum(self._batches.comm, self._batches.sums(squares)))
+            self._diagonal[chosen], self._of_factor[chosen] = norms[chosen], self._factor
+
+    @staticmethod
+    def _as_rounded(body: Any, each: FloatArray, extent: float) -> FloatArray:
+        """Stiffness of a beam's or shell's nodal vectors against rounding [kg], (num_owned,)."""
+        # A node's place comes before its directors.
+        place = each[body.places].max(axis=1)[np.cumsum(body.places) - 1, None]
+        turns, out = ~body.places, each.copy()
+        out[turns] *= body.length / extent
+        out[turns] += np.sqrt(np.abs(each[turns] * place[turns]))
+        return out.ravel()
 
     def measure_springs(self) -> None:
         """Measure that of forces between bodies in this step. Collective."""

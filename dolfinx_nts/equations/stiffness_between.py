@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import evaluate_together
 
@@ -15,28 +16,27 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def stiffness_between(
+    batches: Batches,
     laid: Unknowns,
     elements: Sequence[Any],
     bodies: Sequence[tuple[int, ...]],
-    u: Mapping[int, FloatArray],
-    count: int,
+    u: Sequence[FloatArray],
 ) -> FloatArray:
     """Norm of the stiffness of elements without own unknowns, of each body [kg]. Collective.
 
     Args:
+        batches: Of bodies.
         laid: Layout of the unknowns.
         elements: Batches of elements.
         bodies: Numbers of the bodies of each batch.
-        u: Owned displacements of each body that is awake [m].
-        count: Number of bodies.
+        u: Owned displacements of each batch of bodies [m].
 
     Returns:
         Shape (bodies,); [N/m] in statics.
     """
-    local, start = np.zeros(count), laid.x.duplicate()
+    local, start = np.zeros(batches.count), laid.x.duplicate()
     start.set(0.0)
-    for k, values in u.items():
-        start.array_w[laid.of_body(k)] = values
+    laid.write(u, start.array_w)
     positions = laid.positions(start, elements)
     own = laid.own_values(start.array_r, elements)
     start.destroy()
@@ -52,7 +52,8 @@ def stiffness_between(
         for k, dofs in zip(bodies[i], elements[i].dofs(), strict=True):
             stop = first + dofs.shape[1]
             along = part.tangent[:, first:stop, first:stop].diagonal(axis1=1, axis2=2)
-            local[k] += float(np.square(along[dofs >= 0]).sum())
+            free = dofs >= 0
+            np.add.at(local, batches.body_of(k, dofs[free]), np.square(along[free]))
             first = stop
     found: FloatArray = np.sqrt(laid.layout.comm.allreduce(local))
     return found

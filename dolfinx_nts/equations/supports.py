@@ -152,28 +152,28 @@ class Supports:
         out[fixed] += first[fixed] - self._state.u[k][fixed] - self._ends[k].flown
         return out
 
-    def advance(self, k: int, du: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        """Velocity [m/s] and acceleration [m/s^2], if there is one, of a body at t_{n+1}.
+    def advance(
+        self, k: int, du: FloatArray, v0: FloatArray, a0: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Velocity [m/s] and acceleration [m/s^2], if there is one, at t_{n+1}.
 
         Args:
-            k: Its number.
+            k: Number of a body alone, or the first one of a batch.
             du: Its motion in the step [m], shape (num_owned,).
+            v0: Its velocity at t_n [m/s].
+            a0: Its acceleration then [m/s^2], if there is one.
         """
-        state, fixed = self._state, self._system.bodies[k].fixed
-        v1, a1 = self._rule.advance(du, state.v[k], state.acceleration(k), self._dt)
+        v1, a1 = self._rule.advance(du, v0, a0, self._dt)
         if k in self._ends:
+            fixed = self._system.bodies[k].fixed
             v1[fixed] = self._ends[k].rates.velocity
             if a1 is not None:
                 a1[fixed] = self._ends[k].rates.acceleration
         return v1, a1
 
-    def coast(self, k: int) -> FloatArray:
-        """Velocity of a body at t_{n+1} but for the forces of the step [m/s], (num_owned,).
-
-        Args:
-            k: Its number.
-        """
-        rule, v0, a0 = self._rule, self._state.v[k], self._state.acceleration(k)
+    def coast(self, k: int, v0: FloatArray, a0: FloatArray | None) -> FloatArray:
+        """Velocity at t_{n+1} but for the forces of the step [m/s]; arguments as of `advance`."""
+        rule = self._rule
         ahead = rule.ahead(v0, a0, self._dt)
         velocity, _ = rule.advance(ahead, v0, a0, self._dt)
         if k in self._ends:
@@ -195,7 +195,7 @@ class Supports:
         if k not in self.moving:
             return 0.0
         body, v0, fixed = self._system.bodies[k], self._state.v[k], self._system.bodies[k].fixed
-        v1, _ = self.advance(k, terms.du)
+        v1, _ = self.advance(k, terms.du, v0, self._state.acceleration(k))
         force = (terms.internal + terms.coupling - terms.external)[fixed] / factor
         impulse = np.zeros_like(v1)
         if self._rule.accelerations:
@@ -217,6 +217,7 @@ class Supports:
         """
         if k not in self.moving:
             return np.zeros(3)
-        body = self._system.bodies[k]
-        momentum = body.inertia(0.5 * (self._state.v[k] + self.advance(k, du)[0]))
+        body, v0 = self._system.bodies[k], self._state.v[k]
+        v1, _ = self.advance(k, du, v0, self._state.acceleration(k))
+        momentum = body.inertia(0.5 * (v0 + v1))
         return np.cross(du.reshape(-1, 3), momentum.reshape(-1, 3)).sum(axis=0)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from dolfinx_nts.bodies.batches import Batches
+from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
 
 FloatArray = npt.NDArray[np.float64]
@@ -19,30 +21,39 @@ _OWN = ("augmented", "constraints")
 
 
 class Unknowns:
-    """Layout of the unknowns: bodies first, then those that elements have of their own.
+    """Layout of the unknowns: batches of bodies first, then those that elements have of their own.
 
     Args:
-        comm: MPI communicator.
-        sizes: Of each body in the step, its number -> coordinates on this rank.
+        batches: Of the bodies.
+        awake: Numbers of the bodies in the step, the same on all ranks, in order.
         elements: Batches of elements.
-        bodies: Numbers of the bodies of each batch.
+        bodies: Numbers of the bodies of each batch, see `Batches.batch_of`.
 
     Attributes:
+        awake: Numbers of the batches of bodies with bodies in the step: one field each.
         layout: Fields of the unknowns.
         own: Fields of the elements' own unknowns by name; empty if they have none.
         blocks: Unknowns of each batch of elements; empty if there are no elements on any rank.
         x: PETSc vector of the unknowns.
+        held: Where prescribed coordinates stand among this rank's unknowns.
     """
 
     def __init__(
         self,
-        comm: Any,
-        sizes: Mapping[int, int],
+        batches: Batches,
+        awake: Sequence[int],
         elements: Sequence[Any],
         bodies: Sequence[tuple[int, ...]],
     ) -> None:
-        self._field = {k: f for f, k in enumerate(sizes)}
-        counts = list(sizes.values())
+        comm = batches.comm
+        self._batches = batches
+        self.awake = sorted({batches.batch_of(k) for k in awake})
+        self._field = {j: f for f, j in enumerate(self.awake)}
+        self._renumbered, self._chosen = _of_awake(batches, awake)
+        counts = [
+            batches.bodies[j].num_owned if self._chosen is None or j else int(self._chosen.sum())
+            for j in self.awake
+        ]
         local = [sum(c.num_elements * c.widths[name] for c in elements) for name in _OWN]
         there = comm.allreduce(np.array([*local, sum(c.num_elements for c in elements)]))
         self.own: dict[str, int] = {}
@@ -51,14 +62,20 @@ class Unknowns:
                 self.own[name] = len(counts)
                 counts.append(size)
         self.layout = Layout(comm, counts)
+        self._places = {j: self.layout.owned(f) for j, f in self._field.items()}
+        self.held = np.concatenate(
+            [np.empty(0, np.int64)]
+            + [place.start + batches.bodies[j].fixed for j, place in self._places.items()]
+        )
+        self._part: Any = None
         self.blocks = self._blocks(elements, bodies) if there[-1] else []
         index, owners = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for c, numbers in zip(elements, bodies, strict=True):
             if c.num_elements:
                 both = list(zip(numbers, c.points(), strict=True))
-                parts = [self.layout.to_system(self._field[b], p) for b, p in both]
+                parts = [self.numbers_of(b, p) for b, p in both]
                 index.append(np.concatenate(parts, axis=1).ravel())
-                of = [np.full(p.shape, b) for b, p in both]
+                of = [batches.body_of(b, p) for b, p in both]
                 owners.append(np.concatenate(of, axis=1).ravel())
         self._body_of_row = np.concatenate(owners)
         needed = np.concatenate(index).astype(PETSc.IntType)
@@ -69,6 +86,18 @@ class Unknowns:
         self._scatter = PETSc.Scatter().create(self.x, source, self._local, None)
         source.destroy()
 
+    def _in_field(self, k: int, numbers: IntArray) -> tuple[int, IntArray]:
+        """Field of a body, and its coordinates' numbers there; negative numbers stay."""
+        j, found = self._batches.batch_of(k), self._batches.in_batch(k, numbers)
+        if self._renumbered is not None and j == 0:
+            found = np.where(found < 0, found, self._renumbered[found])
+        return self._field[j], found
+
+    def numbers_of(self, k: int, numbers: IntArray) -> IntArray:
+        """A body's coordinates -> all unknowns; negative numbers stay."""
+        field, own = self._in_field(k, numbers)
+        return np.where(own < 0, own, self.layout.to_system(field, own))
+
     def _blocks(
         self, elements: Sequence[Any], bodies: Sequence[tuple[int, ...]]
     ) -> list[ElementBlocks]:
@@ -76,10 +105,11 @@ class Unknowns:
         blocks = []
         offset = {name: self.layout.start(f) for name, f in self.own.items()}
         for c, of in zip(elements, bodies, strict=True):
-            if not all(b in self._field for b in of):
+            if not all(self._batches.batch_of(b) in self._field for b in of):
                 blocks.append(ElementBlocks((), (), (), np.empty((0, 0), dtype=bool)))
                 continue
-            numbers = list(c.dofs())
+            of_bodies = [self._in_field(b, dofs) for b, dofs in zip(of, c.dofs(), strict=True)]
+            numbers = [number for _, number in of_bodies]
             for name in self.own:
                 shape = c.num_elements, c.widths[name]
                 new = offset[name] + np.arange(shape[0] * shape[1])
@@ -91,13 +121,61 @@ class Unknowns:
             if "constraints" in self.own:
                 pattern[stops[-2] :, stops[-2] :] = c.pattern
             columns = tuple(slice(int(b - w), int(b)) for w, b in zip(widths, stops, strict=True))
-            fields = (*(self._field[b] for b in of), *self.own.values())
+            fields = (*(field for field, _ in of_bodies), *self.own.values())
             blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
         return blocks
 
+    # ---- bodies
+    def of_batch(self, j: int) -> slice:
+        """Where a batch's coordinates that are in the step stand among this rank's unknowns."""
+        return self._places[j]
+
     def of_body(self, k: int) -> slice:
         """Where a body's coordinates stand among this rank's unknowns."""
-        return self.layout.owned(self._field[k])
+        place, rigid = self._places[self._batches.batch_of(k)], self._batches.rigid
+        if rigid is None or k not in self._batches.numbers[0]:
+            return place
+        if k not in rigid.own:
+            return slice(place.start, place.start)
+        number = WIDTH * int(np.flatnonzero(rigid.own == k)[0])
+        if self._chosen is not None:
+            number = int(self._chosen[:number].sum())
+        return slice(place.start + number, place.start + number + WIDTH)
+
+    def part(self, j: int, matrix: Any) -> Any:
+        """The part of a batch's PETSc matrix that is in the step. Collective."""
+        if j or self._chosen is None:
+            return matrix
+        start, _ = matrix.getOwnershipRange()
+        numbers = (start + np.flatnonzero(self._chosen)).astype(PETSc.IntType)
+        chosen = PETSc.IS().createGeneral(numbers, comm=self._batches.comm)
+        chosen.setBlockSize(3)
+        self._part = matrix.createSubMatrix(chosen, chosen, self._part)
+        chosen.destroy()
+        return self._part
+
+    def read(self, values: FloatArray, base: Sequence[FloatArray]) -> list[FloatArray]:
+        """Owned coordinates of each batch, from this rank's unknowns.
+
+        Args:
+            values: This rank's unknowns.
+            base: Coordinates of each batch, for those that are not in the step.
+        """
+        out = list(base)
+        for j, place in self._places.items():
+            if j == 0 and self._chosen is not None:
+                out[j] = base[j].copy()
+                out[j][self._chosen] = values[place]
+            else:
+                out[j] = values[place]
+        return out
+
+    def write(self, values: Sequence[FloatArray | None], out: FloatArray) -> None:
+        """Owned coordinates of each batch -> this rank's unknowns; `read` in reverse."""
+        for j, place in self._places.items():
+            own = values[j]
+            assert own is not None
+            out[place] = own[self._chosen] if j == 0 and self._chosen is not None else own
 
     def of_elements(self, name: str) -> slice:
         """Where a field of the elements' own unknowns stands among this rank's unknowns."""
@@ -159,8 +237,25 @@ class Unknowns:
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
-        for a in (self.x, self._forces, self._local, self._scatter):
-            a.destroy()
+        for a in (self.x, self._forces, self._local, self._scatter, self._part):
+            if a is not None:
+                a.destroy()
+
+
+def _of_awake(
+    batches: Batches, awake: Collection[int]
+) -> tuple[IntArray | None, npt.NDArray[np.bool_] | None]:
+    """Numbers of the rigid batch's coordinates among those in the step, and which here are.
+
+    None where all are, or none is.
+    """
+    rigid = batches.rigid
+    if rigid is None:
+        return None, None
+    there = np.isin(rigid.number_of, list(awake))
+    if there.all() or not there.any():
+        return None, None
+    return np.cumsum(there) - 1, np.repeat(np.isin(rigid.own, list(awake)), WIDTH)
 
 
 def _coordinate_rows(elements: Sequence[Any], parts: Sequence[Any]) -> FloatArray:

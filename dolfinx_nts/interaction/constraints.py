@@ -1,26 +1,28 @@
-"""Elements of constraints at most quadratic in the coordinates: triads, joints, ties.
-
-With y_m = (y_0 + y_1)/2, D g(y_m) (y_1 - y_0) = g(y_1) - g(y_0): at the middle of the step their
-forces -D g(y_m)^T lambda do no work but that of a prescribed value (theory section 11).
-"""
+"""What makes elements of constraints in every step: of one joint, or of many that are alike."""
 
 from __future__ import annotations
 
-import re
-import zlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Callable, Collection, Hashable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.interaction.constraint_elements import (
+    SHIFT,
+    ConstraintElements,
+    ConstraintPart,
+    Equations,
+    extents_of,
+    largest_of_joints,
+)
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import FAR_TURN, OFF, Kinematics
-from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
+from dolfinx_nts.interaction.point_elements import EveryStep
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.parallel import global_max, raise_together
@@ -33,261 +35,60 @@ BoolArray = npt.NDArray[np.bool_]
 #: From nodal vectors at the end of a step (n, k, 3) and the times of both its ends [s].
 Upright = Callable[[FloatArray, tuple[float, ...]], FloatArray]
 
-#: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies,
-#: beside their gap times their curvature. Equations that repeat others agree at the solution;
-#: before it they miss each other by the square of the gap, and multipliers change by that over the
-#: compliance: a fixed one makes them huge. One that vanishes with the gap leaves Newton's method
-#: its order (Levenberg-Marquardt: Yamashita and Fukushima 2001).
-SHIFT = 1e-7
 
-
-def rank_of(name: str, comm: Any) -> int:
-    """Rank that holds an item that lives on one rank, the same in every run.
-
-    Names that differ in their last number are dealt one by one, others by chance.
-    """
-    numbers = re.findall(r"\d+", name)
-    stem = zlib.crc32(re.sub(r"\d+", "", name).encode())
-    return (stem + int(numbers[-1] if numbers else 0)) % int(comm.size)
-
-
-class Equations(NamedTuple):
-    """Constraints v . w = c [m], v = V_a y_a + v_0 and w alike; axis 0 = element.
+class Arm(NamedTuple):
+    """Vectors w_a y_a + constant, of each element.
 
     Attributes:
-        weights: V and W, whose products are [1/m] or, with a constant, [-], shape (n, m, 2, k).
-        constants: v_0 and w_0, shape (n, m, 2, 3).
-        value: c where nothing prescribes it otherwise [m], shape (n, m).
+        weights: w_a, shape (n, k).
+        constant: Shape (n, 3).
     """
 
     weights: FloatArray
-    constants: FloatArray
-    value: FloatArray
+    constant: FloatArray
+
+    def at(self, y: FloatArray) -> FloatArray:
+        """Their values from nodal vectors (n, k, 3), shape (n, 3)."""
+        found: FloatArray = np.einsum("nk,nki->ni", self.weights, y) + self.constant
+        return found
 
 
-def _extent(equations: Equations, rest: FloatArray) -> float:
-    """Length whose rounding enters constraints on this rank [m].
-
-    That of what each vector is made of, times the other vector: nothing of nodes with weight 0,
-    such as the directors of a point, whose length is no length of the scene.
-
-    Args:
-        equations: Their coefficients.
-        rest: Reference values of the nodes [m], shape (n, k, 3).
-    """
-    weights, constants, _ = equations
-    made_of = np.abs(weights) @ np.abs(rest)[:, None] + np.abs(constants)
-    vectors = np.linalg.norm(kernel.factors(weights, constants, rest), axis=3)
-    both = made_of.max(axis=3) * vectors[:, :, ::-1]
-    return float(both.sum(axis=2).max(initial=0.0))
-
-
-class ConstraintPart(NamedTuple):
-    """What constraints contribute, see `Part`.
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The elements of this rank; axis 0 = element.
 
     Attributes:
-        residual: Rows of coordinates [kg m], then of multipliers.
-        tangent: Its derivative.
-        multiplier: Factor of the step times lambda [kg m], shape (n, m).
-        gap: g - c at t_{n+1} [m], shape (n, m).
-        start: Nodal vectors at t_n [m], shape (n, k, 3).
-        end: The same at t_{n+1}.
-    """
-
-    residual: FloatArray
-    tangent: FloatArray
-    multiplier: FloatArray
-    gap: FloatArray
-    start: FloatArray
-    end: FloatArray
-
-    @property
-    def status(self) -> BoolArray:
-        """Nothing flips."""
-        return np.empty((0, len(self.residual)), dtype=bool)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ConstraintElements(PointElements):
-    """Constraints of a step.
-
-    Attributes:
+        sides: Of each body, or of a batch of bodies, the nodes of the elements.
         equations: Their coefficients.
-        curvature: Second derivative of the constraints, see `kernels.quadratic`, (n, m, k, k).
-        rest: Reference values of the nodes [m], shape (n, k, 3).
-        prescribed: c at t_n and t_{n+1} [m], shape (2, n, m).
-        y0: Nodal vectors at t_n [m], shape (n, k, 3).
-        scale: Force per motion in the units of the step: a mass in dynamics.
-        theta: Where between t_n and t_{n+1} the forces act.
-        lent: Compliance over that of the bodies that the matrix lends them, see `SHIFT`.
-        size: As of `_extent` [m].
+        upright: See `Constraints`; of equations, their values are what is positive.
+        arm: See `Constraints`.
+        lent: As of `ConstraintElements`, (n,).
+        joint: Number of each element's joint, (n,).
+        bodies: Numbers of the bodies of each element in the system, shape (n, sides).
+        force: Multipliers of the last step, shape (n, m).
+        scale: As of `ConstraintElements`, shape (n,), once it is known.
     """
 
+    sides: tuple[Points, ...]
     equations: Equations
-    curvature: FloatArray
-    rest: FloatArray
-    prescribed: FloatArray
-    y0: FloatArray
-    scale: float
-    theta: float
-    lent: float
-    size: float
+    upright: Upright | Equations | None
+    arm: Arm | None
+    lent: FloatArray
+    joint: IntArray
+    bodies: IntArray
+    force: FloatArray
+    scale: FloatArray
 
-    @property
-    def widths(self) -> Mapping[str, int]:
-        """One multiplier per constraint."""
-        return {"augmented": 0, "constraints": self.equations.value.shape[1]}
+    def select(self, chosen: BoolArray) -> _Rows:
+        """Return some of them. Collective."""
+        def some(given: Any) -> Any:
+            if isinstance(given, tuple):
+                return type(given)(*(a[chosen] for a in given))
+            return given[chosen] if isinstance(given, np.ndarray) else given
 
-    @property
-    def force_scale(self) -> float:
-        """Unknowns are lengths, forces over `scale`."""
-        return self.scale
-
-    def reference(self) -> FloatArray:
-        """Reference values of the nodes [m], shape (n, k, 3)."""
-        return self.rest
-
-    @cached_property
-    def pattern(self) -> BoolArray:
-        """Which constraints stand in the rows of which: each in its own."""
-        return np.eye(self.widths["constraints"], dtype=bool)
-
-    @cached_property
-    def extent(self) -> float:
-        """Length whose rounding enters on this rank [m]."""
-        return self.size
-
-    @cached_property
-    def _start(self) -> FloatArray:
-        """Factors of each constraint at t_n, shape (n, m, 2, 3)."""
-        weights, constants, _ = self.equations
-        return kernel.factors(weights, constants, self.y0)
-
-    @cached_property
-    def _bent(self) -> FloatArray:
-        """Largest curvature of each constraint [1/m], shape (n, m)."""
-        return _bent(self.curvature)
-
-    @property
-    def alike(self) -> tuple[Any, ...]:
-        """What batches have in common that are evaluated as one, see `evaluate_together`."""
-        return (self.theta, *self.equations.weights.shape[1:])
-
-    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> ConstraintPart:
-        """Residual and tangent; the multipliers' unknowns are lengths, factor lambda / scale."""
-        (part,) = self.evaluate_alike([self], [x], [own])
-        return part
-
-    @staticmethod
-    def evaluate_alike(
-        batches: Sequence[ConstraintElements],
-        places: Sequence[FloatArray],
-        own: Sequence[Mapping[str, FloatArray]],
-    ) -> list[ConstraintPart]:
-        """`evaluate` of batches that are `alike`, at once: most have a single element."""
-        first, counts = batches[0], [batch.num_elements for batch in batches]
-        each = [
-            _Iterate(*b.equations[:2], b.curvature, b.prescribed[1], b.y0, x, y["constraints"])
-            for b, x, y in zip(batches, places, own, strict=True)
-        ]
-        several = len(each) > 1
-        known = (None, None) if several else (first._start, first._bent)
-        joined = _Iterate(*map(np.concatenate, zip(*each, strict=True))) if several else each[0]
-        scale, lent = (
-            np.repeat([getattr(b, name) for b in batches], counts) for name in ("scale", "lent")
-        )
-        whole = _evaluate(first.theta, scale, lent, joined, *known)
-        stops = np.cumsum(counts)
-        return [
-            ConstraintPart(*(array[stop - n : stop] for array in whole))
-            for n, stop in zip(counts, stops, strict=True)
-        ]
-
-    def largest(self, part: ConstraintPart) -> list[float]:
-        """The largest row of its constraints [m], and its extent."""
-        return [0.0, float(np.abs(part.gap).max(initial=0.0)), 0.0, self.extent]
-
-    def ledger(self, part: ConstraintPart, factor: float) -> dict[str, float]:
-        """Work of prescribed values, -lambda . (c_1 - c_0)."""
-        change = self.prescribed[1] - self.prescribed[0]
-        return {"external_work": -float((part.multiplier * change).sum()) / factor}
-
-    def describe(self, part: ConstraintPart, flips: IntArray) -> tuple[float, str]:
-        """The constraint that is off most."""
-        size = np.nan_to_num(np.abs(part.gap), nan=np.inf)
-        worst = float(size.max())
-        return worst * self.scale, f"{self.name!r}: off by {worst:.3g}"
-
-
-def _bent(curvature: FloatArray) -> FloatArray:
-    """Largest entry of each constraint's curvature [1/m], shape (n, m)."""
-    bent: FloatArray = np.abs(curvature).max(axis=(2, 3), initial=0.0)
-    return bent
-
-
-class _Iterate(NamedTuple):
-    """What constraints are evaluated of; names as of `ConstraintElements`, axis 0 = element.
-
-    Attributes:
-        x: Nodal vectors at t_{n+1} [m], shape (n, k, 3).
-        unknowns: Multipliers as lengths, shape (n, m).
-        prescribed: c at t_{n+1} [m], shape (n, m).
-    """
-
-    weights: FloatArray
-    constants: FloatArray
-    curvature: FloatArray
-    prescribed: FloatArray
-    y0: FloatArray
-    x: FloatArray
-    unknowns: FloatArray
-
-
-def _evaluate(
-    theta: float,
-    scale: FloatArray,
-    lent: FloatArray,
-    at: _Iterate,
-    start: FloatArray | None,
-    bent: FloatArray | None,
-) -> ConstraintPart:
-    """Residual and tangent of constraints.
-
-    Args:
-        theta: As of `ConstraintElements`.
-        scale: The same of each element, shape (n,).
-        lent: Alike.
-        at: The iterate.
-        start: Factors at t_n, if they are known.
-        bent: Curvature of each constraint, if it is known.
-    """
-    weights, constants, curvature, prescribed, y0, x, unknowns = at
-    n, m, _, k = weights.shape
-    start = kernel.factors(weights, constants, y0) if start is None else start
-    bent = _bent(curvature) if bent is None else bent
-    last, scale = 3 * k, scale[:, None]
-    multiplier = scale * unknowns
-    end = kernel.factors(weights, constants, x)
-    middle = start + theta * (end - start)
-    force = kernel.gradient(weights, middle).reshape(n, m, last)
-    gap = kernel.value(end) - prescribed
-    residual = np.empty((n, last + m))
-    residual[:, :last] = np.matmul(multiplier[:, None], force)[:, 0]
-    residual[:, last:] = scale * gap
-    tangent = np.zeros((n, last + m, last + m))
-    if bent.any():
-        bend = np.matmul(theta * multiplier[:, None], curvature.reshape(n, m, k * k))
-        stiffness = bend.reshape(n, k, k)
-        for i in range(3):
-            tangent[:, i:last:3, i:last:3] = stiffness
-    tangent[:, :last, last:] = (scale[:, :, None] * force).transpose(0, 2, 1)
-    gradient = kernel.gradient(weights, end).reshape(n, m, last)
-    tangent[:, last:, :last] = scale[:, :, None] * gradient
-    rows, lends = np.arange(last, last + m), lent > 0.0
-    tangent[:, rows, rows] = -scale * np.where(
-        lends[:, None], lent[:, None] + np.abs(gap) * bent, 0.0
-    )
-    return ConstraintPart(residual, tangent, multiplier, gap, y0, x)
+        sides = tuple(side.part(chosen) for side in self.sides)
+        others = {f.name: some(getattr(self, f.name)) for f in fields(self) if f.name != "sides"}
+        return _Rows(sides, **others)
 
 
 class Constraints(EveryStep):
@@ -302,8 +103,8 @@ class Constraints(EveryStep):
             nothing is prescribed. Collective.
         redundant: Whether they may repeat others.
         upright: Numbers that are positive unless directions have turned over, which solves the
-            equations, too. Collective.
-        arm: Vectors (n, 3) [m] whose turn in a step is looked at, from nodal vectors (n, k, 3).
+            equations, too. Collective. Or the equations whose products they are.
+        arm: Vectors [m] whose turn in a step is looked at.
     """
 
     def __init__(
@@ -315,74 +116,202 @@ class Constraints(EveryStep):
         driven: Callable[[tuple[float, ...]], tuple[Equations, FloatArray]] | None = None,
         *,
         redundant: bool = True,
-        upright: Upright | None = None,
-        arm: Callable[[FloatArray], FloatArray] | None = None,
+        upright: Upright | Equations | None = None,
+        arm: Arm | None = None,
     ) -> None:
-        super().__init__(bodies, self._elements, lambda part: part.multiplier / self._factor)
-        self._of = bodies
-        self._name, self._sides, self._equations = name, tuple(sides), equations
-        self._lent = SHIFT if redundant else 0.0
-        self._scale: float | None = None
-        self._rest = np.concatenate([s.reference for s in self._sides], axis=1)
-        self._curvature = kernel.curvature(equations.weights)
-        self._extent = _extent(equations, self._rest)
-        self._driven, self._force = driven, np.zeros_like(equations.value)
-        self._upright, self._arm = upright, arm
+        n = len(equations.value)
+        rows = _Rows(
+            tuple(sides), equations, upright, arm, np.full(n, SHIFT if redundant else 0.0),
+            np.zeros(n, dtype=int), np.tile(bodies, (n, 1)), np.zeros_like(equations.value),
+            np.ones(n),
+        )  # fmt: skip
+        self._set_up((name,), bodies, rows, driven)
+
+    def _set_up(
+        self, names: Sequence[str], bodies: tuple[int, ...], rows: _Rows, driven: Any = None
+    ) -> None:
+        super().__init__(bodies, self._elements)
+        self._of, self._names, self._driven = bodies, tuple(names), driven
+        others = f" and {len(names) - 1} others" if len(names) > 1 else ""
+        self._name = f"{names[0]}{others}"
+        self._touched = set(bodies)
+        self._members: Sequence[Constraints] = (self,)
+        self._all, self._resting = rows, frozenset[int]()
+        self._take(rows)
+        self._scaled = False
         # What is prescribed may move its bodies in any step.
         self.rests = driven is None
 
+    def _take(self, rows: _Rows) -> None:
+        """Let these be the elements of the step."""
+        self._rows = rows
+        self._rest = np.concatenate([side.reference for side in rows.sides], axis=1)
+        self._curvature = kernel.curvature(rows.equations.weights)
+        self._extents = extents_of(rows.equations, self._rest)
+
+    # ---- many joints as one
+    @property
+    def alike(self) -> Hashable | None:
+        """What joints of rigid bodies have in common that `together` takes; None: none does."""
+        rows, upright = self._all, self._all.upright
+        if self._driven is not None:
+            return None
+        form = upright.value.shape[1] if isinstance(upright, Equations) else upright
+        widths = (side.nodes.shape[1] for side in rows.sides)
+        return (*widths, rows.equations.value.shape[1], form, rows.arm is None)
+
+    @classmethod
+    def together(cls, joints: Sequence[Constraints], batch: Any, number: int) -> Constraints:
+        """One for joints that are `alike`, whose bodies are members of a batch.
+
+        Args:
+            joints: The joints.
+            batch: A `RigidBatch`.
+            number: For which the batch stands as the body of a side, see `Batches`.
+        """
+        each, first = [joint._all for joint in joints], dict(
+            zip(batch.members.tolist(), (batch.first // 3).tolist(), strict=True)
+        )
+        sides = []
+        for k, body in enumerate(each[0].sides):
+            of = [rows.sides[k] for rows in each]
+            nodes = [s.nodes + first[j._of[k]] for s, j in zip(of, joints, strict=True)]
+            values = [
+                np.concatenate([getattr(s, name) for s in of])
+                for name in ("weights", "reference", "fixed", "places")
+            ]
+            sides.append(Points(batch, np.concatenate(nodes).astype(body.nodes.dtype), *values))
+        counts = [len(rows.joint) for rows in each]
+
+        def joined(name: str) -> Any:
+            found = [getattr(rows, name) for rows in each]
+            if isinstance(found[0], tuple):
+                return type(found[0])(*map(np.concatenate, zip(*found, strict=True)))
+            return np.concatenate(found) if isinstance(found[0], np.ndarray) else found[0]
+
+        rows = _Rows(
+            tuple(sides), joined("equations"), joined("upright"), joined("arm"), joined("lent"),
+            np.repeat(np.arange(len(joints)), counts), joined("bodies"), joined("force"),
+            joined("scale"),
+        )  # fmt: skip
+        new = cls.__new__(cls)
+        names = [name for joint in joints for name in joint._names]
+        new._set_up(names, (number,) * len(sides), rows)
+        new._members = joints
+        new._touched = set().union(*(joint._of for joint in joints))
+        return new
+
+    # ---- in a step
     def begin(self, step: Step, history: Any, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step."""
+        if self._resting:
+            self._resting = frozenset()
+            self._take(self._all)
+        # A guess alone: a run may go on from one whose joint of this name had other equations.
+        given = history if len(self._names) > 1 else (history,)
+        start, known = 0, self._all.force.copy()
+        counts = np.bincount(self._all.joint, minlength=len(self._names)).tolist()
+        for own, count in zip(given, counts, strict=True):
+            here = known[start : start + count]
+            if own is not None and own.shape == here.shape:
+                here[:] = own
+            start += count
+        self._scale(step)
+        self._all = self._rows = replace(self._all, force=known)
         self.bodies = [self._of]
         super().begin(step, history, again, search)
 
-    def rest(self) -> None:
-        """Leave the step."""
-        self.elements, self.bodies = [], []
+    def _scale(self, step: Step) -> None:
+        """Ask for the scales of the elements, in dynamics once. Collective."""
+        if self._scaled and step.integrator.inertia:
+            return
+        known: dict[int, float] = {}
+        for of in (side for joint in self._members for side in joint._all.sides):
+            if id(of.body) not in known:
+                known[id(of.body)] = step.mean_scale(of.body)
+        least = [min(known[id(s.body)] for s in joint._all.sides) for joint in self._members]
+        joint = self._all.joint
+        self._all, self._scaled = replace(self._all, scale=np.array(least)[joint]), True
 
-    def rouse(self) -> None:
-        """Be in the step again."""
+    def rest(self, bodies: Collection[int]) -> None:
+        """Leave out of the step the elements of bodies that stay where they are. Collective."""
+        if not self._touched.isdisjoint(bodies):
+            self._choose(self._resting | (self._touched & set(bodies)))
+
+    def rouse(self, bodies: Collection[int]) -> None:
+        """Take elements of bodies into the step again. Collective."""
+        if not self._resting.isdisjoint(bodies):
+            self._choose(self._resting - set(bodies))
+
+    def _choose(self, resting: frozenset[int]) -> None:
+        """Let all elements be in the step but those of some bodies. Collective."""
+        self._resting = frozenset(resting)
+        self.elements, self.bodies = [], []
+        if self._resting >= self._touched:
+            return
         assert self.step is not None
-        self.begin(self.step, self._history, None, False)
+        self._take(self._all.select(~self._rest_of_rows()))
+        self.elements, self.bodies = [self._elements(self.step, None)], [self._of]
+
+    def _rest_of_rows(self) -> BoolArray:
+        """Which of all elements are not in the step."""
+        resting: BoolArray = np.isin(self._all.bodies, list(self._resting)).any(axis=1)
+        return resting
+
+    def touched(self) -> set[int]:
+        """All bodies."""
+        return self._touched
 
     def history(self, parts: Sequence[Any]) -> Any:
-        """Multipliers of an accepted step."""
-        return super().history(parts) if parts else self._force
+        """Multipliers of an accepted step: of a joint alone an array, of many one of each."""
+        force = self._all.force
+        if parts:
+            (part,) = parts
+            force = force.copy()
+            force[~self._rest_of_rows()] = part.multiplier / self._factor
+        if len(self._names) == 1:
+            return force
+        ends = np.searchsorted(self._all.joint, np.arange(len(self._names) + 1)).tolist()
+        return [force[a:b] for a, b in zip(ends, ends[1:], strict=False)]
 
     def hold_alone(self) -> None:
         """They repeat no others: nothing is lent to them, which light bodies would feel."""
-        self._lent = 0.0
+        self._all = self._rows = replace(self._all, lent=np.zeros_like(self._all.lent))
 
     def _elements(self, step: Step, history: Any) -> ConstraintElements:
-        self._factor = step.factor
-        # A guess alone: a run may go on from one whose joint of this name had other equations.
-        if history is not None and history.shape == self._force.shape:
-            self._force = history
-        u = [step.state.u[b] for b in self.bodies[0]]
-        moved = [s.nodal(v) for s, v in zip(self._sides, u, strict=True)]
+        self._factor, rows = step.factor, self._rows
         equations, prescribed = self._at(step.state.time, step.state.time + step.dt)
-        driven = equations is not self._equations
-        if self._scale is None or not step.integrator.inertia:
-            self._scale = min(step.mean_scale(side.body) for side in self._sides)
+        driven = equations is not rows.equations
         return ConstraintElements(
             name=self._name,
-            sides=self._sides,
+            sides=rows.sides,
             equations=equations,
             curvature=kernel.curvature(equations.weights) if driven else self._curvature,
             rest=self._rest,
             prescribed=prescribed,
-            y0=self._rest + np.concatenate(moved, axis=1),
-            scale=self._scale,
+            y0=self._rest + self._nodal(step.state.u),
+            scale=rows.scale,
             theta=step.integrator.theta,
-            lent=self._lent,
-            size=_extent(equations, self._rest) if driven else self._extent,
+            lent=rows.lent,
+            extents=extents_of(equations, self._rest) if driven else self._extents,
+            names=self._names,
+            joint=rows.joint,
         )
+
+    def _nodal(self, values: Sequence[FloatArray]) -> FloatArray:
+        """Values at the nodes, (n, k, 3), from those of each body of the system. Collective."""
+        found = []
+        for k, side in zip(self._of, self._rows.sides, strict=True):
+            own = values[k] if k < len(values) else side.body.joined(values)
+            found.append(side.nodal(own))
+        return np.concatenate(found, axis=1)
 
     def _at(self, *times: float) -> tuple[Equations, FloatArray]:
         """Equations that hold at these times, and c at each of them."""
         if self._driven is not None:
             return self._driven(times)
-        return self._equations, np.array([self._equations.value] * len(times))
+        equations = self._rows.equations
+        return equations, np.array([equations.value] * len(times))
 
     def misses(
         self, e: Evaluation, parts: Sequence[ConstraintPart], motion: FloatArray
@@ -392,105 +321,112 @@ class Constraints(EveryStep):
         Raises:
             StepFailedError: Directions have turned over.
         """
-        step = self.step
-        if self._upright is None or step is None or not parts:
+        step, upright = self.step, self._rows.upright
+        if upright is None or step is None or not parts:
             return False
         (part,) = parts
-        along = self._upright(part.end, (step.state.time, step.state.time + step.dt))
+        if isinstance(upright, Equations):
+            along = kernel.value(kernel.factors(*upright[:2], part.end))
+        else:
+            along = upright(part.end, (step.state.time, step.state.time + step.dt))
+        over = ~(along > 0.0).all(axis=tuple(range(1, along.ndim)))
         raise_together(
-            self._sides[0].body.comm,
-            None if (along > 0.0).all() else (
-                f"step from t={step.state.time:.6g} with dt={step.dt:.3g}: {self._name!r} ends "
-                "with directions turned over, which solves its equations, too; use a smaller dt"
+            self._rows.sides[0].body.comm,
+            None if not over.any() else (
+                f"step from t={step.state.time:.6g} with dt={step.dt:.3g}: "
+                f"{self._names[self._rows.joint[over.argmax()]]!r} ends with directions turned "
+                "over, which solves its equations, too; use a smaller dt"
             ),
             partial(StepFailedError, advises=True),
         )  # fmt: skip
         return False
 
     def warnings(self, parts: Sequence[ConstraintPart]) -> list[StepWarning]:
-        """Whether the arm has turned too far in the step. Collective."""
-        if not parts or self._arm is None or self.step is None or not self.step.integrator.inertia:
+        """Whose arm has turned too far in the step. Collective."""
+        arm = self._rows.arm
+        if not parts or arm is None or self.step is None or not self.step.integrator.inertia:
             return []
         (part,) = parts
-        one, two = self._arm(part.start), self._arm(part.end)
+        one, two = arm.at(part.start), arm.at(part.end)
         sine = np.linalg.norm(np.cross(one, two), axis=1)
-        angle = np.arctan2(sine, np.einsum("ni,ni->n", one, two)).max(initial=0.0)
-        turn = float(global_max(self._sides[0].body.comm, np.array([angle]))[0])
-        if turn <= FAR_TURN:
-            return []
-        text = (
-            f"joint {self._name!r} turns by {turn:.2g} rad in a step, too far for how it turns to "
-            "be right, though energy and momenta may be kept; use a smaller dt"
-        )
-        return [StepWarning("turns", turn, text, (self._name,), False)]
+        angles = np.arctan2(sine, np.einsum("ni,ni->n", one, two))
+        turns = global_max(self._rows.sides[0].body.comm, self._by_joint(angles))
+        return [
+            StepWarning(
+                "turns", float(turns[k]),
+                f"joint {self._names[k]!r} turns by {turns[k]:.2g} rad in a step, too far for how "
+                "it turns to be right, though energy and momenta may be kept; use a smaller dt",
+                (self._names[k],), False,
+            )
+            for k in np.flatnonzero(turns > FAR_TURN)
+        ]  # fmt: skip
+
+    def _by_joint(self, values: FloatArray) -> FloatArray:
+        """Largest of the elements' values (n, ...), >= 0, of each joint on this rank."""
+        return largest_of_joints(len(self._names), self._rows.joint, values)
 
     def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
         """Do as `JointCoupling`, in closed form but for what is prescribed."""
         if not self.elements:
             return []
         (batch,) = self.elements
-        gap, off = self._gap(state)
-        first, second, doubt = self._rates(state, dt)
-        own = {"constraints": np.zeros_like(self._equations.value)}
+        y = self._rest + self._nodal(state.u)
+        gap = self._gap(state, y)
+        first, second, limit = self._rates(state, y, dt)
+        own = {"constraints": np.zeros_like(gap)}
         return [
             Kinematics(
-                batch.scale * np.array([gap, first, second]),
-                np.array([np.abs(values).max(initial=0.0) for values in (gap, first)]),
-                np.array([off, doubt]),
-                batch.evaluate(self._places(state), own).tangent,
+                batch.scale[:, None] * np.array([gap, first, second]),
+                np.array([self._by_joint(np.abs(values)) for values in (gap, first)]),
+                np.array([OFF * self._by_joint(np.abs(y)), limit]),
+                batch.evaluate(y, own).tangent,
             )
         ]
 
-    def _places(self, state: State) -> FloatArray:
-        """Nodal vectors at a state [m], shape (n, k, 3)."""
-        u = [state.u[k] for k in self.bodies[0]]
-        y = [s.reference + s.nodal(w) for s, w in zip(self._sides, u, strict=True)]
-        return np.concatenate(y, axis=1)
-
-    def _gap(self, state: State) -> tuple[FloatArray, float]:
-        """G - c at a state [m], shape (n, m), and what it may be by rounding [m]. Collective."""
-        both = self._places(state)
+    def _gap(self, state: State, y: FloatArray) -> FloatArray:
+        """G - c at a state with these nodal vectors [m], shape (n, m). Collective."""
         (weights, constants, _), (c, *_) = self._at(state.time, state.time)
-        found = kernel.value(kernel.factors(weights, constants, both)) - c
-        return found, OFF * float(np.abs(both).max(initial=0.0))
+        found: FloatArray = kernel.value(kernel.factors(weights, constants, y)) - c
+        return found
 
-    def _rates(self, state: State, dt: float) -> tuple[FloatArray, FloatArray, float]:
+    def _rates(
+        self, state: State, y: FloatArray, dt: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """First and second derivative in time of g - c at a state. Collective.
 
         Args:
-            state: The state; without accelerations they count as zero.
+            state: The state.
+            y: Its nodal vectors [m], shape (n, k, 3).
             dt: Time in which prescribed values are told [s].
 
         Returns:
-            [m/s] and [m/s^2], both (n, m), and what the first may err by [m/s]: by rounding, and
-            by what prescribed values leave open within `dt`.
+            The first [m/s] and the second [m/s^2], both (n, m), and what the first of each joint
+            may err by [m/s]: by rounding, and by what prescribed values leave open within `dt`.
         """
-        v = [state.v[k] for k in self.bodies[0]]
-        speed = np.concatenate(
-            [s.nodal(w) for s, w in zip(self._sides, v, strict=True)], axis=1
-        )
+        speed = self._nodal(state.v)
         times = (state.time + part * dt for part in (0.0, 0.25, 0.5, 1.0))
         (weights, constants, _), (c0, c_in, c1, c2) = self._at(*times)
         rate = (4.0 * (c1 - c0) - (c2 - c0)) / dt
         finer = 2.0 * (4.0 * (c_in - c0) - (c1 - c0)) / dt
-        vectors = kernel.factors(weights, constants, self._places(state))
+        vectors = kernel.factors(weights, constants, y)
         rates = kernel.factors(weights, np.zeros_like(constants), speed)
         gradient = kernel.gradient(weights, vectors)
         first = np.einsum("nmai,nai->nm", gradient, speed) - rate
         second = 2.0 * kernel.value(rates) - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
         if state.a:
-            a = [s.nodal(state.a[k]) for s, k in zip(self._sides, self.bodies[0], strict=True)]
-            second += np.einsum("nmai,nai->nm", gradient, np.concatenate(a, axis=1))
-        size = max(float(np.abs(a).max(initial=0.0)) for a in (speed, rate))
+            second += np.einsum("nmai,nai->nm", gradient, self._nodal(state.a))
+        size = np.maximum(*(self._by_joint(np.abs(a)) for a in (speed, rate)))
         # Both formulas are at least of second order, so the coarse one errs by 4/3 of what they
         # differ by.
-        doubt = 2.0 * float(np.abs(finer - rate).max(initial=0.0))
+        doubt = 2.0 * self._by_joint(np.abs(finer - rate))
         return first, second, OFF * size + doubt
 
     def load_step_work(
-        self, before: Any, after: FloatArray, start: float, end: float
+        self, before: Any, after: Any, start: float, end: float
     ) -> float:
         """Work of prescribed values, -lambda . (c_1 - c_0) with the mean of both lambda [J]."""
+        if self._driven is None:
+            return 0.0
         _, (c0, c1) = self._at(start, end)
         # Nothing acts before the first load step.
         force = after if before is None else before + after
@@ -498,6 +434,5 @@ class Constraints(EveryStep):
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the last step."""
-        batch = self.elements[k]
-        guess: FloatArray = self._factor * self._force / batch.scale
+        guess: FloatArray = self._factor * self._rows.force / self._rows.scale[:, None]
         return guess

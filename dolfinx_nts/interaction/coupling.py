@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
@@ -204,11 +204,11 @@ class JointCoupling(Coupling, Protocol):
 
     rests: bool
 
-    def rest(self) -> None:
-        """Leave the step that has begun: its bodies stay where they are, and it has no forces."""
+    def rest(self, bodies: Collection[int]) -> None:
+        """Leave the step that has begun if it is of bodies that stay where they are. Collective."""
 
-    def rouse(self) -> None:
-        """Be in the step again."""
+    def rouse(self, bodies: Collection[int]) -> None:
+        """Be in the step again if it is of these bodies. Collective."""
 
     def hold_alone(self) -> None:
         """Take note that its constraints repeat no others: its equations need no compliance.

@@ -137,19 +137,12 @@ class Elements(Protocol):
         """Whether its constraints hold always and in both directions, as those of joints."""
 
     @property
-    def alike(self) -> tuple[Any, ...] | None:
-        """What batches of its class have in common that its `evaluate_alike` takes at once.
-
-        None: each batch is evaluated by itself.
-        """
-
-    @property
     def extent(self) -> float:
         """Length beside the displacements whose rounding is in its rows, on this rank [m]."""
 
     @property
-    def force_scale(self) -> float:
-        """Force, in the step's units, per unit of a constraint's unknown."""
+    def force_scale(self) -> Any:
+        """Force, in the step's units, per unit of a constraint's unknown; of each element (n,)."""
 
     def points(self) -> tuple[IntArray, ...]:
         """Global coordinates of each body, shape (n, k) each."""
@@ -181,12 +174,14 @@ class Elements(Protocol):
         """Four sizes on this rank whose maxima over all ranks `ratios` needs."""
 
     def ratios(
-        self, largest: FloatArray, motion: float, rounded: float, rtol: float
+        self, part: Any, largest: Any, motion: float, rounded: float, rtol: float
     ) -> dict[str, float]:
-        """Own rows over what counts as converged, by names for messages.
+        """Own rows over what counts as converged, by names for messages; ranks may differ.
 
         Args:
-            largest: `largest` over all ranks.
+            part: As of `largest`.
+            largest: `largest` over all ranks; where elements belong to several joints, the last one
+                is that of each element, shape (n,).
             motion: Largest motion of the step [m].
             rounded: Length whose rounding is in all positions [m].
             rtol: Tolerance of Newton's method.
@@ -230,9 +225,6 @@ def evaluate_together(
 ) -> tuple[Any, ...]:
     """What elements contribute at an iterate; what fails on one rank fails on all. Collective.
 
-    Arrays of single elements cost as much as those of hundreds, so batches that are `alike` are
-    evaluated by one call.
-
     Args:
         comm: MPI communicator.
         elements: Batches of elements.
@@ -243,36 +235,18 @@ def evaluate_together(
         UserFunctionError: One raised on some rank.
         StepFailedError: It raised this.
     """
-    parts: list[Any] = [None] * len(elements)
-    groups: dict[Any, list[int]] = {}
-    for k, batch in enumerate(elements):
-        alike = batch.alike
-        groups.setdefault(k if alike is None else (type(batch), *alike), []).append(k)
+    parts: list[Any] = []
     cause, problem = None, None
-    for group in groups.values():
+    for batch, x, unknowns in zip(elements, places, own, strict=True):
         try:
-            batches = [elements[k] for k in group]
-            found = _of_group(batches, [places[k] for k in group], [own[k] for k in group])
+            parts.append(batch.evaluate(x, unknowns))
         except Exception as error:  # any: a rank that raises alone would leave the others waiting
             if cause is None:
-                cause, problem = error, _problem(elements[group[0]], error)
-            continue
-        for k, part in zip(group, found, strict=True):
-            parts[k] = part
+                cause, problem = error, _problem(batch, error)
     if global_max(comm, np.array([float(cause is not None)]))[0]:
         kind, text, advises = next(filter(None, comm.allgather(problem)))
         raise kind(text, advises=advises) from cause
     return tuple(parts)
-
-
-def _of_group(
-    batches: Sequence[Any], places: Sequence[FloatArray], own: Sequence[Mapping[str, FloatArray]]
-) -> Sequence[Any]:
-    """What batches that are alike, or a single one, contribute."""
-    if len(batches) == 1:
-        return [batches[0].evaluate(places[0], own[0])]
-    alike: Sequence[Any] = batches[0].evaluate_alike(batches, places, own)
-    return alike
 
 
 def _problem(batch: Any, error: Exception) -> tuple[type[StepFailedError], str, bool]:

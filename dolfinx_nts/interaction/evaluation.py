@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +33,9 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BodyTerms:
-    """Parts of a body's equation at an iterate, owned coordinates, [kg m] except u1 and du [m].
+    """Parts of a body's or a batch's equation at an iterate, [kg m] except u1 and du [m].
+
+    Owned coordinates.
 
     Attributes:
         u1: Displacement at t_{n+1}.
@@ -57,17 +61,26 @@ class Evaluation:
 
     Attributes:
         x: Iterate it belongs to, this rank's part.
-        bodies: Terms of each body.
+        terms: Of each batch of bodies.
+        split: From the coordinates of each batch to those of each body.
         parts: Contribution of each batch of elements.
         iterations: Newton iterations it took.
         min_det: Smallest det F of all bodies, once solved.
     """
 
     x: FloatArray
-    bodies: tuple[BodyTerms, ...]
+    terms: tuple[BodyTerms, ...]
+    split: Callable[[Sequence[FloatArray]], tuple[FloatArray, ...]]
     parts: tuple[Any, ...]
     iterations: int = 0
     min_det: float = np.inf
+
+    @cached_property
+    def bodies(self) -> tuple[BodyTerms, ...]:
+        """Terms of each body: views."""
+        names = [field.name for field in fields(BodyTerms)]
+        each = [self.split([getattr(of, name) for of in self.terms]) for name in names]
+        return tuple(BodyTerms(*found) for found in zip(*each, strict=True))
 
 
 def free(body: Any, residual: FloatArray) -> FloatArray:

@@ -31,8 +31,10 @@ class Kinematics(NamedTuple):
     Attributes:
         rows: g, and its first and second derivative in time, in the units of the elements' rows,
             shape (3, n, m).
-        size: Largest |g| [m] and |dg/dt| [m/s] on this rank.
-        limit: What both may be by rounding, or as prescribed values leave it open within the step.
+        size: Largest |g| [m] and |dg/dt| [m/s] on this rank; of several joints those of each,
+            shape (2, joints).
+        limit: What both may be by rounding, or as prescribed values leave it open within the step,
+            likewise.
         tangent: That of the elements without forces, shape (n, r, r).
     """
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -66,12 +66,7 @@ class PointElements:
         return True
 
     @property
-    def alike(self) -> tuple[Any, ...] | None:
-        """Each batch is evaluated by itself."""
-        return None
-
-    @property
-    def force_scale(self) -> float:
+    def force_scale(self) -> Any:
         """Unknowns are forces."""
         return 1.0
 
@@ -118,7 +113,7 @@ class PointElements:
         return [0.0, float(np.abs(rows).max(initial=0.0)), 0.0, self.extent]
 
     def ratios(
-        self, largest: FloatArray, motion: float, rounded: float, rtol: float
+        self, part: Any, largest: Any, motion: float, rounded: float, rtol: float
     ) -> dict[str, float]:
         """Its constraints over what counts as converged, if it has any."""
         if not self.widths["constraints"]:
@@ -128,14 +123,16 @@ class PointElements:
 
     def resultant(self, part: Any, k: int, u: FloatArray) -> FloatArray:
         """Sums over the nodes of side k."""
-        side, out = self.sides[k], np.zeros((4, 3))
+        return self.resultants(part, k, u).sum(axis=0)
+
+    def resultants(self, part: Any, k: int, u: FloatArray) -> FloatArray:
+        """`resultant` of each element, shape (n, 4, 3). Collective."""
+        side = self.sides[k]
         y = side.reference + side.nodal(u)
         start = sum(3 * other.nodes.shape[1] for other in self.sides[:k])
         force = -part.residual[:, start : start + 3 * side.nodes.shape[1]].reshape(y.shape)
-        out[0] = force[side.places].sum(axis=0)
-        out[1] = cross(y, force).sum(axis=(0, 1))
-        out[2], out[3] = side.combine(y).sum(axis=0), len(y)
-        return out
+        sums = (force * side.places[:, :, None]).sum(axis=1), cross(y, force).sum(axis=1)
+        return np.stack([*sums, side.combine(y), np.ones((len(y), 3))], axis=1)
 
     def ledger(self, part: Any, factor: float) -> dict[str, float]:
         """Nothing lost."""
@@ -191,10 +188,10 @@ class EveryStep:
         self.step, self._history = step, history
         self.elements = [self.make(step, history)]
 
-    def rest(self) -> None:
+    def rest(self, bodies: Collection[int]) -> None:
         """It never rests."""
 
-    def rouse(self) -> None:
+    def rouse(self, bodies: Collection[int]) -> None:
         """It never rests."""
 
     def hold_alone(self) -> None:

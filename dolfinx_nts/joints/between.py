@@ -12,9 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.interaction.constraints import Constraints, Equations, Upright, rank_of
+from dolfinx_nts.interaction.constraint_elements import Equations
+from dolfinx_nts.interaction.constraints import Arm, Constraints, Upright
 from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.kernels import quadratic
+from dolfinx_nts.parallel import rank_of
 from dolfinx_nts.validation import require_name, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]
@@ -44,10 +46,6 @@ class Vector:
 
     def __rmul__(self, factor: float) -> Vector:
         return Vector(factor * self.weights, factor * self.constant)
-
-    def at(self, nodes: FloatArray) -> FloatArray:
-        """Its value from the nodal vectors of elements, (n, k, 3) -> (n, 3)."""
-        return np.tensordot(nodes, self.weights, (1, 0)) + self.constant
 
 
 class Product(NamedTuple):
@@ -212,15 +210,16 @@ class Between(Joint, ABC):
         n = self._here
         return Equations(*(a[:n] for a in found)), prescribed[:, :n]
 
-    def _kept_upright(self) -> Upright | None:
+    def _kept_upright(self) -> Upright | Equations | None:
         """What `Constraints` take for `upright`, if there is any. Collective."""
         products = list(self.upright((0.0,)))
         if not products:
             return None
-        known, _ = self._here_of(products, (0.0,))
+        if not self.motion:
+            return self._here_of(products, (0.0,))[0]
 
         def upright(y: FloatArray, times: Times) -> FloatArray:
-            now = self._here_of(self.upright(times), times)[0] if self.motion else known
+            now, _ = self._here_of(self.upright(times), times)
             return quadratic.value(quadratic.factors(now.weights, now.constants, y))
 
         return upright
@@ -246,10 +245,11 @@ class Between(Joint, ABC):
         """Its constraints in a run. Collective."""
         sides = [side.part(slice(self._here)) for side in self.sides]
         equations, _ = self._in_step((0.0,))
-        arm = self.arm()
+        found, n = self.arm(), self._here
+        arm = None if found is None else Arm(found.weights[None][:n], found.constant[None][:n])
         return Constraints(
             self.name, bodies, sides, equations, self._in_step if self.motion else None,
-            upright=self._kept_upright(), arm=None if arm is None else arm.at,
+            upright=self._kept_upright(), arm=arm,
         )  # fmt: skip
 
 

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.interaction.constraints import rank_of
 from dolfinx_nts.interaction.coupling import Joint, Slopes
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.measured import Measure, Measured, Move, holds
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import measures as kernel
+from dolfinx_nts.parallel import rank_of
 from dolfinx_nts.validation import StepFailedError, require_same, vector
 
 FloatArray = npt.NDArray[np.float64]

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.slender.shell import Shell
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.interaction.constraints import Constraints, Equations
+from dolfinx_nts.interaction.constraint_elements import Equations
+from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import named, points_of

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.search import closest_facets
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.interaction.constraints import Constraints, Equations
+from dolfinx_nts.interaction.constraint_elements import Equations
+from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import named, points_of

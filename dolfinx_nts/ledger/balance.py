@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 from mpi4py import MPI
@@ -131,13 +131,13 @@ def measure(
         system: Its bodies.
         state: The state.
         known: Of each body's name what was measured last, which holds while its arrays are the
-            same objects; brought up to date.
+            same objects; brought up to date. What is evaluated together costs little.
 
     Returns:
         kinetic, potential, linear_momentum (3,), angular_momentum (3,).
     """
     local, known = np.zeros(8), {} if known is None else known
-    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+    for body, u, v in _ends(system, state):
         last = known.get(body.name)
         if last is None or last[0] is not u or last[1] is not v:
             known[body.name] = last = u, v, _of_body(body, u, v)
@@ -158,11 +158,17 @@ def measure(
 def momenta(system: System, state: State) -> dict[str, FloatArray]:
     """Momenta of a state [kg m/s, kg m^2/s], as `measure` has them. Collective."""
     local = np.zeros(6)
-    for body, u, v in zip(system.bodies, state.u, state.v, strict=True):
+    for body, u, v in _ends(system, state):
         local += np.concatenate(_momenta(body, u, body.inertia(v)))
     total = np.empty_like(local)
     system.comm.Allreduce(local, total, op=MPI.SUM)
     return {"linear_momentum": total[:3], "angular_momentum": total[3:]}
+
+
+def _ends(system: System, state: State) -> Iterator[tuple[Any, FloatArray, FloatArray]]:
+    """Batches of bodies with their u and v."""
+    batches = system.batches
+    return zip(batches.bodies, batches.join(state.u), batches.join(state.v), strict=True)
 
 
 def _of_body(body: Any, u: FloatArray, v: FloatArray) -> FloatArray:
@@ -189,9 +195,9 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
     scale = 1.0 / problem.factor
     losses = (name for joint in problem.system.joints for name in joint.losses)
     sums, smallest = dict.fromkeys((*WORKS, *COUNTS, *losses), 0.0), {"min_gap": np.inf}
-    added = problem.loads.work_at_ends(step)
-    for k, (terms, more) in enumerate(zip(step.bodies, added, strict=True)):
-        work = scale * float(terms.external @ terms.du + more)
+    sums["external_work"] = scale * problem.loads.work_at_ends(step)
+    for (k, *_), terms in zip(problem.batches.numbers, step.terms, strict=True):
+        work = scale * float(terms.external @ terms.du)
         sums["external_work"] += work + problem.supports.work(k, terms, problem.factor)
     for elements, part in zip(problem.elements, step.parts, strict=True):
         for name, value in elements.ledger(part, problem.factor).items():
@@ -217,8 +223,9 @@ def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
         problem: Equations of the step.
         step: Their solution.
     """
-    work = np.zeros(len(problem.couplings.joints))
-    for k, (coupling, parts) in enumerate(problem.couplings.of_joints(step)):
+    work = np.zeros(len(problem.system.joints))
+    for coupling, (k, *_), parts in problem.couplings.of_joints(step):
+        # Several that are evaluated together prescribe nothing.
         for batch, part in zip(coupling.elements, parts, strict=True):
             work[k] += batch.ledger(part, problem.factor).get("external_work", 0.0)
     return work

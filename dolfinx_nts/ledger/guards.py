@@ -54,10 +54,10 @@ def check_momentum(
     Raises:
         StepFailedError: The step is wrong.
     """
-    local, rule, dt = np.zeros(16), problem.integrator, problem.dt
-    for k, (body, terms, u0, v0, v1) in enumerate(zip(
-        problem.system.bodies, step.bodies, problem.state.u, problem.state.v, state.v, strict=True
-    )):
+    local, rule, dt, batches = np.zeros(16), problem.integrator, problem.dt, problem.batches
+    old = zip(batches.join(problem.state.u), *batches.rates(problem.state), strict=True)
+    each = zip(batches.bodies, batches.numbers, step.terms, old, batches.join(state.v), strict=True)
+    for body, (k, *_), terms, (u0, v0, a0), v1 in each:
         force = terms.external - terms.internal - terms.coupling
         force[body.fixed] += terms.residual[body.fixed]
         local[:3] += body.linear_momentum(force)
@@ -67,7 +67,7 @@ def check_momentum(
         speed = np.abs(v0) + np.abs(v1)
         if rule.accelerations:
             # What the velocity would be without the forces of this step.
-            free = problem.supports.coast(k)
+            free = problem.supports.coast(k, v0, a0)
             local[9:12] += body.linear_momentum(body.inertia(free - v0))
             speed += np.abs(free)
         local[13:] += problem.supports.bend(k, terms.du)

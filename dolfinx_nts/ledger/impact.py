@@ -25,7 +25,7 @@ from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.equations.unknowns import Unknowns
-from dolfinx_nts.interaction.constraints import SHIFT
+from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
@@ -173,27 +173,24 @@ def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
 
 
 def _forces(problem: StepProblem, contacts: Sequence[_New]) -> list[FloatArray]:
-    """Impulses of all contacts on the owned coordinates of each body [N s]."""
+    """Impulses of all contacts on the owned coordinates of each batch of bodies [N s]."""
     pushed = {id(new.batch): new.push[:, None] * new.gradient for new in contacts}
     parts = []
     for batch in problem.elements:
         nothing = np.zeros((batch.num_elements, batch.num_coordinates))
         parts.append(SimpleNamespace(residual=pushed.get(id(batch), nothing)))
-    assert problem.unknowns is not None
-    force = problem.unknowns.forces(problem.elements, parts)
-    out = []
-    for k, body in enumerate(problem.system.bodies):
-        own = force[problem.of_body(k)] if k in problem.awake else np.zeros(body.num_owned)
+    force, batches = problem.laid.forces(problem.elements, parts), problem.batches
+    out = problem.laid.read(force, [np.zeros(body.num_owned) for body in batches.bodies])
+    for body, own in zip(batches.bodies, out, strict=True):
         own[body.fixed] = 0.0
-        out.append(own)
     return out
 
 
 def _response(
     problem: StepProblem, step: Evaluation, impulses: Sequence[FloatArray]
 ) -> tuple[FloatArray, ...]:
-    """Change of velocities by impulses [m/s], as joints allow it."""
-    system = problem.system
+    """Change of velocities by impulses on batches [m/s], as joints allow it; of each body."""
+    batches = problem.batches
     chosen: list[tuple[Any, Any, tuple[int, ...]]] = [
         (batch, part, of)
         for batch, part, of in zip(
@@ -202,11 +199,12 @@ def _response(
         if batch.bilateral and batch.widths["constraints"]
     ]
     if not chosen:
-        return tuple(solve_mass(b, f) for b, f in zip(system.bodies, impulses, strict=True))
-    masses = [b.tangent(t.u1, 1.0, 0.0) for b, t in zip(system.bodies, step.bodies, strict=True)]
+        both = zip(batches.bodies, impulses, strict=True)
+        return batches.split([solve_mass(body, impulse) for body, impulse in both])
+    each = zip(batches.bodies, step.terms, strict=True)
+    masses = [body.tangent(terms.u1, 1.0, 0.0) for body, terms in each]
     elements, bodies = [batch for batch, _, _ in chosen], [of for _, _, of in chosen]
-    sizes = {k: body.num_owned for k, body in enumerate(system.bodies)}
-    laid = Unknowns(system.comm, sizes, elements, bodies)
+    laid = Unknowns(batches, range(batches.count), elements, bodies)
     tangents, lent = [], []
     for batch, part, _ in chosen:
         stop, width = batch.num_coordinates, batch.widths["constraints"]
@@ -220,18 +218,14 @@ def _response(
     matrix = StepMatrix(laid.layout, masses, laid.blocks)
     matrix.assemble(tangents)
     right, rows = np.zeros(laid.layout.num_owned), laid.of_elements("constraints")
-    for k, impulse in enumerate(impulses):
-        right[laid.of_body(k)] = impulse
+    laid.write(impulses, right)
     saddle = Saddle(matrix.operator)
     for _ in range(_SOLVES):
         solution = saddle.solve(right)
         right[rows] = -np.concatenate(lent) * solution[rows]
-    out = []
-    for k, body in enumerate(system.bodies):
-        change = solution[laid.of_body(k)].copy()
-        change[body.fixed] = 0.0
-        out.append(change)
+    solution[laid.held] = 0.0
+    change = batches.split(laid.read(solution, impulses))
     saddle.destroy()
     matrix.destroy()
     laid.destroy()
-    return tuple(out)
+    return change

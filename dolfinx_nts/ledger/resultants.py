@@ -62,26 +62,30 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
             - of all contacts: forces [N] on the slaves, and their moments about the origin [N m],
               shape (contacts, 3) each.
     """
-    bodies, contacts = problem.system.bodies, problem.couplings.touching(step)
+    batches, contacts = problem.batches, problem.couplings.touching(step)
     joints = problem.system.declared_joints
-    parts = [b.reactions(t.residual, t.u1) for b, t in zip(bodies, step.bodies, strict=True)]
+    # Nothing holds bodies that are evaluated together.
+    each = zip(batches.bodies, step.terms, strict=True)
+    held = {body: terms for body, terms in each if body is not batches.rigid}
+    parts = [body.reactions(terms.residual, terms.u1) for body, terms in held.items()]
     forces = [part.force.sum(axis=0) for _, part, _ in contacts]
     parts.append(np.reshape(forces, (len(contacts), 3)))
     moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
     parts.append(np.reshape(moments, (len(contacts), 3)))
-    each, theta = zip(problem.state.u, step.bodies, strict=True), problem.integrator.theta
-    u = [u0 + theta * terms.du for u0, terms in each]
-    held = {id(batch): part for batch, part in zip(problem.elements, step.parts, strict=True)}
-    parts += _of_joints(problem, held, u)
+    both = zip(batches.join(problem.state.u), step.terms, strict=True)
+    u = batches.split([u0 + problem.integrator.theta * terms.du for u0, terms in both])
+    coupled = {id(batch): part for batch, part in zip(problem.elements, step.parts, strict=True)}
+    of_joints = _of_joints(problem, coupled, u)
+    parts.append(of_joints.reshape(-1, 3))
     total = np.concatenate(parts)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     stops = accumulate(map(len, parts))
     split = [total[stop - len(part) : stop] for part, stop in zip(parts, stops, strict=True)]
-    names = [*map(reactions_of, bodies), CONTACT_FORCES, CONTACT_MOMENTS]
-    found = {name: value / problem.factor for name, value in zip(names, split, strict=False)}
-    for joint, total in zip(joints, split[len(names) :], strict=True):
-        found[reactions_of(joint)] = _about_point(total) / problem.factor
-    return found
+    found = {reactions_of(body): np.zeros((0, 3)) for body in problem.system.bodies}
+    names = [*map(reactions_of, held), CONTACT_FORCES, CONTACT_MOMENTS]
+    found |= {name: value / problem.factor for name, value in zip(names, split, strict=False)}
+    about = _about_point(split[-1].reshape(of_joints.shape)) / problem.factor
+    return found | dict(zip(map(reactions_of, joints), about, strict=True))
 
 
 def of_joints(
@@ -94,29 +98,35 @@ def of_joints(
         parts: What elements contribute, by their id; of others nothing.
         u: Owned displacements of each body where they act [m].
     """
-    total = np.array(_of_joints(problem, parts, u)).reshape(-1, 4, 3)
+    total = _of_joints(problem, parts, u)
     problem.system.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-    both = zip(problem.system.declared_joints, total, strict=True)
-    return {reactions_of(joint): _about_point(of) for joint, of in both}
+    names = map(reactions_of, problem.system.declared_joints)
+    return dict(zip(names, _about_point(total), strict=True))
 
 
 def _of_joints(
     problem: StepProblem, parts: Mapping[int, Any], u: Sequence[FloatArray]
-) -> list[FloatArray]:
+) -> FloatArray:
     """Of each declared joint on its first body, as of `Elements.resultant`, on this rank."""
-    out, system = [], problem.system
-    # Others, which come last, hold bodies in shape.
-    each = zip(system.declared_joints, system.joint_bodies, problem.couplings.joints, strict=False)
-    for _, bodies, coupling in each:
-        first, total = bodies[0], np.zeros((4, 3))
+    system, rigid = problem.system, problem.batches.rigid
+    declared = len(system.declared_joints)
+    out = np.zeros((declared, 4, 3))
+    for coupling, numbers in problem.couplings.joints:
+        k, first = numbers[0], system.joint_bodies[numbers[0]][0]
+        if k >= declared:  # others hold bodies in shape
+            continue
         for batch, of in zip(coupling.elements, coupling.bodies, strict=True):
-            if first in of and id(batch) in parts:
-                total += batch.resultant(parts[id(batch)], of.index(first), u[first])
-        out.append(total)
+            part = parts.get(id(batch))
+            if part is not None and len(numbers) > 1:
+                assert rigid is not None
+                found = batch.resultants(part, 0, rigid.joined(u))
+                np.add.at(out, np.array(numbers)[batch.joint], found)
+            elif part is not None and first in of:
+                out[k] += batch.resultant(part, of.index(first), u[first])
     return out
 
 
 def _about_point(total: FloatArray) -> FloatArray:
-    """Force, and moment about the mean of the points where a joint holds its body, (2, 3)."""
-    force, moment, places, count = total
-    return np.array([force, moment - cross(places / max(count[0], 1.0), force)])
+    """Force, and moment about the mean of the points where a joint holds its body, (n, 2, 3)."""
+    force, moment, places, count = total.swapaxes(0, 1)
+    return np.stack([force, moment - cross(places / np.maximum(count, 1.0), force)], axis=1)

@@ -204,13 +204,12 @@ class _LoadStepper(Stepper):
             new: At its end.
             told: What the ledgers of each joint's elements say, shape (joints,).
         """
-        histories, works = zip(old.joints, new.joints, strict=True), []
-        for joint, both, ledger in zip(
-            self.problem.couplings.joints, histories, told.tolist(), strict=True
-        ):
-            found = joint.load_step_work(*both, old.time, new.time)
-            works.append(ledger if found is None else found)
-        return works
+        works = np.zeros(len(told))
+        for coupling, (k, *_) in self.problem.couplings.joints:
+            # Several that are evaluated together prescribe nothing.
+            found = coupling.load_step_work(old.joints[k], new.joints[k], old.time, new.time)
+            works[k] = told[k] if found is None else found
+        return works.tolist()
 
     def _left(self, time: float) -> float:
         """Part of the overlap at the start that is left at a pseudo time."""

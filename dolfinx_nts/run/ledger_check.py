@@ -81,7 +81,7 @@ class Promises:
             impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
         """
         energy = self._measure(problem, step, before, row)
-        squares = np.array([float(terms.du @ terms.du) for terms in step.bodies])
+        squares = problem.batches.sums([np.square(terms.du) for terms in step.terms])
         problem.system.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
         moved = np.sqrt(squares)
         self._rounding += _ROUNDING * float(problem.rounding.forces @ moved) / problem.factor
@@ -129,8 +129,8 @@ class Promises:
         if self._driven:
             local = np.zeros(2)
             for k in self._driven:
-                after, _ = problem.supports.advance(k, step.bodies[k].du)
-                speeds = problem.state.v[k], after
+                v0, a0 = problem.state.v[k], problem.state.acceleration(k)
+                speeds = v0, problem.supports.advance(k, step.bodies[k].du, v0, a0)[0]
                 local += [0.5 * float(v @ bodies[k].inertia(v)) for v in speeds]
             driven = comm.allreduce(local).tolist()
             # The first row is that of the start, unless the run goes on.

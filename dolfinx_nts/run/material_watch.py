@@ -35,7 +35,8 @@ class MaterialWatch:
         Those bodies take them over. Collective.
         """
         now = self._values()
-        differ = [not np.array_equal(a, b) for a, b in zip(self._known, now, strict=True)]
+        both = zip(self._known, now, strict=True)
+        differ = [bool(a.size or b.size) and not np.array_equal(a, b) for a, b in both]
         flags = np.array(differ, dtype=bool)
         self._comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.LOR)
         bodies = [body for body, flag in zip(self._bodies, flags, strict=True) if flag]

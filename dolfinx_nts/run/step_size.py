@@ -17,7 +17,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.equations.lengths import Lengths
+from dolfinx_nts.equations.lengths import box_of
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.state import State
@@ -183,11 +183,12 @@ class Pace:
         Where a change of facet has left nodes behind their facets the step is taken as it is: a
         shorter one would only expel them faster.
         """
-        h = problem.dt
-        acceleration = tuple(
-            (problem.supports.advance(k, b.du)[0] - v) / h
-            for k, (b, v) in enumerate(zip(step.bodies, problem.state.v, strict=True))
-        )
+        h, batches = problem.dt, problem.batches
+        each = zip(batches.numbers, step.terms, *batches.rates(problem.state), strict=True)
+        acceleration = batches.split([
+            (problem.supports.advance(k, terms.du, v0, a0)[0] - v0) / h
+            for (k, *_), terms, v0, a0 in each
+        ])  # fmt: skip
         speed, error = self._measure(problem, acceleration)
         short = h <= self.shortest * (1 + 1e-9)
         if not error <= 1.0 and not short and not self._expels(problem, step):
@@ -240,7 +241,7 @@ def _size(system: System) -> float:
         free = np.ones(body.num_owned, dtype=bool)
         free[body.fixed] = False
         mass += float(body.nodal_mass[free].sum()) / 3.0
-    radius = Lengths(system).radius
+    radius = box_of(system)[1]
     return math.sqrt(system.comm.allreduce(mass)) * radius if radius else math.inf
 
 

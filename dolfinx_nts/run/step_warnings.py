@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import numpy.typing as npt
 
@@ -126,24 +124,27 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
         # What has no mass has no spin.
         masses = system.comm.allreduce(np.array([b.nodal_mass.sum() for b in system.bodies]))
         awake = set(problem.awake) & set(np.flatnonzero(masses > 0.0).tolist())
-    turning = [k for k, body in enumerate(system.bodies) if body.oriented or k in awake]
-    if not turning:
+    oriented = [body.oriented for body in system.bodies]
+    if not (any(oriented) or awake):
         return
-    seen, driven, far = (np.zeros(len(turning)) for _ in range(3))
-    for place, k in enumerate(turning):
-        body = system.bodies[k]
-        far[place] = FAR_TURN if body.oriented else _STRETCHED
-        if body.oriented:
-            driven[place] = body.prescribed_turn(old.time, new.time)
-            seen[place] = body.turn(old.u[k], new.u[k])
-        else:
-            spin = motion_of(body, new.u[k], new.v[k]).spin
-            seen[place] = problem.dt * float(np.linalg.norm(spin))
-    seen, driven = global_max(system.comm, np.array([seen, driven]))
-    turns = np.maximum(seen, driven)
+    local = np.zeros((2, len(oriented)))
+    seen, driven = local
+    batches = problem.batches
+    ends = (batches.join(state.u) for state in (old, new))
+    for body, (k, *_), u0, u1 in zip(batches.bodies, batches.numbers, *ends, strict=True):
+        if body is batches.rigid:
+            seen[body.own] = body.turns(u0, u1)
+        elif body.oriented:
+            driven[k] = body.prescribed_turn(old.time, new.time)
+            seen[k] = body.turn(u0, u1)
+        elif k in awake:
+            spin = motion_of(body, u1, new.v[k]).spin
+            seen[k] = problem.dt * float(np.linalg.norm(spin))
+    seen, driven = global_max(system.comm, local)
+    turns, far = np.maximum(seen, driven), np.where(oriented, FAR_TURN, _STRETCHED)
     worst = int((turns / far).argmax())
     if turns[worst] > far[worst]:
-        name, turn = system.bodies[turning[worst]].name, float(turns[worst])
+        name, turn = system.bodies[worst].name, float(turns[worst])
         by = "by" if turn < np.pi else "by at least"
         prescribed = driven[worst] > FAR_TURN
         solution.warn(
@@ -153,12 +154,11 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
             f"{'as prescribed' if prescribed else 'kept'}; use a smaller dt",
             grave=bool(prescribed),
         )  # fmt: skip
-    by_body = dict(zip(turning, turns.tolist(), strict=True))
-    _tell_corners(solution, problem, new, by_body)
+    _tell_corners(solution, problem, new, turns)
 
 
 def _tell_corners(
-    solution: Solution, problem: StepProblem, new: State, turns: Mapping[int, float]
+    solution: Solution, problem: StepProblem, new: State, turns: FloatArray
 ) -> None:
     """Warn where points of a rigid body leave the straight ways on which contact is sought.
 
@@ -169,10 +169,10 @@ def _tell_corners(
         solution: The run.
         problem: Equations of the step.
         new: State at its end.
-        turns: Turn in the step of some bodies [rad], the same on all ranks.
+        turns: Turn in the step of each body [rad], the same on all ranks.
     """
     system, old = problem.system, problem.state
-    bodies = [k for k, turn in turns.items() if system.bodies[k].oriented and turn > _BENT]
+    bodies = [k for k in np.flatnonzero(turns > _BENT).tolist() if system.bodies[k].oriented]
     if not bodies:
         return
     chords = [system.bodies[k].motion_of_points(new.u[k] - old.u[k]) for k in bodies]

@@ -433,8 +433,11 @@ class Stepper:
                 )  # fmt: skip
 
     def _accept(self, state: State) -> None:
-        for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
+        batches = self.system.batches
+        ends = (batches.join(values) for values in (state.u, state.v))
+        for body, u, v in zip(batches.bodies, *ends, strict=True):
             body.accept(u, v)
+        for body, u, v in zip(self.system.bodies, state.u, state.v, strict=True):
             # A body's own `accept` need not call the base's.
             Body.accept(body, u, v)
             note_shown(body)

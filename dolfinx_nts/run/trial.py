@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -80,34 +80,39 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
         step: Their solution.
         time: t_{n+1} [s].
     """
-    old, dt = problem.state, problem.dt
-    u, v, a = list(old.u), list(old.v), list(old.a)
-    for k in problem.awake:
-        u[k] = step.bodies[k].u1.copy()
-        v[k], a1 = problem.supports.advance(k, step.bodies[k].du)
-        if a1 is not None:
-            a[k] = a1
-        body = problem.system.bodies[k]
+    old, dt, batches = problem.state, problem.dt, problem.batches
+    u, v, a = (list(values) for values in (old.u, old.v, old.a))
+    ends = [
+        problem.supports.advance(of[0], terms.du, v0, a0)
+        for of, terms, v0, a0 in zip(batches.numbers, step.terms, *batches.rates(old), strict=True)
+    ]
+    for body, terms, (v1, _) in zip(batches.bodies, step.terms, ends, strict=True):
         if body.has_massless:
             # What has no momentum has no velocity of its own either.
-            v[k][body.massless] = step.bodies[k].du[body.massless] / dt
-    _keep_unchanged(problem, u, v)
-    both = problem.couplings.each(step)
-    contacts, *joints = (coupling.history(parts) for coupling, parts in both)
-    return State(time, tuple(u), tuple(v), tuple(a), contacts, tuple(joints))
+            v1[body.massless] = terms.du[body.massless] / dt
+    places = [terms.u1.copy() for terms in step.terms]
+    both = (u, places), (v, [v1 for v1, _ in ends])
+    moves = _moves(problem, places, both[1][1])
+    for (now, found), moved in zip(both, moves, strict=True):
+        after = batches.split(found)
+        for k in np.flatnonzero(moved).tolist():
+            now[k] = after[k]
+    if a:
+        after = batches.split([a1 for _, a1 in ends if a1 is not None])
+        for k in problem.awake:
+            a[k] = after[k]
+    contacts, joints = problem.couplings.history(step)
+    return State(time, tuple(u), tuple(v), tuple(a), contacts, joints)
 
 
-def _keep_unchanged(problem: StepProblem, u: list[FloatArray], v: list[FloatArray]) -> None:
-    """Take bodies' arrays at t_n where all ranks find them unchanged. Collective.
+def _moves(problem: StepProblem, *ends: Sequence[FloatArray]) -> FloatArray:
+    """Of u and v of batches at t_{n+1} which bodies' differ on any rank, (2, bodies). Collective.
 
     What is known of a body holds while its arrays are the same objects, on all ranks alike.
     """
-    both = (u, problem.state.u), (v, problem.state.v)
-    moved = [
-        [float(not np.array_equal(now[k], before[k])) for k in range(len(u))]
-        for now, before in both
-    ]
-    anywhere = global_max(problem.system.comm, np.array(moved))
-    for (now, before), moves in zip(both, anywhere, strict=True):
-        for k in np.flatnonzero(moves == 0.0):
-            now[k] = before[k]
+    batches, out = problem.batches, np.zeros((2, problem.batches.count))
+    for row, before, now in zip(out, (problem.state.u, problem.state.v), ends, strict=True):
+        both = zip(batches.join(before), now, strict=True)
+        row[:] = batches.largest([(a != b).astype(float) for a, b in both])
+    out[:, [k for k in range(batches.count) if k not in set(problem.awake)]] = 0.0
+    return global_max(batches.comm, out)

@@ -66,22 +66,25 @@ class AugmentedMatrix:
         bodies: Sequence[Any],
         around: Callable[[Any], FloatArray] | None = None,
     ) -> None:
-        laid, awake = problem.laid, [problem.system.bodies[k] for k in problem.awake]
+        laid, batches = problem.laid, problem.batches
         blocks = [b._replace(pattern=np.ones_like(b.pattern)) for b in laid.blocks]
         self.matrix = StepMatrix(laid.layout, bodies, blocks, split=True, blocked=True, kind="aij")
         stiffness, place = around or problem.stabilization.stiffness, problem.x.duplicate()
         place.set(0.0)
-        for k, body in zip(problem.awake, awake, strict=True):
-            place.array_w[problem.of_body(k)] = problem.factor * stiffness(body)
+        laid.write([problem.factor * stiffness(body) for body in batches.bodies], place.array_w)
         self._stiffness = laid.at_elements(place, problem.elements) if laid.blocks else []
         place.destroy()
         self._comm = problem.system.comm
-        continua = np.repeat([not body.joints for body in awake], [b.num_owned for b in awake])
-        self._continua = np.flatnonzero(continua)
-        self.mixed = not all(not body.joints for body in awake)
-        both = zip(problem.awake, awake, strict=True)
-        places = [body.reference + problem.state.u[k] for k, body in both]
-        self._places = np.concatenate(places)[continua]
+        # Those without constraints of their own, and where they are.
+        free = [not body.joints for body in batches.bodies]
+        known = zip(batches.bodies, batches.join(problem.state.u), strict=True)
+        values = np.zeros((2, laid.layout.num_owned))
+        both = zip(batches.bodies, free, strict=True)
+        laid.write([np.full(body.num_owned, alone) for body, alone in both], values[0])
+        laid.write([body.reference + u for body, u in known], values[1])
+        self._continua = np.flatnonzero(values[0])
+        self.mixed = not all(free[j] for j in laid.awake)
+        self._places = values[1][self._continua]
 
     def assemble(self, tangents: Sequence[FloatArray], *, fresh: bool) -> None:
         """As `StepMatrix.assemble`."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.elements import over
-from dolfinx_nts.interaction.evaluation import Evaluation, free
+from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max, global_sum
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,10 +24,9 @@ def ratios(problem: StepProblem, e: Evaluation) -> dict[str, float]:
 
     Collective.
     """
-    bodies = problem.system.bodies
-    residuals = {k: free(bodies[k], e.bodies[k].residual) for k in problem.awake}
+    residuals = [terms.residual for terms in e.terms]
     of_bodies = _over_limits(problem, e, residuals, problem.rounding.forces)
-    ratio = dict(zip((b.name for b in bodies), of_bodies, strict=True))
+    ratio = dict(zip((b.name for b in problem.system.bodies), of_bodies, strict=True))
     if problem.laid.own:
         ratio |= _of_elements(problem, e)
     return ratio
@@ -38,11 +37,11 @@ def unrest(problem: StepProblem, e: Evaluation) -> tuple[float, str]:
 
     Collective.
     """
-    bodies = problem.system.bodies
-    held = {k: problem.stabilization.of(bodies[k]) * e.bodies[k].du for k in problem.awake}
+    both = zip(problem.batches.bodies, e.terms, strict=True)
+    held = [problem.stabilization.of(body) * terms.du for body, terms in both]
     found = _over_limits(problem, e, held, problem.rounding.at(problem.lengths.displacement_of(e)))
     k = int(np.argmax(found))
-    return found[k], bodies[k].name
+    return found[k], problem.system.bodies[k].name
 
 
 def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
@@ -55,55 +54,74 @@ def leaves_work(problem: StepProblem, e: Evaluation, share: float) -> bool:
         e: Iterate.
         share: The part, of the largest work of one kind of forces on one body.
     """
-    local = np.zeros((len(e.bodies), 6))
-    for k in problem.awake:
-        t = e.bodies[k]
-        left = free(problem.system.bodies[k], t.residual)
-        parts = (left, problem.flight[k], t.internal, t.external, t.coupling, t.du)
-        local[k] = [float(p @ t.du) for p in parts]
-    work = global_sum(problem.system.comm, local)
+    parts = _forces_on(problem, e, [terms.residual for terms in e.terms])
+    both = list(zip(parts, e.terms, strict=True))
+    works = problem.batches.sums([forces * terms.du for forces, terms in both])
+    squares = problem.batches.sums([np.square(terms.du) for terms in e.terms])
+    work = global_sum(problem.system.comm, np.array([*works, squares])).T
     rounding = problem.rounding.forces @ np.sqrt(work[:, 5])
     return abs(work[:, 0].sum()) > share * np.abs(work[:, 1:5]).max() + rounding
 
 
 def _over_limits(
-    problem: StepProblem, e: Evaluation, forces: Mapping[int, FloatArray], rounding: FloatArray
+    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray], rounding: FloatArray
 ) -> list[float]:
-    """A force on each body over that which counts as zero there; asleep 0. Collective.
+    """A force on each batch over that which counts as zero, by body; asleep 0. Collective.
 
     It is measured by the largest of its inertial, internal, external and coupling forces. Of
     elements' forces that cancel each other, as on a body without mass of note between two springs,
     only the rounding counts, so that strong joints loosen no tolerance.
     """
-    squares = np.zeros((len(e.bodies), 6))
+    batches, parts = problem.batches, _forces_on(problem, e, forces)
+    squares = np.empty((6, batches.count))
+    squares[:5] = batches.sums([np.square(own) for own in parts])
+    squares[5] = problem.laid.gross_forces(problem.elements, e.parts, batches.count)
+    norms = np.sqrt(global_sum(batches.comm, squares))
+    limits = problem.rtol * norms[1:5].max(axis=0) + _CANCELLED * norms[5] + rounding
+    limits = limits.tolist()
+    found, sizes = [0.0] * batches.count, norms[0].tolist()
     for k in problem.awake:
-        t = e.bodies[k]
-        parts = (forces[k], problem.flight[k], t.internal, t.external, t.coupling)
-        squares[k, :5] = [float(p @ p) for p in parts]
-    squares[:, 5] = problem.laid.gross_forces(problem.elements, e.parts, len(e.bodies))
-    norms = np.sqrt(global_sum(problem.system.comm, squares))
-    limits = problem.rtol * norms[:, 1:5].max(axis=1) + _CANCELLED * norms[:, 5] + rounding
-    return [over(a, b) for a, b in zip(norms[:, 0], limits, strict=True)]
+        found[k] = over(sizes[k], limits[k])
+    return found
+
+
+def _forces_on(
+    problem: StepProblem, e: Evaluation, forces: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Of each batch the given forces where it is free, then all of the step's, (5, num_owned)."""
+    found = []
+    each = zip(problem.batches.bodies, forces, problem.flight, e.terms, strict=True)
+    for body, own, flight, terms in each:
+        rows = np.array([own, flight, terms.internal, terms.external, terms.coupling])
+        rows[0, body.fixed] = 0.0
+        found.append(rows)
+    return found
 
 
 def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     """`ratios` of the elements' own unknowns."""
-    moved = max(float(np.abs(b.du).max(initial=0.0)) for b in e.bodies)
+    moved = max(float(np.abs(terms.du).max(initial=0.0)) for terms in e.terms)
+    comm, linked = problem.system.comm, problem.couplings.linked
     # MPI's maximum may swallow a NaN, so it travels as a flag.
     rows = np.concatenate([np.empty(0), *(p.residual.ravel() for p in e.parts)])
     local = [moved, float(np.isnan(rows).any())]
     for c, part in zip(problem.elements, e.parts, strict=True):
         local += c.largest(part)
-    top = global_max(problem.system.comm, np.array(local))
+    extents = np.zeros(problem.couplings.mechanisms)
+    for c, of in zip(problem.elements, linked, strict=True):
+        if of is not None:
+            np.maximum.at(extents, of, c.extents if np.ndim(of) else c.extent)
+    top = global_max(comm, np.array([*local, *extents]))
     motion = max(top[0], float(problem.lengths.motion.max()))
     rounded = motion + float(problem.lengths.moved.max())
-    sizes, ratio = top[2:].reshape(-1, 4), dict[str, float]()
-    # What rounding leaves open in a joint the linear solve passes on to all that its bodies link.
-    for of in problem.couplings.mechanisms:
-        sizes[of, 3] = sizes[of, 3].max(initial=0.0)
-    for c, largest in zip(problem.elements, sizes, strict=True):
-        broken = np.inf if top[1] else 0.0
+    extents = top[len(local) :]
+    sizes, ratio = top[2 : len(local)].reshape(-1, 4), dict[str, float]()
+    for c, part, largest, of in zip(problem.elements, e.parts, sizes, linked, strict=True):
+        # What rounding leaves open in a joint the linear solve passes on to all that its bodies
+        # link.
+        given = largest if of is None else [*largest[:3], extents[of]]
         # Several contacts of two bodies have one name.
-        for name, value in c.ratios(largest, motion, rounded, problem.rtol).items():
-            ratio[name] = max(value, broken, ratio.get(name, 0.0))
-    return ratio
+        for name, value in c.ratios(part, given, motion, rounded, problem.rtol).items():
+            ratio[name] = max(value, ratio.get(name, 0.0))
+    found = np.array(list(ratio.values())) if not top[1] else np.full(len(ratio), np.inf)
+    return dict(zip(ratio, global_max(comm, found).tolist(), strict=True))

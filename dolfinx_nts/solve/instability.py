@@ -92,17 +92,16 @@ def _no_stiffness(
         matrix: Stiffness.
         turning: What turning forces add to it, see `AugmentedMatrix.turning`.
     """
-    bodies = [problem.system.bodies[k] for k in problem.awake]
-    left = _unbalanced(problem, step)
-    diagonal = matrix.getDiagonal()
-    ends = np.cumsum([body.num_owned for body in bodies])[:-1]
-    parts = (np.split(each, ends) for each in (np.abs(diagonal.array_r), turning))
-    found = [
-        _of_rigid(body, size, turns) if body.rigid else _NONE * size + unbalanced
-        for body, size, turns, unbalanced in zip(bodies, *parts, left, strict=True)
-    ]
+    left, diagonal = _unbalanced(problem, step), matrix.getDiagonal()
+    size, found = np.abs(diagonal.array_r), np.zeros(len(turning))
     diagonal.destroy()
-    return np.concatenate(found)
+    for row, k in enumerate(problem.awake):
+        body, here = problem.system.bodies[k], problem.of_body(k)
+        found[here] = (
+            _of_rigid(body, size[here], turning[here]) if body.rigid
+            else _NONE * size[here] + left[row]
+        )  # fmt: skip
+    return found
 
 
 def _unbalanced(problem: StepProblem, step: Evaluation) -> FloatArray:

@@ -102,7 +102,10 @@ class Upright:
 
     def _displacements(self, x: FloatArray) -> list[FloatArray]:
         """Displacement of each body at an iterate [m]; the array of t_n if it stays. Collective."""
-        u = list(self._problem.state.u)
-        for k in self._problem.elsewhere(x, dict(enumerate(u))):
-            u[k] = x[self._problem.of_body(k)]
+        problem, u = self._problem, list(self._problem.state.u)
+        places = problem.displacements(x)
+        moved = problem.elsewhere(places, dict(enumerate(problem.batches.join(u))))
+        now = problem.batches.split(places)
+        for k in (k for j in moved for k in problem.batches.numbers[j]):
+            u[k] = now[k]
         return u

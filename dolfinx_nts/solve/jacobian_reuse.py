@@ -41,20 +41,24 @@ class KeptTangents:
         self._factor = factor
 
     def at(self, e: Evaluation) -> tuple[list[Any], bool]:
-        """Matrices of the bodies that are awake, and whether they are those of an iterate.
+        """Matrices of the batches of bodies that are awake, and whether they are of an iterate.
 
         Collective.
         """
-        awake = self._problem.awake
+        problem = self._problem
+        awake = problem.laid.awake
+        if problem.batches.rigid:
+            # Which of these are awake may have changed; their matrix costs nothing.
+            self._matrices.pop(0, None)
         changed = any(a.stateGet() != self._states[k] for k, a in self._matrices.items())
-        fresh = anywhere(self._problem.system.comm, self.due or changed)
+        fresh = anywhere(problem.system.comm, self.due or changed)
         if fresh:
-            self._matrices = dict(zip(awake, self._problem.body_tangents(e), strict=True))
+            self._matrices = dict(zip(awake, problem.body_tangents(e), strict=True))
             self.due = not self._reuse()
-        for k in awake:
-            if k not in self._matrices:
-                self._matrices[k] = self._problem.body_tangent(k, e.bodies[k].u1)
-        return [self._matrices[k] for k in awake], fresh
+        for j in awake:
+            if j not in self._matrices:
+                self._matrices[j] = problem.body_tangent(j, e.terms[j].u1)
+        return [self._matrices[j] for j in awake], fresh
 
     def remember(self) -> None:
         """Take the matrices as they are for those of this run."""

@@ -210,7 +210,9 @@ class StepSolver:
         if self._independent:
             return solved
         bodies = problem.couplings.bodies
-        space = NullSpace(problem.system.comm, problem.elements, bodies, solved.parts)
+        space = NullSpace(
+            problem.laid, problem.system.comm, problem.elements, bodies, solved.parts
+        )
         if self._independent is None:
             self._independent = space.is_empty()
             if self._independent:
@@ -307,7 +309,7 @@ class StepSolver:
         bodies = self.matrix.whole_bodies() if ours else None
         whole = bodies is not None
         mixed = self._augmented is not None and self._augmented.mixed
-        options.configure(self.snes, split, len(self.problem.awake), whole=whole, mixed=mixed)
+        options.configure(self.snes, split, len(self.problem.laid.awake), whole=whole, mixed=mixed)
         self._refresh_schur()
         if self._augmented is not None and mixed:
             self._augmented.split_bodies(self.snes, self.matrix.operator)
@@ -337,8 +339,7 @@ class StepSolver:
 
     def _check_update(self, x: Any, y: Any) -> bool:
         """Hold prescribed coordinates, which a multigrid moves a little, and shorten updates."""
-        for k in self.problem.awake:
-            y.array_w[self.problem.of_body(k)][self.problem.system.bodies[k].fixed] = 0.0
+        y.array_w[self.problem.laid.held] = 0.0
         return self._upright.shorten(x, y)
 
     def _worst(self, e: Evaluation) -> float:

@@ -8,7 +8,6 @@ from typing import Any
 
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.linear_solver import ITERATIVE, SolverOptions, most_iterations
 from dolfinx_nts.system import System
@@ -38,6 +37,9 @@ def _mumps_factors(pc: Any) -> Any:
     """Matrix of MUMPS's factors, whose INFOG(1) is the same on all ranks; None of others."""
     factors = pc.getType() in ("lu", "cholesky") and pc.getFactorSolverType() == "mumps"
     return pc.getFactorMatrix() if factors else None
+
+
+_HAS_KLU = PETSc.Sys.hasExternalPackage("suitesparse")
 
 
 def _is_chain(body: Any) -> bool:
@@ -90,7 +92,7 @@ class Presets:
             self._names = mumps[:1] if own else mumps
             chains = all(map(_is_chain, system.bodies)) and not system.contacts
             auto = newton.linear_solver == "auto" and not given
-            if chains and auto and system.comm.size == 1 and compat.has_solver("klu"):
+            if chains and auto and system.comm.size == 1 and _HAS_KLU:
                 self._names = ("chains", *mumps)
         elif newton.linear_solver == "auto":
             self._names += mumps

@@ -67,16 +67,17 @@ def violation(
         [m/s] or [m], or None where all constraints hold.
     """
     worst, name, system = 0.0, "", problem.system
-    every = zip(system.joints, system.joint_bodies, problem.couplings.joints, strict=True)
-    for joint, of, coupling in every:
-        if driven and not _drives(joint):
+    speeds = problem.batches.largest(problem.batches.join(state.v))
+    for coupling, numbers in problem.couplings.joints:
+        if driven and not any(_drives(system.joints[k]) for k in numbers):
             continue
-        speed = max(float(np.abs(state.v[k]).max(initial=0.0)) for k in of)
+        fastest = [max(speeds[b] for b in system.joint_bodies[k]) for k in numbers]
         for found in filter(None, coupling.kinematics(state, dt)):
-            local = np.array([found.size[int(rates)], found.limit[int(rates)], speed])
-            off, limit, speed = global_max(system.comm, local).tolist()
-            if off > max(limit, part * speed) and off > worst:
-                worst, name = off, joint.name
+            both = (np.atleast_1d(values[int(rates)]) for values in (found.size, found.limit))
+            off, limit, speed = global_max(system.comm, np.array([*both, fastest]))
+            off = np.where(off > np.maximum(limit, part * speed), off, 0.0)
+            if off.max() > worst:
+                worst, name = float(off.max()), system.joints[numbers[off.argmax()]].name
     return (worst, name) if name else None
 
 
@@ -194,7 +195,7 @@ def _constraints(
     """Elements of joints with constraints that a start has to fit, and their bodies' numbers."""
     return [
         (batch, bodies, found)
-        for c in problem.couplings.joints
+        for c, _ in problem.couplings.joints
         for batch, bodies, found in zip(
             c.elements, c.bodies, c.kinematics(state, dt), strict=True
         )
@@ -210,37 +211,34 @@ def _solve(
     Returns:
         x of each body, and G^T lambda by the id of the elements.
     """
-    system = problem.system
-    chosen = _constraints(problem, state, dt)
+    batches = problem.batches
+    chosen, pushes = _constraints(problem, state, dt), batches.join(forces)
     if not chosen:
-        both = zip(system.bodies, forces, strict=True)
-        return tuple(solve_mass(body, force) for body, force in both), {}
-    masses = [b.tangent(u, 1.0, 0.0) for b, u in zip(system.bodies, state.u, strict=True)]
+        both = zip(batches.bodies, pushes, strict=True)
+        return batches.split([solve_mass(body, push) for body, push in both]), {}
+    each = zip(batches.bodies, batches.join(state.u), strict=True)
+    masses = [body.tangent(u, 1.0, 0.0) for body, u in each]
     elements, of = [batch for batch, _, _ in chosen], [bodies for _, bodies, _ in chosen]
-    laid = Unknowns(system.comm, {k: len(u) for k, u in enumerate(state.u)}, elements, of)
+    laid = Unknowns(batches, range(batches.count), elements, of)
     tangents = [_symmetric(found) for _, _, found in chosen]
     matrix = StepMatrix(laid.layout, masses, laid.blocks)
     matrix.assemble(tangents)
     saddle = Saddle(matrix.operator)
-    total, held = [np.zeros_like(force) for force in forces], laid.of_elements("constraints")
-    multipliers = np.zeros(laid.layout.num_owned)[held]
+    unknown, held = np.zeros(laid.layout.num_owned), laid.of_elements("constraints")
+    right, total = np.zeros_like(unknown), batches.split([np.zeros_like(push) for push in pushes])
+    laid.write(pushes, right)
     # Each time less is left of what the matrix lends to constraints, see `SHIFT`.
     for _ in range(_TIMES):
         known = state.a if order else state.v
         changed = tuple(x + dx for x, dx in zip(known, total, strict=True))
         now = replace(state, a=changed) if order else replace(state, v=changed)
-        right = np.zeros(laid.layout.num_owned)
-        for k, force in enumerate(forces):
-            right[laid.of_body(k)] = force
         rows = [found.rows[1 + order].ravel() for _, _, found in _constraints(problem, now, dt)]
         right[held] = -np.concatenate(rows)
-        solution = saddle.solve(right)
-        multipliers += solution[held]
-        for k, body in enumerate(system.bodies):
-            change = solution[laid.of_body(k)].copy()
-            change[body.fixed] = 0.0
-            total[k] = total[k] + change
-        forces = [np.zeros_like(force) for force in forces]
+        unknown = unknown + saddle.solve(right)
+        unknown[laid.held] = 0.0
+        total = batches.split(laid.read(unknown, pushes))
+        right[:] = 0.0
+    multipliers = unknown[held]
     saddle.destroy()
     matrix.destroy()
     laid.destroy()
@@ -251,7 +249,7 @@ def _solve(
         first += own.size
         force = np.einsum("nma,nm->na", tangent[:, -width:, :-width], own)
         pulls[id(batch)] = PointPart(force, tangent)
-    return tuple(total), pulls
+    return total, pulls
 
 
 def _symmetric(found: Kinematics) -> FloatArray:

@@ -103,10 +103,10 @@ def _suspects(
 def _joined(problem: StepProblem, bodies: Iterable[int]) -> set[int]:
     """Bodies that constraints of joints hold to some bodies, with these; after `begin`."""
     held = [
-        set(of)
-        for coupling in problem.couplings.joints
-        for batch, of in zip(coupling.elements, coupling.bodies, strict=True)
-        if has_constraints(batch)
+        set(problem.system.joint_bodies[k])
+        for coupling, numbers in problem.couplings.joints
+        if any(has_constraints(batch) for batch in coupling.elements)
+        for k in numbers
     ]
     reached, more = set(bodies), set(bodies)
     while more:

@@ -28,11 +28,10 @@ from dolfinx_nts.bodies.solid.parameters import (
 )
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.interaction.constraints import rank_of
 from dolfinx_nts.interaction.evaluation import Moment
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross, range_of
-from dolfinx_nts.parallel import gather_rows, raise_together
+from dolfinx_nts.parallel import gather_rows, raise_together, rank_of
 from dolfinx_nts.validation import (
     UserFunctionError,
     known_options,
@@ -217,12 +216,13 @@ class RigidBody(Body):
         self._matrix: Any = None
         # Mass factor that it holds, and PETSc's count of changes since.
         self._holds: tuple[float, int] | None = None
-        self._reach = np.ones(4)
+        #: Of each node the largest weight in a point of the mesh, shape (4,).
+        self.reach = np.ones(4)
         if self.mesh is not None:
             x = self.space.tabulate_dof_coordinates()
             self._mesh_weights = self._weights(x)
             local = np.abs(self._mesh_weights).max(axis=0, initial=0.0)
-            comm.Allreduce(local, self._reach, op=MPI.MAX)
+            comm.Allreduce(local, self.reach, op=MPI.MAX)
         self.accept(np.zeros(self.num_owned), self.initial_velocity)
 
     def _set_up_nodes(self, linear: FloatArray, turning: FloatArray) -> None:
@@ -233,9 +233,10 @@ class RigidBody(Body):
         y, masses = self._inertia.nodes, self._inertia.nodal_mass
         self.reference: FloatArray = y.ravel()[: self.num_owned]
         self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
-        self._lent = np.zeros(self.num_owned)
+        #: Mass that matrices have beside `nodal_mass` [kg], see `_LENT`.
+        self.lent = np.zeros(self.num_owned)
         if np.count_nonzero(masses[1:]) < 2:
-            self._lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * self.mass
+            self.lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * self.mass
         speeds = np.vstack([linear, np.cross(turning, y[1:])])
         self.initial_velocity = speeds.ravel()[: self.num_owned]
         self._fixed = np.repeat([self._drive.moves] + 3 * [self._drive.turns], 3)
@@ -372,10 +373,16 @@ class RigidBody(Body):
     def motion_range(self, du: FloatArray) -> FloatArray:
         """Bounds on the motion of the mesh's points on this rank, see `Body` [m]."""
         moved = du.reshape(-1, 4, 3)
-        turned = np.einsum("k,nki->ni", self._reach[1:], np.abs(moved[:, 1:]))
+        turned = np.einsum("k,nki->ni", self.reach[1:], np.abs(moved[:, 1:]))
         return range_of(moved[:, 0], turned)
 
     # ---- as of Body
+    @property
+    def plain(self) -> bool:
+        """Whether inertia and gravity are all there is to it, so that many are evaluated as one."""
+        overridden = type(self) is not RigidBody
+        return self._loads.none and not (overridden or self._drive.moves or self._drive.turns)
+
     @property
     def settings(self) -> dict[str, Any]:
         """What ranks must have in common, see `Body`."""
@@ -427,7 +434,7 @@ class RigidBody(Body):
         if constant and self._holds == (mass, self._matrix.stateGet()):
             return self._matrix
         if self.num_owned:
-            whole = np.diag(mass * (self.nodal_mass + self._lent))
+            whole = np.diag(mass * (self.nodal_mass + self.lent))
             if not constant:
                 by_directors = self._loads.gradient(self._directors(u1))
                 whole[3:, 3:] -= stiffness * self._theta * by_directors
@@ -496,13 +503,21 @@ class RigidBody(Body):
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""
         super().accept(u, v)
-        local = np.concatenate([(self.reference + u).reshape(-1, 3), v.reshape(-1, 3)], axis=1)
-        both = gather_rows(self.comm, local)
-        self._y, self._v = both[:, :3], both[:, 3:]
+        local = np.reshape([self.reference + u, u, v], (3, -1, 3)).swapaxes(0, 1)
+        self.show(*gather_rows(self.comm, local).swapaxes(0, 1))
+
+    def show(self, place: FloatArray, moved: FloatArray, speed: FloatArray) -> None:
+        """Take what others see of the body: of each node (4, 3).
+
+        Args:
+            place: Its vector [m].
+            moved: Displacement [m].
+            speed: Velocity [m/s].
+        """
+        self._y, self._v = place, speed
         if self.mesh is not None:
-            for function, values in ((self.u, u), (self.v, v)):
-                whole = self._everywhere(values)
-                function.x.array[:] = (self._mesh_weights @ whole).ravel()
+            for function, values in ((self.u, moved), (self.v, speed)):
+                function.x.array[:] = (self._mesh_weights @ values).ravel()
 
     def destroy(self) -> None:
         """Free the PETSc objects; the body is of no use then."""

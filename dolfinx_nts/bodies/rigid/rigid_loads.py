@@ -46,6 +46,11 @@ class RigidLoads:
         """As they were given, by their names."""
         return {name: value for name, value, _ in self._given}
 
+    @property
+    def none(self) -> bool:
+        """Whether there are none at any time."""
+        return not any(callable(value) or np.any(value) for _, value, _ in self._given)
+
     def begin(self, time: float, ramp: float, axes: FloatArray) -> None:
         """Set the loads at a time [s]. Collective.
 

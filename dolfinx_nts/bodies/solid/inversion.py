@@ -144,6 +144,9 @@ def smallest_dets(
     """
     local, known = np.empty(len(system.bodies)), {} if known is None else known
     for k, (body, values) in enumerate(zip(system.bodies, u, strict=True)):
+        if body.rigid:
+            local[k] = np.inf
+            continue
         if k not in known or known[k][0] is not values:
             known[k] = values, body.smallest_det(values)[0]
         local[k] = known[k][1]
