@@ -109,7 +109,7 @@ class Rounding:
             diagonal.destroy()
             if body.oriented and not body.rigid:
                 each = self._as_rounded(body, each.reshape(-1, 3), self._extent[of[0]])
-            squares = [np.empty(0)] * len(self._batches.bodies)
+            squares = [np.zeros(other.num_owned) for other in self._batches.bodies]
             squares[j] = np.square(each)
             norms = np.sqrt(global_sum(self._batches.comm, self._batches.sums(squares)))
             self._diagonal[chosen], self._of_factor[chosen] = norms[chosen], self._factor
