@@ -126,12 +126,16 @@ def _beam(frame, low, high, cells, **options):
 
 
 def beam(frame):
-    """A clamped beam with a rigid weight on a ball joint at its end."""
+    """A clamped beam with two rigid weights below its end, one below the other."""
     clamp = nts.Clamp(frame.where(lambda x: x[:, 0] < 1e-6))
     rod = _beam(frame, (0, 0, 0), (2, 0, 0), 4, bcs=[clamp], name="rod")
     weight = _rigid(frame, (1.9, -0.1, -0.3), (2.1, 0.1, -0.1), "weight", cells=(1, 1, 1))
-    joint = nts.Spherical(rod, weight, point=frame.place(2, 0, 0), name="eye")
-    return nts.System([rod, weight], joints=[joint], gravity=_gravity(frame))
+    second = _rigid(frame, (1.9, -0.1, -0.6), (2.2, 0.1, -0.4), "second", cells=(1, 1, 1))
+    joints = [
+        nts.Spherical(rod, weight, point=frame.place(2, 0, 0), name="eye"),
+        nts.Spherical(weight, second, point=frame.place(2, 0, -0.35), name="hook"),
+    ]
+    return nts.System([rod, weight, second], joints=joints, gravity=_gravity(frame))
 
 
 def shell(frame):
