@@ -251,6 +251,38 @@ def test_a_driven_hinge_between_free_bodies_keeps_the_momenta(rule):
     assert np.ptp(table["kinetic"][stopped]) < 1e-10 * table["kinetic"].max()
 
 
+@pytest.mark.parametrize("speed, spin", [(30.0, 0.0), (1e3, 100.0)])
+@pytest.mark.parametrize("kind", [nts.Prismatic, nts.Revolute])
+def test_a_slow_drive_stops_in_a_scene_that_flies_and_turns(kind, speed, spin):
+    """The miss of its velocity was measured by speeds of the bodies: +-0.15 m/s for ever."""
+    drive, place, w = 0.25, np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.0, spin])
+    v = speed * np.array([0.6, 0.8, 0.0])
+    car = nts.RigidBody.from_inertia(
+        1000.0, (100, 200, 250), velocity=v, angular_velocity=w, name="car"
+    )
+    arm = nts.RigidBody.from_inertia(
+        10.0, (1, 2, 2.5), place, velocity=v + np.cross(w, place), angular_velocity=w, name="arm"
+    )
+    slides = kind is nts.Prismatic
+    motion = {"displacement" if slides else "angle": lambda t: drive * min(t, STOP - 2e-4)}
+    joint = kind(arm, car, point=place, axis=(1, 0, 0) if slides else (0, 0, 1), **motion)
+    system = nts.System([car, arm], joints=[joint])
+    stepper = nts.Stepper(system, nts.EnergyMomentum(), project_start=True)
+    for _ in range(50):
+        stepper.advance(1e-3)
+    for _ in range(2):
+        stepper.advance(1e-3)
+        found = arm.angular_velocity - car.angular_velocity
+        if slides:
+            # Velocities relative to the turning scene; it turns by tan(w h/2) for w h/2.
+            along = nts.motion_of(arm).centre - nts.motion_of(car).centre
+            found = (arm.velocity - car.velocity) @ along / np.linalg.norm(along)
+        assert np.abs(found).max() < 1e-5 * drive
+    stepper.close()
+    table = stepper.solution.balance
+    assert abs(table["ledger_residual"]).max() < 1e-11 * table["kinetic"].max()
+
+
 @few
 @both
 def test_a_driven_flexible_body_stops_where_it_is_held(rule):

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.interaction.kinematics import FAR_TURN, OFF, Kinematics
+from dolfinx_nts.interaction.kinematics import FAR_TURN, OFF, ROUNDED, Kinematics
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import quadratic as kernel
@@ -430,13 +430,14 @@ class Constraints(EveryStep):
             return []
         (batch,) = self.elements
         gap, off = self._gap(state)
-        first, second, doubt = self._rates(state, dt)
+        first, second, doubt, along = self._rates(state, dt)
         own = {"constraints": np.zeros_like(self._equations.value)}
         return [
             Kinematics(
                 batch.scale * np.array([gap, first, second]),
                 np.array([np.abs(values).max(initial=0.0) for values in (gap, first)]),
                 np.array([off, doubt]),
+                along,
                 batch.evaluate(self._places(state), own).tangent,
             )
         ]
@@ -454,30 +455,35 @@ class Constraints(EveryStep):
         found = kernel.value(kernel.factors(weights, constants, both)) - c
         return found, OFF * float(np.abs(both).max(initial=0.0))
 
-    def _rates(self, state: State, dt: float) -> tuple[FloatArray, FloatArray, float]:
+    def _speeds(self, state: State) -> FloatArray:
+        """Velocities of the nodal vectors at a state [m/s], shape (n, k, 3)."""
+        v = [state.v[k] for k in self.bodies[0]]
+        return np.concatenate([s.nodal(w) for s, w in zip(self._sides, v, strict=True)], axis=1)
+
+    def _rates(self, state: State, dt: float) -> tuple[FloatArray, FloatArray, float, float]:
         """First and second derivative in time of g - c at a state. Collective.
 
         Args:
             state: The state; without accelerations they count as zero.
-            dt: Time in which prescribed values are told [s].
+            dt: Time in which prescribed values are told [s]; less the last step at its end.
 
         Returns:
-            [m/s] and [m/s^2], both (n, m), and what the first may err by [m/s]: by rounding, and
-            by what prescribed values leave open within `dt`.
+            [m/s] and [m/s^2], both (n, m), and what the first may err by [m/s]: by rounding, by
+            what prescribed values leave open within `dt`, and at the end of a step by its rule for
+            velocities; and `Kinematics.along`.
         """
-        v = [state.v[k] for k in self.bodies[0]]
-        speed = np.concatenate(
-            [s.nodal(w) for s, w in zip(self._sides, v, strict=True)], axis=1
-        )
+        speed = self._speeds(state)
         times = (state.time + part * dt for part in (0.0, 0.25, 0.5, 1.0))
         (weights, constants, _), (c0, c_in, c1, c2) = self._at(*times)
         rate = (4.0 * (c1 - c0) - (c2 - c0)) / dt
         finer = 2.0 * (4.0 * (c_in - c0) - (c1 - c0)) / dt
-        vectors = kernel.factors(weights, constants, self._places(state))
+        places = self._places(state)
+        vectors = kernel.factors(weights, constants, places)
         rates = kernel.factors(weights, np.zeros_like(constants), speed)
         gradient = kernel.gradient(weights, vectors)
-        first = np.einsum("nmai,nai->nm", gradient, speed) - rate
-        second = 2.0 * kernel.value(rates) - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
+        flow, bend = np.einsum("nmai,nai->nm", gradient, speed), 2.0 * kernel.value(rates)
+        first = flow - rate
+        second = bend - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
         if state.a:
             a = [s.nodal(state.a[k]) for s, k in zip(self._sides, self.bodies[0], strict=True)]
             second += np.einsum("nmai,nai->nm", gradient, np.concatenate(a, axis=1))
@@ -485,7 +491,15 @@ class Constraints(EveryStep):
         # Both formulas are at least of second order, so the coarse one errs by 4/3 of what they
         # differ by.
         doubt = 2.0 * float(np.abs(finer - rate).max(initial=0.0))
-        return first, second, OFF * size + doubt
+        if dt < 0.0 and self.step is not None:
+            # With v_0 + v_1 = 2 (y_1 - y_0)/h the sum of both ends' G v is 2 (c_1 - c_0)/h and a
+            # quarter of h times the change of (G v)' v.
+            rates = kernel.factors(weights, np.zeros_like(constants), self._speeds(self.step.state))
+            change = bend - 2.0 * kernel.value(rates)
+            doubt -= 0.5 * dt * float(np.abs(change).max(initial=0.0))
+            doubt -= ROUNDED * float(np.abs(places).max(initial=0.0)) / dt
+        along = max(float(np.abs(a).max(initial=0.0)) for a in (flow, rate))
+        return first, second, OFF * size + doubt, along
 
     def load_step_work(
         self, before: Any, after: FloatArray, start: float, end: float

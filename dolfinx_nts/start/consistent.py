@@ -29,8 +29,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Linear solves of a start; what prescribed values change in the first step slows them down.
 _TIMES = 8
-#: Part of the speed of a joint's bodies by which they may miss the velocity of its drive; steps
-#: that resolve a drive miss it by their second order.
+#: Part of its drive's velocity by which a joint may miss it; steps that resolve a drive miss it by
+#: their second order.
 _MISSED = 0.01
 
 
@@ -61,7 +61,8 @@ def violation(
         dt: First step [s]; less the last one, to take rates of what is prescribed in it.
         rates: That of velocities; else of positions.
         part: Of the speed of a joint's bodies that it may be, beside its rounding.
-        driven: Whether to look at joints alone that prescribe a motion.
+        driven: Whether to look at joints alone that prescribe a motion; `part` is then of the speed
+            along their constraints, which is the same wherever the whole scene flies or turns.
 
     Returns:
         [m/s] or [m], or None where all constraints hold.
@@ -73,9 +74,10 @@ def violation(
             continue
         speed = max(float(np.abs(state.v[k]).max(initial=0.0)) for k in of)
         for found in filter(None, coupling.kinematics(state, dt)):
-            local = np.array([found.size[int(rates)], found.limit[int(rates)], speed])
-            off, limit, speed = global_max(system.comm, local).tolist()
-            if off > max(limit, part * speed) and off > worst:
+            scale = found.along if driven else speed
+            local = np.array([found.size[int(rates)], found.limit[int(rates)], scale])
+            off, limit, scale = global_max(system.comm, local).tolist()
+            if off > max(limit, part * scale) and off > worst:
                 worst, name = off, joint.name
     return (worst, name) if name else None
 
