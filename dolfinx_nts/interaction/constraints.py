@@ -22,6 +22,7 @@ from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import FAR_TURN, OFF, ROUNDED, Kinematics
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.interaction.prescribed import times, told
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.state import State
@@ -455,11 +456,6 @@ class Constraints(EveryStep):
         found = kernel.value(kernel.factors(weights, constants, both)) - c
         return found, OFF * float(np.abs(both).max(initial=0.0))
 
-    def _speeds(self, state: State) -> FloatArray:
-        """Velocities of the nodal vectors at a state [m/s], shape (n, k, 3)."""
-        v = [state.v[k] for k in self.bodies[0]]
-        return np.concatenate([s.nodal(w) for s, w in zip(self._sides, v, strict=True)], axis=1)
-
     def _rates(self, state: State, dt: float) -> tuple[FloatArray, FloatArray, float, float]:
         """First and second derivative in time of g - c at a state. Collective.
 
@@ -472,34 +468,46 @@ class Constraints(EveryStep):
             what prescribed values leave open within `dt`, and at the end of a step by its rule for
             velocities; and `Kinematics.along`.
         """
-        speed = self._speeds(state)
-        times = (state.time + part * dt for part in (0.0, 0.25, 0.5, 1.0))
-        (weights, constants, _), (c0, c_in, c1, c2) = self._at(*times)
-        rate = (4.0 * (c1 - c0) - (c2 - c0)) / dt
-        finer = 2.0 * (4.0 * (c_in - c0) - (c1 - c0)) / dt
-        places = self._places(state)
-        vectors = kernel.factors(weights, constants, places)
-        rates = kernel.factors(weights, np.zeros_like(constants), speed)
-        gradient = kernel.gradient(weights, vectors)
-        flow, bend = np.einsum("nmai,nai->nm", gradient, speed), 2.0 * kernel.value(rates)
-        first = flow - rate
-        second = bend - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
+        step = self.step if dt < 0.0 else None
+        if step is None:
+            at, other = state.time, state.time + dt
+        else:
+            at, other = step.state.time + step.dt, step.state.time
+        equations, c = self._at(*times(at, other))
+        gradient, flow, bend = self._flow(state, equations)
+        before = None if step is None else self._flow(step.state, equations)
+        rate, doubt, faster = told(c, at - other, None if before is None else before[1])
+        second = bend - faster
         if state.a:
             a = [s.nodal(state.a[k]) for s, k in zip(self._sides, self.bodies[0], strict=True)]
             second += np.einsum("nmai,nai->nm", gradient, np.concatenate(a, axis=1))
-        size = max(float(np.abs(a).max(initial=0.0)) for a in (speed, rate))
-        # Both formulas are at least of second order, so the coarse one errs by 4/3 of what they
-        # differ by.
-        doubt = 2.0 * float(np.abs(finer - rate).max(initial=0.0))
-        if dt < 0.0 and self.step is not None:
+        v = [s.nodal(state.v[k]) for s, k in zip(self._sides, self.bodies[0], strict=True)]
+        size, along, off = (
+            max(float(np.abs(a).max(initial=0.0)) for a in arrays)
+            for arrays in ((*v, rate), (flow, rate), (doubt,))
+        )
+        off += OFF * size
+        if before is not None:
             # With v_0 + v_1 = 2 (y_1 - y_0)/h the sum of both ends' G v is 2 (c_1 - c_0)/h and a
             # quarter of h times the change of (G v)' v.
-            rates = kernel.factors(weights, np.zeros_like(constants), self._speeds(self.step.state))
-            change = bend - 2.0 * kernel.value(rates)
-            doubt -= 0.5 * dt * float(np.abs(change).max(initial=0.0))
-            doubt -= ROUNDED * float(np.abs(places).max(initial=0.0)) / dt
-        along = max(float(np.abs(a).max(initial=0.0)) for a in (flow, rate))
-        return first, second, OFF * size + doubt, along
+            off -= 0.5 * dt * float(np.abs(bend - before[2]).max(initial=0.0))
+            off -= ROUNDED * float(np.abs(self._places(state)).max(initial=0.0)) / dt
+        return flow - rate, second, off, along
+
+    def _flow(
+        self, state: State, equations: Equations
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """G (n, m, k, 3), G v [m/s] and (G v)' v [m/s^2], both (n, m), at a state."""
+        weights, constants, _ = equations
+        v = [s.nodal(state.v[k]) for s, k in zip(self._sides, self.bodies[0], strict=True)]
+        speed = np.concatenate(v, axis=1)
+        gradient = kernel.gradient(
+            weights, kernel.factors(weights, constants, self._places(state))
+        )
+        rates = kernel.factors(weights, np.zeros_like(constants), speed)
+        return (
+            gradient, np.einsum("nmai,nai->nm", gradient, speed), 2.0 * kernel.value(rates)
+        )  # fmt: skip
 
     def load_step_work(
         self, before: Any, after: FloatArray, start: float, end: float

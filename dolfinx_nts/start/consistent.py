@@ -16,7 +16,7 @@ import numpy.typing as npt
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
-from dolfinx_nts.equations.supports import rates_at
+from dolfinx_nts.equations.supports import rates_at_start
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.evaluation import Moment
 from dolfinx_nts.interaction.kinematics import Kinematics
@@ -120,7 +120,7 @@ def accelerating_forces(
     for body, u, force in zip(problem.system.bodies, state.u, contact, strict=True):
         right = body.external(u, gravity) - body.internal(u) - force
         a = np.zeros_like(u)
-        a[body.fixed] = rates_at(body, state.time, -dt).acceleration
+        a[body.fixed] = rates_at_start(body, state.time, dt).acceleration
         right -= body.inertia(a)
         right[body.fixed] = 0.0
         out.append((right, a))
