@@ -12,31 +12,57 @@ import dolfinx_nts as nts
 COMM = MPI.COMM_WORLD
 
 
-def frustum(metre):
-    """A fixed block of 1 m whose sides slope by 45 degrees, its top from -0.5 to 0.5 m."""
+#: How far sides go outwards on their way down: a frustum, boxes and a wedge of 73 degrees.
+SLOPES = [1.0, 0.1, 0.0, -0.3]
+
+
+def block(slope, metre=1.0):
+    """A fixed one of 1 m whose sides slope, its top from -0.5 to 0.5 m."""
     mesh = box(low=(-0.5, -0.5, 0.0), high=(0.5, 0.5, 1.0), cells=2)
     x = mesh.geometry.x
-    x[:, 0] *= 2.0 - x[:, 2]
+    x[:, 0] *= 1.0 + slope * (1.0 - x[:, 2])
     x *= metre
     return nts.RigidBody(mesh, density=1.0, motion=lambda t: (0, 0, 0), name="block")
 
 
+def passing(slope, corner, velocity, rule, dt, metre=1.0):
+    """A cube of 0.2 m that flies for 0.1 s, its lower left edge from `corner` (x, z) on."""
+    x, z = corner
+    mesh = box(low=(x, -0.1, z), high=(x + 0.2, 0.1, z + 0.2), cells=1)
+    mesh.geometry.x[:] *= metre
+    cube = nts.RigidBody(mesh, density=1.0, velocity=metre * np.array(velocity), name="cube")
+    fixed = block(slope, metre)
+    pair = nts.ContactPair(slave=cube.surface(everywhere), master=fixed.surface(everywhere))
+    run = nts.simulate(nts.System([fixed, cube], contacts=[pair]), rule, dt=dt, t_end=0.1)
+    assert run.status == "completed" and not run.warnings
+    return cube, np.abs(run.contact_forces).max() / (cube.mass * metre / dt**2)
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("metre", [1.0, 2.0**-10])
+@pytest.mark.parametrize("slope", SLOPES)
 @pytest.mark.parametrize("rule", MID_STEP.values(), ids=MID_STEP)
-def test_what_passes_an_edge_closely_is_not_held_by_the_plane_beyond_it(rule, metre):
+def test_what_passes_an_edge_closely_is_not_held_by_the_plane_beyond_it(rule, slope, metre):
     """Above the top at the start of a step, beside it and below its plane at the end."""
-    block = frustum(metre)
-    mesh = box(low=(0.49, -0.1, 1.05), high=(0.69, 0.1, 1.25), cells=1)
-    mesh.geometry.x[:] *= metre
-    velocity = metre * np.array([2.0, 0.0, -1.0])
-    cube = nts.RigidBody(mesh, density=1.0, velocity=velocity, name="cube")
-    sides = block.surface(everywhere)
-    pair = nts.ContactPair(slave=cube.surface(everywhere), master=sides)
-    run = nts.simulate(nts.System([block, cube], contacts=[pair]), rule, dt=0.1, t_end=0.1)
-    assert run.status == "completed"
-    assert np.abs(run.contact_forces).max() < 1e-13 * cube.mass * metre / 0.1**2
-    np.testing.assert_allclose(cube.velocity, velocity, rtol=1e-13, atol=1e-13 * metre)
+    velocity = np.array([2.0, 0.0, -1.0])
+    cube, force = passing(slope, (0.49, 1.05), velocity, rule, 0.1, metre)
+    assert force < 1e-13
+    np.testing.assert_allclose(cube.velocity / metre, velocity, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("passes", [6, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("slope", [1.0, 0.0, -0.3])
+def test_what_hits_the_top_is_held_and_what_passes_beside_it_is_not(slope, passes):
+    """As the straight way of a corner meets the block or not, in the plane of both."""
+    random, time = np.random.default_rng(0), np.linspace(0.0, 0.1, 100_001)
+    for _ in range(passes):
+        height, inside = random.uniform(0.0, 0.05, 2)
+        corner = np.array([0.5 - inside, 1.0 + height])
+        velocity = random.uniform([1.0, 0.0, -2.0], [4.0, 0.0, -0.5])
+        x, z = corner[:, None] + velocity[[0, 2], None] * time
+        hit = bool(((z < 1.0) & (x < 0.5 * (1.0 + slope * (1.0 - z)))).any())
+        _, force = passing(slope, corner, velocity, nts.EnergyMomentum(), 0.02)
+        assert (force > 1e-6) == hit
 
 
 def profile(teeth, module=4.0, points=7):

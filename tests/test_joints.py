@@ -822,7 +822,7 @@ def test_the_angle_of_a_hinge_is_no_mirror_image(turn):
     """Its sine about the middle of the step has two angles; Newmark's steps found the other one."""
     body, system = motor(lambda t: turn / 0.05 * t, turn / 0.05)
     run = nts.simulate(system, nts.Newmark(), dt=0.05, t_end=0.5)
-    assert run.status.startswith("completed") and run.retries > 0
+    assert run.status.startswith("completed")
     assert np.abs(body.rotation - turned(10.0 * turn)).max() < 1e-9
 
 

@@ -199,6 +199,7 @@ class FacetPair(ContactPair, master=Surface):
         """
         slave_path, master_path = self._gather_paths(motion.paths)
         found = self._round_edges(found, x, master, slave_path, master_path)
+        found = self._past_edges(found, x, master, slave_path, master_path)
         change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
         corners, node = master[self.master.facets], found.node[change]
         if len(node):
@@ -263,6 +264,113 @@ class FacetPair(ContactPair, master=Surface):
         other, _ = self._measure(x, master, node, facet, start, None)
         return _replace(found, other)
 
+    def _past_edges(
+        self,
+        found: Candidates,
+        x: FloatArray,
+        master: FloatArray,
+        slave_path: FloatArray,
+        master_path: FloatArray,
+    ) -> Candidates:
+        """Candidates that will cross a facet's plane beyond its edge, with the facet beyond that.
+
+        Arguments as of `_round_edges`.
+        """
+        end = (x + slave_path)[found.node]
+        sinks = self._gap_at(found.facet, found.xi, end, master + master_path) < 0.0
+        some = np.flatnonzero(sinks & self._sharp[found.facet])
+        if not some.size:
+            return found
+        node = found.node[some]
+        _, facet = self._passes(
+            x[node], slave_path[node], found.facet[some], master, master_path
+        )
+        change = facet >= 0
+        if not change.any():
+            return found
+        node, facet = node[change], facet[change]
+        start, _ = compiled.closest_point(x[node], master[self.master.facets[facet]])
+        other, _ = self._measure(x, master, node, facet, start, None)
+        return _replace(found, other)
+
+    def _passes(
+        self,
+        x: FloatArray,
+        way: FloatArray,
+        facet: IntArray,
+        master: FloatArray,
+        master_path: FloatArray,
+    ) -> tuple[BoolArray, IntArray]:
+        """Whether ways of nodes sink through facets' planes, and facets that they pass then.
+
+        The plane of a facet goes on beyond its edges, the body does not: what crosses it beyond a
+        sharp convex edge passes the facet on the other side of that edge.
+
+        Args:
+            x: Nodes at t_n [m], shape (n, 3).
+            way: Their motion [m], shape (n, 3).
+            facet: Facets, shape (n,).
+            master: Points of the master at t_n [m].
+            master_path: Their motion [m].
+
+        Returns:
+            Shape (n,) each; -1 for what crosses within the facet, or not at all.
+        """
+        patch, control, xi, good = self._projected(x, master, facet, np.zeros((len(x), 2)))
+        carried, gaps = self.master.control_points(master_path, patch), []
+        for place, points in ((x, control), (x + way, control + carried)):
+            xi, _ = compiled.project(place, points, xi)
+            foot, _, normal = facets.frame(points, xi)
+            gaps.append(np.einsum("ni,ni->n", normal, place - foot))
+        above, below = gaps
+        length = facets.size(master[self.master.facets[facet]])
+        sinks = good & (below < -_OUTSIDE * length) & (below < above)
+        fall = np.where(sinks, above - below, 1.0)
+        part = np.where(sinks, np.clip(above / fall, 0.0, 1.0), 1.0)
+        return sinks, self._across(x + part[:, None] * way, facet, master, master_path, part)
+
+    def _across(
+        self,
+        points: FloatArray,
+        facet: IntArray,
+        master: FloatArray,
+        master_path: FloatArray,
+        part: FloatArray,
+    ) -> IntArray:
+        """Facets across the sharp convex edges that points (n, 3) are beyond, or -1, (n,).
+
+        Args:
+            points: [m].
+            facet: Facets in whose planes they are, shape (n,).
+            master: Points of the master at t_n [m].
+            master_path: Their motion in the step [m].
+            part: How much of that they have behind them, shape (n,).
+        """
+        at, nc = self.master.facets, self.master.facets.shape[1]
+        pairs = np.arange(len(points))
+
+        def corners(of: IntArray) -> FloatArray:
+            now: FloatArray = master[at[of]] + part[:, None, None] * master_path[at[of]]
+            return now
+
+        for k in range(_MOST_PATCHES):
+            xi, converged = compiled.project(points, corners(facet), np.zeros((len(points), 2)))
+            excess = facets.edge_excess(xi, nc)
+            edge = excess.argmax(axis=1)
+            out = converged & (excess[pairs, edge] > _ASIDE)
+            joined = self._joined[facet, edge]
+            onward = out & (joined >= 0)
+            if k == _MOST_PATCHES - 1 or not onward.any():
+                break
+            facet = np.where(onward, joined // nc, facet)
+        beside = self._beside[facet, edge]
+        out &= (beside >= 0) & (joined < 0)
+        other = np.where(out, beside // nc, 0)
+        foot, _, normal = facets.frame(corners(other), np.zeros((len(points), 2)))
+        gap = np.einsum("ni,ni->n", normal, points - foot)
+        out &= gap > _ASIDE * facets.size(master[at[other]])
+        return np.where(out, other, -1)
+
     def _gap_at(
         self, facet: IntArray, xi: FloatArray, points: FloatArray, master: FloatArray
     ) -> FloatArray:
@@ -285,6 +393,7 @@ class FacetPair(ContactPair, master=Surface):
         positions: Sequence[FloatArray],
         motions: Sequence[FloatArray],
         path: FloatArray,
+        ahead: Sequence[FloatArray],
         reach: float,
         held: IntArray,
     ) -> IntArray | None:
@@ -294,38 +403,50 @@ class FacetPair(ContactPair, master=Surface):
         if not (aside or self.is_long(reach)):
             return None
         x, paths = positions[0][self.slave.share], self._gather_paths(motions)
-        end, moved = x + paths[0], positions[1] + paths[1]
         hit = np.full(len(held), -1)
         if self.is_long(reach):
             hit = self._came_through(x, positions[1], *paths, held)
-        if by_edges.size:
-            behind = self._behind_edges(end[by_edges], moved, held[by_edges])
+        if aside:
+            behind = self._behind_edges(x, positions[1], paths, ahead, held, by_edges)
             hit[by_edges] = np.where(behind >= 0, behind, hit[by_edges])
         return hit
 
-    def _behind_edges(self, end: FloatArray, moved: FloatArray, held: IntArray) -> IntArray:
-        """Facet behind the sharp edge that nodes (n, 3) are held beyond at the end, or -1, (n,).
+    def _behind_edges(
+        self,
+        x: FloatArray,
+        master: FloatArray,
+        paths: tuple[FloatArray, FloatArray],
+        ahead: Sequence[FloatArray],
+        held: IntArray,
+        some: IntArray,
+    ) -> IntArray:
+        """Facet across the edge that nodes are held beyond, or -1, shape (n,). Collective.
 
-        The plane of a facet goes on beyond its edges, the body does not.
+        Where they would have gone without contact tells what they hit; what does not meet its facet
+        then is carried to it, and is judged by where it ends.
 
         Args:
-            end: Nodes at the end [m].
-            moved: Points of the master there [m].
-            held: Facets that hold them, shape (n,).
+            x: This rank's slaves at t_n [m], shape (share, 3).
+            master: Points of the master at t_n [m].
+            paths: Motion of both in the solved step [m].
+            ahead: As of `missed`.
+            held: Facets that hold the slaves, shape (share,).
+            some: Numbers of those slaves that are looked at, shape (n,).
         """
-        at, nc = self.master.facets, self.master.facets.shape[1]
-        _, control, xi, converged = self._projected(end, moved, held, np.zeros((len(held), 2)))
-        out = np.flatnonzero(converged & (facets.edge_excess(xi, nc).max(axis=1) > _ASIDE))
-        found = np.full(len(held), -1)
-        if not out.size:
-            return found
-        closest = search.closest_facets(end[out], moved[at], reach=np.inf, current=held[out])
-        foot, _, normal = facets.frame(moved[at[closest.facet]], closest.xi)
-        _, _, own = facets.frame(control[out], xi[out])
-        gap = np.einsum("ni,ni->n", normal, end[out] - foot)
-        turned = np.einsum("ni,ni->n", normal, own) < patches.SHARP
-        away = turned & (gap > _ASIDE * facets.size(moved[at[closest.facet]]))
-        found[out[away]] = closest.facet[away]
+        found, end, moved = np.full(len(some), -1), (x + paths[0])[some], master + paths[1]
+        start = np.zeros((len(some), 2))
+        _, _, xi, converged = self._projected(end, moved, held[some], start)
+        excess = facets.edge_excess(xi, self.master.facets.shape[1]).max(axis=1)
+        out = np.flatnonzero(converged & (excess > _ASIDE))
+        found[out] = self._across(
+            end[out], held[some[out]], master, paths[1], np.ones(len(out))
+        )
+        out = np.flatnonzero(found >= 0)
+        if anywhere(self.slave.body.comm, bool(out.size)):
+            slaves, masters = self._gather_paths(ahead)
+            node = some[out]
+            sinks, past = self._passes(x[node], slaves[node], held[node], master, masters)
+            found[out[sinks]] = past[sinks]
         return found
 
     def _came_through(

@@ -115,6 +115,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
         positions: Sequence[FloatArray],
         motions: Sequence[FloatArray],
         path: FloatArray,
+        ahead: Sequence[FloatArray],
         reach: float,
         held: IntArray,
     ) -> IntArray | None:

@@ -14,17 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.interaction.evaluation import BodyTerms
+from dolfinx_nts.interaction.prescribed import times, told
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Times at which a function is asked for its velocity, apart by this part of a step: close to the
-#: end, so that few of its kinks lie between, and far enough for rounding.
-_APART = 0.125
-#: The same for its acceleration, which rounding spoils sooner: all of the step.
-_THIRD = 1.0 / 3.0
 #: Part of its motion in a step by which what is prescribed may be off the state at t_n, as by
 #: rounding of the time; more is a jump.
 _JUMP = 0.1
@@ -37,27 +33,21 @@ class Rates(NamedTuple):
     acceleration: FloatArray
 
 
-def rates_at(body: Any, time: float, span: float, *, twice: bool = True) -> Rates:
-    """Rates of what is prescribed, by one-sided differences of second order. Collective.
+def rates_at_start(body: Any, time: float, dt: float) -> Rates:
+    """Rates of what is prescribed at the start of a step. Collective.
 
     Args:
         body: Whose `prescribed` is asked.
-        time: When [s].
-        span: The step that ends then [s]; that which begins then with a minus.
-        twice: Whether the acceleration is asked for; else it is zero.
+        time: When it starts [s].
+        dt: Step [s].
     """
-    end = body.prescribed(time)
+    found = told(_values(body, time, time + dt), -dt)
+    return Rates(found.velocity, found.acceleration)
 
-    def back(part: float) -> FloatArray:
-        change: FloatArray = end - body.prescribed(time - part * span)
-        return change
 
-    # Written in this way, the rates of what does not move are 0, not rounding.
-    velocity = (4.0 * back(_APART) - back(2.0 * _APART)) / (2.0 * _APART * span)
-    if not twice:
-        return Rates(velocity, np.zeros_like(velocity))
-    second = 5.0 * back(_THIRD) - 4.0 * back(2.0 * _THIRD) + back(1.0)
-    return Rates(velocity, second / (_THIRD * span) ** 2)
+def _values(body: Any, at: float, other: float) -> FloatArray:
+    """What is prescribed at `times`, shape (6, fixed). Collective."""
+    return np.array([body.prescribed(time) for time in times(at, other)])
 
 
 class _Ends(NamedTuple):
@@ -119,10 +109,12 @@ class Supports:
         held = Rates(mean, (mean - v0) / dt)
         if not body.driven:
             return held
-        found = rates_at(body, state.time + dt, dt, twice=self._rule.accelerations)
-        off = np.abs(body.prescribed(state.time) - state.u[k][body.fixed])
-        jumps = off > _JUMP * np.maximum(np.abs(du), dt * np.abs(found.velocity))
-        return Rates(*(np.where(jumps, *both) for both in zip(held, found, strict=True)))
+        values = _values(body, state.time + dt, state.time)
+        velocity, _, acceleration = told(values, dt, v0)
+        off = np.abs(values[-1] - state.u[k][body.fixed])
+        jumps = off > _JUMP * np.maximum(np.abs(du), dt * np.abs(velocity))
+        both = zip(held, (velocity, acceleration), strict=True)
+        return Rates(*(np.where(jumps, *each) for each in both))
 
     def _flown(
         self, rates: Rates, du: FloatArray, v0: FloatArray, a0: FloatArray | None

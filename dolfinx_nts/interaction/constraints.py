@@ -21,9 +21,10 @@ from dolfinx_nts.interaction.constraint_elements import (
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.interaction.kinematics import FAR_TURN, OFF, Kinematics
+from dolfinx_nts.interaction.kinematics import FAR_TURN, OFF, ROUNDED, Kinematics
 from dolfinx_nts.interaction.point_elements import EveryStep
 from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.interaction.prescribed import times, told
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.state import State
@@ -372,13 +373,14 @@ class Constraints(EveryStep):
         (batch,) = self.elements
         y = self._rest + self._nodal(state.u)
         gap = self._gap(state, y)
-        first, second, limit = self._rates(state, y, dt)
+        first, second, limit, along = self._rates(state, y, dt)
         own = {"constraints": np.zeros_like(gap)}
         return [
             Kinematics(
                 batch.scale[:, None] * np.array([gap, first, second]),
                 np.array([self._by_joint(np.abs(values)) for values in (gap, first)]),
                 np.array([OFF * self._by_joint(np.abs(y)), limit]),
+                along,
                 batch.evaluate(y, own).tangent,
             )
         ]
@@ -391,35 +393,53 @@ class Constraints(EveryStep):
 
     def _rates(
         self, state: State, y: FloatArray, dt: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """First and second derivative in time of g - c at a state. Collective.
 
         Args:
             state: The state.
             y: Its nodal vectors [m], shape (n, k, 3).
-            dt: Time in which prescribed values are told [s].
+            dt: Time in which prescribed values are told [s]; less the last step at its end.
 
         Returns:
-            The first [m/s] and the second [m/s^2], both (n, m), and what the first of each joint
-            may err by [m/s]: by rounding, and by what prescribed values leave open within `dt`.
+            [m/s] and [m/s^2], both (n, m), and of each joint what the first may err by [m/s]: by
+            rounding, by what prescribed values leave open within `dt`, and at the end of a step by
+            its rule for velocities; and `Kinematics.along`.
         """
-        speed = self._nodal(state.v)
-        times = (state.time + part * dt for part in (0.0, 0.25, 0.5, 1.0))
-        (weights, constants, _), (c0, c_in, c1, c2) = self._at(*times)
-        rate = (4.0 * (c1 - c0) - (c2 - c0)) / dt
-        finer = 2.0 * (4.0 * (c_in - c0) - (c1 - c0)) / dt
-        vectors = kernel.factors(weights, constants, y)
-        rates = kernel.factors(weights, np.zeros_like(constants), speed)
-        gradient = kernel.gradient(weights, vectors)
-        first = np.einsum("nmai,nai->nm", gradient, speed) - rate
-        second = 2.0 * kernel.value(rates) - 4.0 * (c0 - 2.0 * c1 + c2) / dt**2
+        step = self.step if dt < 0.0 else None
+        if step is None:
+            at, other = state.time, state.time + dt
+        else:
+            at, other = step.state.time + step.dt, step.state.time
+        equations, c = self._at(*times(at, other))
+        gradient, flow, bend = self._flow(state, equations)
+        before = None if step is None else self._flow(step.state, equations)
+        rate, doubt, faster = told(c, at - other, None if before is None else before[1])
+        second = bend - faster
         if state.a:
             second += np.einsum("nmai,nai->nm", gradient, self._nodal(state.a))
-        size = np.maximum(*(self._by_joint(np.abs(a)) for a in (speed, rate)))
-        # Both formulas are at least of second order, so the coarse one errs by 4/3 of what they
-        # differ by.
-        doubt = 2.0 * self._by_joint(np.abs(finer - rate))
-        return first, second, OFF * size + doubt
+        speed, flows, rates, off = (
+            self._by_joint(np.abs(a)) for a in (self._nodal(state.v), flow, rate, doubt)
+        )
+        off = off + OFF * np.maximum(speed, rates)
+        if before is not None:
+            # With v_0 + v_1 = 2 (y_1 - y_0)/h the sum of both ends' G v is 2 (c_1 - c_0)/h and a
+            # quarter of h times the change of (G v)' v.
+            off -= 0.5 * dt * self._by_joint(np.abs(bend - before[2]))
+            off -= ROUNDED * self._by_joint(np.abs(y)) / dt
+        return flow - rate, second, off, np.maximum(flows, rates)
+
+    def _flow(
+        self, state: State, equations: Equations
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """G (n, m, k, 3), G v [m/s] and (G v)' v [m/s^2], both (n, m), at a state."""
+        weights, constants, _ = equations
+        speed, y = self._nodal(state.v), self._rest + self._nodal(state.u)
+        gradient = kernel.gradient(weights, kernel.factors(weights, constants, y))
+        rates = kernel.factors(weights, np.zeros_like(constants), speed)
+        return (
+            gradient, np.einsum("nmai,nai->nm", gradient, speed), 2.0 * kernel.value(rates)
+        )  # fmt: skip
 
     def load_step_work(
         self, before: Any, after: Any, start: float, end: float

@@ -23,6 +23,8 @@ _FINE, _COARSE = (
     np.linalg.inv(np.vander(_PLACES[:n], increasing=True)) for n in (len(_PLACES), 3)
 )
 _EPS = float(np.finfo(float).eps)
+#: Part of positions by which differences of them are off.
+ROUNDED = 8.0 * _EPS
 
 
 class Kinematics(NamedTuple):
@@ -35,12 +37,15 @@ class Kinematics(NamedTuple):
             shape (2, joints).
         limit: What both may be by rounding, or as prescribed values leave it open within the step,
             likewise.
+        along: Largest velocity along a constraint [m/s] on this rank, of the bodies or prescribed,
+            likewise: of both it is the same however the whole scene flies or turns.
         tangent: That of the elements without forces, shape (n, r, r).
     """
 
     rows: FloatArray
     size: FloatArray
     limit: FloatArray
+    along: FloatArray | float
     tangent: FloatArray
 
 
@@ -103,11 +108,12 @@ def differenced(
         np.abs(values).max(axis=(1, 2), initial=0.0) / unit for values in (found[:2], doubts)
     )
     extent, speed = (float(np.abs(values).max(initial=0.0)) for values in (y, v))
-    rounding = 8.0 * _EPS * extent * np.abs(_FINE[:2]).sum(axis=1) * np.array([1.0, 1.0 / dt])
+    rounding = ROUNDED * extent * np.abs(_FINE[:2]).sum(axis=1) * np.array([1.0, 1.0 / dt])
+    along = max(float(np.abs(values).max(initial=0.0)) for values in (flow, rate)) / unit
     # Springs that the same elements may have are no mass.
     tangent[:, :-m, :-m] = 0.0
     limit = OFF * np.array([extent, speed]) + doubt + rounding
-    return Kinematics(found, size, limit, tangent)
+    return Kinematics(found, size, limit, along, tangent)
 
 
 def _along(part: Any, v: FloatArray) -> FloatArray:

@@ -157,7 +157,7 @@ class Revolute(_WithAxis):
     def products(self, times: Times) -> Iterator[Product]:
         """Spherical, parallel axes, and the angle.
 
-        With the mean t of the angles t_k at the times and b = cos t m2_B - sin t m1_B:
+        With the mean t of the first and the last of the angles t_k and b = cos t m2_B - sin t m1_B:
         m1_A . b = sin(t_k - t), which is as good at any angle.
         """
         yield from self.meet()
@@ -171,7 +171,7 @@ class Revolute(_WithAxis):
                     f"{np.ptp(angles):.3g} rad, half a turn or more; use a smaller dt",
                     advises=True,
                 )
-            middle = angles.mean()
+            middle = 0.5 * (angles[0] + angles[-1])
             b = np.cos(middle) * self.m2_b - np.sin(middle) * self.m1_b
             value = self.length * np.sin(angles - middle)
             yield Product(self.length * self.m1_a, b, value.tolist())

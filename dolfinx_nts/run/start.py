@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.equations.problem import StepProblem
-from dolfinx_nts.equations.supports import rates_at
+from dolfinx_nts.equations.supports import rates_at_start
 from dolfinx_nts.ledger import resultants
 from dolfinx_nts.parallel import first_problem, global_max, raise_together
 from dolfinx_nts.run.run_file import Saved
@@ -286,7 +286,7 @@ def with_prescribed_rates(system: System, state: State, dt: float, *, goes_on: b
     """
     v = [v.copy() for v in state.v]
     for body, values in zip(system.bodies, v, strict=True):
-        rate = rates_at(body, state.time, -dt, twice=False).velocity
+        rate = rates_at_start(body, state.time, dt).velocity
         old = values[body.fixed]
         sizes = [np.abs(a).max(initial=0.0) for a in (rate - old, rate, old)]
         off, *size = global_max(system.comm, np.array(sizes)).tolist()

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
-from dolfinx_nts.equations.supports import rates_at
+from dolfinx_nts.equations.supports import rates_at_start
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.evaluation import Moment
 from dolfinx_nts.interaction.kinematics import Kinematics
@@ -29,8 +29,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Linear solves of a start; what prescribed values change in the first step slows them down.
 _TIMES = 8
-#: Part of the speed of a joint's bodies by which they may miss the velocity of its drive; steps
-#: that resolve a drive miss it by their second order.
+#: Part of its drive's velocity by which a joint may miss it; steps that resolve a drive miss it by
+#: their second order.
 _MISSED = 0.01
 
 
@@ -61,7 +61,8 @@ def violation(
         dt: First step [s]; less the last one, to take rates of what is prescribed in it.
         rates: That of velocities; else of positions.
         part: Of the speed of a joint's bodies that it may be, beside its rounding.
-        driven: Whether to look at joints alone that prescribe a motion.
+        driven: Whether to look at joints alone that prescribe a motion; `part` is then of the speed
+            along their constraints, which is the same wherever the whole scene flies or turns.
 
     Returns:
         [m/s] or [m], or None where all constraints hold.
@@ -74,8 +75,9 @@ def violation(
         fastest = [max(speeds[b] for b in system.joint_bodies[k]) for k in numbers]
         for found in filter(None, coupling.kinematics(state, dt)):
             both = (np.atleast_1d(values[int(rates)]) for values in (found.size, found.limit))
-            off, limit, speed = global_max(system.comm, np.array([*both, fastest]))
-            off = np.where(off > np.maximum(limit, part * speed), off, 0.0)
+            scale = np.atleast_1d(found.along) if driven else fastest
+            off, limit, scale = global_max(system.comm, np.array([*both, scale]))
+            off = np.where(off > np.maximum(limit, part * scale), off, 0.0)
             if off.max() > worst:
                 worst, name = float(off.max()), system.joints[numbers[off.argmax()]].name
     return (worst, name) if name else None
@@ -119,7 +121,7 @@ def accelerating_forces(
     for body, u, force in zip(problem.system.bodies, state.u, contact, strict=True):
         right = body.external(u, gravity) - body.internal(u) - force
         a = np.zeros_like(u)
-        a[body.fixed] = rates_at(body, state.time, -dt).acceleration
+        a[body.fixed] = rates_at_start(body, state.time, dt).acceleration
         right -= body.inertia(a)
         right[body.fixed] = 0.0
         out.append((right, a))
