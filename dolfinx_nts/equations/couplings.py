@@ -74,7 +74,10 @@ class Couplings:
     @property
     def elements(self) -> list[Any]:
         """Batches of elements in the step."""
-        return [batch for coupling in self._all for batch in coupling.elements]
+        found: list[Any] = list(self.contacts.elements)
+        for coupling, _ in self.joints:
+            found += coupling.elements
+        return found
 
     @property
     def bodies(self) -> list[tuple[int, ...]]:

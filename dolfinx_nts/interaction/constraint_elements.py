@@ -21,6 +21,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
+#: What a limit of 0 counts as: a gap of 0 is below it, any other far above.
+_TINY = float(np.finfo(float).tiny)
 
 #: Compliance that the matrix lends to constraints that may repeat others, over that of the bodies,
 #: beside their gap times their curvature. Equations that repeat others agree at the solution;
@@ -186,18 +188,17 @@ class ConstraintElements(PointElements):
         tangent[:, :last, last:] = (scale[:, :, None] * force).transpose(0, 2, 1)
         gradient = kernel.gradient(weights, end).reshape(n, m, last)
         tangent[:, last:, :last] = scale[:, :, None] * gradient
-        rows, lent = np.arange(last, last + m), self.lent[:, None]
-        tangent[:, rows, rows] = -scale * np.where(lent > 0.0, lent + np.abs(gap) * bent, 0.0)
+        if self.lent.any():
+            rows, lent = np.arange(last, last + m), self.lent[:, None]
+            tangent[:, rows, rows] = -scale * np.where(lent > 0.0, lent + np.abs(gap) * bent, 0.0)
         return ConstraintPart(residual, tangent, multiplier, gap, self.y0, x)
 
     def ratios(
         self, part: Any, largest: Any, motion: float, rounded: float, rtol: float
     ) -> dict[str, float]:
         """Of each joint the constraint that misses most of what counts as converged."""
-        gap = np.abs(part.gap).max(axis=1, initial=0.0)
         limit = rtol * motion + 8 * _EPS * (rounded + np.maximum(self.extents, largest[3]))
-        size = np.divide(gap, limit, out=np.full_like(gap, np.inf), where=limit > 0.0)
-        size[gap == 0.0] = 0.0
+        size = np.abs(part.gap) / np.maximum(limit, _TINY)[:, None]
         worst = largest_of_joints(len(self.names), self.joint, size)
         return dict(zip(self._labels, worst.tolist(), strict=True))
 

@@ -101,14 +101,13 @@ def _forces_on(
 def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     """`ratios` of the elements' own unknowns."""
     moved = max(float(np.abs(terms.du).max(initial=0.0)) for terms in e.terms)
-    comm, linked = problem.system.comm, problem.couplings.linked
+    comm, linked, elements = problem.system.comm, problem.couplings.linked, problem.elements
     # MPI's maximum may swallow a NaN, so it travels as a flag.
-    rows = np.concatenate([np.empty(0), *(p.residual.ravel() for p in e.parts)])
-    local = [moved, float(np.isnan(rows).any())]
-    for c, part in zip(problem.elements, e.parts, strict=True):
+    local = [moved, float(any(np.isnan(part.residual.sum()) for part in e.parts))]
+    for c, part in zip(elements, e.parts, strict=True):
         local += c.largest(part)
     extents = np.zeros(problem.couplings.mechanisms)
-    for c, of in zip(problem.elements, linked, strict=True):
+    for c, of in zip(elements, linked, strict=True):
         if of is not None:
             np.maximum.at(extents, of, c.extents if np.ndim(of) else c.extent)
     top = global_max(comm, np.array([*local, *extents]))
@@ -116,7 +115,7 @@ def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
     rounded = motion + float(problem.lengths.moved.max())
     extents = top[len(local) :]
     sizes, ratio = top[2 : len(local)].reshape(-1, 4), dict[str, float]()
-    for c, part, largest, of in zip(problem.elements, e.parts, sizes, linked, strict=True):
+    for c, part, largest, of in zip(elements, e.parts, sizes, linked, strict=True):
         # What rounding leaves open in a joint the linear solve passes on to all that its bodies
         # link.
         given = largest if of is None else [*largest[:3], extents[of]]
