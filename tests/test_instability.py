@@ -85,6 +85,26 @@ def test_a_column_buckles(part, width, expected):
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("part, expected", [(0.9, 0), (1.5, 2)])
+def test_friction_at_its_bound_is_no_instability(part, expected):
+    """Loaded, then held: the foot spreads by Poisson's ratio, slips, and rests at Coulomb's bound.
+
+    There each node would slip in the tangent, which has no potential then.
+    """
+    load = part * EULER / SIDE**2
+    push = nts.Traction(at(2, 1.0), lambda t: (0, 0, -load * min(t, 1.0)))
+    body = nts.Continuum(
+        box([0, 0, 0], [SIDE, SIDE, 1], (2, 2, 20)), nts.NeoHookean(young=YOUNG, poisson=0.3),
+        density=1e3, traction=[push], name="column",
+    )  # fmt: skip
+    floor = nts.Plane((0, 0, 0), (0, 0, 1))
+    pair = nts.ContactPair(body.surface(at(2, 0.0)), floor, friction=0.1)
+    run = nts.equilibrium(nts.System([body], contacts=[pair]), load_steps=[0.5, 1.0, 1.5])
+    assert run.balance["slip"][-2] > 0.0 and run.balance["slip"][-1] == 0.0
+    assert told(run) == expected
+
+
+@pytest.mark.mpi
 @pytest.mark.parametrize("up", [True, False])
 def test_a_pendulum_stands_or_hangs(up):
     ends = [0, 1] if up else [-1, 0]

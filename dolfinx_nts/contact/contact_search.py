@@ -404,14 +404,18 @@ class ContactSearch:
         return anywhere(self._comm, any((old.force > 0.0).any() for old in self._old))
 
     @contextmanager
-    def imposed(self, active: Sequence[BoolArray]) -> Iterator[None]:
+    def imposed(self, active: Sequence[BoolArray], *, stick: bool = False) -> Iterator[None]:
         """Hold candidates active or inactive for a while, whatever the laws say.
 
         Args:
             active: Of each of `elements`, shape (n,).
+            stick: Let the active ones stick, too.
         """
         by_law = self.elements
-        self.elements = [replace(c, imposed=on) for c, on in zip(by_law, active, strict=True)]
+        self.elements = [
+            replace(c, imposed=on, rubs=Rub.STICKS if stick else c.rubs)
+            for c, on in zip(by_law, active, strict=True)
+        ]
         try:
             yield
         finally:

@@ -45,12 +45,14 @@ class Rub(Enum):
 
     Where nothing carries yet, all bounds are zero: nodes would stick, whatever pulls at them, and
     pass no force on to those whose normal forces it makes. So nodes slide first almost freely, till
-    it is known which ones touch; then each slips where it has slid.
+    it is known which ones touch; then each slips where it has slid. What a state at rest resists is
+    told with all that touch sticking: a node at Coulomb's bound would slip in the law's tangent.
     """
 
     LAW = "law"
     HARDLY = "hardly"
     SLIDES = "slides"
+    STICKS = "sticks"
 
 
 class Slip(NamedTuple):
@@ -122,7 +124,7 @@ class Coulomb:
     @property
     def endless(self) -> bool:
         """Whether friction has no bound."""
-        return bool(np.isinf(self.friction))
+        return self.rubs is Rub.STICKS or bool(np.isinf(self.friction))
 
     @property
     def still(self) -> FloatArray:

@@ -55,8 +55,14 @@ _NEARLY_AT_REST = 1e-2
 _STIFFEST = 10.0
 #: A relaxation that leaves less than this part of the stabilization's force ...
 _RELIEVED = 0.5
-#: ... lowers the next one's stiffness by this. What falls freely, whose force stays, is held on.
-_RELIEF = 0.1
+#: ... lowers the next one's stiffness by this. So does one of few iterations whose force stays, as
+#: that of a body that swings or falls far, ...
+_RELIEF, _EASY = 0.1, 10
+#: ... as far as the next one then moves by less than this part of the scene.
+_FAR = 0.3
+#: Contacts are sought anew once bodies have moved by this part of the scene, or while more than
+#: `_NEARLY_AT_REST` is left.
+_NEAR = 0.05
 
 _REMEDY = (
     "Try more load steps, or inspect the nodes named here; a body that nothing but contact holds "
@@ -312,7 +318,8 @@ class _LoadStepper(Stepper):
         stabilization: a proximal-point iteration, whose limit knows nothing of it.
         """
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
-        search, since = True, 0.0
+        search, since, lowest, way, moved = True, 0.0, 0.0, 0.0, 0.0
+        size = problem.lengths.radius + problem.lengths.director
         relaxed = _Relaxed(self.system)
         slipped = [contact.slip for contact in kept.contacts]
         problem.stabilization.share = self._stabilization
@@ -342,6 +349,7 @@ class _LoadStepper(Stepper):
                         advises = bool(unheld) or failure.advises
                         raise StepFailedError(f"{unheld}{failure}", advises=advises) from failure
                     problem.stabilization.share /= _RELIEF
+                    lowest = problem.stabilization.share
                     continue
                 iterations += step.iterations
                 relaxed.driven += balance.told_by_joints(problem, step)
@@ -353,16 +361,22 @@ class _LoadStepper(Stepper):
                 since = terms["friction_dissipation"]
                 for name in relaxed.of_joints:
                     relaxed.lost[name] += terms[name]
+                moved = float(problem.lengths.motion_of(step).max()) / size
+                share = problem.stabilization.share
                 if left < _RELIEVED * last:
                     problem.stabilization.share *= _RELIEF
-                last = left
+                elif step.iterations <= _EASY:
+                    lower = share * min(max(_RELIEF, moved / _FAR), 1.0)
+                    problem.stabilization.share = max(lower, min(lowest, share))
+                last, way = left, moved if search else way + moved
                 # A node on an edge could change its facet for ever, and its place with it.
-                search = left * self.newton.rtol > _NEARLY_AT_REST
+                search = left * self.newton.rtol > _NEARLY_AT_REST or way > _NEAR
         finally:
             problem.stabilization.share = 0.0
         raise self.solver.with_flat(
             f"step from t={kept.time:.6g}: body {restless!r} is not at rest after {_RELAXATIONS} "
-            "relaxations; nothing holds it, or it hops from facet to facet",
+            f"relaxations, the last of which moves it by {moved * size:.3g}, {moved:.2g} of the "
+            "scene; nothing holds it, or it hops from facet to facet",
             step,
         )
 

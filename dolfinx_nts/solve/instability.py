@@ -42,7 +42,7 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
     They are the negative pivots of L D L^T (Sylvester's law of inertia) of the stiffness, in which
     closed contacts and joints are stiff springs. Nothing is known, and 0 returned, of bodies under
     loads that have no potential, and of more than 20,000 coordinates. Nodes are not to slip with
-    friction, which has none.
+    friction, which has none; those that rest at Coulomb's bound count as sticking.
 
     Args:
         problem: Equations of a load step.
@@ -57,7 +57,7 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
         problem, tangents,
         lambda body: _STIFF * stabilization.stiffness(body, (body,)),
     )  # fmt: skip
-    coupled = step.parts if problem.laid.blocks else []
+    coupled = _sticking(problem, step) if problem.laid.blocks else []
     elements = [part.tangent for part in coupled]
     turning = augmented.turning(elements)
     augmented.assemble(elements, fresh=True)
@@ -70,6 +70,21 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
     negative = _negative_pivots(matrix, none)
     matrix.destroy()
     return negative
+
+
+def _sticking(problem: StepProblem, step: Evaluation) -> tuple[Any, ...]:
+    """Contributions of elements to a solution, of nodes in contact as they stick. Collective.
+
+    One that has come to rest at Coulomb's bound is held there, as by a smaller load.
+    """
+    contacts = problem.couplings.contacts
+    active = [part.active for part in step.parts[: len(contacts.elements)]]
+    x = problem.x.duplicate()
+    x.array_w[:] = step.x
+    with contacts.imposed(active, stick=True):
+        parts = problem.evaluate(x).parts
+    x.destroy()
+    return parts
 
 
 def _is_symmetric(matrix: Any) -> bool:
