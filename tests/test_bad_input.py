@@ -578,7 +578,7 @@ def test_facets_are_oriented_outward_whatever_their_numbering():
 
 def test_surface_of_a_quadratic_body():
     body = continuum(box(cells=(1, 1, 1)), degree=2)
-    pattern = r"^degree=2 of body 'body': contact surfaces need degree 1"
+    pattern = r"^degree=2 of body 'body': surfaces, of contacts and of ties, need degree 1"
     raises(ValueError, pattern, lambda: body.surface(top))
 
 

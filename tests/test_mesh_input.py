@@ -326,6 +326,9 @@ def test_wrong_tags_and_names_are_named():
     parts = bodies_from_tags(mesh, cell_tags, facet_tags, surfaces={"start": 4})
     with pytest.raises(ValueError, match="surface='end': body 'volume_7' has 'start'"):
         parts["volume_7"].where("end")
+    nameless = bodies_from_tags(mesh, cell_tags)["volume_7"]
+    with pytest.raises(ValueError, match="no surface of 'volume_7' has a name; add physical group"):
+        nameless.where("end")
     with pytest.raises(KeyError, match="no body 'volume_8' in this mesh; it has 'volume_7'"):
         parts["volume_8"]
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
+from lines import interval_mesh
 from point_mass import MASS, SPEED, STEP, mass_on_wall
-from scenes import CELLS, box, everywhere
+from scenes import CELLS, at, box, everywhere
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
@@ -39,6 +40,52 @@ def standing(friction=0.0, **options):
 
 def held(axis):
     return nts.Dirichlet(lambda x: x[axis] < 1e-9, components=(axis,))
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("cells", [2, 5, 10])
+def test_the_spin_of_a_wire_about_its_axis_is_no_free_motion(cells):
+    """It hangs from a pin; before its load acts, what nothing resists is its swing alone."""
+    x = np.linspace(0, 1, cells + 1)[:, None] * [np.cos(0.3), 0, -np.sin(0.3)]
+    section = nts.Circle(5e-4).section(young=2e11, poisson=0.3, density=7800.0)
+
+    def pinned(x):
+        pull = nts.PointForce(lambda y: np.abs(y[2] - x[-1, 2]) < 1e-9, (0, 0, -50))
+        pin = nts.Dirichlet(lambda y: np.linalg.norm(y, axis=0) < 1e-9)
+        wire = nts.Beam(interval_mesh(x), section, bcs=[pin], forces=[pull], name="wire")
+        return nts.System([wire])
+
+    hangs = nts.equilibrium(pinned(np.linalg.norm(x, axis=1)[:, None] * [0, 0, -1.0]))
+    assert hangs.status == "completed" and not hangs.warnings
+    swings = nts.equilibrium(pinned(x), newton=nts.Newton(max_retries=0))
+    words = swings.status.split("(")[1].split(")")[0]
+    way = np.array([float(c) for c in words.split(",")])
+    axis = x[-1]
+    # It moves across its axis, or turns about what is across.
+    assert "nothing resists body 'wire'" in swings.status and abs(way @ axis) < 0.02
+
+
+def test_a_body_that_slides_is_no_equilibrium():
+    """A block pulled by up to twice what friction carries: half of it is reached at t = 1.5."""
+    weight, mu = 1e3 * 9.81 * 0.1 * 0.05 * 0.02, 0.3
+    pull = nts.Traction(
+        at(0, 0.1), lambda t: (2 * mu * weight * max(t - 1, 0) / (0.05 * 0.02), 0, 0)
+    )
+    block = nts.Continuum(
+        box([0, 0, 0], [0.1, 0.05, 0.02], (4, 3, 2)), nts.NeoHookean(young=1e6, poisson=0.3),
+        density=1e3, body_force=lambda t: (0, 0, -9.81e3 * min(t, 1)), traction=[pull],
+        name="block",
+    )  # fmt: skip
+    floor = nts.Plane((0, 0, 0), (0, 0, 1))
+    pair = nts.ContactPair(block.surface(at(2, 0.0)), floor, friction=mu)
+    run = nts.equilibrium(
+        nts.System([block], contacts=[pair]), load_steps=[1, 1.4, 1.8],
+        newton=nts.Newton(max_retries=3),
+    )  # fmt: skip
+    assert 1.4 <= run.balance["time"][-1] <= 1.5
+    assert run.status.startswith("friction is used up (|F_t| = mu F_n at all nodes that carry): ")
+    assert "body 'block' slides; use simulate, or hold it" in run.status
+    assert "another" not in run.status and "more load steps" not in run.status
 
 
 @pytest.mark.parametrize(

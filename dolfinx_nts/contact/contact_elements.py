@@ -437,7 +437,7 @@ class ContactElements(ContactLaws):
             text += f" and {slide} between stick and slip"
         if touch + slide >= _CYCLE:
             states = "stick and slip" if slide > touch else "contact and none"
-            remedy = "try another dt"
+            remedy = "try steps of another length"
             if not self._free[i, 0].any():
                 # Several such nodes on one facet share the little that its nodes can give way.
                 remedy = "its motion is prescribed, so make its surface the master"

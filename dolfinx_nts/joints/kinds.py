@@ -85,7 +85,7 @@ class _WithAxis(Between):
 
     Raises:
         TypeError: An argument is of another kind.
-        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+        ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
     def __init__(self, a: Any, b: Any, *, point: Any, axis: Any, name: str | None = None) -> None:
@@ -119,8 +119,8 @@ class Revolute(_WithAxis):
     """A hinge: the points stay together, and the axes parallel.
 
     Args:
-        a: A rigid body, or None.
-        b: A rigid body, or None.
+        a: A rigid body, a beam or shell, which it takes at the node there, or None.
+        b: Likewise.
         point: On the axis at the start [m].
         axis: n at the start, of any length.
         angle: Function of time, the angle about n by which A turns relative to B [rad]; None: free.
@@ -133,7 +133,7 @@ class Revolute(_WithAxis):
 
     Raises:
         TypeError: An argument is of another kind.
-        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+        ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
     def __init__(
@@ -199,8 +199,8 @@ class Prismatic(_WithAxis):
     """B slides along A's axis without turning.
 
     Args:
-        a: A rigid body, or None.
-        b: A rigid body, or None.
+        a: A rigid body, a beam or shell, which it takes at the node there, or None.
+        b: Likewise.
         point: On the axis at the start [m].
         axis: n at the start, of any length.
         displacement: Function of time, that of A relative to B along n [m]; None: free.
@@ -212,7 +212,7 @@ class Prismatic(_WithAxis):
 
     Raises:
         TypeError: An argument is of another kind.
-        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+        ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
     def __init__(
@@ -263,15 +263,15 @@ class Universal(Between):
     """A cross between two shafts, whose arms stay at right angles: spherical, n_A . n_B = 0.
 
     Args:
-        a: A rigid body, or None.
-        b: A rigid body, or None.
+        a: A rigid body, a beam or shell, which it takes at the node there, or None.
+        b: Likewise.
         point: Centre of the cross at the start [m].
         axes: Its arms at the start, that in A and that in B, at right angles, of any length.
         name: In messages and files; default: kind and bodies.
 
     Raises:
         TypeError: An argument is of another kind.
-        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+        ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
     def __init__(self, a: Any, b: Any, *, point: Any, axes: Any, name: str | None = None) -> None:
@@ -302,14 +302,14 @@ class Fixed(Between):
     """A weld: the points stay together, and the axes parallel.
 
     Args:
-        a: A rigid body, or None.
-        b: A rigid body, or None.
+        a: A rigid body, a beam or shell, which it takes at the node there, or None.
+        b: Likewise.
         point: Of both at the start [m].
         name: In messages and files; default: kind and bodies.
 
     Raises:
         TypeError: An argument is of another kind.
-        ValueError: An argument is out of range, or a body is flexible and so has no directions.
+        ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
     def __init__(self, a: Any, b: Any, *, point: Any, name: str | None = None) -> None:

@@ -51,8 +51,9 @@ def tell_inversion(
         body, det = bodies[k], float(dets[k])
         text, remedy = describe(body, state.u[k])
         if body.oriented:
-            text += f", where it is too easy to bend; {remedy}"
-            solution.warn("turn of an element", state.time, 1.0 - det, text, about=(body.name,))
+            solution.warn(
+                "turn of an element", state.time, 1.0 - det, f"{text}; {remedy}", about=(body.name,)
+            )
         elif det <= 0.0:
             text += "; what comes after it may be wrong"
             solution.warn("inversion", state.time, -det, text, grave=True)

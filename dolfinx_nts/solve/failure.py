@@ -12,7 +12,11 @@ import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation
+from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.solve.convergence import ratios
+
+#: Friction where a failed load step starts, over its bound, from which on a body slides.
+_USED_UP = 0.9
 
 
 def diagnosis(
@@ -67,6 +71,42 @@ def diagnosis(
     return (
         f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
         f"{iterations} iterations ({why}); worst block {worst!r} {size}; {'; '.join(top)}"
+    )
+
+
+def used_up(problem: StepProblem, e: Evaluation) -> str:
+    """Of statics, which body slides as friction alone holds it, or nothing. Collective.
+
+    Args:
+        problem: The step.
+        e: The last iterate.
+    """
+    system = problem.system
+    if problem.integrator.inertia:
+        return ""
+    local = np.zeros((len(system.bodies), 7))
+    both = zip(problem.couplings.touching(e), problem.couplings.bodies, strict=False)
+    for (contact, part, old), of in both:
+        bodies = list(of)
+        if not contact.num_tangential:  # may hold the body against sliding, as a wall does
+            local[bodies, 0] += part.active.sum()
+            continue
+        local[bodies, 1] += part.active.sum()
+        local[bodies, 2] += (part.active & contact.sticks(part)).sum()
+        local[bodies, 3] += contact.coulomb.coefficient * old.force.sum()
+        local[bodies, 4:] += old.tangential.sum(axis=0)
+    local[:, 0] += [len(body.fixed) for body in system.bodies]
+    for linked in system.joint_bodies:
+        local[list(linked), 0] += 1
+    held, carry, stick, bound, *friction = global_sum(system.comm, local).T
+    slide = (carry > 0) & (stick == 0)
+    slide |= (bound > 0) & (np.linalg.norm(friction, axis=0) > _USED_UP * bound)
+    found = [b.name for b, s, h in zip(system.bodies, slide, held, strict=True) if s and not h]
+    if not found:
+        return ""
+    return (
+        f"friction is used up (|F_t| = mu F_n at all nodes that carry): body {found[0]!r} slides; "
+        "use simulate, or hold it; "
     )
 
 

@@ -21,7 +21,7 @@ from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.solve.accuracy import EXACT, Newton
 from dolfinx_nts.solve.augmented import AugmentedMatrix
 from dolfinx_nts.solve.convergence import leaves_work, ratios
-from dolfinx_nts.solve.failure import contact_on, diagnosis
+from dolfinx_nts.solve.failure import contact_on, diagnosis, used_up
 from dolfinx_nts.solve.inversion_guard import Upright
 from dolfinx_nts.solve.iterates import Iterates
 from dolfinx_nts.solve.jacobian_reuse import KeptTangents
@@ -407,18 +407,19 @@ class StepSolver:
     # ---- failure
     def _failure(self, e: Evaluation, reason: int, iterations: int) -> StepFailedError:
         """What failed, and where a body is inside out or nearly so; every rank must call it."""
-        problem = self.problem
+        problem, slides = self.problem, used_up(self.problem, e)
         if reason == PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN:
             worst, text = self._upright.describe_inverted(e.x)
             text = contact_on(problem, e, self.iterates.flips, worst) + text
             return StepFailedError(
-                f"step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved after "
-                f"{iterations} iterations: {text}",
+                f"{slides}step from t={problem.state.time:.6g} with dt={problem.dt:.3g} not solved "
+                f"after {iterations} iterations: {text}",
                 advises=True,
             )
         why, advises = self._presets.why_failed(self.snes, reason)
-        message = diagnosis(problem, e, self.iterates.flips, why, iterations)
-        return self.with_flat(message, e, advises=advises or UNSETTLED in message)
+        message = slides + diagnosis(problem, e, self.iterates.flips, why, iterations)
+        advises |= bool(slides) or UNSETTLED in message
+        return self.with_flat(message, e, advises=advises)
 
     def with_flat(self, message: str, e: Evaluation, *, advises: bool = False) -> StepFailedError:
         """A failure that also names the cell that is nearly inside out, if one is. Collective.

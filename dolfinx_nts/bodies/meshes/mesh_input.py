@@ -74,6 +74,11 @@ class Part:
         tag = self.surfaces.get(surface) if isinstance(surface, str) else surface
         # A rank need not hold facets of a tag, so a number that no rank knows is left to the user
         # of the tags, who asks all ranks.
+        if not is_whole(tag) and not self.surfaces:
+            raise ValueError(
+                f"surface={surface!r}: no surface of {self.name!r} has a name; add physical groups "
+                "of dimension 2, or pass a function of x in place of where(...)"
+            )
         if not is_whole(tag):
             raise ValueError(
                 f"surface={surface!r}: body {self.name!r} has {listed(self.surfaces)}; "

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
+from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from dolfinx_nts import dolfinx_compat as compat
@@ -36,8 +37,12 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Turn between neighbouring nodes [rad] that leaves the moment right to 5 %: sin(a) is for a.
-_RESOLVED = np.pi / 6.0
+#: Turn between neighbouring nodes [rad] from which on failed steps name it.
+_NAMED = np.pi / 6.0
+#: Moment of a bent element over the right one below which a run warns, that of a beam of two nodes
+#: at 15 degrees, and what the elements have that a message asks for. Rounding must not tell an axis
+#: that turns by just this.
+_TOLD, _RESOLVED = 3.0 / np.pi - 1e-9, 0.97
 #: Part of a body's size within which a point is a node.
 _AT_NODE = 1e-9
 
@@ -54,7 +59,6 @@ class DirectorBody(Body):
     """
 
     oriented = True
-    low_dets = 0.5, float(np.cos(_RESOLVED))
     kind: ClassVar[str]
 
     # ---- what each kind has of its own
@@ -82,12 +86,21 @@ class DirectorBody(Body):
         """Which elements are needed, so many times as many along an axis as there are."""
         raise NotImplementedError
 
+    def _felt(self, turn: float) -> tuple[float, float]:
+        """Turn that the strains of an element feel, and its slope.
+
+        Args:
+            turn: Between neighbouring nodes [rad].
+        """
+        raise NotImplementedError
+
     # ---- set-up
     def _set_up_mesh(self, mesh: Any, name: str, degree: int = 1) -> None:
         """What fields live on."""
         self.name, self.mesh, self.degree = name, mesh, degree
         self.comm = compat.petsc_communicator(mesh.comm)
         self.made_on = places_of(mesh)
+        self.low_dets = float(np.cos(self._turn_that_leaves(_TOLD))), float(np.cos(_NAMED))
         self.space = compat.vector_space(mesh, degree)
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
@@ -541,13 +554,26 @@ class DirectorBody(Body):
 
     def describe_det(self, det: float, place: FloatArray) -> tuple[str, str]:
         """How far neighbouring nodes turn against each other, and what elements are needed."""
-        angle = float(np.arccos(np.clip(det, -1.0, 1.0)))
+        turn = float(np.arccos(np.clip(det, -1.0, 1.0)))
+        bent = min(turn, 0.5 * np.pi)
+        straight, arc = (100.0 * (1.0 - part) for part in self._moments(bent))
         x = ", ".join(f"{c:.4g}" for c in place)
         text = (
-            f"{self.kind} {self.name!r} turns by {np.degrees(angle):.3g} degrees between "
-            f"neighbouring nodes near X = ({x})"
+            f"{self.kind} {self.name!r} turns by {np.degrees(turn):.3g} degrees between "
+            f"neighbouring nodes near X = ({x}): too easy to bend by {straight:.0f} % if it was "
+            f"straight, by {arc:.0f} % if it was an arc like this"
         )
-        return text, self._finer(min(angle, 0.5 * np.pi) / _RESOLVED)
+        return text, self._finer(bent / self._turn_that_leaves(_RESOLVED))
+
+    def _moments(self, turn: float) -> tuple[float, float]:
+        """Moment of an element over the right one, bent by so much, and a little on from there."""
+        felt, slope = self._felt(turn)
+        return felt * slope / turn, slope**2
+
+    def _turn_that_leaves(self, part: float) -> float:
+        """Turn between neighbouring nodes that leaves this part of a straight one's moment."""
+        found = brentq(lambda turn: self._moments(turn)[0] - part, 1e-3, 0.5 * np.pi)
+        return float(found)
 
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""

@@ -18,6 +18,9 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 BoolArray = npt.NDArray[np.bool_]
 
+#: Nodes that a message names.
+_SHOWN = 6
+
 
 class NodeConditions:
     """What holds and loads the nodes of a body with directors. Collective.
@@ -117,7 +120,12 @@ class NodeConditions:
         chosen: BoolArray = at_points(self._comm, what, where, x.T, (), "b")
         if not chosen.any():
             low, high = x.min(axis=0).tolist(), x.max(axis=0).tolist()
-            raise ValueError(f"{what}={where!r}: selects no node between {low} and {high}")
+            here = ", ".join(str(place.tolist()) for place in x[self._skeleton.order[:_SHOWN]])
+            raise ValueError(
+                f"{what}: selects no node between {low} and {high}; the nodes are {here}"
+                + (", ...; " if len(x) > _SHOWN else "; ")
+                + "compare with a tolerance, or place a node there"
+            )
         return chosen
 
     def _load(self, k: int, load: Load) -> tuple[Load, FloatArray, str]:
@@ -139,7 +147,7 @@ class NodeConditions:
             borne = self._skeleton.lengths[along].ravel()
             weights = np.bincount(edges[along].ravel(), borne, len(x))
         elif chosen.sum() != 1:
-            raise ValueError(f"{what}={load.where!r}: selects {chosen.sum()} nodes; select one")
+            raise ValueError(f"{what}: selects {chosen.sum()} nodes; select one")
         return load, weights[self._here], f"{kind}.value of forces[{k}] of {self._name!r}"
 
     def loads(self, time: float, ramp: float) -> tuple[FloatArray, FloatArray]:

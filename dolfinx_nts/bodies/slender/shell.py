@@ -118,7 +118,13 @@ class Shell(DirectorBody):
 
     def _finer(self, times: float) -> str:
         """Which elements are needed, see `DirectorBody`."""
-        return f"about {times:.2g} times as many elements are needed there in that direction"
+        return (
+            f"about {times:.2g} times as many elements are needed there in that direction for 3 %"
+        )
+
+    def _felt(self, turn: float) -> tuple[float, float]:
+        """Turn that strains feel, and its slope, see `DirectorBody`."""
+        return 2.0 * float(np.sin(0.5 * turn)), float(np.cos(0.5 * turn))
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -176,8 +176,8 @@ class UflBody(Body):
             )
         if self.degree != 1:
             raise ValueError(
-                f"degree={self.degree!r} of body {self.name!r}: contact surfaces need degree 1; "
-                "pass degree=1, on a finer mesh for the same accuracy"
+                f"degree={self.degree!r} of body {self.name!r}: surfaces, of contacts and of "
+                "ties, need degree 1; pass degree=1, on a finer mesh for the same accuracy"
             )
         found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
         surface = Surface(self, skin_of_mesh(self, found), smoothing)
