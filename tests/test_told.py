@@ -55,7 +55,9 @@ def test_the_spin_of_a_wire_about_its_axis_is_no_free_motion(cells):
         wire = nts.Beam(interval_mesh(x), section, bcs=[pin], forces=[pull], name="wire")
         return nts.System([wire])
 
-    hangs = nts.equilibrium(pinned(np.linalg.norm(x, axis=1)[:, None] * [0, 0, -1.0]))
+    down = pinned(np.linalg.norm(x, axis=1)[:, None] * [0, 0, -1.0])
+    # Rounding turns what nothing holds: without it the spin is solved on some machines alone.
+    hangs = nts.equilibrium(down, stabilization=0.1)
     assert hangs.status == "completed" and not hangs.warnings
     swings = nts.equilibrium(pinned(x), newton=nts.Newton(max_retries=0))
     words = swings.status.split("(")[1].split(")")[0]

@@ -92,7 +92,8 @@ class Presets:
             self._names = mumps[:1] if own else mumps
             chains = all(map(_is_chain, system.bodies)) and not system.contacts
             auto = newton.linear_solver == "auto" and not given
-            if chains and auto and system.comm.size == 1 and _HAS_KLU:
+            # Statics may leave a motion free, which MUMPS stands better.
+            if chains and auto and inertia and system.comm.size == 1 and _HAS_KLU:
                 self._names = ("chains", *mumps)
         elif newton.linear_solver == "auto":
             self._names += mumps
