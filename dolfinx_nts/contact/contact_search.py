@@ -292,9 +292,8 @@ class ContactSearch:
         c, active = self.elements[k].candidates, part.active
         held[c.node[active]] = c.facet[active]
         motions, positions = [e.bodies[b].du for b in bodies], self._positions(k)
-        ahead = [self._step.ahead[b] for b in bodies]
         try:
-            hit = pair.missed(positions, motions, path, ahead, reach, held)
+            hit = pair.missed(positions, motions, path, reach, held)
         except UserFunctionError:
             raise
         except StepFailedError as failure:

@@ -282,9 +282,7 @@ class FacetPair(ContactPair, master=Surface):
         if not some.size:
             return found
         node = found.node[some]
-        _, facet = self._passes(
-            x[node], slave_path[node], found.facet[some], master, master_path
-        )
+        facet = self._passed(x[node], slave_path[node], found.facet[some], master, master_path)
         change = facet >= 0
         if not change.any():
             return found
@@ -293,15 +291,15 @@ class FacetPair(ContactPair, master=Surface):
         other, _ = self._measure(x, master, node, facet, start, None)
         return _replace(found, other)
 
-    def _passes(
+    def _passed(
         self,
         x: FloatArray,
         way: FloatArray,
         facet: IntArray,
         master: FloatArray,
         master_path: FloatArray,
-    ) -> tuple[BoolArray, IntArray]:
-        """Whether ways of nodes sink through facets' planes, and facets that they pass then.
+    ) -> IntArray:
+        """Facets that nodes pass when they cross the planes of others, or -1, shape (n,).
 
         The plane of a facet goes on beyond its edges, the body does not: what crosses it beyond a
         sharp convex edge passes the facet on the other side of that edge.
@@ -312,9 +310,6 @@ class FacetPair(ContactPair, master=Surface):
             facet: Facets, shape (n,).
             master: Points of the master at t_n [m].
             master_path: Their motion [m].
-
-        Returns:
-            Shape (n,) each; -1 for what crosses within the facet, or not at all.
         """
         patch, control, xi, good = self._projected(x, master, facet, np.zeros((len(x), 2)))
         carried, gaps = self.master.control_points(master_path, patch), []
@@ -324,10 +319,11 @@ class FacetPair(ContactPair, master=Surface):
             gaps.append(np.einsum("ni,ni->n", normal, place - foot))
         above, below = gaps
         length = facets.size(master[self.master.facets[facet]])
-        sinks = good & (below < -_OUTSIDE * length) & (below < above)
-        fall = np.where(sinks, above - below, 1.0)
-        part = np.where(sinks, np.clip(above / fall, 0.0, 1.0), 1.0)
-        return sinks, self._across(x + part[:, None] * way, facet, master, master_path, part)
+        sinks = np.flatnonzero(good & (below < -_OUTSIDE * length) & (below < above))
+        part = np.clip(above[sinks] / (above - below)[sinks], 0.0, 1.0)
+        at, found = x[sinks] + part[:, None] * way[sinks], np.full(len(x), -1)
+        found[sinks] = self._across(at, facet[sinks], master, master_path, part)
+        return found
 
     def _across(
         self,
@@ -393,7 +389,6 @@ class FacetPair(ContactPair, master=Surface):
         positions: Sequence[FloatArray],
         motions: Sequence[FloatArray],
         path: FloatArray,
-        ahead: Sequence[FloatArray],
         reach: float,
         held: IntArray,
     ) -> IntArray | None:
@@ -403,50 +398,38 @@ class FacetPair(ContactPair, master=Surface):
         if not (aside or self.is_long(reach)):
             return None
         x, paths = positions[0][self.slave.share], self._gather_paths(motions)
+        end, moved = x + paths[0], positions[1] + paths[1]
         hit = np.full(len(held), -1)
         if self.is_long(reach):
             hit = self._came_through(x, positions[1], *paths, held)
-        if aside:
-            behind = self._behind_edges(x, positions[1], paths, ahead, held, by_edges)
+        if by_edges.size:
+            behind = self._behind_edges(end[by_edges], moved, held[by_edges])
             hit[by_edges] = np.where(behind >= 0, behind, hit[by_edges])
         return hit
 
-    def _behind_edges(
-        self,
-        x: FloatArray,
-        master: FloatArray,
-        paths: tuple[FloatArray, FloatArray],
-        ahead: Sequence[FloatArray],
-        held: IntArray,
-        some: IntArray,
-    ) -> IntArray:
-        """Facet across the edge that nodes are held beyond, or -1, shape (n,). Collective.
+    def _behind_edges(self, end: FloatArray, moved: FloatArray, held: IntArray) -> IntArray:
+        """Facet behind the sharp edge that nodes (n, 3) are held beyond at the end, or -1, (n,).
 
-        Where they would have gone without contact tells what they hit; what does not meet its facet
-        then is carried to it, and is judged by where it ends.
+        The plane of a facet goes on beyond its edges, the body does not.
 
         Args:
-            x: This rank's slaves at t_n [m], shape (share, 3).
-            master: Points of the master at t_n [m].
-            paths: Motion of both in the solved step [m].
-            ahead: As of `missed`.
-            held: Facets that hold the slaves, shape (share,).
-            some: Numbers of those slaves that are looked at, shape (n,).
+            end: Nodes at the end [m].
+            moved: Points of the master there [m].
+            held: Facets that hold them, shape (n,).
         """
-        found, end, moved = np.full(len(some), -1), (x + paths[0])[some], master + paths[1]
-        start = np.zeros((len(some), 2))
-        _, _, xi, converged = self._projected(end, moved, held[some], start)
-        excess = facets.edge_excess(xi, self.master.facets.shape[1]).max(axis=1)
-        out = np.flatnonzero(converged & (excess > _ASIDE))
-        found[out] = self._across(
-            end[out], held[some[out]], master, paths[1], np.ones(len(out))
-        )
-        out = np.flatnonzero(found >= 0)
-        if anywhere(self.slave.body.comm, bool(out.size)):
-            slaves, masters = self._gather_paths(ahead)
-            node = some[out]
-            sinks, past = self._passes(x[node], slaves[node], held[node], master, masters)
-            found[out[sinks]] = past[sinks]
+        at, nc = self.master.facets, self.master.facets.shape[1]
+        _, control, xi, converged = self._projected(end, moved, held, np.zeros((len(held), 2)))
+        out = np.flatnonzero(converged & (facets.edge_excess(xi, nc).max(axis=1) > _ASIDE))
+        found = np.full(len(held), -1)
+        if not out.size:
+            return found
+        closest = search.closest_facets(end[out], moved[at], reach=np.inf, current=held[out])
+        foot, _, normal = facets.frame(moved[at[closest.facet]], closest.xi)
+        _, _, own = facets.frame(control[out], xi[out])
+        gap = np.einsum("ni,ni->n", normal, end[out] - foot)
+        turned = np.einsum("ni,ni->n", normal, own) < patches.SHARP
+        away = turned & (gap > _ASIDE * facets.size(moved[at[closest.facet]]))
+        found[out[away]] = closest.facet[away]
         return found
 
     def _came_through(

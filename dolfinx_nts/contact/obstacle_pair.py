@@ -115,7 +115,6 @@ class ObstaclePair(ContactPair, master=Obstacle):
         positions: Sequence[FloatArray],
         motions: Sequence[FloatArray],
         path: FloatArray,
-        ahead: Sequence[FloatArray],
         reach: float,
         held: IntArray,
     ) -> IntArray | None:

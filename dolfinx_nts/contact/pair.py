@@ -310,7 +310,6 @@ class ContactPair:
         positions: Sequence[FloatArray],
         motions: Sequence[FloatArray],
         path: FloatArray,
-        ahead: Sequence[FloatArray],
         reach: float,
         held: IntArray,
     ) -> IntArray | None:
@@ -322,7 +321,6 @@ class ContactPair:
             positions: Of all points at t_n [m].
             motions: Displacement of each of `bodies` in the solved step [m], owned coordinates.
             path: As of `find`.
-            ahead: Motions as they were expected [m].
             reach: Bound on the motion of slaves relative to the master [m].
             held: Facet that each of the rank's slaves is held at in the end, or -1, shape (share,).
 
