@@ -417,17 +417,19 @@ def bricard(masses=(1.0,) * 5, **options):
 def force_columns(stepper):
     """Columns of all constraints in the forces of the last step, and their multipliers [N]."""
     system, columns, multipliers = stepper.system, [], []
-    couplings = zip(
-        stepper.problem.elements, system.joint_bodies, stepper.state.joints, strict=True
-    )
-    for batch, bodies, found in couplings:
+    step = stepper.problem.couplings.joints[0][0].step
+    joints = zip(system.joints, system.joint_bodies, stepper.state.joints, strict=True)
+    for joint, bodies, found in joints:
+        alone = joint.coupling(bodies)
+        alone.begin(step, None, None, False)
+        (batch,) = alone.elements
         u1 = [stepper.state.u[b].reshape(1, 4, 3) for b in bodies]
         x = batch.reference() + np.concatenate(u1, axis=1)
         c = batch.num_coordinates
         slopes = batch.evaluate(x, {"constraints": np.zeros_like(found)}).tangent[0, :c, c:]
         column = np.zeros((12 * len(system.bodies), found.size))
         for k, b in enumerate(bodies):
-            column[12 * b : 12 * b + 12] = slopes[12 * k : 12 * k + 12] / batch.scale
+            column[12 * b : 12 * b + 12] = slopes[12 * k : 12 * k + 12] / batch.scale[0]
         columns.append(column)
         multipliers.append(found[0])
     return np.concatenate(columns, axis=1), np.concatenate(multipliers)
