@@ -199,7 +199,7 @@ class FacetPair(ContactPair, master=Surface):
         """
         slave_path, master_path = self._gather_paths(motion.paths)
         found = self._round_edges(found, x, master, slave_path, master_path)
-        found = self._past_edges(found, x, master, slave_path, master_path)
+        found = self._past_edges(found, x, master, slave_path, master_path, motion.reach)
         change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
         corners, node = master[self.master.facets], found.node[change]
         if len(node):
@@ -271,18 +271,24 @@ class FacetPair(ContactPair, master=Surface):
         master: FloatArray,
         slave_path: FloatArray,
         master_path: FloatArray,
+        reach: float,
     ) -> Candidates:
         """Candidates that will cross a facet's plane beyond its edge, with the facet beyond that.
 
-        Arguments as of `_round_edges`.
+        Arguments as of `_round_edges` and `Motion`.
         """
-        end = (x + slave_path)[found.node]
-        sinks = self._gap_at(found.facet, found.xi, end, master + master_path) < 0.0
-        some = np.flatnonzero(sinks & self._sharp[found.facet])
-        if not some.size:
+        # A facet is 2 xi wide, and less along its heights; most nodes come to no edge of theirs.
+        beyond = facets.edge_excess(found.xi, self.master.facets.shape[1]).max(axis=1, initial=-1.0)
+        near = self._sharp[found.facet] & (beyond + 4.0 * reach / found.length > _ASIDE)
+        if not near.any():
             return found
-        node = found.node[some]
-        facet = self._passed(x[node], slave_path[node], found.facet[some], master, master_path)
+        some = found.part(near)
+        end, moved = (x + slave_path)[some.node], master + master_path
+        some = some.part(self._gap_at(some.facet, some.xi, end, moved) < 0.0)
+        if not some.node.size:
+            return found
+        node = some.node
+        facet = self._passed(x[node], slave_path[node], some.facet, master, master_path)
         change = facet >= 0
         if not change.any():
             return found
