@@ -821,11 +821,31 @@ def test_load_steps_of_half_a_turn_are_cut():
 @pytest.mark.fast("2.2")
 @pytest.mark.fast_on_ranks()
 def test_the_angle_of_a_hinge_is_no_mirror_image(turn):
-    """Its sine about the middle of the step has two angles; Newmark's steps found the other one."""
+    """Its sine about a mean of the step has two angles, of which one is refused."""
     body, system = motor(lambda t: turn / 0.05 * t, turn / 0.05)
     run = nts.simulate(system, nts.Newmark(), dt=0.05, t_end=0.5)
     assert run.status.startswith("completed")
     assert np.abs(body.rotation - turned(10.0 * turn)).max() < 1e-9
+    _, system = motor(lambda t: turn / 0.05 * t, turn / 0.05)
+    stepper = nts.Stepper(system, nts.Newmark())
+    stepper.start(0.05)
+    stepper.problem.begin(stepper.state, 0.05)
+    (hinge,) = (c for c, (k, *_) in stepper.problem.couplings.joints if system.joints[k].driven)
+    (batch,) = hinge.elements
+    own = {"constraints": np.zeros((batch.num_elements, batch.widths["constraints"]))}
+
+    def missed(angle):
+        x = batch.reference().copy()
+        x[:, 1:] = x[:, 1:] @ turned(angle).T
+        part = batch.evaluate(x, own)
+        assert np.abs(part.gap).max(initial=0.0) < 1e-12
+        return hinge.misses(None, [part], None)
+
+    assert not missed(turn)
+    # sin(t_1 - t) = sin(pi - t_1 + t) with t in the middle of 0 and t_1.
+    with pytest.raises(nts.StepFailedError, match="'motor' ends with directions turned over"):
+        missed(np.pi)
+    stepper.close()
 
 
 @pytest.mark.mpi

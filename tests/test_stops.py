@@ -66,7 +66,8 @@ def test_a_held_face_stops(rule):
     body = held_cube(ramp)
     run = nts.simulate(nts.System([body]), rule, dt=0.004, t_end=0.08)
     # Newmark's energy drifts by 1 %, which the status tells.
-    assert run.status.startswith("completed")
+    drifts = isinstance(rule, nts.Newmark) and "this integrator does not keep it" in run.status
+    assert run.status == "completed" or drifts
     assert not velocities_below(body).any()
     assert run.balance["kinetic"][-1] > 0.01
 

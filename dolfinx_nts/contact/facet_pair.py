@@ -259,7 +259,17 @@ class FacetPair(ContactPair, master=Surface):
         change = np.flatnonzero(best != near.facet)
         if not change.size:
             return found
-        node, facet = near.node[change], best[change]
+        return self._moved_to(found, near.node[change], best[change], x, master)
+
+    def _moved_to(
+        self,
+        found: Candidates,
+        node: IntArray,
+        facet: IntArray,
+        x: FloatArray,
+        master: FloatArray,
+    ) -> Candidates:
+        """Candidates with other facets for some nodes, shape (n,) each."""
         start, _ = compiled.closest_point(x[node], master[self.master.facets[facet]])
         other, _ = self._measure(x, master, node, facet, start, None)
         return _replace(found, other)
@@ -292,10 +302,7 @@ class FacetPair(ContactPair, master=Surface):
         change = facet >= 0
         if not change.any():
             return found
-        node, facet = node[change], facet[change]
-        start, _ = compiled.closest_point(x[node], master[self.master.facets[facet]])
-        other, _ = self._measure(x, master, node, facet, start, None)
-        return _replace(found, other)
+        return self._moved_to(found, node[change], facet[change], x, master)
 
     def _passed(
         self,
