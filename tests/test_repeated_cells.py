@@ -93,3 +93,21 @@ def test_cells_of_a_lattice_are_not_taken_for_each_other():
         dolfinx_mesh.CellType.tetrahedron,
     )  # fmt: skip
     refuse_repeated(box, "mesh")
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("pieces", [1, 2, 3])
+def test_a_mesh_in_pieces_is_told(pieces):
+    """Boxes that touch, as of Gmsh without a fragment, share no node."""
+    box = CELLS["hexahedron"]
+    cells = np.concatenate([box + k * len(PLACES) for k in range(pieces)])
+    x = np.concatenate([PLACES + [2.0 * k, 0, 0] for k in range(pieces)])
+    body = nts.Continuum(
+        mesh("hexahedron", cells, x), nts.NeoHookean(1e6, 0.3), density=1e3, name="body"
+    )
+    assert body.pieces == pieces
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=1e-3, t_end=2e-3)
+    assert run.status == "completed"
+    assert list(run.warnings) == (["pieces"] if pieces > 1 else [])
+    if pieces > 1:
+        assert f"'body' falls into {pieces} pieces" in run.warnings["pieces"].text

@@ -55,6 +55,7 @@ class Body:
         law: W as a function of Green's strain in UFL; None: it has no material.
         made_on: Places of its mesh's nodes when it was made, see `places_of`; None without a mesh.
         starts_moved: Whether the user has given it a displacement to start with.
+        pieces: Number of parts of its mesh that share no node, of solid bodies. Collective.
         stressed: Stress of the undeformed body over its stiffness, once it is known and too large.
         destroyed: Whether `destroy` was called.
     """
@@ -83,6 +84,7 @@ class Body:
     law: Any = None
     made_on: Any = None
     starts_moved: bool = False
+    pieces: int = 1
     stressed: float | None = None
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None

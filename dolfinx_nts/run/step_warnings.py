@@ -95,6 +95,23 @@ def tell_stressed(solution: Solution, time: float) -> None:
     )  # fmt: skip
 
 
+def tell_pieces(solution: Solution, time: float) -> None:
+    """Warn of solid bodies whose mesh falls into pieces. Collective.
+
+    Args:
+        solution: The run.
+        time: When it begins [s].
+    """
+    found = {body.name: body.pieces for body in solution.system.bodies if body.pieces > 1}
+    for name, pieces in found.items():
+        solution.warn(
+            "pieces", time, pieces,
+            f"the mesh of body {name!r} falls into {pieces} pieces that share no node; fuse or "
+            "fragment the volumes in Gmsh, or make each a body",
+            about=(name,),
+        )  # fmt: skip
+
+
 def tell_frictionless(solution: Solution, impulses: FloatArray, time: float) -> None:
     """Warn of restored impulses in contacts with friction, of which they know nothing.
 

@@ -41,7 +41,7 @@ from dolfinx_nts.run.start import (
     with_prescribed_rates,
 )
 from dolfinx_nts.run.step_size import Pace
-from dolfinx_nts.run.step_warnings import tell_frictionless, tell_step, tell_stressed
+from dolfinx_nts.run.step_warnings import tell_frictionless, tell_pieces, tell_step, tell_stressed
 from dolfinx_nts.run.trial import Trial, solved, state_after
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.newton import StepSolver
@@ -178,6 +178,7 @@ class Stepper:
         self._started, self._goes_on = False, start is not None and start.moving
         if self.restart is None:
             self._ledger.open(state, start)
+            tell_pieces(self.solution, state.time)
 
     @property
     def memory(self) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import flux, oriented_nodes
@@ -17,6 +19,7 @@ from dolfinx_nts.parallel import gather_rows, raise_together
 
 FloatArray = npt.NDArray[np.float64]
 HashArray = npt.NDArray[np.uint64]
+IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Corners of the cells of each kind.
 _CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
@@ -118,6 +121,33 @@ def refuse_repeated(mesh: Any, name: str) -> None:
         f"x={where}; give each cell once, on one rank, not the whole mesh on every rank"
     )
     raise_together(mesh.comm, text if len(twice) else None)
+
+
+def pieces_of(mesh: Any) -> int:
+    """Number of parts of a mesh that share no node, the same on all ranks. Collective."""
+    size = mesh.topology.index_map(mesh.topology.dim).size_local
+    cells = compat.geometry_dofmap(mesh)[:size]
+    nodes, owned = len(mesh.geometry.x), mesh.geometry.index_map().size_local
+    used = np.unique(cells)
+    one = np.repeat(cells[:, 0], cells.shape[1])
+    _, label = _joined(one, cells.ravel(), nodes)
+    count, label = np.unique(label[used], return_inverse=True)
+    first = np.cumsum([0, *mesh.comm.allgather(len(count))])
+    numbers = np.asarray(mesh.geometry.input_global_indices)[used]
+    # What a node that several ranks have is part of on each of them.
+    shared = np.isin(numbers, gather_rows(mesh.comm, numbers[used >= owned]))
+    both = np.column_stack([numbers[shared], label[shared] + first[mesh.comm.rank]])
+    node, part = gather_rows(mesh.comm, both).T
+    _, node = np.unique(node, return_inverse=True)
+    number, _ = _joined(part, first[-1] + node, first[-1] + int(node.max(initial=-1)) + 1)
+    return number
+
+
+def _joined(one: IntArray, two: IntArray, count: int) -> tuple[int, IntArray]:
+    """Number of parts of a graph with these edges and so many nodes, and each node's part."""
+    edges = coo_matrix((np.ones(len(one), dtype=bool), (one, two)), (count, count))
+    found: tuple[int, IntArray] = connected_components(edges, directed=False)
+    return found
 
 
 def _hashed(a: HashArray) -> HashArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 from mpi4py import MPI
@@ -16,7 +17,7 @@ from dolfinx import fem
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports
-from dolfinx_nts.bodies.meshes.mesh_check import places_of
+from dolfinx_nts.bodies.meshes.mesh_check import pieces_of, places_of
 from dolfinx_nts.bodies.nodal_values import nodal_values
 from dolfinx_nts.bodies.solid.inversion import Determinants
 from dolfinx_nts.bodies.solid.layer import waves
@@ -112,6 +113,11 @@ class UflBody(Body):
     def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
         """Internal virtual work between two displacements by a rule, in UFL."""
         raise NotImplementedError
+
+    @cached_property
+    def pieces(self) -> int:  # type: ignore[override]
+        """As of `Body`."""
+        return pieces_of(self.mesh) if self.mesh.topology.dim == 3 else 1
 
     def surface(
         self,
