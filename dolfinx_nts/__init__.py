@@ -33,7 +33,7 @@ from dolfinx_nts.integrators import (
 )
 from dolfinx_nts.interaction.coupling import Coupling, Joint, JointCoupling, Slopes, StepWarning
 from dolfinx_nts.interaction.elements import Elements, Step
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements, PointPart
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints import (
@@ -101,7 +101,7 @@ __all__ = [
     "LineForce",
     "LineMoment",
     "Midpoint",
-    "Moment",
+    "EvaluationPoint",
     "MooneyRivlin",
     "NeoHookean",
     "Newmark",

@@ -353,7 +353,7 @@ def deformed(body, f):
 def piola(body, integrator, f0, f1):
     """P of a step from F_0 to F_1, read from the forces of one tetrahedron."""
     u0 = deformed(body, f0)
-    body.begin_step(integrator, nts.Moment(u0, 0.0))
+    body.begin_step(integrator, nts.EvaluationPoint(u0, 0.0))
     force = body.internal(deformed(body, f1)).reshape(-1, 3)
     return 6.0 * force[unit_nodes(body.reference.reshape(-1, 3))].T
 
@@ -407,7 +407,7 @@ def test_internal_work_is_the_change_of_the_potential(name, size):
     body = body_of(MATERIALS[name], hexahedron(rng))
     u0 = 0.1 * rng.uniform(-1, 1, body.num_owned)
     u1 = u0 + size * rng.uniform(-0.3, 0.3, body.num_owned)
-    body.begin_step(nts.EnergyMomentum(), nts.Moment(u0, 0.0))
+    body.begin_step(nts.EnergyMomentum(), nts.EvaluationPoint(u0, 0.0))
     force = body.internal(u1)
     before, after = body.potential(u0), body.potential(u1)
     work = force @ (u1 - u0)
@@ -425,7 +425,7 @@ def test_step_from_rest_is_finite_and_exact(name, rule):
     body = body_of(MATERIALS[name], hexahedron(rng))
     for size in (0.0, 0.1):
         u0 = size * rng.uniform(-1, 1, body.num_owned)
-        body.begin_step(RULES[rule], nts.Moment(u0, 0.0))
+        body.begin_step(RULES[rule], nts.EvaluationPoint(u0, 0.0))
         force = body.internal(u0)
         step = 1e-3
 
@@ -451,7 +451,7 @@ def test_gonzalez_tangent_near_rest_has_no_noise(size):
     rng = np.random.default_rng(12)
     body = body_of(MATERIALS["neo-hooke"], hexahedron(rng))
     u0, w = 0.1 * rng.uniform(-1, 1, (2, body.num_owned))
-    body.begin_step(nts.EnergyMomentum(), nts.Moment(u0, 0.0))
+    body.begin_step(nts.EnergyMomentum(), nts.EvaluationPoint(u0, 0.0))
     everything = np.arange(len(u0), dtype=np.int32)
     rest = body.tangent(u0, 1.0, 0.5).getValues(everything, everything)
     near = body.tangent(u0 + size * w, 1.0, 0.5).getValues(everything, everything)
@@ -473,7 +473,7 @@ def test_gonzalez_tangent_next_to_collapse(low):
     body = body_of(MATERIALS["neo-hooke"], hexahedron(rng))
     u0, u1 = (deformed(body, np.diag([1.1, 0.9, x])) for x in (0.1, low))
     u1 += 0.002 * rng.uniform(-1, 1, len(u1))
-    body.begin_step(nts.EnergyMomentum(), nts.Moment(u0, 0.0))
+    body.begin_step(nts.EnergyMomentum(), nts.EvaluationPoint(u0, 0.0))
     everything = np.arange(len(u0), dtype=np.int32)
     found = body.tangent(u1, 1.0, 0.5).getValues(everything, everything)
     expected = difference_tangent(body, u1, 1e-4 * low)

@@ -169,7 +169,7 @@ def test_tangent():
     rule = nts.EnergyMomentum(quadrature_points=2)
     rng, size = np.random.default_rng(1), 1e-5
     u0, u1, du = (0.1 * rng.standard_normal(body.num_owned) for _ in range(3))
-    body.begin_step(rule, nts.Moment(u0, 0.0))
+    body.begin_step(rule, nts.EvaluationPoint(u0, 0.0))
     difference = (body.internal(u1 + size * du) - body.internal(u1 - size * du)) / (2 * size)
     tangent = body.tangent(u1, 0.0, 1.0)
     x, y = tangent.createVecs()

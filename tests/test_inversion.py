@@ -19,7 +19,7 @@ from dolfinx_nts.bodies.solid.inversion import smallest_dets
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.output import BalanceCSV
 from dolfinx_nts.solve.accuracy import ACCURACY
-from dolfinx_nts.solve.inversion_guard import Upright
+from dolfinx_nts.solve.inversion_guard import InversionGuard
 
 COMM = MPI.COMM_WORLD
 SENTENCE = "inside out, which W(C) cannot see: det F = "
@@ -400,7 +400,7 @@ def test_an_update_is_halved_until_a_tenth_of_det_is_left(scale):
     (body,) = system.bodies
     stepper = nts.Stepper(system, nts.EnergyMomentum())
     stepper.problem.begin(stepper.state, 1e-3)
-    upright = Upright(stepper.problem)
+    upright = InversionGuard(stepper.problem)
     step = scale * np.cos(9 * body.reference.reshape(-1, 3)[:, [1, 2, 0]]).ravel()
 
     def left(part):

@@ -270,7 +270,7 @@ def test_massless_nodes_do_not_alternate():
         body, found = stepper.system.bodies[0], []
         for _ in range(round(0.8 / dt)):
             u = stepper.advance(dt).u[0]
-            body.begin_step(stepper.problem.integrator, nts.Moment(u, 0.0))
+            body.begin_step(stepper.problem.integrator, nts.EvaluationPoint(u, 0.0))
             force = np.abs(body.internal(u))
             found.append((force[body.massless].max(), force.max()))
         stepper.close()

@@ -185,7 +185,7 @@ def test_pressure_on_a_part_in_time():
     half = nts.Pressure(lambda t: 5.0 * t, where=lambda x: x[0] < 0.5 + 1e-9)
     body = nts.Shell(plate(4, 2, 1.0, 2.0), **RUBBER, bcs=[edge], forces=[half])
     for time in (1.0, 2.0):
-        body.begin_step(EM, nts.Moment(u0=np.zeros(body.num_owned), time=time))
+        body.begin_step(EM, nts.EvaluationPoint(u0=np.zeros(body.num_owned), time=time))
         force = body.external(np.zeros(body.num_owned), np.zeros(3))
         total = body.comm.allreduce(force.reshape(-1, 2, 3)[:, 0].sum(axis=0))
         assert total == pytest.approx((0, 0, 5.0 * time * 0.5 * 2.0), abs=1e-13)

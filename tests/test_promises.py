@@ -15,7 +15,7 @@ from point_mass import PointMass
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.run.ledger_check import Promises
+from dolfinx_nts.run.ledger_check import LedgerCheck
 
 COMM = MPI.COMM_WORLD
 
@@ -53,7 +53,7 @@ def test_energy_that_contact_brings_in_small_parts_is_told():
     stepper = nts.Stepper(nts.System([Sprung(1.0)]), nts.EnergyMomentum())
     stepper.problem.begin(stepper.state, 0.05)
     step = stepper.solver.solve()
-    promises = Promises(solution, nts.EnergyMomentum(), 1e-12)
+    promises = LedgerCheck(solution, nts.EnergyMomentum(), 1e-12)
     for k in range(1, 11):
         row = dict(stepper.solution.rows[-1], energy=1.0, kinetic=1.0)
         solution.rows = [
@@ -249,7 +249,7 @@ def test_a_gain_in_one_step_is_measured_without_driven_bodies(monkeypatch):
     step = stepper.solver.solve()
     row = dict(stepper.solution.rows[-1], energy=1e6 + 1.0, kinetic=1e6 + 1.0)
     solution.rows = [row, row | {"time": 0.05, "contact_defect": -0.1}]
-    promises = Promises(solution, nts.EnergyMomentum(), 1e-12)
+    promises = LedgerCheck(solution, nts.EnergyMomentum(), 1e-12)
     promises.hold(stepper.problem, step, *solution.rows, 0.0)
     stepper.close()
     ((kind, _, size, text),) = told

@@ -231,7 +231,7 @@ def test_tangent_of_a_torque_is_its_derivative():
     body = nts.RigidBody.from_inertia(2.0, (1, 2, 2.5), torque=(0.3, -0.5, 1.5), motion=(0, 0, 0))
     rng = np.random.default_rng(1)
     u0, u1, du = 0.3 * rng.standard_normal((3, 12))
-    body.begin_step(nts.EnergyMomentum(), nts.Moment(u0, 0.0))
+    body.begin_step(nts.EnergyMomentum(), nts.EvaluationPoint(u0, 0.0))
     step, none = 1e-6, np.zeros(3)
     change = body.external(u1 + step * du, none) - body.external(u1 - step * du, none)
     rows, _, values = body.tangent(u1, 0.0, 1.0).getValuesCSR()
@@ -261,7 +261,7 @@ def test_reactions_depend_on_the_displacement_that_is_asked_for():
     """Not on the iterate that was evaluated last."""
     body = nts.RigidBody.from_inertia(2.0, (1, 1, 2), rotation=(0, 0, 0))
     force, u1, other = 0.3 * np.random.default_rng(2).standard_normal((3, 12))
-    body.begin_step(nts.EnergyMomentum(), nts.Moment(np.zeros(12), 0.0))
+    body.begin_step(nts.EnergyMomentum(), nts.EvaluationPoint(np.zeros(12), 0.0))
     arms = (body.reference + 0.5 * u1).reshape(4, 3)[1:]
     moment = np.cross(arms, force.reshape(4, 3)[1:]).sum(axis=0)
     body.external(other, np.zeros(3))

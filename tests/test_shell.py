@@ -260,7 +260,7 @@ def lowest_frequency(n, thickness):
         bcs=[nts.Dirichlet(at(k, e), components=(2,)) for k, e in edges]
         + [nts.Clamp(at(k, e), components=(1 - k,)) for k, e in edges],
     )  # fmt: skip
-    body.begin_step(EM, nts.Moment(u0=np.zeros(body.num_owned), time=0.0))
+    body.begin_step(EM, nts.EvaluationPoint(u0=np.zeros(body.num_owned), time=0.0))
     both = []
     for mass, stiffness in ((0.0, 1.0 / EM.theta), (1.0, 0.0)):
         a = body.tangent(np.zeros(body.num_owned), mass, stiffness)

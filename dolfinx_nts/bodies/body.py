@@ -12,7 +12,7 @@ import numpy.typing as npt
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import range_of
 
@@ -100,7 +100,7 @@ class Body:
             f"{type(self).__name__} has no {name}(), which is asked for here; see nts.Body"
         )
 
-    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+    def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Fix what the evaluations of a step have in common."""
         raise self._missing("begin_step")
 

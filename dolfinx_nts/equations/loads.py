@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.interaction.evaluation import Evaluation, Moment, free
+from dolfinx_nts.interaction.evaluation import Evaluation, EvaluationPoint, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
@@ -30,10 +30,10 @@ class Loads:
 
     def __init__(self, system: System, integrator: Any) -> None:
         self._system, self._integrator = system, integrator
-        self.moments: list[Moment] = []
+        self.moments: list[EvaluationPoint] = []
         self.gravity: FloatArray = system.gravity
 
-    def begin(self, state: State, dt: float, moments: Sequence[Moment] | None) -> None:
+    def begin(self, state: State, dt: float, moments: Sequence[EvaluationPoint] | None) -> None:
         """Fix the step.
 
         Args:
@@ -49,7 +49,7 @@ class Loads:
             body.begin_step(rule, self.moments[k])
         self.gravity = rule.ramp(when) * self._system.gravity
 
-    def _moments(self, when: float) -> list[Moment]:
+    def _moments(self, when: float) -> list[EvaluationPoint]:
         """What bodies are told of a step whose loads act at a time [s]."""
         rule, state, dt, batches = self._integrator, self._state, self._dt, self._system.batches
         drifts: Sequence[FloatArray | None] = [None] * len(state.u)
@@ -62,7 +62,7 @@ class Loads:
         # Load steps of equilibrium end with some of no length.
         rate, ramp = rule.theta * rule.rate(dt) if rule.inertia else 0.0, rule.ramp(when)
         both = zip(state.u, drifts, strict=True)
-        return [Moment(u, when, ramp, rate, drift) for u, drift in both]
+        return [EvaluationPoint(u, when, ramp, rate, drift) for u, drift in both]
 
     def work_at_ends(self, e: Evaluation) -> float:
         """What work of loads at both ends adds on this rank, times `factor`. Collective.

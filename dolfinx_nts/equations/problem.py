@@ -29,7 +29,7 @@ from dolfinx_nts.equations.stiffness_between import stiffness_between
 from dolfinx_nts.equations.supports import Supports
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import Step, evaluate_together
-from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, Moment
+from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, EvaluationPoint
 from dolfinx_nts.parallel import everywhere, global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
@@ -107,7 +107,7 @@ class StepProblem:
         *,
         search: bool = True,
         sleep: bool = True,
-        moments: Sequence[Moment] | None = None,
+        moments: Sequence[EvaluationPoint] | None = None,
     ) -> None:
         """Fix the state at t_n and the step: loads, candidates, layout, first guess.
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
@@ -60,7 +60,7 @@ class Step:
     motion: FloatArray
     length: FloatArray
     stiffness: Callable[..., FloatArray]
-    moments: Sequence[Moment]
+    moments: Sequence[EvaluationPoint]
     force_rounding: Callable[[Sequence[int]], float]
 
     def mean_scale(self, body: Any) -> float:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 
 
-class Moment(NamedTuple):
+class EvaluationPoint(NamedTuple):
     """Where a step evaluates the forces of a body.
 
     Attributes:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.ledger import balance, resultants
-from dolfinx_nts.run.ledger_check import Promises
+from dolfinx_nts.run.ledger_check import LedgerCheck
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.start import carried_forces
 from dolfinx_nts.run.table import Table
@@ -26,7 +26,7 @@ class Ledger:
         kept: Whether energies, momenta, works and counts are known; if not, forces alone are.
     """
 
-    def __init__(self, solution: Solution, promises: Promises, *, kept: bool) -> None:
+    def __init__(self, solution: Solution, promises: LedgerCheck, *, kept: bool) -> None:
         self._solution, self._system = solution, solution.system
         self._promises, self._kept = promises, kept
         self._known: dict[str, balance.Measured] = {}

@@ -38,7 +38,7 @@ NOT_FINITE = (
 )
 
 
-class Promises:
+class LedgerCheck:
     """Compares the ledger of a run with what its integrator and its accuracy promise.
 
     Args:

@@ -22,7 +22,7 @@ from dolfinx_nts.ledger.impact import restored
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme
 from dolfinx_nts.run.balance_table import Ledger
 from dolfinx_nts.run.last_steps import LastSteps
-from dolfinx_nts.run.ledger_check import Promises
+from dolfinx_nts.run.ledger_check import LedgerCheck
 from dolfinx_nts.run.material_watch import MaterialWatch
 from dolfinx_nts.run.rank_agreement import same_run
 from dolfinx_nts.run.run_file import Saved
@@ -160,7 +160,7 @@ class Stepper:
             "restitution": float(restitution),
             "ranks": system.comm.size,
         }
-        self._promises = Promises(self.solution, integrator, self.newton.rtol)
+        self._promises = LedgerCheck(self.solution, integrator, self.newton.rtol)
         self._ledger = Ledger(self.solution, self._promises, kept=ledger)
         self._set_out(begun, start_time)
 
@@ -184,7 +184,7 @@ class Stepper:
     def memory(self) -> dict[str, Any]:
         """What a checkpoint keeps beside state and solution: numbers and tuples of them.
 
-        last: start and length of the last step [s], or None; promised: see `Promises.memory`;
+        last: start and length of the last step [s], or None; promised: see `LedgerCheck.memory`;
         measured: see `Rounding`; recent: lengths of the last two steps [s]; solver: see
         `StepSolver.memory`.
         """

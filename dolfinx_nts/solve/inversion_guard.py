@@ -20,7 +20,7 @@ _HALVINGS = 10
 _SHORTENED = 5
 
 
-class Upright:
+class InversionGuard:
     """Watches the cells of a step's iterates and shortens updates that would invert them.
 
     Args:

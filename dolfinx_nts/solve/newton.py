@@ -22,7 +22,7 @@ from dolfinx_nts.solve.accuracy import EXACT, Newton
 from dolfinx_nts.solve.augmented import AugmentedMatrix
 from dolfinx_nts.solve.convergence import leaves_work, ratios
 from dolfinx_nts.solve.failure import contact_on, diagnosis, used_up
-from dolfinx_nts.solve.inversion_guard import Upright
+from dolfinx_nts.solve.inversion_guard import InversionGuard
 from dolfinx_nts.solve.iterates import Iterates
 from dolfinx_nts.solve.jacobian_reuse import KeptTangents
 from dolfinx_nts.solve.lent_stiffness import LentStiffness
@@ -77,7 +77,7 @@ class StepSolver:
             problem.integrator.inertia,
         )  # fmt: skip
         self._tangents = KeptTangents(problem, lambda: self._presets.keeps)
-        self.iterates, self._upright = Iterates(problem), Upright(problem)
+        self.iterates, self._upright = Iterates(problem), InversionGuard(problem)
         self._lent, self._wanders = LentStiffness(problem), False
         self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None

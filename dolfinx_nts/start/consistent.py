@@ -18,7 +18,7 @@ from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.equations.supports import rates_at_start
 from dolfinx_nts.equations.unknowns import Unknowns
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.kinematics import Kinematics
 from dolfinx_nts.interaction.point_elements import PointPart
 from dolfinx_nts.ledger import resultants
@@ -112,7 +112,8 @@ def accelerating_forces(
     """
     still = tuple(np.zeros_like(v) for v in state.v)
     ramp = problem.integrator.ramp(state.time)
-    moments = [Moment(u, state.time, ramp, 0.0, v) for u, v in zip(state.u, state.v, strict=True)]
+    both = zip(state.u, state.v, strict=True)
+    moments = [EvaluationPoint(u, state.time, ramp, 0.0, v) for u, v in both]
     problem.begin(replace(state, a=still), dt, moments=moments)
     problem.guess(flight=False, forces=True, carried=True)
     contact = [terms.coupling / problem.factor for terms in problem.evaluate(problem.x).bodies]

@@ -28,7 +28,7 @@ from dolfinx_nts.bodies.solid.parameters import (
 )
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross, range_of
 from dolfinx_nts.parallel import gather_rows, raise_together, rank_of
@@ -398,7 +398,7 @@ class RigidBody(Body):
             u[1:] = self.length * (turn @ self._inertia.axes).T
         return u.ravel()[self.fixed]
 
-    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+    def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n and the loads of the step."""
         self._u0, self._theta = moment.u0, rule.theta
         self._loads.begin(moment.time, moment.ramp, self.rotation)

@@ -14,7 +14,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import turns_of
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import gather_rows
 
 FloatArray = npt.NDArray[np.float64]
@@ -98,7 +98,7 @@ class RigidBatch(Body):
         return turns_of(self.reference + u0, self.reference + u1, 3)
 
     # ---- as of Body
-    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+    def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Nothing on them depends on the step."""
 
     def inertia(self, v: FloatArray) -> FloatArray:

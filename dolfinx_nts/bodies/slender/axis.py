@@ -12,7 +12,7 @@ from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.meshes.mesh_check import check_any_mesh
-from dolfinx_nts.bodies.slender.director_mesh import Skeleton, nodes_and_cells
+from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, nodes_and_cells
 from dolfinx_nts.kernels.beam import shares
 from dolfinx_nts.validation import at_points, floats
 
@@ -69,7 +69,7 @@ def check_line(mesh: Any, degree: Any, name: str) -> int:
     return int(degree)
 
 
-def axis_of(space: Any, direction: Any, name: str) -> Skeleton:
+def axis_of(space: Any, direction: Any, name: str) -> DirectorMesh:
     """The axis of a mesh that `check_line` let pass; nodes follow it, d_3 is along it. Collective.
 
     Args:
@@ -91,7 +91,7 @@ def axis_of(space: Any, direction: Any, name: str) -> Skeleton:
                         name)  # fmt: skip
     first = _first(space.mesh.comm, x, tangent, direction, name)
     directors = np.stack([first, np.cross(tangent, first), tangent], axis=1)
-    return Skeleton(x, order, cells, directors, cells, shares(x[cells]).sum(axis=2))
+    return DirectorMesh(x, order, cells, directors, cells, shares(x[cells]).sum(axis=2))
 
 
 def _check_cells(x: FloatArray, cells: IntArray, name: str) -> None:

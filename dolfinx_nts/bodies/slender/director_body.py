@@ -20,13 +20,13 @@ from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
-from dolfinx_nts.bodies.slender.director_mesh import Skeleton
+from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.bodies.slender.node_conditions import NodeConditions
 from dolfinx_nts.bodies.slender.pressure import Pressure, Pressures
 from dolfinx_nts.bodies.slender.skin import Hull
 from dolfinx_nts.contact.surfaces import Skin, Surface, Touching, in_order
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import quadratic_energy as kernel
 from dolfinx_nts.kernels.vectors import range_of
@@ -107,7 +107,7 @@ class DirectorBody(Body):
 
     def _set_up(
         self,
-        skeleton: Skeleton,
+        skeleton: DirectorMesh,
         length: float,
         masses: FloatArray,
         bcs: Sequence[Clamp | Dirichlet],
@@ -391,7 +391,7 @@ class DirectorBody(Body):
         return values.reshape(-1, self._width)[:, :3].ravel()
 
     # ---- as of Body
-    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+    def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n and the loads of the step."""
         self._u0, self._y0 = moment.u0, self._vectors(moment.u0)
         self._theta, self._held_at = rule.taken_at, rule.theta

@@ -14,7 +14,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
-class Skeleton(NamedTuple):
+class DirectorMesh(NamedTuple):
     """A line or surface in the reference, the same on all ranks; axis 0 = node where not told.
 
     Attributes:

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.meshes.mesh_check import check_any_mesh
-from dolfinx_nts.bodies.slender.director_mesh import Skeleton, nodes_and_cells
+from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, nodes_and_cells
 from dolfinx_nts.kernels.vectors import cross
 
 FloatArray = npt.NDArray[np.float64]
@@ -51,7 +51,7 @@ def check_midsurface(mesh: Any, name: str) -> None:
     check_any_mesh(mesh, name)
 
 
-def midsurface_of(space: Any, name: str) -> Skeleton:
+def midsurface_of(space: Any, name: str) -> DirectorMesh:
     """Nodes in the order of the user's input, cells of one orientation, directors. Collective.
 
     The director of a node is the mean of the normals of its cells there, each weighted by its
@@ -85,7 +85,7 @@ def midsurface_of(space: Any, name: str) -> Skeleton:
     edges = ends[count[edge] == 1]
     halves = 0.5 * np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1)
     lengths = np.repeat(halves[:, None], 2, axis=1)
-    return Skeleton(x, np.argsort(given), cells, directors[:, None], edges, lengths)
+    return DirectorMesh(x, np.argsort(given), cells, directors[:, None], edges, lengths)
 
 
 def _edges(cells: IntArray) -> tuple[IntArray, IntArray]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from dolfinx_nts.bodies.conditions import Dirichlet, Meetings, takes_place
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
-from dolfinx_nts.bodies.slender.director_mesh import Skeleton
+from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.bodies.slender.pressure import Pressure
 from dolfinx_nts.validation import at_points, items, vector_in_time
 
@@ -47,7 +47,7 @@ class NodeConditions:
     def __init__(
         self,
         comm: Any,
-        skeleton: Skeleton,
+        skeleton: DirectorMesh,
         here: slice,
         bcs: Sequence[Clamp | Dirichlet],
         forces: Sequence[Load | Pressure],

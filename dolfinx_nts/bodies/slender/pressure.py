@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.slender.director_mesh import Skeleton
+from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.kernels import pressure as kernel
 from dolfinx_nts.validation import (
     at_points,
@@ -73,7 +73,7 @@ class Pressures:
     """
 
     def __init__(
-        self, comm: Any, skeleton: Skeleton, cells: npt.NDArray[Any],
+        self, comm: Any, skeleton: DirectorMesh, cells: npt.NDArray[Any],
         loads: dict[int, Pressure], name: str,
     ) -> None:  # fmt: skip
         self._comm = comm

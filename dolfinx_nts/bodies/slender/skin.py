@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.bodies.slender.director_mesh import Skeleton
+from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.signedinteger[Any]]
@@ -34,14 +34,14 @@ class Hull(NamedTuple):
     part: IntArray
 
 
-def _ranked(skeleton: Skeleton) -> IntArray:
+def _ranked(skeleton: DirectorMesh) -> IntArray:
     """Number of each node in the order of files."""
     rank = np.empty_like(skeleton.order)
     rank[skeleton.order] = np.arange(len(rank))
     return rank
 
 
-def of_shell(skeleton: Skeleton) -> Hull:
+def of_shell(skeleton: DirectorMesh) -> Hull:
     """Skin of a shell: phi - D, then phi + D of each node."""
     cells, edges, n = skeleton.cells, skeleton.edges, len(skeleton.x)
     a, b = edges.T
@@ -55,7 +55,7 @@ def of_shell(skeleton: Skeleton) -> Hull:
     return Hull(point // 2, weights, original, np.concatenate(facets), part)
 
 
-def of_beam(skeleton: Skeleton, outline: FloatArray) -> Hull:
+def of_beam(skeleton: DirectorMesh, outline: FloatArray) -> Hull:
     """Skin of a beam: polygons at its nodes, and at its ends fans about their centres.
 
     Args:

@@ -19,7 +19,7 @@ from dolfinx_nts.bodies.solid.materials import misfit, with_constants
 from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import (
@@ -214,7 +214,7 @@ class Continuum(UflBody):
         own = {"material": self.material, "density": self.density, "degree": self.degree}
         return own | loads | super().settings
 
-    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+    def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n and the loads of the step."""
         if not self._seen_at_rest:
             self._seek_stress_at_rest(rule)

@@ -14,7 +14,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.static import EQUILIBRIUM
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 
 FloatArray = npt.NDArray[np.float64]
 ExtraForm = Callable[[Any, Any, Any, Any], Any]
@@ -60,7 +60,7 @@ class StepForms:
         """Whether a step was made with them."""
         return bool(self._forms)
 
-    def begin(self, rule: Integrator, moment: Moment) -> None:
+    def begin(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n."""
         self._work, self._tangent, self._extra_work = self._compiled(rule)
         if self._matrix is None:

@@ -36,7 +36,7 @@ from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
-from dolfinx_nts.interaction.evaluation import Moment
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points, in_mesh
 from dolfinx_nts.parallel import gather_on_root, raise_together
 from dolfinx_nts.validation import (
@@ -328,7 +328,7 @@ class UflBody(Body):
         )  # fmt: skip
 
     # ---- as of Body
-    def begin_step(self, rule: Integrator, moment: Moment) -> None:
+    def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n."""
         self._forms.begin(rule, moment)
 
