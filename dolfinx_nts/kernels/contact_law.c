@@ -1,6 +1,6 @@
 /* The laws of contact and friction, pair after pair, and what stands before and after them.
 
-   tests/twins has the same in NumPy, which tests/test_compiled.py compares with this. */
+   tests/twins has the same in NumPy, which tests/kernels/test_compiled.py compares with this. */
 
 #include "facets.h"
 

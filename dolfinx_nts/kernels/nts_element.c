@@ -2,7 +2,7 @@
 
    `condensed` is contact/facet_elements.py, _condensed, with kernels/nts_element.py, element, of the
    mean-value rule, which have the numbers of the formulas and are compared with this by
-   tests/test_compiled.py. */
+   tests/kernels/test_compiled.py. */
 
 #include "facets.h"
 

@@ -13,7 +13,7 @@ import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.meshes.mesh_input import bodies_from_gmsh
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 COMM = MPI.COMM_WORLD
 
 

@@ -174,7 +174,7 @@ nts.simulate(system, nts.Midpoint(), dt=dt, t_end=100 * dt, output=[fields])
 @pytest.mark.parametrize("loop", [False, True])
 def test_a_script_ends_by_an_exception_where_the_disk_is_full(loop, tmp_path):
     """By exit status 1, neither by a signal nor in silence; what was written before can be read."""
-    script = SCRIPT.format(tests=str(Path(__file__).parent), folder=str(tmp_path), loop=loop)
+    script = SCRIPT.format(tests=str(Path(__file__).parents[1]), folder=str(tmp_path), loop=loop)
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False
     )

@@ -409,8 +409,8 @@ def alone(tmp_path_factory):
 @pytest.mark.parametrize("ranks", [2, 3, 4])
 def test_impacts_on_more_ranks(ranks, on_ranks, alone, tmp_path):
     """Places and velocities to 1e-9 of those of one rank."""
-    here = str(Path(__file__).parent)
-    code = f"import sys; sys.path.insert(0, {here!r}); import test_thin_contact as t; "
+    here = [str(p) for p in Path(__file__).parents[:2]]
+    code = f"import sys; sys.path[:0] = {here!r}; import test_thin_contact as t; "
     on_ranks(ranks, "-c", f"{code}t.save_impacts({str(tmp_path)!r})")
     for k, case in enumerate(CASES):
         one, several = (nts.load(folder / f"{k}.h5") for folder in (alone, tmp_path))

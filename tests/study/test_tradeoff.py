@@ -16,7 +16,7 @@ from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.study import scene_runs, tradeoff
 
 COMM = MPI.COMM_WORLD
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SCRIPT = """
 from mpi4py import MPI
 from dolfinx.mesh import create_box

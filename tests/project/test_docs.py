@@ -97,7 +97,7 @@ def check_tests(command):
     words = shlex.split(command)
     files = [ROOT / w.partition("::")[0] for w in words if w.startswith("tests/")]
     assert all(path.is_file() for path in files), command
-    files = files or sorted((ROOT / "tests").glob("test_*.py"))
+    files = files or sorted((ROOT / "tests").rglob("test_*.py"))
     chosen = words[words.index("-k") + 1] if "-k" in words else ""
     for word in re.findall(r"\w+", chosen):
         found = word in ("or", "and", "not") or any(word.lower() in names_in(f) for f in files)

@@ -17,7 +17,7 @@ from processes import in_fresh_python
 import dolfinx_nts as nts
 from dolfinx_nts.integrators import Static
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "dolfinx_nts"
 
 #: Floors from below: files, and folders that stand for all of theirs.
@@ -253,6 +253,6 @@ def test_the_list_of_integrators_in_the_tests_is_whole():
 
 def test_no_test_module_is_imported_by_another():
     """Shared helpers stand in modules of their own; what runs on ranks may import itself."""
-    for path in (ROOT / "tests").glob("*.py"):
+    for path in (ROOT / "tests").rglob("*.py"):
         names = set(re.findall(r"\b(?:from|import) (?:tests\.)?(test_\w+)", path.read_text()))
         assert not names - {path.stem}, f"{path.name} imports {sorted(names - {path.stem})}"

@@ -8,7 +8,7 @@ import pytest
 
 import dolfinx_nts as nts
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def project():

@@ -35,7 +35,7 @@ SMALL = {
 }
 #: Equilibria alone, in which next to nothing moves.
 STILL = {"own_problem", "hertz", "partial_slip"}
-DEMOS = Path(__file__).resolve().parents[1] / "demos"
+DEMOS = Path(__file__).resolve().parents[2] / "demos"
 
 
 def test_all_are_here():

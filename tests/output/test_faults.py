@@ -21,7 +21,7 @@ from scenes import box, thrown_block
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-TESTS = str(Path(__file__).parent)
+TESTS = str(Path(__file__).parents[1])
 
 #: Each step writes fields and a checkpoint to a disk of 300 kB, until it is full.
 ON_A_SMALL_DISK = """

@@ -1,7 +1,8 @@
 """Scenes that no one wrote, drawn by hypothesis: refused, stopped, warned of, or right.
 
-`SCENES=5000 SEED=1 pytest tests/test_unwritten.py` tries others and more. All that fail are named
-at the end, as text that `unwritten_judge.judge` takes. What was found is in the regression tests.
+`SCENES=5000 SEED=1 pytest tests/project/test_unwritten.py` tries others and more. All that fail are
+named at the end, as text that `unwritten_judge.judge` takes. What was found is in the regression
+tests.
 """
 
 import os
