@@ -25,6 +25,7 @@ from ffcx.codegeneration import jit as ffcx_jit
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.canonical import canonical
 from dolfinx_nts.parallel import raise_together
@@ -35,9 +36,6 @@ VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
 #: UFL-owned elements, AdjacencyList dofmaps.
 _OLD = VERSION < (0, 8)
 _SHARED = mesh.GhostMode.shared_facet
-
-IntArray = npt.NDArray[np.signedinteger[Any]]
-FloatArray = npt.NDArray[np.float64]
 
 
 # ---- meshes

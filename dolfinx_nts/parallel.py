@@ -12,9 +12,9 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import library
 
-FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 
 
 class ContactHistory(NamedTuple):

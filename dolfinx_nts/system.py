@@ -9,8 +9,8 @@ from functools import cached_property
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.bodies.jumps import jumps
@@ -22,8 +22,6 @@ from dolfinx_nts.interaction.coupling import Joint, is_joint
 from dolfinx_nts.parallel import need_kernels, raise_together
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.validation import items, known_options, require_same, vector
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Part of a body's coordinates by which a start may differ from prescribed displacements.
 _ON_SUPPORT = 1e-9

@@ -17,9 +17,9 @@ from typing import Any, TypeGuard, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.parallel import raise_together
 
-FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
 StrPath = str | os.PathLike[str]
 

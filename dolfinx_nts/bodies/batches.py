@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH, RigidBatch
 from dolfinx_nts.state import State
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 class Batches:

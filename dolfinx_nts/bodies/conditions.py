@@ -11,10 +11,10 @@ from typing import Any, TypeAlias
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.nodal_values import at_nodes
 from dolfinx_nts.contact.surfaces import locate_facets
 from dolfinx_nts.parallel import raise_together
@@ -30,8 +30,6 @@ from dolfinx_nts.validation import (
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 VectorInTime = Vector | Callable[[float], Vector]
 #: Of a body's nodes: one for all, or one for each.

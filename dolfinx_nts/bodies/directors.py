@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.interaction.constraint_elements import Equations
 from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Joint
@@ -14,8 +14,6 @@ from dolfinx_nts.interaction.coupling import Joint
 if TYPE_CHECKING:
     from dolfinx_nts.interaction.points import Points
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Directors whose products are held, of a triad and of one alone.
 _PAIRS = {3: ((1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (3, 1)), 1: ((1, 1),)}

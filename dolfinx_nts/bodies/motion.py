@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Part of the largest moment of inertia below which a smaller one counts as rounding ...
 _NO_ARM = 1e-12

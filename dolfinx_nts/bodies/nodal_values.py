@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import UserFunctionError, at_points, vector
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def nodal_values(space: Any, name: str, body: str, given: Any, unit: str) -> FloatArray:

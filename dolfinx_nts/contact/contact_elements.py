@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution
 from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.interaction.elements import over
@@ -22,10 +22,6 @@ from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import ContactHistory
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Changes of one node's state in a step that are no search any more.
 _CYCLE = 8

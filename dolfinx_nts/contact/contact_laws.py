@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.coulomb import (
     HARDLY,
     NO_PULL,
@@ -27,10 +27,6 @@ from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.parallel import gather_rows
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Part of the slave's mass by which an open gap counts against a force. In each solution one of the
 #: two is zero, and any part will do; in a first guess forces of the last step go with gaps of free

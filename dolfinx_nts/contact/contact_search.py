@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import Rub, no_pull
@@ -22,10 +22,6 @@ from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, global_max
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 _EPS = float(np.finfo(float).eps)
 #: In statics a node nearer to its facet than this part of the facet's size starts as active.

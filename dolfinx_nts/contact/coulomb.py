@@ -8,12 +8,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.kernels import nts_element
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Algorithmic scale c of the return map over the scale of the active set. No result depends on it;
 #: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which

@@ -7,14 +7,10 @@ from functools import cached_property, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.intrusion import Boundary, Found, Placed, box_gap, intrusions
 from dolfinx_nts.contact.surfaces import Surface, winding
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Bodies whose boxes meet are looked at again after a relative motion of this many facet sizes.
 _LOOK = 0.25

@@ -11,16 +11,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import compiled, facets, nts_element
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.facet_elements import FacetElements
 from dolfinx_nts.contact.pair import (
@@ -23,10 +23,6 @@ from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets, nts_element, patches
 from dolfinx_nts.parallel import anywhere
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: A node may project this far (in convective coordinates) beyond an edge that the master surface
 #: ends at ...

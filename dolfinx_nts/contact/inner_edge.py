@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.contact.crossings import Finding
 from dolfinx_nts.contact.search import closest_facets
 from dolfinx_nts.kernels import facets as fc
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Facets meet at an edge where the cosine of the angle between their normals is below this; in a
 #: bore of facets a node that slides is behind the next one for a step, which is known.

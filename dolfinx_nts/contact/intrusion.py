@@ -7,20 +7,16 @@ most the way, which bounds it between two points and leaves few edges to look at
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.surfaces import winding
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels.bounded_slope import highest
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Depth in facet sizes that is reported. What contact of nodes leaves by its nature is a few
 #: hundredths: a master that bulges between two slave nodes, a slave's edge over a convex master.

@@ -7,16 +7,12 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.crossings import Finding, Pause, belong, places, point
 from dolfinx_nts.contact.intrusion import LEAST, Boundary, Placed, sunk
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as fc
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: So many points of an obstacle are looked for in a body, each next to another of the body's.
 _INNER = 8

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.obstacle_elements import ObstacleElements
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.pair import (
@@ -21,10 +20,6 @@ from dolfinx_nts.contact.pair import (
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.validation import StepFailedError
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: A node passes through an obstacle if its path is longer than this part of the radius, and lies
 #: this part of it deeper than both ends.

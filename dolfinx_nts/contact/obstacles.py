@@ -15,13 +15,12 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels.bounded_slope import highest
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.validation import at_time, known_options, require_name, require_positive, vector
 
-FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float] | FloatArray
 Motion = Callable[[float], Vector]
 

@@ -5,15 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.crossings import Finding
 from dolfinx_nts.contact.search import closest_facets
 from dolfinx_nts.kernels import facets as fc
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: All but this part of a contact's force must act at the rim: a body that tips stands on one edge.
 _ELSEWHERE = 0.01

@@ -15,18 +15,14 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
 from dolfinx_nts.contact.inner_edge import InnerEdges, in_inner_edge
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.overhang import inside_rim
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels.vectors import range_of
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass

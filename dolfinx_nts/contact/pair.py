@@ -11,16 +11,12 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.validation import known_options
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 MARGIN = 0.5

@@ -10,15 +10,12 @@ from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels.vectors import range_of
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int_]
 
 # Two distances that differ by less than this part of the lengths they come from are a tie: a
 # point over a shared edge must not choose its facet by rounding noise.

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray
 from dolfinx_nts.contact.pair import ContactPair
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 def check_shared(contacts: Sequence[ContactPair]) -> None:

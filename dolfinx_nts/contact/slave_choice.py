@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as facet_math
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Surfaces are alike where their node spacings or stiffnesses differ by less than this part.
 _ALIKE = 0.1

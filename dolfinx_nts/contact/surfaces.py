@@ -20,6 +20,7 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.contact import search
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import facets as facet_math
@@ -29,8 +30,6 @@ from dolfinx_nts.validation import at_points, is_whole
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 _CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
 

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.equations import node_blocks
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
 from dolfinx_nts.equations.schur import SchurApproximation
@@ -17,9 +17,6 @@ from dolfinx_nts.interaction.points import of_nodes
 
 #: Coordinates of the busiest rank over the mean; parts of the mesh with their overlap come to more.
 _EVENLY = 1.25
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 class Entries(NamedTuple):

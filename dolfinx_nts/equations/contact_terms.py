@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.equations.assembly import StepMatrix
@@ -19,8 +19,6 @@ from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import StepFailedError, is_finite
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class ContactTerms:

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
@@ -19,8 +19,6 @@ from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.system import System
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class OfJoints(NamedTuple):

@@ -12,15 +12,14 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import lsqr
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.unknowns import Unknowns
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 
 #: Tolerance of the least squares, relative to the multipliers.
 _RTOL = 1e-14

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.system import System
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class Lengths:

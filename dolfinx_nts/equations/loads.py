@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.evaluation import Evaluation, EvaluationPoint, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class Loads:

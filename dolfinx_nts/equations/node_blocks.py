@@ -16,9 +16,9 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import IntArray
 from dolfinx_nts.interaction.points import of_nodes
 
-IntArray = npt.NDArray[np.signedinteger[Any]]
 #: Nodes at a time.
 _CHUNK = 500
 #: Name by which a matrix knows its pattern.

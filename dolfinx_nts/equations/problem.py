@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.couplings import Couplings
 from dolfinx_nts.equations.lengths import Lengths
@@ -33,9 +33,6 @@ from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, Evaluation
 from dolfinx_nts.parallel import everywhere, global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 class StepProblem:

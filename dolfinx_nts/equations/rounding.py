@@ -6,12 +6,10 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.parallel import global_sum
-
-FloatArray = npt.NDArray[np.float64]
 
 _EPS = float(np.finfo(float).eps)
 #: Factor by which h^2/2 may change before the rounding of a body's forces is measured again.

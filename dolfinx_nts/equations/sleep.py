@@ -8,9 +8,8 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from dolfinx_nts.arrays import FloatArray
 
 
 class Sleepers:

@@ -7,11 +7,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.system import System
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Where all bodies are rigid, contact takes them to give way under their loads by this part of
 #: their size. Of gaps that repeat each other an iteration leaves the change of the forces over this

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import evaluate_together
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def stiffness_between(

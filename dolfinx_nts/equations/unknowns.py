@@ -9,12 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Fields of the elements' own unknowns; the first is left out where nobody has any.
 _OWN = ("augmented", "constraints")

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-import numpy as np
-import numpy.typing as npt
 import ufl
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy, green_strain
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @runtime_checkable

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.integrators.rule import stress_of
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

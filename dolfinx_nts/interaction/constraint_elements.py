@@ -12,14 +12,11 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.interaction.point_elements import PointElements
 from dolfinx_nts.kernels import quadratic as kernel
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 _EPS = float(np.finfo(float).eps)
 #: What a limit of 0 counts as: a gap of 0 is below it, any other far above.
 _TINY = float(np.finfo(float).tiny)

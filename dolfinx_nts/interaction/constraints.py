@@ -8,8 +8,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.interaction.constraint_elements import (
     SHIFT,
     ConstraintElements,
@@ -30,9 +30,6 @@ from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 #: From nodal vectors at the end of a step (n, k, 3) and the times of both its ends [s].
 Upright = Callable[[FloatArray, tuple[float, ...]], FloatArray]
 

@@ -7,18 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
-
 
 _EPS = float(np.finfo(float).eps)
 

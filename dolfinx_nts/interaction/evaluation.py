@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from dolfinx_nts.arrays import FloatArray
 
 
 class EvaluationPoint(NamedTuple):

@@ -6,11 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.state import State
-
-FloatArray = npt.NDArray[np.float64]
 
 #: A run warns of a larger turn in a step [rad]: a steady one is short by a twelfth of its cube.
 FAR_TURN = 1.0

@@ -14,15 +14,12 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.measures import Gradient
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 class Kind(Protocol):

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step, over
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -17,10 +17,6 @@ from dolfinx_nts.interaction.kinematics import Kinematics, differenced, has_cons
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 _EPS = float(np.finfo(float).eps)
 

@@ -11,11 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.parallel import gather_rows, raise_together
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Part of a cell by which a point may lie beside it, and of coordinates that their rounding is.
 _ON_CELL, _ROUNDING = 1e-9, 4 * np.finfo(np.float64).eps

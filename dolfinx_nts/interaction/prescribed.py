@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
+from dolfinx_nts.arrays import BoolArray, FloatArray
 
 #: Where functions are asked, over the step, from the end at which rates are sought: near to it
 #: for the velocity, so that few kinks lie between, and evenly for the acceleration, which rounding

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.interaction.constraint_elements import Equations
 from dolfinx_nts.interaction.constraints import Arm, Constraints, Upright
@@ -19,7 +19,6 @@ from dolfinx_nts.kernels import quadratic
 from dolfinx_nts.parallel import rank_of
 from dolfinx_nts.validation import require_name, require_same, vector
 
-FloatArray = npt.NDArray[np.float64]
 Times = tuple[float, ...]
 
 #: Part of a joint's size by which what is given may miss what the start prescribes.

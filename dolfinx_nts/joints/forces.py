@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.coupling import Joint, Slopes
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.measured import Measure, Measured, Move, holds
@@ -22,9 +22,6 @@ from dolfinx_nts.joints.between import direction, named, points_of, require_dire
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import rank_of
 from dolfinx_nts.validation import StepFailedError, require_same, vector
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Part of their distance from the origin within which two points are one.
 _ROUNDED = 1e-9

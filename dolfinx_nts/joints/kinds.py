@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts.joints.between import (
     ROUNDED,
@@ -34,7 +33,6 @@ from dolfinx_nts.validation import (
     require_positive,
 )
 
-FloatArray = npt.NDArray[np.float64]
 Number = Callable[[float], float]
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.measured import Move, Row, holds
 from dolfinx_nts.joints.forces import Between
 from dolfinx_nts.kernels import measures as kernel
@@ -23,7 +23,6 @@ from dolfinx_nts.validation import (
     require_same,
 )
 
-FloatArray = npt.NDArray[np.float64]
 #: Torque [N m] or force [N] on a of time, angle or way, and its rate.
 Motor = Callable[[float, float, float], float]
 

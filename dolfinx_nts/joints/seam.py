@@ -6,7 +6,6 @@ import zlib
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts.bodies.slender.shell import Shell
 from dolfinx_nts.contact.surfaces import Surface
@@ -16,8 +15,6 @@ from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import named, points_of
 from dolfinx_nts.validation import known_options
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Sine of the angle between directors below which their product hardly says how they turn.
 _SHARP = np.sin(np.deg2rad(20.0))

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.joints.forces import AboutAxis, Between, BetweenPoints, Stiff, Viscous
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import raise_together
@@ -18,7 +18,6 @@ from dolfinx_nts.validation import (
     require_positive,
 )
 
-FloatArray = npt.NDArray[np.float64]
 Function = Callable[[Any], Any]
 
 #: Part of the start's coordinate over which a user's energy is compared with its force, and part of

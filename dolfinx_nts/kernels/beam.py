@@ -10,11 +10,9 @@ pull would turn them.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import quadratic_energy as energy
-
-FloatArray = npt.NDArray[np.float64]
 
 #: d_3 and d_2 of K_1, and cyclic.
 _CYCLES = ((3, 2), (1, 3), (2, 1))

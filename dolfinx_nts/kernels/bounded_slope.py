@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
+from dolfinx_nts.arrays import FloatArray, IntArray
 
 #: What may hold a higher value is divided so many times into so many parts, until the highest is
 #: known to this part of it.

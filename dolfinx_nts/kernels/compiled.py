@@ -10,8 +10,8 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.kernels import (
     discrete_gradient,
     facets,
@@ -20,10 +20,6 @@ from dolfinx_nts.kernels import (
     patches,
     triangle_patches,
 )
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int_]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Squared sine of an angle between two edges that is rounding only.
 COLLINEAR = 1e-14

@@ -10,13 +10,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 _EPS = float(np.finfo(float).eps)
 

@@ -18,14 +18,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.kernels import patches, triangle_patches
 from dolfinx_nts.kernels.vectors import cross, solve_2x2
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int_]
-BoolArray = npt.NDArray[np.bool_]
 
 EPS = float(np.finfo(np.float64).eps)
 

@@ -17,10 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import discrete_gradient, facets, patches, triangle_patches
 from dolfinx_nts.kernels.vectors import solve_2x2
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Constraints per pair: the gap and five augmented ones (43).
 NUM_CONSTRAINTS = 6

@@ -12,14 +12,9 @@ points of a facet and its ring. Axis 0 is the pair or the facet, and
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 
 #: Control points of a patch.
 NUM_POINTS = 16

@@ -8,11 +8,9 @@ p (V_1 - V_0) exactly. As x_,1 x x_,2 is quadratic, the mean is B(x_m, x_m) + B(
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels.shell import POINTS, shapes
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def _coefficients() -> FloatArray:

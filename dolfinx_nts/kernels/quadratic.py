@@ -7,9 +7,8 @@ are formed before they are multiplied: a difference of points far from the origi
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from dolfinx_nts.arrays import FloatArray
 
 
 def factors(weights: FloatArray, constants: FloatArray, y: FloatArray) -> FloatArray:

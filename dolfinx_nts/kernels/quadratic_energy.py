@@ -10,11 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import quadratic
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class Elements(NamedTuple):

@@ -10,12 +10,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import quadratic_energy as energy
 from dolfinx_nts.kernels.vectors import cross
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Corners in the plane of xi, eta.
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])

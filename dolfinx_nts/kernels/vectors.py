@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from dolfinx_nts.arrays import FloatArray
 
 _ONE, _TWO = [1, 2, 0], [2, 0, 1]
 

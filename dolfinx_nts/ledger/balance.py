@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, overload
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.solid.inversion import smallest_dets
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_sum
@@ -20,7 +20,6 @@ from dolfinx_nts.system import System
 if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem
 
-FloatArray = npt.NDArray[np.float64]
 
 #: Columns of the balance table; momenta have three components.
 COLUMNS = (
@@ -45,7 +44,6 @@ COLUMNS = (
     "min_det",
     "newton_iterations",
 )
-
 
 
 def columns(system: System) -> tuple[str, ...]:

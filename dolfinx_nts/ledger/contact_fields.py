@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -19,8 +19,6 @@ from dolfinx_nts.system import System
 
 if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class ContactLoads(NamedTuple):

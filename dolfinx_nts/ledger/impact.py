@@ -21,6 +21,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
@@ -30,8 +31,6 @@ from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError
-
-FloatArray = npt.NDArray[np.float64]
 
 #: What `simulate(impact=...)` may be.
 IMPACTS = ("published", "restored")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.system import System
@@ -18,7 +18,6 @@ from dolfinx_nts.system import System
 if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem
 
-FloatArray = npt.NDArray[np.float64]
 
 #: Column of the resultants of all contacts.
 CONTACT_FORCES = "contact_forces"

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import contact_fields
 from dolfinx_nts.output.cadence import Cadence
 from dolfinx_nts.output.pictures import (
@@ -25,8 +25,6 @@ from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.validation import StrPath, as_path, require_bool
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Length of the longest arrow as part of the larger side of the film; forces below this part of the
 #: largest are left out.

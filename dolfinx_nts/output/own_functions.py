@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import items
 
-FloatArray = npt.NDArray[np.float64]
 #: A Function, or what makes one of a body, as `von_mises` does.
 Own: TypeAlias = fem.Function | Callable[[Any], fem.Function]
 

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import balance as ledger
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.validation import StrPath
 
-FloatArray = npt.NDArray[np.float64]
 Balance = Mapping[str, FloatArray]
 
 

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class Results(Protocol):

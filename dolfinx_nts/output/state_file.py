@@ -41,13 +41,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.system import System
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 #: Arrays of a file by their place in it, on rank 0; empty elsewhere.
 Tables = dict[str, npt.NDArray[Any]]
 

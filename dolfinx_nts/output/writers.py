@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import balance as ledger
 from dolfinx_nts.ledger import contact_fields, resultants
 from dolfinx_nts.output.cadence import Cadence
@@ -27,9 +27,6 @@ from dolfinx_nts.output.running import Running
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
 from dolfinx_nts.validation import StrPath, as_path
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 def _file_name(name: str) -> str:

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION
 from dolfinx_nts.integrators import Static
@@ -41,8 +41,6 @@ from dolfinx_nts.validation import (
     require_bool,
     require_positive,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 #: A load step is dropped if a slave ends this part of a facet behind one of which it was no
 #: candidate.

@@ -7,11 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.state import State
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class LastSteps:

@@ -5,11 +5,9 @@ from __future__ import annotations
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.system import System
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class MaterialWatch:

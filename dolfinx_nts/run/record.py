@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import resultants
 from dolfinx_nts.ledger.balance import CHANGES, COLUMNS, Switch, Switches
 from dolfinx_nts.run.run_warnings import RunWarning, RunWarnings
 from dolfinx_nts.run.table import Table
 
-FloatArray = npt.NDArray[np.float64]
 #: Arrays by their place in a file.
 Tables = dict[str, npt.NDArray[Any]]
 

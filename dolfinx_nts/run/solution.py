@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-import numpy as np
-import numpy.typing as npt
-
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import contact_fields
 from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.parallel import on_root, write_on_root
@@ -21,8 +19,6 @@ from dolfinx_nts.run.table import Table
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import StrPath, as_path
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(eq=False, repr=False)

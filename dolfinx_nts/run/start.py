@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.equations.problem import StepProblem
@@ -20,8 +20,6 @@ from dolfinx_nts.start import consistent
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import UserFunctionError, is_finite
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Part of the speed of its bodies by which a joint may be violated at the start as meshes do it,
 #: whose centre of mass is off the axis of what they stand for.

@@ -15,16 +15,14 @@ from typing import Any, NamedTuple
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.lengths import box_of
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import known_options
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Error of a step in powers of h, one more than the order of the integrators that it takes.
 _ORDER = 3

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.motion import motion_of
 from dolfinx_nts.bodies.solid.inversion import describe, smallest_dets
 from dolfinx_nts.equations.problem import StepProblem
@@ -13,8 +13,6 @@ from dolfinx_nts.interaction.kinematics import FAR_TURN
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.state import State
-
-FloatArray = npt.NDArray[np.float64]
 
 #: As `FAR_TURN`, of a flexible body, by its spin: as it turns it stretches, and turns more slowly.
 _STRETCHED = 0.95

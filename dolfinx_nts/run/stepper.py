@@ -8,9 +8,7 @@ from dataclasses import replace
 from itertools import count
 from typing import Any, ClassVar
 
-import numpy as np
-import numpy.typing as npt
-
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.jumps import jumps
 from dolfinx_nts.contact.hidden_facets import hidden_facets
@@ -61,7 +59,6 @@ from dolfinx_nts.validation import (
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 
 #: What a step chosen by its error is cut to: halves would soon end where it has failed.
 _CUT = 0.4

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, overload
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from dolfinx_nts.arrays import FloatArray
+
 Row = dict[str, Any]
 
 #: Rows there is room for at first.

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.ledger.impact import Impact
@@ -17,8 +17,6 @@ from dolfinx_nts.solve.newton import StepSolver
 from dolfinx_nts.start.consistent import Fitted
 from dolfinx_nts.state import State
 from dolfinx_nts.validation import StepFailedError
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Searches for contact, each along the motion that came of the one before.
 _SEARCHES = 4

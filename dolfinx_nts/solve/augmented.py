@@ -17,14 +17,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.solve.linear_solver import PARTS
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def augmented(tangent: FloatArray, stiffness: FloatArray) -> FloatArray:

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.solve.augmented import AugmentedMatrix
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Coordinates up to which the factors of one more matrix cost little beside the solution.
 _MOST = 20_000

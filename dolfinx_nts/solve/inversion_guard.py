@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.solid.inversion import describe, forbidden, smallest_dets
 from dolfinx_nts.equations.problem import StepProblem
-
-FloatArray = npt.NDArray[np.float64]
 
 #: An update that would leave less than this part of the smallest det F of a body is halved, ...
 _KEPT_DET = 0.1

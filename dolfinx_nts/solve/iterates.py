@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import IntArray
 from dolfinx_nts.contact.coulomb import Rub
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, everywhere, global_max, global_sum
-
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Iterations in a row without fewer changes of the active set before one changes at a time.
 _PATIENCE = 4

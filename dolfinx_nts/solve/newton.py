@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
@@ -32,8 +31,6 @@ from dolfinx_nts.validation import StepFailedError
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Part of the residual that may be left after an iteration with matrices of an earlier iterate.
 _SLOW = 0.05

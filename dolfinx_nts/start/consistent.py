@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
@@ -24,8 +24,6 @@ from dolfinx_nts.interaction.point_elements import PointPart
 from dolfinx_nts.ledger import resultants
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Linear solves of a start; what prescribed values change in the first step slows them down.
 _TIMES = 8

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 
+from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem
     from dolfinx_nts.solve.newton import StepSolver
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Force against a motion over stiffness times motion that counts as none.
 _NONE = 1e-12

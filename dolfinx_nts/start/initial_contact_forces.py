@@ -10,8 +10,8 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Newmark
@@ -23,7 +23,6 @@ from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 logger = logging.getLogger(__name__)
 
-BoolArray = npt.NDArray[np.bool_]
 
 #: Length of the step that the forces are taken from over that of the run's first one: forces that
 #: change are those of the start. Less would leave them to the rounding of positions.

@@ -23,7 +23,6 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, GhostMode, create_box
@@ -31,13 +30,12 @@ from petsc4py import PETSc
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.forms import CellForm, assemble_vector
 from dolfinx_nts.kernels.strain_energy import strain_energy
 from dolfinx_nts.output import writers as output
 from dolfinx_nts.solve.linear_solver import SolverOptions
 from dolfinx_nts.validation import known_options, require_positive
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Of a residual, relative to the forces of the step.
 RTOL = 1e-8

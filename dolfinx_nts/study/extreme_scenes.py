@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
-
-FloatArray = npt.NDArray[np.float64]
+from dolfinx_nts.arrays import FloatArray
 
 #: Young's modulus [Pa], density [kg/m^3] and edge [m] of the cubes.
 _YOUNG, _DENSITY, _EDGE = 1e6, 1e3, 1.0

@@ -26,13 +26,11 @@ from typing import Any, NamedTuple
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.study.scene_runs import load
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Way to treat impacts -> mass of slave nodes and options of `simulate`.
 WAYS: Mapping[str, tuple[str, Mapping[str, Any]]] = {

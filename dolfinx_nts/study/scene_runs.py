@@ -17,13 +17,11 @@ from unittest.mock import patch
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
 import dolfinx_nts as nts
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.validation import require_bool, require_positive
-
-FloatArray = npt.NDArray[np.float64]
 
 INTEGRATORS = {"energy-momentum": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}
 #: Measures of error, each relative to what the reference run has of it.

@@ -12,10 +12,8 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
+from dolfinx_nts.arrays import FloatArray, IntArray
 
 #: Gmsh element type -> cell name, DOLFINx vertex k = Gmsh vertex order[k].
 _GMSH_CELLS = {4: ("tetrahedron", [0, 1, 2, 3]), 5: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}

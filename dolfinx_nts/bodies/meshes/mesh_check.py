@@ -14,12 +14,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.contact.surfaces import flux, oriented_nodes
 from dolfinx_nts.parallel import gather_rows, raise_together
 
-FloatArray = npt.NDArray[np.float64]
 HashArray = npt.NDArray[np.uint64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Corners of the cells of each kind.
 _CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}

@@ -8,16 +8,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.meshes.mesh_check import refuse_repeated
 from dolfinx_nts.parallel import gather_on_root
 from dolfinx_nts.validation import is_whole, require_positive
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 _CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
 #: Corners of three tetrahedra in a prism, whose lower corners 0, 1, 2 ascend by their numbers: so

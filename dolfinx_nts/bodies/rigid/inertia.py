@@ -5,16 +5,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.solid.parameters import Parameter, is_number
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.validation import floats
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Part of the largest moment by which given moments and axes may miss what they must satisfy.
 ROUNDED = 1e-9

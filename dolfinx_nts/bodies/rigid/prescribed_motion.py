@@ -6,14 +6,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.rigid.inertia import misfit_of_axes
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import agree, call_together, floats, vector_in_time
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Parts of a step at which a prescribed rotation is asked for how far it turns.
 _ASKED = (0.0, 0.30, 0.57, 1.0)

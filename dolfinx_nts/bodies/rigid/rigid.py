@@ -9,11 +9,11 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
@@ -42,10 +42,6 @@ from dolfinx_nts.validation import (
     vector,
     vectors,
 )
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Part of the mass that the matrix lends to directors without mass where a rotation has no
 #: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.

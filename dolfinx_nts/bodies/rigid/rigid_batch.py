@@ -7,18 +7,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import turns_of
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import gather_rows
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Coordinates of a rigid body.
 WIDTH = 12

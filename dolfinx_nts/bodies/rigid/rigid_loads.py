@@ -6,12 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.validation import UserFunctionError, vector_in_time
 
-FloatArray = npt.NDArray[np.float64]
 VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
 
 #: Part of a torque along an axis without inertia that counts as none.

@@ -7,18 +7,14 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.bodies.meshes.mesh_check import check_any_mesh
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, nodes_and_cells
 from dolfinx_nts.kernels.beam import shares
 from dolfinx_nts.validation import at_points, floats
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Cosine of the largest angle between neighbouring cells, 60 degrees.
 _STRAIGHT = 0.5

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.slender.axis import axis_of, check_line
@@ -20,8 +20,6 @@ from dolfinx_nts.kernels import beam as kernel
 from dolfinx_nts.kernels.quadratic_energy import Elements
 from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 
 

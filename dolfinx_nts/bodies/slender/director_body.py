@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
@@ -32,10 +33,6 @@ from dolfinx_nts.kernels import quadratic_energy as kernel
 from dolfinx_nts.kernels.vectors import range_of
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.validation import at_points, vector, vectors
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Turn between neighbouring nodes [rad] from which on failed steps name it.
 _NAMED = np.pi / 6.0

@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet, Meetings, takes_place
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.bodies.slender.pressure import Pressure
 from dolfinx_nts.validation import at_points, items, vector_in_time
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Nodes that a message names.
 _SHOWN = 6

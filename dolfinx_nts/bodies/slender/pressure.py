@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.kernels import pressure as kernel
 from dolfinx_nts.validation import (
@@ -18,8 +19,6 @@ from dolfinx_nts.validation import (
     number_at,
     require_bool,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @known_options

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.validation import floats, is_finite, known_options, require_positive
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @known_options

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
@@ -28,8 +28,6 @@ from dolfinx_nts.validation import (
     vector,
 )
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 Vector = Sequence[float] | FloatArray
 
 #: Sine of the angle between a direction and a director within which they are parallel.

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 #: Parts of a shell's skin.
 SIDES = ("bottom", "top", "edge")

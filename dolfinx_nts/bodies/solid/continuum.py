@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
 from dolfinx_nts.bodies.solid.materials import misfit, with_constants
@@ -29,8 +29,6 @@ from dolfinx_nts.validation import (
     require_name,
     vector_in_time,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Stress of an undeformed body, over its stiffness, that counts as none.
 _STRESS_FREE = 1e-6

@@ -10,14 +10,12 @@ from mpi4py import MPI
 
 import basix
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, load
 from dolfinx_nts.parallel import raise_together
-
-FloatArray = npt.NDArray[np.float64]
 
 #: det(dx/dxi) at the points of a cell, from its nodes' positions, as FFCx would write it.
 _KERNEL = """

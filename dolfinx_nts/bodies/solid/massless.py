@@ -21,11 +21,8 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.interaction.points import of_nodes
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Part by which neighbours that count as equally near may differ in their distance.
 _AS_NEAR = 1e-6

@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from ufl.corealg.traversal import traverse_unique_terminals
 
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import is_finite
 
-FloatArray = npt.NDArray[np.float64]
 #: What a parameter may be; the latter two of a scalar, a Function e.g. of degree 0.
 Parameter = float | fem.Constant | fem.Function
 

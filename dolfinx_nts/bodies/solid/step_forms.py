@@ -6,17 +6,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.static import EQUILIBRIUM
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 
-FloatArray = npt.NDArray[np.float64]
 ExtraForm = Callable[[Any, Any, Any, Any], Any]
 
 

@@ -10,11 +10,11 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.meshes.mesh_check import pieces_of, places_of
@@ -45,9 +45,6 @@ from dolfinx_nts.validation import (
     require_name,
     vectors,
 )
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.signedinteger[Any]]
 
 
 class UflBody(Body):
