@@ -8,9 +8,15 @@ from dolfinx_nts.bodies.conditions import Dirichlet, Traction
 from dolfinx_nts.bodies.meshes.mesh_input import Part, bodies_from_gmsh, bodies_from_tags
 from dolfinx_nts.bodies.meshes.mesh_made import extrude, linear
 from dolfinx_nts.bodies.motion import BodyMotion, motion_of
-from dolfinx_nts.bodies.nodal_loads import Clamp, LineForce, LineMoment, PointForce, PointMoment
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.bodies.slender.beam import Beam
+from dolfinx_nts.bodies.slender.node_conditions import (
+    Clamp,
+    LineForce,
+    LineMoment,
+    PointForce,
+    PointMoment,
+)
 from dolfinx_nts.bodies.slender.pressure import Pressure
 from dolfinx_nts.bodies.slender.section import Circle, Rectangle, Section
 from dolfinx_nts.bodies.slender.shell import Shell

@@ -19,13 +19,11 @@ from petsc4py import PETSc
 from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.couplings import Couplings
-from dolfinx_nts.equations.lengths import Lengths
 from dolfinx_nts.equations.loads import Loads
-from dolfinx_nts.equations.rounding import Rounding
+from dolfinx_nts.equations.scales import Lengths, Rounding, stiffness_between
 from dolfinx_nts.equations.shared_weight import SharedWeight
 from dolfinx_nts.equations.sleep import Sleepers
 from dolfinx_nts.equations.stabilization import Stabilization
-from dolfinx_nts.equations.stiffness_between import stiffness_between
 from dolfinx_nts.equations.supports import Supports
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import Step, evaluate_together

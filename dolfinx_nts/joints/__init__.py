@@ -14,8 +14,7 @@ from dolfinx_nts.joints.kinds import (
     Spherical,
     Universal,
 )
-from dolfinx_nts.joints.seam import Seam
-from dolfinx_nts.joints.tie import Tie
+from dolfinx_nts.joints.tie import Seam, Tie
 
 __all__ = [
     "Cylindrical",

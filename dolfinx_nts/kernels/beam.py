@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinx_nts.arrays import FloatArray
-from dolfinx_nts.kernels import quadratic_energy as energy
+from dolfinx_nts.kernels import quadratic as energy
 
 #: d_3 and d_2 of K_1, and cyclic.
 _CYCLES = ((3, 2), (1, 3), (2, 1))

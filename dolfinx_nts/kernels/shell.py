@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dolfinx_nts.arrays import FloatArray
-from dolfinx_nts.kernels import quadratic_energy as energy
+from dolfinx_nts.kernels import quadratic as energy
 from dolfinx_nts.kernels.vectors import cross
 
 #: Corners in the plane of xi, eta.

@@ -11,7 +11,6 @@ import numpy as np
 
 from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import contact_fields
-from dolfinx_nts.output.cadence import Cadence
 from dolfinx_nts.output.pictures import (
     Drawn,
     axes_of,
@@ -21,7 +20,7 @@ from dolfinx_nts.output.pictures import (
     painted,
     seen,
 )
-from dolfinx_nts.output.running import Running
+from dolfinx_nts.output.running import Cadence, Running
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.validation import StrPath, as_path, require_bool

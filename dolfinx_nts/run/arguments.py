@@ -11,7 +11,7 @@ from dolfinx_nts.run.start import refuse_moved
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.start.massless_start import check_massless
 from dolfinx_nts.system import System
-from dolfinx_nts.validation import is_finite, require_bool
+from dolfinx_nts.validation import is_finite, require_bool, require_same
 
 #: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
 _WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
@@ -83,3 +83,32 @@ def check_impact(system: System, integrator: Integrator, impact: Any, restitutio
     if impact != "published":
         refuse_moved(system)
     check_massless(system, integrator, impact)
+
+
+def same_run(system: Any, **options: Any) -> None:
+    """Raise a ValueError on all ranks unless options and scene are the same there. Collective.
+
+    Called before all that depends on them; ranks with other steps would wait for each other for
+    ever. Numbers and texts are compared, of functions only that they are some.
+
+    Args:
+        system: The scene; what is none is refused elsewhere.
+        **options: Of the run.
+    """
+    if isinstance(system, System):
+        require_same(system.comm, **options, **_scene(system))
+
+
+def _scene(system: System) -> dict[str, Any]:
+    found: dict[str, Any] = {"gravity": system.gravity}
+    for number, pair in enumerate(system.contacts):
+        found[f"friction of contacts[{number}]"] = pair.friction
+        found[f"interference of contacts[{number}]"] = pair.interference
+        surfaces: Mapping[str, Any] = {"slave": pair.slave, "master": pair.master}
+        for role, surface in surfaces.items():
+            for name, value in surface.settings.items():
+                found[f"{name} of the {role} of contacts[{number}]"] = value
+    for item in (*system.bodies, *system.joints):
+        for name, value in item.settings.items():
+            found[f"{name} of {item.name!r}"] = value
+    return found

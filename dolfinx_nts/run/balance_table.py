@@ -10,9 +10,9 @@ import numpy as np
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.run.ledger_check import LedgerCheck
+from dolfinx_nts.run.record import Table
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.start import carried_forces
-from dolfinx_nts.run.table import Table
 from dolfinx_nts.run.trial import Trial
 from dolfinx_nts.state import State
 

@@ -16,8 +16,8 @@ from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.run.arguments import same_run
 from dolfinx_nts.run.ledger_check import NOT_FINITE
-from dolfinx_nts.run.rank_agreement import same_run
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.simulate import run, writers
 from dolfinx_nts.run.solution import Equilibrium

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from dolfinx_nts.parallel import first_problem
+from dolfinx_nts.run.arguments import same_run
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.interrupts import Interrupts
 from dolfinx_nts.run.progress import progress_bar
-from dolfinx_nts.run.rank_agreement import same_run
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.step_size import Adapt, Pace

@@ -11,11 +11,10 @@ from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import contact_fields
 from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.parallel import on_root, write_on_root
-from dolfinx_nts.run.record import Record
+from dolfinx_nts.run.record import Record, Table
 from dolfinx_nts.run.run_file import save
 from dolfinx_nts.run.run_warnings import RunWarnings
 from dolfinx_nts.run.step_size import PaceMemory
-from dolfinx_nts.run.table import Table
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.validation import StrPath, as_path

@@ -17,8 +17,8 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx_nts.arrays import FloatArray
-from dolfinx_nts.equations.lengths import box_of
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.equations.scales import box_of
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System

@@ -10,19 +10,17 @@ from typing import Any, ClassVar
 
 from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.bodies.jumps import jumps
+from dolfinx_nts.bodies.conditions import jumps
 from dolfinx_nts.contact.hidden_facets import hidden_facets
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.ledger.guards import check_momentum
 from dolfinx_nts.ledger.impact import restored
-from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme
+from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme, same_run
 from dolfinx_nts.run.balance_table import Ledger
-from dolfinx_nts.run.last_steps import LastSteps
 from dolfinx_nts.run.ledger_check import LedgerCheck
 from dolfinx_nts.run.material_watch import MaterialWatch
-from dolfinx_nts.run.rank_agreement import same_run
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
@@ -40,7 +38,7 @@ from dolfinx_nts.run.start import (
 )
 from dolfinx_nts.run.step_size import Pace
 from dolfinx_nts.run.step_warnings import tell_frictionless, tell_pieces, tell_step, tell_stressed
-from dolfinx_nts.run.trial import Trial, solved, state_after
+from dolfinx_nts.run.trial import LastSteps, Trial, solved, state_after
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.newton import StepSolver
 from dolfinx_nts.start import consistent
@@ -528,7 +526,7 @@ class Stepper:
         return self.state.contacts[k].force if mean is None else mean
 
     def jumps_at_start(self, dt: float) -> str:
-        """What a failure may come of that `bodies.jumps` tells, in the first steps. Collective.
+        """What a failure may come of that `jumps` tells, in the first steps. Collective.
 
         Args:
             dt: First step [s].

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import dolfinx_nts as nts
 from dolfinx_nts.kernels import beam as beam_kernel
-from dolfinx_nts.kernels import quadratic_energy as kernel
+from dolfinx_nts.kernels import quadratic as kernel
 
 STEEL = nts.Section(EA=2000, GA=(800, 700), GJ=3, EI=(1, 2), rhoA=1, rhoI=(1e-2, 2e-2))
 #: Tip of the cantilever by as many elements (B26'); Reissner's is at (.44412985, .81711894).

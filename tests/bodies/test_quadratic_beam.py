@@ -8,7 +8,7 @@ from lines import arc, curved_mesh, interval_mesh, straight
 
 import dolfinx_nts as nts
 from dolfinx_nts.kernels import beam as beam_kernel
-from dolfinx_nts.kernels import quadratic_energy as kernel
+from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.output import Fields
 
 EM, COMM = nts.EnergyMomentum(), MPI.COMM_WORLD

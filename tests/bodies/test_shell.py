@@ -14,7 +14,7 @@ from shells import grid, plate, plate_nodes, surface_mesh
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.kernels import quadratic_energy as kernel
+from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kernels import shell as shell_kernel
 from dolfinx_nts.output.pictures import picture
 

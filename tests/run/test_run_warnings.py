@@ -11,9 +11,8 @@ from point_mass import mass_on_wall
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
-from dolfinx_nts.run.record import Record, unpacked
+from dolfinx_nts.run.record import Record, Table, unpacked
 from dolfinx_nts.run.run_warnings import RunWarnings
-from dolfinx_nts.run.table import Table
 
 
 def test_a_kind_is_counted_and_its_worst_case_kept(caplog):

@@ -13,8 +13,8 @@ from dolfinx.mesh import CellType, create_box
 
 import dolfinx_nts as nts
 from dolfinx_nts.ledger.balance import COLUMNS, Switch, Switches
+from dolfinx_nts.run.record import Table
 from dolfinx_nts.run.solution import Solution
-from dolfinx_nts.run.table import Table
 
 COMM = MPI.COMM_WORLD
 

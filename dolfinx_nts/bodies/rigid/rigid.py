@@ -18,8 +18,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
 from dolfinx_nts.bodies.rigid.inertia import Inertia, inertia_of, principal
-from dolfinx_nts.bodies.rigid.prescribed_motion import PrescribedMotion
-from dolfinx_nts.bodies.rigid.rigid_loads import RigidLoads, VectorInTime
+from dolfinx_nts.bodies.rigid.rigid_loads import PrescribedMotion, RigidLoads, VectorInTime
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,
     is_number,

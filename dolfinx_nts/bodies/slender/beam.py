@@ -9,15 +9,15 @@ import numpy as np
 
 from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet
-from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.slender.axis import axis_of, check_line
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
+from dolfinx_nts.bodies.slender.director_mesh import Hull, of_beam
+from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load
 from dolfinx_nts.bodies.slender.section import Section
-from dolfinx_nts.bodies.slender.skin import Hull, of_beam
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import beam as kernel
-from dolfinx_nts.kernels.quadratic_energy import Elements
+from dolfinx_nts.kernels.quadratic import Elements
 from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
 Vector = Sequence[float] | FloatArray

@@ -20,16 +20,14 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
-from dolfinx_nts.bodies.nodal_loads import Clamp, Load
-from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
-from dolfinx_nts.bodies.slender.node_conditions import NodeConditions
+from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, Hull
+from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load, NodeConditions
 from dolfinx_nts.bodies.slender.pressure import Pressure, Pressures
-from dolfinx_nts.bodies.slender.skin import Hull
 from dolfinx_nts.contact.surfaces import Skin, Surface, Touching, in_order
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.kernels import quadratic_energy as kernel
+from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kernels.vectors import range_of
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.validation import at_points, vector, vectors

@@ -9,16 +9,16 @@ import numpy as np
 
 from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet
-from dolfinx_nts.bodies.nodal_loads import Clamp, Load
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
+from dolfinx_nts.bodies.slender.director_mesh import SIDES, Hull, of_shell
 from dolfinx_nts.bodies.slender.midsurface import check_midsurface, midsurface_of
+from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load
 from dolfinx_nts.bodies.slender.pressure import Pressure
-from dolfinx_nts.bodies.slender.skin import SIDES, Hull, of_shell
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import shell as kernel
-from dolfinx_nts.kernels.quadratic_energy import Elements
+from dolfinx_nts.kernels.quadratic import Elements
 from dolfinx_nts.validation import (
     is_finite,
     known_options,

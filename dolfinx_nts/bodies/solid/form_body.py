@@ -12,8 +12,8 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.meshes.mesh_check import check_any_mesh
 from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
+from dolfinx_nts.bodies.solid.step_forms import checked_form
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
-from dolfinx_nts.bodies.solid.user_forms import checked_form
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.parallel import raise_together

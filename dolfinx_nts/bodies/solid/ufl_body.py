@@ -20,8 +20,7 @@ from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.meshes.mesh_check import pieces_of, places_of
 from dolfinx_nts.bodies.nodal_values import nodal_values
 from dolfinx_nts.bodies.solid.inversion import Determinants
-from dolfinx_nts.bodies.solid.layer import waves
-from dolfinx_nts.bodies.solid.mass_matrix import MassMatrix
+from dolfinx_nts.bodies.solid.mass import MassMatrix, waves
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,
@@ -30,8 +29,7 @@ from dolfinx_nts.bodies.solid.parameters import (
     require_positive_parameter,
     values_of,
 )
-from dolfinx_nts.bodies.solid.step_forms import ExtraForm, StepForms, fill
-from dolfinx_nts.bodies.solid.user_forms import checked_form
+from dolfinx_nts.bodies.solid.step_forms import ExtraForm, StepForms, checked_form, fill
 from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
