@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import cpp, fem, geometry, jit, mesh
+from dolfinx.mesh import Mesh
 from ffcx.codegeneration import jit as ffcx_jit
 from petsc4py import PETSc
 from ufl.core.expr import Expr
@@ -47,7 +48,7 @@ def _ghosts() -> dict[str, Any]:
     return {"partitioner": mesh.create_cell_partitioner(_SHARED, *links)}
 
 
-def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Any:
+def create_mesh(comm: MPI.Comm, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Any:
     """Mesh of degree 1, of intervals with three nodes of degree 2, with shared-facet ghosts.
 
     Args:
@@ -73,7 +74,7 @@ def create_mesh(comm: Any, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: st
     return mesh.create_mesh(comm, cells, *args, **_ghosts())
 
 
-def _refuse_whole(comm: Any, cells: IntArray, x: FloatArray) -> None:
+def _refuse_whole(comm: MPI.Comm, cells: IntArray, x: FloatArray) -> None:
     """Raise on every rank if two give the same cells, of the same points or of a copy of them."""
     if comm.size == 1:
         return
@@ -92,7 +93,7 @@ def _refuse_whole(comm: Any, cells: IntArray, x: FloatArray) -> None:
     raise_together(comm, problem)
 
 
-def model_to_mesh(model: Any, comm: Any, rank: int = 0) -> tuple[Any, Any, Any]:
+def model_to_mesh(model: Any, comm: MPI.Comm, rank: int = 0) -> tuple[Any, Any, Any]:
     """Gmsh model -> (mesh, cell tags, facet tags), with shared-facet ghosts in every version."""
     if _OLD:
         gmshio = importlib.import_module("dolfinx.io.gmshio")
@@ -109,7 +110,7 @@ def _table(a: Any, layout: Any) -> IntArray:
     return table
 
 
-def geometry_dofmap(msh: Any) -> IntArray:
+def geometry_dofmap(msh: Mesh) -> IntArray:
     """Geometry nodes of the cells, shape (cells, nodes)."""
     g = msh.geometry
     if _OLD:
@@ -118,13 +119,13 @@ def geometry_dofmap(msh: Any) -> IntArray:
     return nodes
 
 
-def coordinate_map(msh: Any) -> Any:
+def coordinate_map(msh: Mesh) -> Any:
     """How the cells' points of reference are mapped to their geometry nodes."""
     g = msh.geometry
     return g.cmaps[0] if hasattr(g, "cmaps") else g.cmap
 
 
-def cell_dofs(space: Any) -> IntArray:
+def cell_dofs(space: fem.FunctionSpace) -> IntArray:
     """Blocked dofs of the cells, shape (cells, dofs)."""
     if _OLD:
         return _table(space.dofmap.list, space.dofmap.dof_layout)
@@ -132,7 +133,7 @@ def cell_dofs(space: Any) -> IntArray:
     return dofs
 
 
-def entities_to_geometry(msh: Any, dim: int, entities: npt.ArrayLike) -> IntArray:
+def entities_to_geometry(msh: Mesh, dim: int, entities: npt.ArrayLike) -> IntArray:
     """Geometry nodes of the vertices of entities, shape (entities, vertices), tensor-ordered."""
     entities, t = np.asarray(entities, dtype=np.int32), msh.topology
     t.create_connectivity(dim, t.dim)
@@ -148,31 +149,31 @@ def entities_to_geometry(msh: Any, dim: int, entities: npt.ArrayLike) -> IntArra
     return nodes
 
 
-def _cpp_mesh(msh: Any) -> Any:
+def _cpp_mesh(msh: Mesh) -> Any:
     return getattr(msh, "_mesh", msh)
 
 
-def exterior_facets(msh: Any) -> IntArray:
+def exterior_facets(msh: Mesh) -> IntArray:
     """Owned exterior facets, sorted."""
     t = msh.topology
     t.create_connectivity(t.dim - 1, t.dim)
     return np.sort(mesh.exterior_facet_indices(t))
 
 
-def is_tagging(tags: Any, msh: Any) -> bool:
+def is_tagging(tags: Any, msh: Mesh) -> bool:
     """Whether meshtags are of this mesh, or of one with the same cells of the same vertices."""
     theirs = getattr(tags, "mesh", tags).topology  # only 0.5 has a mesh there
     cells = [t.connectivity(t.dim, 0).array for t in (theirs, msh.topology)]
     return bool(np.array_equal(*cells))
 
 
-def cell_name(msh: Any) -> str:
+def cell_name(msh: Mesh) -> str:
     """Name of the mesh's cell type, e.g. "hexahedron"."""
     name = str(msh.topology.cell_type)
     return name.rsplit(".", maxsplit=1)[-1]
 
 
-def create_submesh(msh: Any, dim: int, entities: npt.ArrayLike) -> tuple[Any, IntArray, IntArray]:
+def create_submesh(msh: Mesh, dim: int, entities: npt.ArrayLike) -> tuple[Any, IntArray, IntArray]:
     """Submesh and two int32 arrays: sub entity -> parent entity, sub node -> parent node."""
     s, e, _, g = mesh.create_submesh(msh, dim, np.asarray(entities, dtype=np.int32))
     if hasattr(e, "sub_topology_to_topology"):
@@ -248,7 +249,7 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
         logging.disable(before)
 
 
-def vector_space(msh: Any, degree: int) -> Any:
+def vector_space(msh: Mesh, degree: int) -> Any:
     """Continuous Lagrange space of 3-vectors."""
     if _OLD:
         with _told_compiler("an element"):
@@ -256,7 +257,7 @@ def vector_space(msh: Any, degree: int) -> Any:
     return fem.functionspace(msh, ("Lagrange", degree, (3,)))
 
 
-def lagrange_degree(space: Any) -> int | None:
+def lagrange_degree(space: fem.FunctionSpace) -> int | None:
     """Degree of a continuous Lagrange space of 3-vectors, None of any other."""
     element = space.ufl_element()
     if _OLD:
@@ -270,7 +271,7 @@ def lagrange_degree(space: Any) -> int | None:
     return int(degree) if vectors and known else None
 
 
-def is_nodal(space: Any, msh: Any) -> bool:
+def is_nodal(space: fem.FunctionSpace, msh: Mesh) -> bool:
     """Return whether a space is of Lagrange elements with one block at each corner of a cell."""
     element = space.ufl_element()
     if _OLD:
@@ -282,7 +283,7 @@ def is_nodal(space: Any, msh: Any) -> bool:
     return same and not broken
 
 
-def scalar_space(msh: Any, family: str, degree: int) -> Any:
+def scalar_space(msh: Mesh, family: str, degree: int) -> Any:
     """Scalar space of the family ("Lagrange" or "DG")."""
     if _OLD:
         with _told_compiler("an element"):
@@ -290,7 +291,7 @@ def scalar_space(msh: Any, family: str, degree: int) -> Any:
     return fem.functionspace(msh, (family, degree))
 
 
-def cell_vector_space(msh: Any, family: str, degree: int) -> Any:
+def cell_vector_space(msh: Mesh, family: str, degree: int) -> Any:
     """Space of 3-vectors of the family ("DG")."""
     if _OLD:
         with _told_compiler("an element"):
@@ -298,7 +299,7 @@ def cell_vector_space(msh: Any, family: str, degree: int) -> Any:
     return fem.functionspace(msh, (family, degree, (3,)))
 
 
-def tensor_space(msh: Any, family: str, degree: int) -> Any:
+def tensor_space(msh: Mesh, family: str, degree: int) -> Any:
     """Space of 3 x 3 tensors of the family ("Lagrange" or "DG")."""
     if _OLD:
         with _told_compiler("an element"):
@@ -306,7 +307,7 @@ def tensor_space(msh: Any, family: str, degree: int) -> Any:
     return fem.functionspace(msh, (family, degree, (3, 3)))
 
 
-def node_blocks(mesh: Any, space: Any) -> IntArray:
+def node_blocks(mesh: Mesh, space: fem.FunctionSpace) -> IntArray:
     """Block of coordinates of each geometry node of this rank, ghosts included, shape (nodes,)."""
     nodes = geometry_dofmap(mesh)
     blocks = np.full(len(mesh.geometry.x), -1, dtype=np.int64)
@@ -314,7 +315,7 @@ def node_blocks(mesh: Any, space: Any) -> IntArray:
     return blocks
 
 
-def cells_near(msh: Any, x: FloatArray, padding: float) -> list[list[int]]:
+def cells_near(msh: Mesh, x: FloatArray, padding: float) -> list[list[int]]:
     """This rank's own cells whose boxes, padded [m], hold each point (n, 3)."""
     dim = msh.topology.dim
     make = geometry.BoundingBoxTree if _OLD else geometry.bb_tree
@@ -324,7 +325,7 @@ def cells_near(msh: Any, x: FloatArray, padding: float) -> list[list[int]]:
     return [[int(c) for c in found.links(i) if c < owned] for i in range(len(x))]
 
 
-def with_ghosts(space: Any, chosen: IntArray) -> npt.NDArray[np.bool_]:
+def with_ghosts(space: fem.FunctionSpace, chosen: IntArray) -> npt.NDArray[np.bool_]:
     """Return which coordinates of nodes and ghosts are among chosen owned ones, (b, 3)."""
     mark = fem.Function(space)
     mark.x.array[chosen] = 1.0
@@ -333,7 +334,7 @@ def with_ghosts(space: Any, chosen: IntArray) -> npt.NDArray[np.bool_]:
     return marked
 
 
-def subspace_component_bc(space: Any, component: int, blocked_dofs: IntArray) -> Any:
+def subspace_component_bc(space: fem.FunctionSpace, component: int, blocked_dofs: IntArray) -> Any:
     """Homogeneous DirichletBC on one component of blocked dofs; it only masks rows and columns."""
     dofs = np.sort(np.asarray(blocked_dofs, np.int32) * 3 + component)
     return fem.dirichletbc(PETSc.ScalarType(0.0), dofs, space.sub(component))
@@ -423,7 +424,7 @@ def cell_kernel(form: Any) -> Any:
     return ctypes.CFUNCTYPE(None, *(ctypes.c_void_p,) * 7)(address)
 
 
-def plain_dofs(space: Any, cells: int) -> IntArray | None:
+def plain_dofs(space: fem.FunctionSpace, cells: int) -> IntArray | None:
     """Blocks of dofs of the first cells as a kernel takes them, (cells, blocks).
 
     None where the dofs of a cell are turned by how its neighbours are numbered, or where their list
@@ -443,7 +444,7 @@ def plain_dofs(space: Any, cells: int) -> IntArray | None:
 _COMMUNICATORS: list[Any] = [MPI.COMM_SELF, MPI.COMM_WORLD]
 
 
-def petsc_communicator(comm: Any) -> Any:
+def petsc_communicator(comm: MPI.Comm) -> Any:
     """Communicator of the same ranks, one for all meshes, for PETSc's objects.
 
     In parallel PETSc frees what Python has dropped in `free_dropped` alone, by communicator. Each
@@ -456,13 +457,13 @@ def petsc_communicator(comm: Any) -> Any:
     return _COMMUNICATORS[-1]
 
 
-def free_dropped(comm: Any) -> None:
+def free_dropped(comm: MPI.Comm) -> None:
     """Free what PETSc made on a communicator and Python has dropped; all ranks call it."""
     if comm.size > 1:
         PETSc.garbage_cleanup(comm)
 
 
-def create_vector(space: Any) -> Any:
+def create_vector(space: fem.FunctionSpace) -> Any:
     """New zero ghosted PETSc vector in the layout of the space."""
     blocks, size = space.dofmap.index_map, space.dofmap.index_map_bs
     b = PETSc.Vec().createGhost(
@@ -495,7 +496,7 @@ def create_matrix(form: Any) -> Any:
     return cpp.la.petsc.create_matrix(petsc_communicator(form.mesh.comm), pattern)
 
 
-def dense_matrix(comm: Any, size: int) -> Any:
+def dense_matrix(comm: MPI.Comm, size: int) -> Any:
     """New PETSc AIJ matrix of nodes, 3 x 3 blocks, with room for all entries of a rank's own.
 
     Args:
@@ -505,7 +506,7 @@ def dense_matrix(comm: Any, size: int) -> Any:
     return PETSc.Mat().createAIJ(((size, None), (size, None)), nnz=(size, 0), bsize=3, comm=comm)
 
 
-def coo_matrix(comm: Any, size: int, rows: npt.ArrayLike, cols: npt.ArrayLike) -> Any:
+def coo_matrix(comm: MPI.Comm, size: int, rows: npt.ArrayLike, cols: npt.ArrayLike) -> Any:
     """New PETSc AIJ matrix of nodes, 3 x 3 blocks, for `set_values_coo`.
 
     Args:

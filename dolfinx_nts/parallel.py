@@ -18,7 +18,7 @@ from dolfinx_nts.kernels import library
 T = TypeVar("T")
 
 
-def rank_of(name: str, comm: Any) -> int:
+def rank_of(name: str, comm: MPI.Comm) -> int:
     """Rank that holds an item that lives on one rank, the same in every run.
 
     Names that differ in their last number are dealt one by one, others by chance.
@@ -28,47 +28,47 @@ def rank_of(name: str, comm: Any) -> int:
     return (stem + int(numbers[-1] if numbers else 0)) % int(comm.size)
 
 
-def gather_rows(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def gather_rows(comm: MPI.Comm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Rows of all ranks in rank order, on every rank."""
     if comm.size == 1:  # pickling takes longer than the rows
         return rows.copy()
     return np.concatenate(comm.allgather(rows))
 
 
-def gather_on_root(comm: Any, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def gather_on_root(comm: MPI.Comm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Rows of all ranks in rank order on rank 0, none elsewhere."""
     parts = comm.gather(rows)
     return rows[:0] if parts is None else np.concatenate([p for p in parts if len(p)] or parts)
 
 
-def global_max(comm: Any, values: FloatArray) -> FloatArray:
+def global_max(comm: MPI.Comm, values: FloatArray) -> FloatArray:
     """Largest of each value over all ranks, on every rank."""
     return _over_ranks(comm, values, MPI.MAX)
 
 
-def global_sum(comm: Any, values: FloatArray) -> FloatArray:
+def global_sum(comm: MPI.Comm, values: FloatArray) -> FloatArray:
     """Sum of each value over all ranks, on every rank."""
     return _over_ranks(comm, values, MPI.SUM)
 
 
-def _over_ranks(comm: Any, values: FloatArray, op: Any) -> FloatArray:
+def _over_ranks(comm: MPI.Comm, values: FloatArray, op: Any) -> FloatArray:
     out = np.array(values, dtype=np.float64)
     if comm.size > 1:
         comm.Allreduce(MPI.IN_PLACE, out, op=op)
     return out
 
 
-def anywhere(comm: Any, flag: bool) -> bool:
+def anywhere(comm: MPI.Comm, flag: bool) -> bool:
     """Whether it holds on any rank, on every rank."""
     return bool(flag) if comm.size == 1 else bool(comm.allreduce(bool(flag), op=MPI.LOR))
 
 
-def everywhere(comm: Any, flag: bool) -> bool:
+def everywhere(comm: MPI.Comm, flag: bool) -> bool:
     """Whether it holds on all ranks, on every rank."""
     return bool(flag) if comm.size == 1 else bool(comm.allreduce(bool(flag), op=MPI.LAND))
 
 
-def first_problem(comm: Any, problem: str | None) -> str | None:
+def first_problem(comm: MPI.Comm, problem: str | None) -> str | None:
     """The first rank's problem, on every rank."""
     if comm.size == 1:
         return problem
@@ -76,7 +76,7 @@ def first_problem(comm: Any, problem: str | None) -> str | None:
 
 
 def raise_together(
-    comm: Any,
+    comm: MPI.Comm,
     problem: str | None,
     kind: Callable[[str], Exception] = ValueError,
     cause: Exception | None = None,
@@ -87,7 +87,7 @@ def raise_together(
         raise kind(found) from cause
 
 
-def on_root(comm: Any, work: Callable[[], T]) -> T | None:
+def on_root(comm: MPI.Comm, work: Callable[[], T]) -> T | None:
     """Run `work` on rank 0 and return its result there; what it raises is raised on every rank."""
     result, error = None, None
     if comm.rank == 0:
@@ -101,7 +101,7 @@ def on_root(comm: Any, work: Callable[[], T]) -> T | None:
     return result
 
 
-def write_on_root(comm: Any, what: str, action: Callable[[], Any]) -> Any:
+def write_on_root(comm: MPI.Comm, what: str, action: Callable[[], Any]) -> Any:
     """Let rank 0 write; its result there. If it fails, every rank raises.
 
     Args:
@@ -130,7 +130,7 @@ def write_on_root(comm: Any, what: str, action: Callable[[], Any]) -> Any:
     ) from cause
 
 
-def need_kernels(comm: Any) -> None:
+def need_kernels(comm: MPI.Comm) -> None:
     """Compile the kernels of contact where they are not there. Collective.
 
     Raises:

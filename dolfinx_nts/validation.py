@@ -14,6 +14,8 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 
@@ -181,7 +183,7 @@ def vectors(name: str, value: Any, what: str) -> FloatArray:
     return array
 
 
-def require_same(comm: Any, **given: Any) -> None:
+def require_same(comm: MPI.Comm, **given: Any) -> None:
     """Raise a ValueError on all ranks unless arguments have the same values there. Collective.
 
     Of functions only that they are some is compared.
@@ -236,7 +238,7 @@ def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tu
 
 
 def call_together(
-    comm: Any, name: str, function: Callable[..., Any], *arguments: Any, shown: Any = None
+    comm: MPI.Comm, name: str, function: Callable[..., Any], *arguments: Any, shown: Any = None
 ) -> Any:
     """Call the user's function; what it raises on one rank is raised on all.
 
@@ -261,7 +263,7 @@ def call_together(
 
 
 def at_time(
-    comm: Any, name: str, function: Callable[[float], Any], time: float, unit: str
+    comm: MPI.Comm, name: str, function: Callable[[float], Any], time: float, unit: str
 ) -> FloatArray:
     """The user's vector at a time, shape (3,); what fails on one rank raises on all.
 
@@ -296,7 +298,11 @@ def at_time(
 
 
 def agree(
-    comm: Any, label: str, value: FloatArray, problem: str | None, cause: Exception | None = None
+    comm: MPI.Comm,
+    label: str,
+    value: FloatArray,
+    problem: str | None,
+    cause: Exception | None = None,
 ) -> None:
     """Raise on all ranks what is wrong with a function's value on one, or if values differ.
 
@@ -324,13 +330,15 @@ def agree(
         raise UserFunctionError(problem) from cause
 
 
-def vector_in_time(comm: Any, name: str, value: Any, time: float, unit: str) -> FloatArray:
+def vector_in_time(comm: MPI.Comm, name: str, value: Any, time: float, unit: str) -> FloatArray:
     """A vector, or a function of time at a time, for which every rank must call this."""
     is_function = callable(value) and not hasattr(value, "ufl_shape")  # UFL's can be called, too
     return at_time(comm, name, value, time, unit) if is_function else vector(name, value, unit)
 
 
-def number_at(comm: Any, name: str, function: Callable[[float], Any], t: float, unit: str) -> float:
+def number_at(
+    comm: MPI.Comm, name: str, function: Callable[[float], Any], t: float, unit: str
+) -> float:
     """The user's number at a time; what fails on one rank raises on all.
 
     Raises:
@@ -346,7 +354,7 @@ def number_at(comm: Any, name: str, function: Callable[[float], Any], t: float, 
 
 
 def at_points(
-    comm: Any,
+    comm: MPI.Comm,
     name: str,
     function: Callable[[Any], Any],
     x: FloatArray,

@@ -6,7 +6,11 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
+from dolfinx import fem
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
@@ -57,14 +61,14 @@ class Body:
     """
 
     name: str
-    comm: Any
+    comm: MPI.Comm
     num_owned: int
     reference: FloatArray
     nodal_mass: FloatArray
     fixed: IntArray
 
-    mesh: Any = None
-    space: Any = None
+    mesh: Mesh = None
+    space: fem.FunctionSpace = None
     degree: int | None = None
     joints: tuple[Any, ...] = ()
     driven: bool = False

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import FloatArray, IntArray
@@ -139,7 +140,7 @@ def takes_place(value: Any) -> bool:
     return sum(p.kind in places and p.default is p.empty for p in parameters) == 2
 
 
-def facets_of(mesh: Any, where: Any, what: str) -> IntArray:
+def facets_of(mesh: Mesh, where: Any, what: str) -> IntArray:
     """This rank's facets that a `where` selects, as of `locate_facets`."""
     if isinstance(where, tuple) and len(where) == 2:
         return locate_facets(mesh, *where, what)
@@ -159,7 +160,7 @@ class Meetings:
     """
 
     def __init__(
-        self, comm: Any, name: str, values: Sequence[Any], dofs: Sequence[IntArray],
+        self, comm: MPI.Comm, name: str, values: Sequence[Any], dofs: Sequence[IntArray],
         x: FloatArray, width: int = 3,
     ) -> None:  # fmt: skip
         self._comm, self._name, self._dofs, self._x, self._width = comm, name, dofs, x, width
@@ -230,7 +231,9 @@ class Supports:
             prescribe different values of one coordinate.
     """
 
-    def __init__(self, comm: Any, space: Any, bcs: Sequence[Dirichlet], name: str) -> None:
+    def __init__(
+        self, comm: MPI.Comm, space: fem.FunctionSpace, bcs: Sequence[Dirichlet], name: str
+    ) -> None:
         self._comm, self._name = comm, name
         self._num_owned = 3 * space.dofmap.index_map.size_local
         bcs = items("bcs", bcs, lambda b: isinstance(b, Dirichlet), "Dirichlet")

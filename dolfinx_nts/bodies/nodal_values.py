@@ -13,7 +13,9 @@ from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.validation import UserFunctionError, at_points, vector
 
 
-def nodal_values(space: Any, name: str, body: str, given: Any, unit: str) -> FloatArray:
+def nodal_values(
+    space: fem.FunctionSpace, name: str, body: str, given: Any, unit: str
+) -> FloatArray:
     """Values of a vector field at all nodes of this rank, shape (nodes, 3). Collective.
 
     Args:
@@ -33,7 +35,7 @@ def nodal_values(space: Any, name: str, body: str, given: Any, unit: str) -> Flo
     return np.tile(vector(name, given, unit, or_else=else_), (len(x), 1))
 
 
-def at_nodes(space: Any, what: str, value: Any) -> FloatArray:
+def at_nodes(space: fem.FunctionSpace, what: str, value: Any) -> FloatArray:
     """Values of a Function of vectors at all nodes of this rank, shape (nodes, 3). Collective.
 
     Args:

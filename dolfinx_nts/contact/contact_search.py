@@ -6,7 +6,8 @@ import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
 
@@ -58,7 +59,7 @@ class ContactSearch:
     """
 
     def __init__(
-        self, contacts: Sequence[ContactPair], bodies: Sequence[tuple[int, ...]], comm: Any
+        self, contacts: Sequence[ContactPair], bodies: Sequence[tuple[int, ...]], comm: MPI.Comm
     ) -> None:
         self._pairs, self._comm = contacts, comm
         self.bodies = list(bodies)

@@ -54,7 +54,7 @@ class Obstacle:
             given = {f.name: getattr(self, f.name) for f in fields(self)}
         return given | {"name": self.name, "motion": self.driven}
 
-    def displacement(self, time: float, comm: Any) -> FloatArray:
+    def displacement(self, time: float, comm: MPI.Comm) -> FloatArray:
         """Displacement at a time [m], shape (3,). Collective if there is a motion.
 
         Raises:

@@ -18,6 +18,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import FloatArray, IntArray
@@ -34,7 +35,7 @@ logger = logging.getLogger(__name__)
 _CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
 
 
-def locate_facets(mesh: Any, marker: Any, tag: int | None, what: str) -> IntArray:
+def locate_facets(mesh: Mesh, marker: Any, tag: int | None, what: str) -> IntArray:
     """This rank's owned exterior facets selected by a marker function or by a tag.
 
     Args:
@@ -479,7 +480,7 @@ def winding(x: FloatArray, corners: FloatArray) -> float:
     return total / (2 * np.pi)
 
 
-def oriented_nodes(mesh: Any, local_facets: IntArray) -> IntArray:
+def oriented_nodes(mesh: Mesh, local_facets: IntArray) -> IntArray:
     """Geometry nodes of facets, cyclic and counter-clockwise seen from outside the cell."""
     nodes = compat.entities_to_geometry(mesh, 2, local_facets)
     nodes = nodes[:, _CYCLIC[nodes.shape[1]]]

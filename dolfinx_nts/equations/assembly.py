@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 from petsc4py import PETSc
 
@@ -49,7 +51,7 @@ class Triplets:
 
     def __init__(
         self,
-        comm: Any,
+        comm: MPI.Comm,
         size: tuple[int, int],
         parts: Sequence[Entries],
         bodies: Sequence[Any] = (),

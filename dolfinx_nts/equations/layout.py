@@ -8,7 +8,9 @@ unknowns (d, f), then the multipliers. A rank's unknowns are contiguous: its par
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +26,7 @@ class Layout:
         sizes: Unknowns of each field on this rank.
     """
 
-    def __init__(self, comm: Any, sizes: Sequence[int]) -> None:
+    def __init__(self, comm: MPI.Comm, sizes: Sequence[int]) -> None:
         counts = np.asarray(comm.allgather(list(sizes)), dtype=np.int64)
         zero = np.zeros((1, counts.shape[1]), np.int64)
         self.comm, self.counts, self._rank = comm, counts, comm.rank

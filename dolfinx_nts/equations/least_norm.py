@@ -11,6 +11,8 @@ import logging
 from collections.abc import Collection, Sequence
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import lsqr
@@ -89,7 +91,7 @@ class NullSpace:
     def __init__(
         self,
         laid: Unknowns,
-        comm: Any,
+        comm: MPI.Comm,
         elements: Sequence[Any],
         bodies: Sequence[tuple[int, ...]],
         parts: Sequence[Any],

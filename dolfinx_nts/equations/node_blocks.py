@@ -181,7 +181,7 @@ def add(matrix: Any, numbers: IntArray, values: npt.NDArray[np.float64]) -> None
     )
 
 
-def _most_couplings(comm: Any, first: IntArray, elements: Sequence[IntArray]) -> IntArray:
+def _most_couplings(comm: MPI.Comm, first: IntArray, elements: Sequence[IntArray]) -> IntArray:
     """Upper bound of the blocks that elements need in each of this rank's rows. Collective.
 
     Args:

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
@@ -58,7 +60,7 @@ class SharedWeight:
         contacts: Contacts of the scene.
     """
 
-    def __init__(self, comm: Any, contacts: Sequence[Any]) -> None:
+    def __init__(self, comm: MPI.Comm, contacts: Sequence[Any]) -> None:
         self._comm = comm
         self._any = any(_is_rigid(pair) for pair in contacts)
 

@@ -22,7 +22,7 @@ class Sleepers:
         comm: MPI communicator.
     """
 
-    def __init__(self, bodies: Sequence[Any], comm: Any) -> None:
+    def __init__(self, bodies: Sequence[Any], comm: MPI.Comm) -> None:
         self._bodies, self._comm = bodies, comm
         self._known: dict[int, tuple[FloatArray, FloatArray]] = {}
 

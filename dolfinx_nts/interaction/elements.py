@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from mpi4py import MPI
+
 import numpy as np
 
 from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
@@ -213,7 +215,7 @@ class Elements(Protocol):
 
 
 def evaluate_together(
-    comm: Any,
+    comm: MPI.Comm,
     elements: Sequence[Any],
     places: Sequence[FloatArray],
     own: Sequence[Mapping[str, FloatArray]],

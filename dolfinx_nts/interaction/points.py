@@ -9,6 +9,7 @@ from typing import Any
 import basix
 import numpy as np
 import numpy.typing as npt
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
@@ -191,7 +192,7 @@ def in_mesh(body: Any, x: FloatArray, name: str) -> Points:
     return Points(body, nodes, weights, reference, fixed, np.ones(nodes.shape, dtype=bool))
 
 
-def _cells_of(mesh: Any, x: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+def _cells_of(mesh: Mesh, x: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
     """Return which points (n, 3) this rank's own cells hold, of which one each, and where in it.
 
     DOLFINx's own search has a tolerance in metres, so that cells of 10 um hold nothing.

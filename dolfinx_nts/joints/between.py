@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 
 from dolfinx_nts.arrays import FloatArray
@@ -334,7 +336,7 @@ class Motion:
     """
 
     def __init__(
-        self, comm: Any, name: str, function: Any, unit: str, read: Callable[..., Any]
+        self, comm: MPI.Comm, name: str, function: Any, unit: str, read: Callable[..., Any]
     ) -> None:
         if not callable(function):
             raise TypeError(f"{name}={function!r}: pass a function of time, or leave it out")

@@ -21,7 +21,7 @@ class Interrupts:
         comm: MPI communicator.
     """
 
-    def __init__(self, comm: Any) -> None:
+    def __init__(self, comm: MPI.Comm) -> None:
         self._comm, self._number, self._told = comm, 0, False
         self._old: dict[int, Any] = {}
 

@@ -112,7 +112,7 @@ class AugmentedMatrix:
         diagonal.destroy()
         return found
 
-    def split_bodies(self, snes: Any, operator: Any) -> None:
+    def split_bodies(self, snes: PETSc.SNES, operator: Any) -> None:
         """Tell continua, for a multigrid, from other bodies. Collective, before the first solve.
 
         Args:

@@ -7,6 +7,8 @@ import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from mpi4py import MPI
+
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
@@ -192,7 +194,7 @@ class SolverOptions:
 
     def __init__(
         self,
-        comm: Any,
+        comm: MPI.Comm,
         preset: str,
         condense: bool,
         given: Mapping[str, Any],
@@ -256,7 +258,7 @@ class SolverOptions:
 
     def configure(
         self,
-        snes: Any,
+        snes: PETSc.SNES,
         matrix: StepMatrix | None,
         num_bodies: int,
         *,
@@ -289,7 +291,7 @@ class SolverOptions:
         if matrix is not None and self.split:
             _split(snes, *matrix.field_sets(num_bodies))
 
-    def _set(self, snes: Any, options: Mapping[str, str]) -> None:
+    def _set(self, snes: PETSc.SNES, options: Mapping[str, str]) -> None:
         """Give a SNES options (name -> the user's name) under a prefix that no other one has."""
         prefix = _free.pop() if _free else f"nts_{next(_numbers)}_"
         self._prefixes.append(prefix)
@@ -303,7 +305,7 @@ class SolverOptions:
         except PETSc.Error as error:
             raise self._refused(error) from error
 
-    def check(self, snes: Any, matrix: Any, source: Any) -> None:
+    def check(self, snes: PETSc.SNES, matrix: Any, source: Any) -> None:
         """Raise on every rank if PETSc asks for one of the user's options nowhere in a solve.
 
         Nothing is solved yet: most options are asked for when the solver is set up. If some are
@@ -377,7 +379,7 @@ def _remove(entered: dict[str, str], prefixes: list[str]) -> None:
     prefixes.clear()
 
 
-def _split(snes: Any, *parts: tuple[str, Any]) -> None:
+def _split(snes: PETSc.SNES, *parts: tuple[str, Any]) -> None:
     snes.getKSP().getPC().setFieldSplitIS(*parts)
     for _, index in parts:
         index.destroy()
@@ -431,7 +433,7 @@ class SchurInverse:
                 each.destroy()
 
 
-def set_schur(snes: Any, approximation: SchurApproximation) -> None:
+def set_schur(snes: PETSc.SNES, approximation: SchurApproximation) -> None:
     """Give a Schur field split what its constraints are preconditioned with.
 
     Args:
@@ -443,7 +445,7 @@ def set_schur(snes: Any, approximation: SchurApproximation) -> None:
     snes.getKSP().getPC().setFieldSplitSchurPreType(user, approximation.first)
 
 
-def take_bodies(snes: Any, operator: Any, bodies: Sequence[Any], split: bool) -> None:
+def take_bodies(snes: PETSc.SNES, operator: Any, bodies: Sequence[Any], split: bool) -> None:
     """Let this rank's preconditioner take whole bodies. Collective, before the first solve.
 
     Args:
@@ -465,7 +467,7 @@ def take_bodies(snes: Any, operator: Any, bodies: Sequence[Any], split: bool) ->
         part.destroy()
 
 
-def keep_bodies(snes: Any, keep: bool) -> None:
+def keep_bodies(snes: PETSc.SNES, keep: bool) -> None:
     """Whether a field split keeps the bodies' preconditioner when the matrix changes.
 
     Args:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from mpi4py import MPI
+
 from petsc4py import PETSc
 
 
 def model_problem(
-    comm: Any, *, constraint: bool
+    comm: MPI.Comm, *, constraint: bool
 ) -> tuple[Any, tuple[tuple[str, Any], tuple[str, Any]]]:
     """A chain of masses and springs, small but large enough for an algebraic multigrid.
 

@@ -84,7 +84,7 @@ class StepSolver:
         self._independent: bool | None = True if form_tree(joints) else None
         self.matrix: StepMatrix | None = None
         self._augmented: AugmentedMatrix | None = None
-        self.snes: Any = None
+        self.snes: PETSc.SNES = None
 
     @property
     def memory(self) -> tuple[Any, ...]:

@@ -136,7 +136,7 @@ class Presets:
             self._system.comm, self.name, self._condense, self._given, limit, workspace
         )
 
-    def alternative(self, snes: Any = None) -> int | None:
+    def alternative(self, snes: PETSc.SNES = None) -> int | None:
         """Number of the preset that takes over where a linear solve failed, None if none does.
 
         It is the one in use where MUMPS may try again with more workspace, which it then gets.
@@ -171,7 +171,7 @@ class Presets:
         # In the end rounding is left, which says nothing of the matrices.
         self._left = left if worst > 1.0 else min(left, self._left)
 
-    def aim(self, snes: Any, worst: float) -> None:
+    def aim(self, snes: PETSc.SNES, worst: float) -> None:
         """Let the Krylov solver of "krylov" and "multigrid" go as far as is worth it at an iterate.
 
         Args:
@@ -191,7 +191,7 @@ class Presets:
             limit = int(limit * math.log(rtol) / math.log(_COARSE))
         snes.getKSP().setTolerances(rtol=rtol, max_it=limit)
 
-    def why_failed(self, snes: Any, reason: int) -> tuple[str, bool]:
+    def why_failed(self, snes: PETSc.SNES, reason: int) -> tuple[str, bool]:
         """PETSc's reason of a failure in words, and whether they say what to do.
 
         Args:

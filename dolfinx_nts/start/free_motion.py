@@ -119,7 +119,7 @@ def _is_spin(combination: FloatArray, products: FloatArray, spin: BoolArray) -> 
 
 
 def _rigid(
-    y: FloatArray, places: BoolArray, comm: Any
+    y: FloatArray, places: BoolArray, comm: MPI.Comm
 ) -> tuple[list[FloatArray], FloatArray, bool]:
     """Three translations and three rotations about the middle of the places. Collective.
 

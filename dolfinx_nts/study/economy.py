@@ -25,7 +25,7 @@ from mpi4py import MPI
 import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import CellType, GhostMode, create_box
+from dolfinx.mesh import CellType, GhostMode, Mesh, create_box
 from petsc4py import PETSc
 
 import dolfinx_nts as nts
@@ -189,7 +189,7 @@ class PlainBody:
         dt: Step [s].
     """
 
-    def __init__(self, mesh: Any, material: Any, density: float, v: FloatArray, dt: float) -> None:
+    def __init__(self, mesh: Mesh, material: Any, density: float, v: FloatArray, dt: float) -> None:
         space = compat.vector_space(mesh, 1)
         self._u0, self._u1 = fem.Function(space), fem.Function(space)
         self.u, self.v, self._dt = np.zeros_like(v), v.copy(), dt
@@ -266,7 +266,7 @@ class Economy:
         dt: Step [s].
     """
 
-    def __init__(self, comm: Any, cells: int, dt: float = 5e-4) -> None:
+    def __init__(self, comm: MPI.Comm, cells: int, dt: float = 5e-4) -> None:
         self.comm, self.cells, self.dt = comm, cells, dt
         self._bodies = {place: self._cubes(*numbers) for place, numbers in PLACES.items()}
 
@@ -357,7 +357,9 @@ def _spinning(speed: float) -> Any:
 
 
 @known_options
-def table(comm: Any, *, cells: int = 8, steps: int = 10, rounds: int = 9) -> list[dict[str, Any]]:
+def table(
+    comm: MPI.Comm, *, cells: int = 8, steps: int = 10, rounds: int = 9
+) -> list[dict[str, Any]]:
     """Rows of the cost table, the same on all ranks.
 
     All rows are run once in each round, step by step in turn, and compared within it, as the

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
@@ -111,7 +113,7 @@ class Scene:
     facets: str = "even"
     held: bool = False
 
-    def case(self, comm: Any) -> Case:
+    def case(self, comm: MPI.Comm) -> Case:
         """The scene to run."""
         dt = self.dt * CONTACT
         edge, far = self.unit, self.offset * self.unit
@@ -186,7 +188,7 @@ class Scene:
             x[odd, 0] += 0.2 * size[0] / self.cells[1]
 
 
-def strips(comm: Any, cells: tuple[int, int]) -> Case:
+def strips(comm: MPI.Comm, cells: tuple[int, int]) -> Case:
     """Surfaces of very different meshes, at a speed that forces on single nodes allow.
 
     Args:
@@ -196,7 +198,7 @@ def strips(comm: Any, cells: tuple[int, int]) -> Case:
     return Scene(cells=cells, strip=2, speed=_GENTLE, dt=_COARSE).case(comm)
 
 
-def closing(comm: Any, dt: float) -> Case:
+def closing(comm: MPI.Comm, dt: float) -> Case:
     """An open ring whose ends meet: both surfaces belong to one body.
 
     Args:
@@ -241,7 +243,7 @@ def _shaking(time: float) -> tuple[float, float, float]:
     return 0.05 * math.sin(7.0 * time), 0.0, 0.0
 
 
-def long_run(comm: Any, kind: str) -> Case:
+def long_run(comm: MPI.Comm, kind: str) -> Case:
     """20,000 steps of a cube of one cell on a plane.
 
     Args:

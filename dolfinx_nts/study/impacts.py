@@ -69,12 +69,12 @@ class Problem(NamedTuple):
     accuracy: str = "exact"
 
 
-def two_blocks(comm: Any, mass: str) -> Problem:
+def two_blocks(comm: MPI.Comm, mass: str) -> Problem:
     """B1: oblique impact of two cubes."""
     return Problem(load("two_blocks").scene(comm, mass=mass), 2e-3, 0.2)
 
 
-def bar(comm: Any, mass: str, *, gravity: bool = False, elements: int = 50) -> Problem:
+def bar(comm: MPI.Comm, mass: str, *, gravity: bool = False, elements: int = 50) -> Problem:
     """B2, B3: an elastic bar is thrown or dropped onto a wall, Courant number 1."""
     demo = load("bar_impact")
 
@@ -88,7 +88,7 @@ def bar(comm: Any, mass: str, *, gravity: bool = False, elements: int = 50) -> P
     )
 
 
-def block(comm: Any, mass: str) -> Problem:
+def block(comm: MPI.Comm, mass: str) -> Problem:
     """B6: a rigid block meets a plane, whose gap closes in a quarter of a step."""
     speed, dt = 2.0, 1e-3
     low = (3 + _THETA) * speed * dt
@@ -151,7 +151,7 @@ class Hertz:
         return np.append(t, 2 * t[-1] - t[-2::-1]), np.append(force, force[-2::-1])
 
 
-def ball_mesh(comm: Any, cells: int, grading: float = 4.0) -> Any:
+def ball_mesh(comm: MPI.Comm, cells: int, grading: float = 4.0) -> Any:
     """A quarter of the unit ball whose cells are small at the south pole.
 
     Args:
@@ -172,7 +172,7 @@ def ball_mesh(comm: Any, cells: int, grading: float = 4.0) -> Any:
     return mesh
 
 
-def sphere(comm: Any, mass: str, *, cells: int = 8, steps: int = 60) -> Problem:
+def sphere(comm: MPI.Comm, mass: str, *, cells: int = 8, steps: int = 60) -> Problem:
     """B11: Hertz's impact; the gap closes after two and a half steps."""
     exact = Hertz()
     mesh, (times, forces) = ball_mesh(comm, cells), exact.over_time()
@@ -202,7 +202,7 @@ def sphere(comm: Any, mass: str, *, cells: int = 8, steps: int = 60) -> Problem:
     return Problem(nts.System([body], contacts=[pair]), dt, end, force, True, 4, "balanced")
 
 
-def two_tori(comm: Any, mass: str) -> Problem:
+def two_tori(comm: MPI.Comm, mass: str) -> Problem:
     """B13: hollow tori collide."""
     system = load("two_tori").scene(comm, mass=mass)
     return Problem(system, 0.1, 8.0, accuracy="balanced")
@@ -255,7 +255,7 @@ class Recorder:
         return speed
 
 
-def measure(problem: str, way: str, comm: Any) -> dict[str, Any]:
+def measure(problem: str, way: str, comm: MPI.Comm) -> dict[str, Any]:
     """A row of the table. Collective."""
     row: dict[str, Any] = {"problem": problem, "way": way}
     mass, options = WAYS[way]
@@ -314,7 +314,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def table(only: Sequence[str] = (), ways: Sequence[str] = (), comm: Any = MPI.COMM_WORLD) -> (
+def table(only: Sequence[str] = (), ways: Sequence[str] = (), comm: MPI.Comm = MPI.COMM_WORLD) -> (
     list[dict[str, Any]]
 ):  # fmt: skip
     """Rows of all runs.

@@ -264,7 +264,7 @@ def check_value(name: str, value: Any) -> None:
         _options({"dt": 1.0, "integrator": nts.EnergyMomentum()}, {name: value})
 
 
-def measure(scene: str, choices: Mapping[str, Any], comm: Any) -> Run:
+def measure(scene: str, choices: Mapping[str, Any], comm: MPI.Comm) -> Run:
     """Run a scene with some choices.
 
     Args:

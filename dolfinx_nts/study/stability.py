@@ -84,7 +84,7 @@ AXES: Mapping[str, tuple[str | Callable[[Any, Any], Case], tuple[Any, ...]]] = {
 }
 
 
-def case(axis: str, value: Any, comm: Any) -> Case:
+def case(axis: str, value: Any, comm: MPI.Comm) -> Case:
     """The scene at a value of an axis."""
     what = AXES[axis][0]
     if callable(what):
@@ -126,7 +126,7 @@ def _energy(run: nts.Solution) -> float:
 
 
 def measure(
-    axis: str, value: Any, name: str, comm: Any, accuracy: str = "exact"
+    axis: str, value: Any, name: str, comm: MPI.Comm, accuracy: str = "exact"
 ) -> dict[str, Any]:
     """A row of the table."""
     integrator, begin, scene = INTEGRATORS[name], time.perf_counter(), case(axis, value, comm)
@@ -150,7 +150,7 @@ def chart(
     only: Sequence[str] = (),
     integrators: Sequence[str] = (),
     accuracy: Sequence[str] = (),
-    comm: Any = MPI.COMM_WORLD,
+    comm: MPI.Comm = MPI.COMM_WORLD,
     told: Callable[[list[dict[str, Any]]], None] = lambda _: None,
 ) -> list[dict[str, Any]]:
     """Rows of all runs of some axes.

@@ -53,7 +53,7 @@ def compare(
     vary: Mapping[str, Sequence[Any]],
     fixed: Mapping[str, Any],
     reference: Mapping[str, Any],
-    comm: Any,
+    comm: MPI.Comm,
 ) -> list[dict[str, Any]]:
     """Rows of all runs, the reference first.
 
@@ -145,7 +145,7 @@ def plot(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     plt.close(figure)
 
 
-def provenance(scene: str, comm: Any) -> str:
+def provenance(scene: str, comm: MPI.Comm) -> str:
     """Scene, versions and ranks."""
     made_by = ", ".join(f"{name} {version}" for name, version in versions().items())
     return f"{scene}: {made_by}, {comm.size} rank(s), {platform.machine()}"

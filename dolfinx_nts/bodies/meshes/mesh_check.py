@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import mesh as dolfinx_mesh
+from dolfinx.mesh import Mesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -32,12 +32,12 @@ _FACES = np.array(
 )
 
 
-def places_of(mesh: Any) -> int:
+def places_of(mesh: Mesh) -> int:
     """Checksum of where a mesh's nodes on this rank are."""
     return zlib.crc32(np.ascontiguousarray(mesh.geometry.x).tobytes())
 
 
-def check_mesh(mesh: Any, name: str) -> None:
+def check_mesh(mesh: Mesh, name: str) -> None:
     """Raise on every rank unless the mesh is a valid 3D mesh of degree 1.
 
     Args:
@@ -68,7 +68,7 @@ def check_mesh(mesh: Any, name: str) -> None:
     _check_cells(mesh, name, mesh.geometry.x[cells[:owned].reshape(owned, _CORNERS[kind])])
 
 
-def check_any_mesh(mesh: Any, name: str, degree: int = 1) -> None:
+def check_any_mesh(mesh: Mesh, name: str, degree: int = 1) -> None:
     """Raise on every rank unless the mesh is valid and of degree 1, of any dimension.
 
     Args:
@@ -85,7 +85,7 @@ def check_any_mesh(mesh: Any, name: str, degree: int = 1) -> None:
         _check_nodes(mesh, name, degree)
 
 
-def refuse_repeated(mesh: Any, name: str) -> None:
+def refuse_repeated(mesh: Mesh, name: str) -> None:
     """Raise on every rank if cells are there twice, as where each rank gives the whole mesh.
 
     Cells are the same that have the same places. Surfaces and lines may lie on each other, so that
@@ -122,7 +122,7 @@ def refuse_repeated(mesh: Any, name: str) -> None:
     raise_together(mesh.comm, text if len(twice) else None)
 
 
-def pieces_of(mesh: Any) -> int:
+def pieces_of(mesh: Mesh) -> int:
     """Number of parts of a mesh that share no node, the same on all ranks. Collective."""
     size = mesh.topology.index_map(mesh.topology.dim).size_local
     cells = compat.geometry_dofmap(mesh)[:size]
@@ -156,7 +156,7 @@ def _hashed(a: HashArray) -> HashArray:
     return a ^ (a >> np.uint64(31))
 
 
-def _check_nodes(mesh: Any, name: str, degree: int = 1) -> None:
+def _check_nodes(mesh: Mesh, name: str, degree: int = 1) -> None:
     """Raise on every rank unless the nodes are corners of known cells, and finite."""
     kind, cells = compat.cell_name(mesh), compat.geometry_dofmap(mesh)
     if kind not in _CORNERS:
@@ -174,7 +174,7 @@ def _check_nodes(mesh: Any, name: str, degree: int = 1) -> None:
     refuse_repeated(mesh, f"mesh of {name!r}")
 
 
-def _check_cells(mesh: Any, name: str, x: FloatArray) -> None:
+def _check_cells(mesh: Mesh, name: str, x: FloatArray) -> None:
     """Raise on every rank if one of the cells with corners x (n, 4 or 8, 3) is inverted."""
     if x.shape[1] == 8:
         edges = x[:, _NEIGHBOURS] - x[:, :, None]

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import FloatArray, IntArray
@@ -51,7 +52,7 @@ class Part:
     """
 
     name: str
-    mesh: Any
+    mesh: Mesh
     facet_tags: Any
     surfaces: Mapping[str, int]
     cell_tags: Any
@@ -144,7 +145,7 @@ class Parts(dict[str, Part]):
 
 
 def bodies_from_gmsh(
-    file_or_model: Any, comm: Any, *, bodies: Mapping[str, Sequence[str]] | None = None
+    file_or_model: Any, comm: MPI.Comm, *, bodies: Mapping[str, Sequence[str]] | None = None
 ) -> Parts:
     """One mesh per physical volume of a Gmsh file or model, or of several of them.
 
@@ -183,7 +184,7 @@ def bodies_from_gmsh(
 
 
 def bodies_from_tags(
-    mesh: Any,
+    mesh: Mesh,
     cell_tags: Any,
     facet_tags: Any = None,
     *,
@@ -230,7 +231,7 @@ def bodies_from_tags(
     return _parts(mesh.comm, on_root(mesh.comm, lambda: _merge(kind, gathered, bodies, named)))
 
 
-def _parts(comm: Any, data: Input | None) -> Parts:
+def _parts(comm: MPI.Comm, data: Input | None) -> Parts:
     """Distribute the bodies that rank 0 holds."""
     names = comm.bcast(None if data is None else [v.name for v in data.volumes])
     surfaces = comm.bcast(None if data is None else data.surfaces)
@@ -285,7 +286,7 @@ def _body(data: Input, index: int) -> tuple[Any, ...]:
     )
 
 
-def _part(comm: Any, name: str, body: Any, surfaces: Mapping[str, int]) -> Part:
+def _part(comm: MPI.Comm, name: str, body: Any, surfaces: Mapping[str, int]) -> Part:
     """Mesh and tags of one body whose arrays rank 0 holds."""
     shared = comm.bcast(None if body is None else (body[0], *body[3:]))
     kind, facets, tags, regions, names = shared
@@ -306,7 +307,7 @@ def _part(comm: Any, name: str, body: Any, surfaces: Mapping[str, int]) -> Part:
     return Part(name, mesh, facet_tags, here, cell_tags, names)
 
 
-def _find_facets(mesh: Any, facets: IntArray, tags: IntArray) -> tuple[IntArray, IntArray]:
+def _find_facets(mesh: Mesh, facets: IntArray, tags: IntArray) -> tuple[IntArray, IntArray]:
     """This rank's facets with the given nodes, ascending, and their tags.
 
     Args:
@@ -331,7 +332,7 @@ def _find_facets(mesh: Any, facets: IntArray, tags: IntArray) -> tuple[IntArray,
 
 
 # ---- DOLFINx meshes
-def _tagged_cells(mesh: Any, cell_tags: Any) -> tuple[IntArray, IntArray, FloatArray]:
+def _tagged_cells(mesh: Mesh, cell_tags: Any) -> tuple[IntArray, IntArray, FloatArray]:
     """This rank's owned tagged cells: tags, nodes (m, corners), positions (m, corners, 3)."""
     owned = cell_tags.indices < mesh.topology.index_map(3).size_local
     index = cell_tags.indices[owned]
@@ -341,7 +342,7 @@ def _tagged_cells(mesh: Any, cell_tags: Any) -> tuple[IntArray, IntArray, FloatA
     return cell_tags.values[owned], ids[nodes], mesh.geometry.x[nodes]
 
 
-def _tagged_facets(mesh: Any, facet_tags: Any) -> tuple[IntArray, IntArray]:
+def _tagged_facets(mesh: Mesh, facet_tags: Any) -> tuple[IntArray, IntArray]:
     """This rank's tagged facets: tags and nodes."""
     index = np.empty(0, np.int32) if facet_tags is None else facet_tags.indices
     nodes = compat.entities_to_geometry(mesh, 2, index)

@@ -7,8 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx import mesh as dolfinx_mesh
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import FloatArray, IntArray
@@ -22,7 +25,7 @@ _CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, 
 _TETRAHEDRA = [[0, 1, 2, 5], [0, 1, 4, 5], [0, 3, 4, 5]]
 
 
-def extrude(mesh: Any, thickness: float, *, layers: int = 1) -> Any:
+def extrude(mesh: Mesh, thickness: float, *, layers: int = 1) -> Any:
     """A body of a plane mesh and a thickness in z, e.g. for plane strain. Collective.
 
     Quadrilaterals become hexahedra, triangles three tetrahedra in each layer. In plane strain one
@@ -63,7 +66,7 @@ def extrude(mesh: Any, thickness: float, *, layers: int = 1) -> Any:
     return _made(mesh.comm, both, points, "hexahedron")
 
 
-def linear(mesh: Any) -> Any:
+def linear(mesh: Mesh) -> Any:
     """The mesh of degree 1 through the corners of a curved one's cells. Collective.
 
     Curved edges become straight: a boundary of radius r and edges of length h lies up to
@@ -84,7 +87,7 @@ def linear(mesh: Any) -> Any:
     return _made(mesh.comm, *_on_root(mesh), kind, mesh.geometry.dim)
 
 
-def _kind(mesh: Any, known: tuple[str, ...]) -> str:
+def _kind(mesh: Mesh, known: tuple[str, ...]) -> str:
     """Cell type of a mesh, one of those known."""
     if not isinstance(mesh, dolfinx_mesh.Mesh):
         raise TypeError(f"mesh={mesh!r}: pass a dolfinx mesh")
@@ -95,7 +98,7 @@ def _kind(mesh: Any, known: tuple[str, ...]) -> str:
     return kind
 
 
-def _on_root(mesh: Any) -> tuple[IntArray, FloatArray]:
+def _on_root(mesh: Mesh) -> tuple[IntArray, FloatArray]:
     """Corners of the cells, (m, corners), and places of nodes that are some, (n, 3), on rank 0."""
     corners, dim = _CORNERS[compat.cell_name(mesh)], mesh.topology.dim
     owned = mesh.topology.index_map(dim).size_local
@@ -110,5 +113,5 @@ def _on_root(mesh: Any) -> tuple[IntArray, FloatArray]:
     return numbers.reshape(-1, corners), x[np.searchsorted(nodes, used)]
 
 
-def _made(comm: Any, cells: IntArray, x: FloatArray, kind: str, dim: int = 3) -> Any:
+def _made(comm: MPI.Comm, cells: IntArray, x: FloatArray, kind: str, dim: int = 3) -> Any:
     return compat.create_mesh(comm, cells, x[:, :dim], kind)

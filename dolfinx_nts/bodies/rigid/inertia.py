@@ -72,7 +72,7 @@ def _not_rounding(euler: FloatArray) -> FloatArray:
     return np.where(euler > ROUNDED * euler.max(), euler, 0.0)
 
 
-def inertia_of(space: Any, density: Parameter) -> Inertia:
+def inertia_of(space: fem.FunctionSpace, density: Parameter) -> Inertia:
     """That of a mesh with a function space of vectors on it. Collective."""
     mesh = space.mesh
     rho = fem.Constant(mesh, float(density)) if is_number(density) else density

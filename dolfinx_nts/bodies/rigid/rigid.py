@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
@@ -92,7 +93,7 @@ class RigidBody(Body):
 
     def __init__(
         self,
-        mesh: Any,
+        mesh: Mesh,
         *,
         density: Parameter,
         velocity: Any = (0.0, 0.0, 0.0),
@@ -136,7 +137,7 @@ class RigidBody(Body):
         motion: VectorInTime | None = None,
         rotation: Any = None,
         name: str = "rigid",
-        comm: Any = MPI.COMM_WORLD,
+        comm: MPI.Comm = MPI.COMM_WORLD,
     ) -> RigidBody:
         """A rigid body without a mesh.
 
@@ -179,7 +180,7 @@ class RigidBody(Body):
 
     def _set_up(
         self,
-        comm: Any,
+        comm: MPI.Comm,
         inertia: Inertia,
         *,
         name: str,

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -38,7 +40,12 @@ class RigidLoads:
     """
 
     def __init__(
-        self, comm: Any, name: str, force: VectorInTime, torque: VectorInTime, euler: FloatArray
+        self,
+        comm: MPI.Comm,
+        name: str,
+        force: VectorInTime,
+        torque: VectorInTime,
+        euler: FloatArray,
     ) -> None:
         self._comm, self._name, self._turned = comm, name, euler > 0.0
         self._given = ("force", force, "N"), ("torque", torque, "N m")
@@ -143,7 +150,7 @@ class PrescribedMotion:
         in_time: Whether one of them is a function of time.
     """
 
-    def __init__(self, comm: Any, name: str, motion: Any, rotation: Any) -> None:
+    def __init__(self, comm: MPI.Comm, name: str, motion: Any, rotation: Any) -> None:
         self._comm, self._name, self._motion, self._rotation = comm, name, motion, rotation
         self.moves, self.turns = motion is not None, rotation is not None
         self.in_time = callable(motion) or callable(rotation)

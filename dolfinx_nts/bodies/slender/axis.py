@@ -7,7 +7,9 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
+from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
@@ -27,7 +29,7 @@ _SHORT = 1e-12
 _UNEVEN = 2.0
 
 
-def check_line(mesh: Any, degree: Any, name: str) -> int:
+def check_line(mesh: Mesh, degree: Any, name: str) -> int:
     """Raise on every rank unless the mesh is one of intervals in space.
 
     Args:
@@ -65,7 +67,7 @@ def check_line(mesh: Any, degree: Any, name: str) -> int:
     return int(degree)
 
 
-def axis_of(space: Any, direction: Any, name: str) -> DirectorMesh:
+def axis_of(space: fem.FunctionSpace, direction: Any, name: str) -> DirectorMesh:
     """The axis of a mesh that `check_line` let pass; nodes follow it, d_3 is along it. Collective.
 
     Args:
@@ -170,7 +172,9 @@ def _tangents(x: FloatArray, cells: IntArray, name: str) -> FloatArray:
     return tangent
 
 
-def _first(comm: Any, x: FloatArray, tangent: FloatArray, direction: Any, name: str) -> FloatArray:
+def _first(
+    comm: MPI.Comm, x: FloatArray, tangent: FloatArray, direction: Any, name: str
+) -> FloatArray:
     """d_1 at right angles to the axis, shape (n, 3). Collective."""
     what = f"direction of {name!r}"
     if direction is None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet
@@ -68,7 +69,7 @@ class Beam(DirectorBody):
 
     def __init__(
         self,
-        mesh: Any,
+        mesh: Mesh,
         section: Section,
         *,
         direction: Any = None,

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
@@ -90,7 +91,7 @@ class DirectorBody(Body):
         raise NotImplementedError
 
     # ---- set-up
-    def _set_up_mesh(self, mesh: Any, name: str, degree: int = 1) -> None:
+    def _set_up_mesh(self, mesh: Mesh, name: str, degree: int = 1) -> None:
         """What fields live on."""
         self.name, self.mesh, self.degree = name, mesh, degree
         self.comm = compat.petsc_communicator(mesh.comm)

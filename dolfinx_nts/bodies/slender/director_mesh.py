@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import FloatArray, IntArray
@@ -31,7 +32,7 @@ class DirectorMesh(NamedTuple):
     lengths: FloatArray
 
 
-def nodes_and_cells(space: Any) -> tuple[FloatArray, IntArray, IntArray]:
+def nodes_and_cells(space: fem.FunctionSpace) -> tuple[FloatArray, IntArray, IntArray]:
     """Nodes and cells of a mesh on all ranks. Collective.
 
     Args:

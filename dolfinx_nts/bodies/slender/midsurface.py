@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
+from dolfinx.mesh import Mesh
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
@@ -25,7 +25,7 @@ _FLAT = 1e-9
 _SEAM = 'nts.Seam(shell, other.surface(where, side="edge"))'
 
 
-def check_midsurface(mesh: Any, name: str) -> None:
+def check_midsurface(mesh: Mesh, name: str) -> None:
     """Raise on every rank unless the mesh is one of quadrilaterals in space.
 
     Raises:
@@ -48,7 +48,7 @@ def check_midsurface(mesh: Any, name: str) -> None:
     check_any_mesh(mesh, name)
 
 
-def midsurface_of(space: Any, name: str) -> DirectorMesh:
+def midsurface_of(space: fem.FunctionSpace, name: str) -> DirectorMesh:
     """Nodes in the order of the user's input, cells of one orientation, directors. Collective.
 
     The director of a node is the mean of the normals of its cells there, each weighted by its

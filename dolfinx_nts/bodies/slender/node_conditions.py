@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from mpi4py import MPI
+
 import numpy as np
 
 from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
@@ -42,7 +44,7 @@ class NodeConditions:
 
     def __init__(
         self,
-        comm: Any,
+        comm: MPI.Comm,
         skeleton: DirectorMesh,
         here: slice,
         bcs: Sequence[Clamp | Dirichlet],

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 
@@ -72,7 +74,7 @@ class Pressures:
     """
 
     def __init__(
-        self, comm: Any, skeleton: DirectorMesh, cells: npt.NDArray[Any],
+        self, comm: MPI.Comm, skeleton: DirectorMesh, cells: npt.NDArray[Any],
         loads: dict[int, Pressure], name: str,
     ) -> None:  # fmt: skip
         self._comm = comm

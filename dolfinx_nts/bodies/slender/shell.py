@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet
@@ -77,7 +78,7 @@ class Shell(DirectorBody):
 
     def __init__(
         self,
-        mesh: Any,
+        mesh: Mesh,
         *,
         young: float,
         poisson: float,

@@ -10,6 +10,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import FloatArray
@@ -86,7 +87,7 @@ class Continuum(UflBody):
 
     def __init__(
         self,
-        mesh: Any,
+        mesh: Mesh,
         material: Callable[[Any], Any],
         *,
         density: Parameter,

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import ufl
+from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet
@@ -81,7 +82,7 @@ class FormBody(UflBody):
 
     def __init__(
         self,
-        space: Any,
+        space: fem.FunctionSpace,
         energy: Callable[..., Any],
         *,
         strain: Callable[[Any], Any] | None = None,

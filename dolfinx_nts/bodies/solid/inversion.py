@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 import basix
 import numpy as np
+from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.arrays import FloatArray
@@ -55,7 +56,7 @@ class Determinants:
         quadrature_degree: That of the strain energy.
     """
 
-    def __init__(self, space: Any, degree: int, quadrature_degree: int) -> None:
+    def __init__(self, space: fem.FunctionSpace, degree: int, quadrature_degree: int) -> None:
         name = compat.cell_name(space.mesh)
         kind = getattr(basix.CellType, name)
         points = basix.make_quadrature(kind, quadrature_degree)[0]

@@ -196,7 +196,7 @@ class _Products:
         self._out.destroy()
 
 
-def _levels(mass: _Products, massless: BoolArray, comm: Any) -> IntArray | None:
+def _levels(mass: _Products, massless: BoolArray, comm: MPI.Comm) -> IntArray | None:
     """Cells from each node to one with mass, shape (n,); None if some node reaches none."""
     level, layer = np.where(massless, -1, 0), 0
     while comm.allreduce(bool((level < 0).any()), op=MPI.LOR):
@@ -248,7 +248,7 @@ def _at_nodes(mass: Any, nodes: npt.NDArray[Any], values: FloatArray) -> FloatAr
     return found
 
 
-def _polynomials(x: FloatArray, comm: Any) -> FloatArray:
+def _polynomials(x: FloatArray, comm: MPI.Comm) -> FloatArray:
     """1, x, y, z and their products about the middle of the nodes, over their size, (n, 10)."""
     ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
     comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
@@ -259,7 +259,7 @@ def _polynomials(x: FloatArray, comm: Any) -> FloatArray:
     return columns
 
 
-def _moments(affine: FloatArray, products: list[FloatArray], comm: Any) -> FloatArray:
+def _moments(affine: FloatArray, products: list[FloatArray], comm: MPI.Comm) -> FloatArray:
     """Return the moments of mass in the order of `_polynomials`, shape (10,). Collective."""
     local = [float(affine[:, i] @ products[j]) for i in range(4) for j in range(i, 4)]
     total: FloatArray = comm.allreduce(np.array(local))
@@ -267,7 +267,7 @@ def _moments(affine: FloatArray, products: list[FloatArray], comm: Any) -> Float
 
 
 def _factors(
-    mass: _Products, shape: FloatArray, wanted: FloatArray, kept: BoolArray, comm: Any
+    mass: _Products, shape: FloatArray, wanted: FloatArray, kept: BoolArray, comm: MPI.Comm
 ) -> tuple[FloatArray, str]:
     """Factors of the nodal masses, (n,), that give the wanted moments, and why none do."""
     affine, unknown = shape[:, :4], np.zeros(shape.shape[1])
@@ -303,7 +303,7 @@ def waves(
     x: FloatArray,
     mass: FloatArray,
     massless: BoolArray,
-    comm: Any,
+    comm: MPI.Comm,
 ) -> tuple[float, float]:
     """Thickness of the layer over the body's, and speed of pressure waves over shear ones.
 

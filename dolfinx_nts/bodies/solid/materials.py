@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 from ufl.constantvalue import RealValue
 from ufl.corealg.traversal import traverse_unique_terminals
 
@@ -210,7 +211,7 @@ class MooneyRivlin(Isotropic):
         return first, first - (a + b), first - linear
 
 
-def with_constants(material: Any, mesh: Any) -> Any:
+def with_constants(material: Any, mesh: Mesh) -> Any:
     """A material of this package with its numbers in a Constant: all moduli share compiled forms.
 
     Args:

@@ -75,7 +75,7 @@ class StepForms:
 
     def __init__(
         self,
-        space: Any,
+        space: fem.FunctionSpace,
         virtual_work: Callable[[Integrator, Any, Any, Any], Any],
         mass: Callable[[Any, Any], Any],
         extra: ExtraForm | None,

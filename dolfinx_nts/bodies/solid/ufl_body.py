@@ -68,7 +68,7 @@ class UflBody(Body):
     _mass: MassMatrix
 
     def __init__(
-        self, space: Any, degree: int, name: str, extra_form: ExtraForm | None,
+        self, space: fem.FunctionSpace, degree: int, name: str, extra_form: ExtraForm | None,
         quadrature_degree: int, allow_inversion: bool,
     ) -> None:  # fmt: skip
         require_name("name", name)
