@@ -26,10 +26,10 @@ from ffcx.codegeneration import jit as ffcx_jit
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.canonical import canonical
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ def _ghosts() -> dict[str, Any]:
     return {"partitioner": mesh.create_cell_partitioner(_SHARED, *links)}
 
 
-def create_mesh(comm: MPI.Comm, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Any:
+def create_mesh(comm: MPI.Comm, cells: npt.ArrayLike, x: npt.ArrayLike, cell_type: str) -> Mesh:
     """Mesh of degree 1, of intervals with three nodes of degree 2, with shared-facet ghosts.
 
     Args:
@@ -249,7 +249,7 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
         logging.disable(before)
 
 
-def vector_space(msh: Mesh, degree: int) -> Any:
+def vector_space(msh: Mesh, degree: int) -> fem.FunctionSpace:
     """Continuous Lagrange space of 3-vectors."""
     if _OLD:
         with _told_compiler("an element"):
@@ -283,7 +283,7 @@ def is_nodal(space: fem.FunctionSpace, msh: Mesh) -> bool:
     return same and not broken
 
 
-def scalar_space(msh: Mesh, family: str, degree: int) -> Any:
+def scalar_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
     """Scalar space of the family ("Lagrange" or "DG")."""
     if _OLD:
         with _told_compiler("an element"):
@@ -291,7 +291,7 @@ def scalar_space(msh: Mesh, family: str, degree: int) -> Any:
     return fem.functionspace(msh, (family, degree))
 
 
-def cell_vector_space(msh: Mesh, family: str, degree: int) -> Any:
+def cell_vector_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
     """Space of 3-vectors of the family ("DG")."""
     if _OLD:
         with _told_compiler("an element"):
@@ -299,7 +299,7 @@ def cell_vector_space(msh: Mesh, family: str, degree: int) -> Any:
     return fem.functionspace(msh, (family, degree, (3,)))
 
 
-def tensor_space(msh: Mesh, family: str, degree: int) -> Any:
+def tensor_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
     """Space of 3 x 3 tensors of the family ("Lagrange" or "DG")."""
     if _OLD:
         with _told_compiler("an element"):
@@ -444,7 +444,7 @@ def plain_dofs(space: fem.FunctionSpace, cells: int) -> IntArray | None:
 _COMMUNICATORS: list[Any] = [MPI.COMM_SELF, MPI.COMM_WORLD]
 
 
-def petsc_communicator(comm: MPI.Comm) -> Any:
+def petsc_communicator(comm: MPI.Comm) -> MPI.Comm:
     """Communicator of the same ranks, one for all meshes, for PETSc's objects.
 
     In parallel PETSc frees what Python has dropped in `free_dropped` alone, by communicator. Each
@@ -463,7 +463,7 @@ def free_dropped(comm: MPI.Comm) -> None:
         PETSc.garbage_cleanup(comm)
 
 
-def create_vector(space: fem.FunctionSpace) -> Any:
+def create_vector(space: fem.FunctionSpace) -> PETSc.Vec:
     """New zero ghosted PETSc vector in the layout of the space."""
     blocks, size = space.dofmap.index_map, space.dofmap.index_map_bs
     b = PETSc.Vec().createGhost(
@@ -481,12 +481,12 @@ def add_vector(values: FloatArray, form: Any) -> None:
     cpp.fem.assemble_vector(values, form, *packed)
 
 
-def sum_ghosts(b: Any) -> None:
+def sum_ghosts(b: PETSc.Vec) -> None:
     """Add values at ghosts of a PETSc vector to their owners."""
     b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
 
-def create_matrix(form: Any) -> Any:
+def create_matrix(form: Any) -> PETSc.Mat:
     """New PETSc matrix with the sparsity of a bilinear form."""
     pattern = fem.create_sparsity_pattern(form)
     if _OLD:
@@ -496,7 +496,7 @@ def create_matrix(form: Any) -> Any:
     return cpp.la.petsc.create_matrix(petsc_communicator(form.mesh.comm), pattern)
 
 
-def dense_matrix(comm: MPI.Comm, size: int) -> Any:
+def dense_matrix(comm: MPI.Comm, size: int) -> PETSc.Mat:
     """New PETSc AIJ matrix of nodes, 3 x 3 blocks, with room for all entries of a rank's own.
 
     Args:
@@ -506,7 +506,7 @@ def dense_matrix(comm: MPI.Comm, size: int) -> Any:
     return PETSc.Mat().createAIJ(((size, None), (size, None)), nnz=(size, 0), bsize=3, comm=comm)
 
 
-def coo_matrix(comm: MPI.Comm, size: int, rows: npt.ArrayLike, cols: npt.ArrayLike) -> Any:
+def coo_matrix(comm: MPI.Comm, size: int, rows: npt.ArrayLike, cols: npt.ArrayLike) -> PETSc.Mat:
     """New PETSc AIJ matrix of nodes, 3 x 3 blocks, for `set_values_coo`.
 
     Args:
@@ -523,7 +523,7 @@ def coo_matrix(comm: MPI.Comm, size: int, rows: npt.ArrayLike, cols: npt.ArrayLi
     return a
 
 
-def without_zeros(a: Any) -> Any:
+def without_zeros(a: PETSc.Mat) -> PETSc.Mat:
     """Copy of an assembled matrix without the zeros stored in it; MatFilter only since 3.20."""
     rows, cols, values = a.getValuesCSR()
     kept = values != 0.0
@@ -531,7 +531,7 @@ def without_zeros(a: Any) -> Any:
     return with_entries(a, start, cols[kept], values[kept])
 
 
-def with_entries(a: Any, start: IntArray, cols: IntArray, values: FloatArray) -> Any:
+def with_entries(a: PETSc.Mat, start: IntArray, cols: IntArray, values: FloatArray) -> PETSc.Mat:
     """PETSc AIJ matrix of the sizes of another with other entries of this rank's rows.
 
     Args:
@@ -544,7 +544,7 @@ def with_entries(a: Any, start: IntArray, cols: IntArray, values: FloatArray) ->
     return PETSc.Mat().createAIJ(a.getSizes(), csr=csr, comm=a.comm)
 
 
-def assemble_matrix(a: Any, form: Any, bcs: Sequence[Any], diagonal: float) -> None:
+def assemble_matrix(a: PETSc.Mat, form: Any, bcs: Sequence[Any], diagonal: float) -> None:
     """Assemble a bilinear form; rows and columns of bcs hold only the given diagonal."""
     a.zeroEntries()
     fem_petsc.assemble_matrix(a, form, list(bcs), diagonal)
@@ -573,7 +573,7 @@ def _petsc_library() -> Any:
     return _lib
 
 
-def set_preallocation_coo(a: Any, rows: npt.ArrayLike, cols: npt.ArrayLike) -> None:
+def set_preallocation_coo(a: PETSc.Mat, rows: npt.ArrayLike, cols: npt.ArrayLike) -> None:
     """Declare the triplets of a matrix; negative indices are ignored, duplicates summed."""
     rows = np.array(rows, dtype=PETSc.IntType)  # copies: PETSc may permute them
     cols = np.array(cols, dtype=PETSc.IntType)
@@ -585,7 +585,7 @@ def set_preallocation_coo(a: Any, rows: npt.ArrayLike, cols: npt.ArrayLike) -> N
         raise PETSc.Error(error)
 
 
-def set_values_coo(a: Any, values: npt.ArrayLike) -> None:
+def set_values_coo(a: PETSc.Mat, values: npt.ArrayLike) -> None:
     """Replace the values of a matrix whose triplets were declared."""
     values = np.ascontiguousarray(values, dtype=PETSc.ScalarType)
     if hasattr(a, "setValuesCOO"):
@@ -596,7 +596,7 @@ def set_values_coo(a: Any, values: npt.ArrayLike) -> None:
         raise PETSc.Error(error)
 
 
-def csr_parts(a: Any) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
+def csr_parts(a: PETSc.Mat) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
     """This rank's rows of an assembled AIJ matrix; unlike `getValuesCSR` nothing is copied.
 
     Args:

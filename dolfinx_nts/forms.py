@@ -12,9 +12,9 @@ import numpy as np
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, difference, load
+from dolfinx_nts.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 

@@ -12,8 +12,8 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import library
+from dolfinx_nts.types import FloatArray
 
 T = TypeVar("T")
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 
 class ContactHistory(NamedTuple):

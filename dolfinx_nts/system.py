@@ -10,7 +10,6 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.bodies.conditions import jumps
@@ -21,6 +20,7 @@ from dolfinx_nts.contact.shared_nodes import areas, check_shared
 from dolfinx_nts.interaction.coupling import Joint, is_joint
 from dolfinx_nts.parallel import need_kernels, raise_together
 from dolfinx_nts.state import ContactHistory, State
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items, known_options, require_same, vector
 
 #: Part of a body's coordinates by which a start may differ from prescribed displacements.

@@ -19,8 +19,8 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray, OfTime
 
 T = TypeVar("T")
 StrPath = str | os.PathLike[str]
@@ -263,7 +263,7 @@ def call_together(
 
 
 def at_time(
-    comm: MPI.Comm, name: str, function: Callable[[float], Any], time: float, unit: str
+    comm: MPI.Comm, name: str, function: OfTime, time: float, unit: str
 ) -> FloatArray:
     """The user's vector at a time, shape (3,); what fails on one rank raises on all.
 
@@ -337,7 +337,7 @@ def vector_in_time(comm: MPI.Comm, name: str, value: Any, time: float, unit: str
 
 
 def number_at(
-    comm: MPI.Comm, name: str, function: Callable[[float], Any], t: float, unit: str
+    comm: MPI.Comm, name: str, function: OfTime, t: float, unit: str
 ) -> float:
     """The user's number at a time; what fails on one rank raises on all.
 

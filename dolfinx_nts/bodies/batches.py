@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH, RigidBatch
 from dolfinx_nts.state import State
+from dolfinx_nts.types import FloatArray, IntArray
 
 
 class Batches:

@@ -11,14 +11,15 @@ from mpi4py import MPI
 import numpy as np
 from dolfinx import fem
 from dolfinx.mesh import Mesh
+from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import range_of
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray, Settings
 
 
 class Body:
@@ -34,7 +35,7 @@ class Body:
         comm: MPI communicator.
         num_owned: Coordinates this rank owns; the global numbering is contiguous by rank.
         reference: X [m], shape (num_owned,).
-        nodal_mass: Row sums of the mass matrix [kg], shape (num_owned,).
+        nodal_mass: BalanceRow sums of the mass matrix [kg], shape (num_owned,).
         fixed: Positions of the prescribed coordinates among the owned ones.
         mesh: DOLFINx mesh whose nodes move with the body; None: it has none, hence no surface, no
             fields and no pictures. With one come `u` and `v`, dolfinx Functions on it.
@@ -116,7 +117,7 @@ class Body:
         """External forces of the step [N]; their work is f . (u_1 - u_0). See `weight`."""
         raise self._missing("external")
 
-    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """PETSc matrix mass M + stiffness d(internal - external)/du_1.
 
         The same matrix in each call, with the same pattern. Rows and columns of `fixed` hold only a
@@ -260,7 +261,7 @@ class Body:
         return 0.0
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """Numbers and texts by the arguments that it was made of, which ranks have in common."""
         return {}
 

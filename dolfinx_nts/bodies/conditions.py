@@ -15,10 +15,11 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.nodal_values import at_nodes
 from dolfinx_nts.contact.surfaces import locate_facets
 from dolfinx_nts.parallel import global_max, raise_together
+from dolfinx_nts.types import FloatArray, IntArray, Marker
 from dolfinx_nts.validation import (
     UserFunctionError,
     at_points,
@@ -68,7 +69,7 @@ class Dirichlet:
         ValueError: Unknown component, or `value` is none of these.
     """
 
-    where: Any
+    where: Marker
     value: NodalVectors = (0.0, 0.0, 0.0)
     components: tuple[int, ...] = (0, 1, 2)
 
@@ -102,7 +103,7 @@ class Traction:
         ValueError: `value` is neither three finite numbers nor a function.
     """
 
-    where: Any
+    where: Marker
     value: VectorInTime
 
     def __post_init__(self) -> None:
@@ -110,7 +111,7 @@ class Traction:
         _check_value("Traction.value", self.value, "Pa", "a function of time that returns them")
 
 
-def _check_where(name: str, where: Any) -> None:
+def _check_where(name: str, where: Marker) -> None:
     """Raise if it is meshtags without a tag, as a pair with a star leaves them."""
     if hasattr(where, "find"):
         raise TypeError(
@@ -140,7 +141,7 @@ def takes_place(value: Any) -> bool:
     return sum(p.kind in places and p.default is p.empty for p in parameters) == 2
 
 
-def facets_of(mesh: Mesh, where: Any, what: str) -> IntArray:
+def facets_of(mesh: Mesh, where: Marker, what: str) -> IntArray:
     """This rank's facets that a `where` selects, as of `locate_facets`."""
     if isinstance(where, tuple) and len(where) == 2:
         return locate_facets(mesh, *where, what)
@@ -272,7 +273,7 @@ class Supports:
         self._meetings = Meetings(comm, name, [bc.value for bc in bcs], of_each, x)
         self._meetings.check([self._at_dofs(*both) for both in enumerate(start)], 0.0, anew=False)
 
-    def _tell_inside(self, what: str, where: Any) -> None:
+    def _tell_inside(self, what: str, where: Marker) -> None:
         """Tell of nodes inside the body at which a function of x holds, too. Collective."""
         if not callable(where):
             return
@@ -341,7 +342,7 @@ class Supports:
 _FAR = 1e-3
 
 
-def jumps(bodies: Iterable[Any]) -> str:
+def jumps(bodies: Iterable[Body]) -> str:
     """Which supports move a part of their body at once, and what to do, or nothing. Collective.
 
     A constant value holds from the start on, so that no smaller step divides its motion.

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.interaction.constraint_elements import Equations
 from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Joint
+from dolfinx_nts.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from dolfinx_nts.interaction.points import Points

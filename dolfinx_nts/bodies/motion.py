@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from dolfinx import fem
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.types import FloatArray
 
 #: Part of the largest moment of inertia below which a smaller one counts as rounding ...
 _NO_ARM = 1e-12

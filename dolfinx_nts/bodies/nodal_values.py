@@ -8,8 +8,8 @@ import numpy as np
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import UserFunctionError, at_points, vector
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.contact_laws import ContactLaws, Contribution
 from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.interaction.elements import over
@@ -22,6 +21,7 @@ from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import ContactHistory
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Changes of one node's state in a step that are no search any more.
 _CYCLE = 8

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.coulomb import (
     HARDLY,
     NO_PULL,
@@ -27,6 +26,7 @@ from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Part of the slave's mass by which an open gap counts against a force. In each solution one of the
 #: two is zero, and any part will do; in a first guess forces of the last step go with gaps of free

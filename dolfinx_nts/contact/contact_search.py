@@ -11,7 +11,6 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import Rub, no_pull
@@ -22,6 +21,7 @@ from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, global_max
 from dolfinx_nts.state import ContactHistory
+from dolfinx_nts.types import BoolArray, FloatArray
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 _EPS = float(np.finfo(float).eps)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.kernels import nts_element
+from dolfinx_nts.types import BoolArray, FloatArray
 
 #: Algorithmic scale c of the return map over the scale of the active set. No result depends on it;
 #: Newton cycles between opposite slips once c exceeds the inertia that a node's slip moves, which

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.intrusion import Boundary, Found, Placed, box_gap, intrusions
 from dolfinx_nts.contact.surfaces import Surface, winding
+from dolfinx_nts.types import BoolArray, FloatArray
 
 #: Bodies whose boxes meet are looked at again after a relative motion of this many facet sizes.
 _LOOK = 0.25

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.coulomb import Slip
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import compiled, facets, nts_element
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.facet_elements import FacetElements
 from dolfinx_nts.contact.pair import (
@@ -23,6 +22,7 @@ from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets, nts_element, patches
 from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: A node may project this far (in convective coordinates) beyond an edge that the master surface
 #: ends at ...

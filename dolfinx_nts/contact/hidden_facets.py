@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.contact.search import apart, closest_facets
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.types import FloatArray
 
 #: Facets lie on each other up to this part of their size, with normals of this cosine or less.
 _ON, _OPPOSITE = 1e-3, -0.99

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.contact.crossings import Finding
 from dolfinx_nts.contact.search import closest_facets
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: Facets meet at an edge where the cosine of the angle between their normals is below this; in a
 #: bore of facets a node that slides is behind the next one for a step, which is known.

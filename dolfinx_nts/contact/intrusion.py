@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.surfaces import winding
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels.bounded_slope import highest
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Depth in facet sizes that is reported. What contact of nodes leaves by its nature is a few
 #: hundredths: a master that bulges between two slave nodes, a slave's edge over a convex master.

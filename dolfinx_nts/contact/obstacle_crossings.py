@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.crossings import Finding, Pause, belong, places, point
 from dolfinx_nts.contact.intrusion import LEAST, Boundary, Placed, sunk
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: So many points of an obstacle are looked for in a body, each next to another of the body's.
 _INNER = 8

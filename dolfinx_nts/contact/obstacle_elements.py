@@ -11,7 +11,6 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
 from dolfinx_nts.contact.coulomb import Slip
@@ -19,6 +18,7 @@ from dolfinx_nts.contact.obstacles import Obstacle, inverse
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.obstacle_elements import ObstacleElements
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.pair import (
@@ -19,6 +18,7 @@ from dolfinx_nts.contact.pair import (
 )
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError
 
 #: A node passes through an obstacle if its path is longer than this part of the radius, and lies

@@ -16,9 +16,9 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels.bounded_slope import highest
 from dolfinx_nts.kernels.nts_element import Gap
+from dolfinx_nts.types import FloatArray, Settings
 from dolfinx_nts.validation import at_time, known_options, require_name, require_positive, vector
 
 Vector = Sequence[float] | FloatArray
@@ -47,7 +47,7 @@ class Obstacle:
         return self.motion is not None
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """What a restart compares: the fields of a dataclass, of a motion whether there is one."""
         given: dict[str, Any] = {}
         if is_dataclass(self):

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.crossings import Finding
 from dolfinx_nts.contact.search import closest_facets
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: All but this part of a contact's force must act at the rim: a body that tips stands on one edge.
 _ELSEWHERE = 0.01

@@ -16,13 +16,13 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
 from dolfinx_nts.contact.inner_edge import InnerEdges, in_inner_edge
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.overhang import inside_rim
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels.vectors import range_of
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 @dataclass

@@ -12,10 +12,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import known_options
 
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels.vectors import range_of
+from dolfinx_nts.types import FloatArray, IntArray
 
 # Two distances that differ by less than this part of the lengths they come from are a tie: a
 # point over a shared edge must not choose its facet by rounding noise.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import BoolArray
 from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.types import BoolArray
 
 
 def check_shared(contacts: Sequence[ContactPair]) -> None:

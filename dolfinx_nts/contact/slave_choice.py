@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets as facet_math
+from dolfinx_nts.types import BoolArray, FloatArray
 
 #: Surfaces are alike where their node spacings or stiffnesses differ by less than this part.
 _ALIKE = 0.1

@@ -21,12 +21,12 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.contact import search
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import facets as facet_math
 from dolfinx_nts.kernels import patches, triangle_patches
 from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.types import FloatArray, IntArray, Marker
 from dolfinx_nts.validation import at_points, is_whole
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 _CYCLIC = {3: [0, 1, 2], 4: [0, 1, 3, 2]}
 
 
-def locate_facets(mesh: Mesh, marker: Any, tag: int | None, what: str) -> IntArray:
+def locate_facets(mesh: Mesh, marker: Marker, tag: int | None, what: str) -> IntArray:
     """This rank's owned exterior facets selected by a marker function or by a tag.
 
     Args:

@@ -11,11 +11,12 @@ import numpy as np
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations import node_blocks
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
 from dolfinx_nts.equations.schur import SchurApproximation
 from dolfinx_nts.interaction.points import of_nodes
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: Coordinates of the busiest rank over the mean; parts of the mesh with their overlap come to more.
 _EVENLY = 1.25
@@ -54,7 +55,7 @@ class Triplets:
         comm: MPI.Comm,
         size: tuple[int, int],
         parts: Sequence[Entries],
-        bodies: Sequence[Any] = (),
+        bodies: Sequence[Body] = (),
         to_whole: Callable[[int, IntArray], IntArray] | None = None,
     ) -> None:
         none = np.empty(0, np.int64)
@@ -93,7 +94,7 @@ class _OfBody:
         matrix: Of the body; if it is no AIJ matrix, each look converts it.
     """
 
-    def __init__(self, matrix: Any) -> None:
+    def __init__(self, matrix: PETSc.Mat) -> None:
         self._given = matrix
         self._aij = matrix
         if matrix.getType() not in {"seqaij", "mpiaij"}:
@@ -141,7 +142,7 @@ class StepMatrix:
     def __init__(
         self,
         layout: Layout,
-        bodies: Sequence[Any],
+        bodies: Sequence[Body],
         elements: Sequence[ElementBlocks],
         *,
         split: bool = False,
@@ -186,7 +187,7 @@ class StepMatrix:
             self.corner = self._parts[0].matrix
         self._constraints = self._parts[-3:] if self._split else []
         self._schur: SchurApproximation | None = None
-        self.operator: Any = None
+        self.operator: PETSc.Mat = None
 
     def _entries(
         self,

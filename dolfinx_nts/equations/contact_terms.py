@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from petsc4py import PETSc
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.batches import Batches
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.contact_search import ContactSearch
+from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.integrators.static import EQUILIBRIUM
@@ -18,6 +20,7 @@ from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StepFailedError, is_finite
 
 
@@ -38,7 +41,7 @@ class ContactTerms:
         ValueError: As of `System`.
     """
 
-    def __init__(self, bodies: Sequence[Any], contacts: Sequence[Any]) -> None:
+    def __init__(self, bodies: Sequence[Body], contacts: Sequence[ContactPair]) -> None:
         self._system = System(bodies, contacts=contacts)
         self._search = ContactSearch(
             self._system.contacts, self._system.contact_bodies, self._system.comm
@@ -99,11 +102,11 @@ class ContactTerms:
                 x[laid.of_elements("constraints")] = np.concatenate(guess)
         return laid.x
 
-    def displacements(self, x: Any) -> list[FloatArray]:
+    def displacements(self, x: PETSc.Vec) -> list[FloatArray]:
         """Displacements of each body at an iterate [m], this rank's part."""
         return [x.array_r[self._layout.of_body(k)].copy() for k in range(len(self.state.u))]
 
-    def forces(self, x: Any) -> list[FloatArray]:
+    def forces(self, x: PETSc.Vec) -> list[FloatArray]:
         """Forces of contact on the coordinates of each body [N]. Collective.
 
         Args:
@@ -119,7 +122,7 @@ class ContactTerms:
         total = laid.forces(self._search.elements, parts)
         return [-total[laid.of_body(k)] for k in range(len(self.state.u))]
 
-    def residual(self, x: Any, forces: Sequence[FloatArray]) -> FloatArray:
+    def residual(self, x: PETSc.Vec, forces: Sequence[FloatArray]) -> FloatArray:
         """The residual with contact, this rank's part. Collective.
 
         Args:
@@ -141,7 +144,7 @@ class ContactTerms:
             out[laid.of_elements("constraints")] = np.concatenate(rows)
         return out
 
-    def jacobian(self, x: Any, matrices: Sequence[Any]) -> Any:
+    def jacobian(self, x: PETSc.Vec, matrices: Sequence[Any]) -> Any:
         """PETSc matrix of the derivatives of `residual`, the same in each call of a step.
 
         Collective.
@@ -158,7 +161,7 @@ class ContactTerms:
         self._matrix.assemble(tangents)
         return self._matrix.operator
 
-    def accept(self, x: Any) -> None:
+    def accept(self, x: PETSc.Vec) -> None:
         """Take a solution for the end of the step. Collective.
 
         Args:
@@ -198,7 +201,7 @@ class ContactTerms:
         assert self._laid is not None, "begin comes first"
         return self._laid
 
-    def _parts(self, x: Any) -> tuple[Any, ...]:
+    def _parts(self, x: PETSc.Vec) -> tuple[Any, ...]:
         """Contribution of the elements at an iterate. Collective."""
         laid, elements = self._layout, self._search.elements
         own = laid.own_values(x.array_r, elements)

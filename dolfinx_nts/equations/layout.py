@@ -15,7 +15,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import IntArray
+from dolfinx_nts.types import IntArray
 
 
 class Layout:

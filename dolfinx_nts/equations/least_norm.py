@@ -17,8 +17,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import lsqr
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.unknowns import Unknowns
+from dolfinx_nts.types import FloatArray
 
 logger = logging.getLogger(__name__)
 

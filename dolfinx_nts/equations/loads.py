@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import Evaluation, EvaluationPoint, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 
 
 class Loads:
@@ -26,7 +26,7 @@ class Loads:
         gravity: What acts of it in the step [m/s^2], shape (3,).
     """
 
-    def __init__(self, system: System, integrator: Any) -> None:
+    def __init__(self, system: System, integrator: Integrator) -> None:
         self._system, self._integrator = system, integrator
         self.moments: list[EvaluationPoint] = []
         self.gravity: FloatArray = system.gravity

@@ -6,7 +6,8 @@ from typing import Any
 
 from petsc4py import PETSc
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.types import FloatArray
 
 
 class Saddle:
@@ -16,7 +17,7 @@ class Saddle:
         matrix: PETSc AIJ matrix.
     """
 
-    def __init__(self, matrix: Any) -> None:
+    def __init__(self, matrix: PETSc.Mat) -> None:
         self._x, self._b = matrix.createVecs()
         self._ksp = PETSc.KSP().create(matrix.getComm())
         self._ksp.setType("preonly")
@@ -44,7 +45,7 @@ class Saddle:
 class _Mass:
     """The mass of a body as a PETSc matrix, with zeros at prescribed coordinates."""
 
-    def __init__(self, body: Any) -> None:
+    def __init__(self, body: Body) -> None:
         self._body = body
 
     def mult(self, _matrix: Any, x: Any, y: Any) -> None:
@@ -57,7 +58,7 @@ class _Mass:
         diagonal.array_w[:] = self._body.nodal_mass
 
 
-def solve_mass(body: Any, right: FloatArray) -> FloatArray:
+def solve_mass(body: Body, right: FloatArray) -> FloatArray:
     """Solution of M x = right, owned entries, zero at prescribed coordinates. Collective.
 
     Args:

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import IntArray
 from dolfinx_nts.interaction.points import of_nodes
+from dolfinx_nts.types import IntArray
 
 #: Nodes at a time.
 _CHUNK = 500
@@ -139,7 +139,7 @@ class NodeBlocks:
         self.size = 3 * local
         self.room = [b.astype(index) for b in np.ascontiguousarray(blocks.T)]
 
-    def fill(self, matrix: Any) -> None:
+    def fill(self, matrix: PETSc.Mat) -> None:
         """Replace all values by those of the bodies, to which others may be added. Collective."""
         if matrix.assembled:
             matrix.zeroEntries()
@@ -157,7 +157,7 @@ class NodeBlocks:
         matrix.assemble(PETSc.Mat.AssemblyType.FLUSH)
 
 
-def add(matrix: Any, numbers: IntArray, values: npt.NDArray[np.float64]) -> None:
+def add(matrix: PETSc.Mat, numbers: IntArray, values: npt.NDArray[np.float64]) -> None:
     """Add blocks of elements to a BAIJ matrix, to be assembled.
 
     Args:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.couplings import Couplings
 from dolfinx_nts.equations.loads import Loads
@@ -31,6 +31,7 @@ from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, Evaluation
 from dolfinx_nts.parallel import everywhere, global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 class StepProblem:
@@ -227,7 +228,7 @@ class StepProblem:
         self.guess(flight=not self.dives, forces=True, again=self._again)
 
     @property
-    def x(self) -> Any:
+    def x(self) -> PETSc.Vec:
         """PETSc vector of the unknowns, holding the first guess after `begin`."""
         return self.laid.x
 
@@ -265,7 +266,7 @@ class StepProblem:
             del self._asleep[k]
         self.couplings.rouse(bodies)
 
-    def _inertial(self, body: Any, du: FloatArray) -> FloatArray:
+    def _inertial(self, body: Body, du: FloatArray) -> FloatArray:
         """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
         if self.integrator.inertia:
             force: FloatArray = body.inertia(du)
@@ -311,7 +312,7 @@ class StepProblem:
                 x[laid.of_elements("augmented")] = np.concatenate(guess)
 
     # ---- iterates
-    def evaluate(self, x: Any) -> Evaluation:
+    def evaluate(self, x: PETSc.Vec) -> Evaluation:
         """The step equations at an iterate; no state changes. Every rank must call it.
 
         Args:
@@ -341,7 +342,7 @@ class StepProblem:
             terms.append(BodyTerms(u1, du, internal, external, pull, total + pull))
         return Evaluation(values, tuple(terms), self.batches.split, parts)
 
-    def _parts_of_elements(self, x: Any, values: FloatArray) -> tuple[Any, ...]:
+    def _parts_of_elements(self, x: PETSc.Vec, values: FloatArray) -> tuple[Any, ...]:
         """What each batch of elements contributes at an iterate. Collective.
 
         Args:
@@ -407,18 +408,18 @@ class StepProblem:
             out[laid.of_elements(name)] = np.concatenate(rows)
         return out
 
-    def body_tangents(self, e: Evaluation) -> list[Any]:
+    def body_tangents(self, e: Evaluation) -> list[PETSc.Mat]:
         """PETSc matrices of the batches that are awake at an iterate, without contact."""
         return [self.body_tangent(j, e.terms[j].u1) for j in self.laid.awake]
 
-    def body_tangent(self, j: int, u1: FloatArray) -> Any:
+    def body_tangent(self, j: int, u1: FloatArray) -> PETSc.Mat:
         """PETSc matrix of a batch at a displacement, without contact: its bodies in the step."""
         a = self._tangent_of_batch(j, u1)
         if self.lent:
             _add_to_diagonal(a, self.lent * self.stabilization.stiffness(self.batches.bodies[j]))
         return self.laid.part(j, a)
 
-    def _tangent_of_batch(self, j: int, u1: FloatArray) -> Any:
+    def _tangent_of_batch(self, j: int, u1: FloatArray) -> PETSc.Mat:
         """`body_tangent` of all its bodies, with nothing lent."""
         mass, body = 1.0 if self.integrator.inertia else 0.0, self.batches.bodies[j]
         a = body.tangent(u1, mass, self.factor)

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.batches import Batches
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import evaluate_together
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max, global_sum
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 
 _EPS = float(np.finfo(float).eps)
 
@@ -217,7 +218,7 @@ class Rounding:
             self._diagonal[chosen], self._of_factor[chosen] = norms[chosen], self._factor
 
     @staticmethod
-    def _as_rounded(body: Any, each: FloatArray, extent: float) -> FloatArray:
+    def _as_rounded(body: Body, each: FloatArray, extent: float) -> FloatArray:
         """Stiffness of a beam's or shell's nodal vectors against rounding [kg], (num_owned,)."""
         # A node's place comes before its directors.
         place = each[body.places].max(axis=1)[np.cumsum(body.places) - 1, None]

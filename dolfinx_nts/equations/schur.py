@@ -24,7 +24,7 @@ class SchurApproximation:
         second: D - C W A W B.
     """
 
-    def __init__(self, rows: Any, cols: Any) -> None:
+    def __init__(self, rows: PETSc.IS, cols: PETSc.IS) -> None:
         self._rows, self._cols = rows, cols
         # Made when first needed, then kept with their patterns.
         self._near: Any = None
@@ -35,7 +35,7 @@ class SchurApproximation:
         self.first: Any = None
         self.second: Any = None
 
-    def renew_bodies(self, bodies: Any) -> None:
+    def renew_bodies(self, bodies: PETSc.Mat) -> None:
         """Take A from the bodies' matrix. Collective."""
         if bodies.getType().endswith("baij"):
             # PETSc has no product of the two formats, nor renews a part of MPIBAIJ.
@@ -49,7 +49,7 @@ class SchurApproximation:
         pointer, _, values = self._near.getValuesCSR()
         self._inverse.array_w[:] = 1.0 / np.add.reduceat(np.abs(values), pointer[:-1])
 
-    def renew(self, above: Any, below: Any, own: Any) -> None:
+    def renew(self, above: PETSc.Mat, below: PETSc.Mat, own: PETSc.Mat) -> None:
         """Compute both complements from the other blocks, A as it is. Collective."""
         self._above = above.createSubMatrix(self._rows, self._cols, submat=self._above)
         self._below = below.createSubMatrix(self._cols, self._rows, submat=self._below)

@@ -19,9 +19,10 @@ import scipy.sparse
 import scipy.sparse.linalg
 from scipy.sparse.csgraph import connected_components
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_laws import Contribution
+from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: Square of the singular values that count as zero, over that of the largest.
 _NONE = 1e-12
@@ -60,7 +61,7 @@ class SharedWeight:
         contacts: Contacts of the scene.
     """
 
-    def __init__(self, comm: MPI.Comm, contacts: Sequence[Any]) -> None:
+    def __init__(self, comm: MPI.Comm, contacts: Sequence[ContactPair]) -> None:
         self._comm = comm
         self._any = any(_is_rigid(pair) for pair in contacts)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.types import FloatArray
 
 
 class Sleepers:
@@ -22,7 +22,7 @@ class Sleepers:
         comm: MPI communicator.
     """
 
-    def __init__(self, bodies: Sequence[Any], comm: MPI.Comm) -> None:
+    def __init__(self, bodies: Sequence[Body], comm: MPI.Comm) -> None:
         self._bodies, self._comm = bodies, comm
         self._known: dict[int, tuple[FloatArray, FloatArray]] = {}
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 
 #: Where all bodies are rigid, contact takes them to give way under their loads by this part of
 #: their size. Of gaps that repeat each other an iteration leaves the change of the forces over this
@@ -39,14 +40,14 @@ class Stabilization:
         self._load = 0.0
         self.share = 0.0
 
-    def of(self, body: Any) -> FloatArray:
+    def of(self, body: Body) -> FloatArray:
         """Stiffness of the springs of a body [N/m], shape (num_owned,). Collective."""
         # Bodies in search of each other cross the scene.
         stiffness = self.share * self._around(body, self._span)
         stiffness[body.fixed] = 0.0
         return stiffness
 
-    def stiffness(self, body: Any, among: Sequence[Any] = ()) -> FloatArray:
+    def stiffness(self, body: Body, among: Sequence[Any] = ()) -> FloatArray:
         """Stiffness of each coordinate's surroundings [N/m], what contact is scaled by. Collective.
 
         Where there is none, of the others. Between rigid bodies it is no less than what holds
@@ -59,7 +60,7 @@ class Stabilization:
         rigid = bool(among) and all(b.rigid for b in among)
         return self._around(body, _YIELD * self._size, rigid)
 
-    def _around(self, body: Any, way: float, rigid: bool = False) -> FloatArray:
+    def _around(self, body: Body, way: float, rigid: bool = False) -> FloatArray:
         """Of each coordinate's surroundings [N/m]; rigid ones give way by `way` [m]. Collective."""
         own: FloatArray = body.nodal_stiffness()
         others = self._of_flexible

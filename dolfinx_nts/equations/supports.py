@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.evaluation import BodyTerms
 from dolfinx_nts.interaction.prescribed import times, told
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 
 #: Part of its motion in a step by which what is prescribed may be off the state at t_n, as by
 #: rounding of the time; more is a jump.

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: Fields of the elements' own unknowns; the first is left out where nobody has any.
 _OWN = ("augmented", "constraints")
@@ -140,7 +140,7 @@ class Unknowns:
             number = int(self._chosen[:number].sum())
         return slice(place.start + number, place.start + number + WIDTH)
 
-    def part(self, j: int, matrix: Any) -> Any:
+    def part(self, j: int, matrix: PETSc.Mat) -> Any:
         """The part of a batch's PETSc matrix that is in the step. Collective."""
         if j or self._chosen is None:
             return matrix
@@ -179,12 +179,12 @@ class Unknowns:
         """Where a field of the elements' own unknowns stands among this rank's unknowns."""
         return self.layout.owned(self.own[name])
 
-    def positions(self, x: Any, elements: Sequence[Any]) -> list[FloatArray]:
+    def positions(self, x: PETSc.Vec, elements: Sequence[Any]) -> list[FloatArray]:
         """Positions that each batch depends on [m], see `Elements.evaluate`. Collective."""
         both = zip([c.reference() for c in elements], self.at_elements(x, elements), strict=True)
         return [reference + u.reshape(reference.shape) for reference, u in both]
 
-    def at_elements(self, x: Any, elements: Sequence[Any]) -> list[FloatArray]:
+    def at_elements(self, x: PETSc.Vec, elements: Sequence[Any]) -> list[FloatArray]:
         """A vector's values at the coordinates of each batch, shape (n, columns). Collective."""
         self._scatter.scatter(x, self._local, mode=PETSc.ScatterMode.FORWARD)
         values, start, out = self._local.array_r.copy(), 0, []

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import ufl
+from ufl import Form
+from ufl.core.expr import Expr
 
 from dolfinx_nts.integrators.rule import MiddleOfStep, choose
 from dolfinx_nts.kernels.discrete_gradient import gonzalez_stress, mean_value_stress
@@ -52,7 +54,7 @@ class EnergyMomentum(MiddleOfStep):
             return ""
         return ', or stress="gonzalez": a mean-value stress is exact for some W only'
 
-    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+    def piola(self, energy: StrainEnergy, h0: Expr, h1: Expr) -> Expr:
         """First Piola-Kirchhoff stress P = F_m S(E_0, E_1) in UFL [Pa] of F = 1 + H."""
         e0, e1 = green_strain(h0), green_strain(h1)
         if self.stress == "gonzalez":
@@ -61,6 +63,6 @@ class EnergyMomentum(MiddleOfStep):
             stress = mean_value_stress(energy, e0, e1, self.quadrature_points)
         return (ufl.Identity(3) + 0.5 * (h0 + h1)) * stress
 
-    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+    def virtual_work(self, potential: Potential, u0: Expr, u1: Expr, w: Expr) -> Form:
         """Virtual work of a potential's forces in the mean over the step in UFL [J]."""
         return potential.mean_virtual_work(u0, u1, w, self.quadrature_points)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
+
+from ufl import Form
+from ufl.core.expr import Expr
 
 from dolfinx_nts.integrators.rule import WithAccelerations, stress_of
 from dolfinx_nts.kernels.potential import Potential
@@ -50,10 +53,10 @@ class GeneralizedAlpha(WithAccelerations):
         shift = 1.0 - self.theta - alpha_m
         return 0.25 * (1.0 + shift) ** 2, 0.5 + shift, alpha_m
 
-    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+    def piola(self, energy: StrainEnergy, h0: Expr, h1: Expr) -> Expr:
         """First Piola-Kirchhoff stress P = F S(E(F)) of F at t_n + theta h in UFL [Pa]."""
         return stress_of(energy, h0 + self.theta * (h1 - h0))
 
-    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+    def virtual_work(self, potential: Potential, u0: Expr, u1: Expr, w: Expr) -> Form:
         """Virtual work of a potential's forces at t_n + theta h in UFL [J]."""
         return potential.virtual_work(u0 + self.theta * (u1 - u0), w)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
+
+from ufl import Form
+from ufl.core.expr import Expr
 
 from dolfinx_nts.integrators.rule import WithAccelerations, stress_of
 from dolfinx_nts.kernels.potential import Potential
@@ -55,10 +58,10 @@ class Newmark(WithAccelerations):
     def _parameters(self) -> tuple[float, float, float]:
         return self.beta, self.gamma, 0.0
 
-    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+    def piola(self, energy: StrainEnergy, h0: Expr, h1: Expr) -> Expr:
         """First Piola-Kirchhoff stress P = F_1 S(E_1) in UFL [Pa] of F = 1 + H."""
         return stress_of(energy, h1)
 
-    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+    def virtual_work(self, potential: Potential, u0: Expr, u1: Expr, w: Expr) -> Form:
         """Virtual work of a potential's forces at t_{n+1} in UFL [J]."""
         return potential.virtual_work(u1, w)

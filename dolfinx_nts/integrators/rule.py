@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import ufl
+from ufl import Form
+from ufl.core.expr import Expr
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy, green_strain
+from dolfinx_nts.types import FloatArray
 
 
 @runtime_checkable
@@ -63,10 +65,10 @@ class Integrator(Protocol):
     ) -> tuple[FloatArray, FloatArray | None]:
         """Velocity [m/s] and acceleration [m/s^2], if there is one, at t_{n+1}."""
 
-    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+    def piola(self, energy: StrainEnergy, h0: Expr, h1: Expr) -> Expr:
         """First Piola-Kirchhoff stress in UFL [Pa] from displacement gradients at both ends."""
 
-    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+    def virtual_work(self, potential: Potential, u0: Expr, u1: Expr, w: Expr) -> Form:
         """Virtual work of a potential's forces in UFL [J] from displacements at both ends."""
 
 
@@ -164,6 +166,6 @@ def choose(name: str, value: str, known: tuple[str, ...]) -> None:
         raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, known))}")
 
 
-def stress_of(energy: StrainEnergy, h: Any) -> Any:
+def stress_of(energy: StrainEnergy, h: Expr) -> Expr:
     """P = F S of one displacement gradient in UFL [Pa]."""
     return (ufl.Identity(3) + h) * energy.stress(green_strain(h))

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from ufl import Form
+from ufl.core.expr import Expr
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.integrators.rule import stress_of
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
+from dolfinx_nts.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -50,11 +52,11 @@ class Static:
         """At rest."""
         return np.zeros_like(v0), None
 
-    def piola(self, energy: StrainEnergy, h0: Any, h1: Any) -> Any:
+    def piola(self, energy: StrainEnergy, h0: Expr, h1: Expr) -> Expr:
         """First Piola-Kirchhoff stress P = F_1 S(E_1) in UFL [Pa] of F = 1 + H."""
         return stress_of(energy, h1)
 
-    def virtual_work(self, potential: Potential, u0: Any, u1: Any, w: Any) -> Any:
+    def virtual_work(self, potential: Potential, u0: Expr, u1: Expr, w: Expr) -> Form:
         """Virtual work of a potential's forces at t_{n+1} in UFL [J]."""
         return potential.virtual_work(u1, w)
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.interaction.point_elements import PointElements
 from dolfinx_nts.kernels import quadratic as kernel
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 _EPS = float(np.finfo(float).eps)
 #: What a limit of 0 counts as: a gap of 0 is below it, any other far above.

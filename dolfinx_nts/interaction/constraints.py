@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.interaction.constraint_elements import (
     SHIFT,
     ConstraintElements,
@@ -28,6 +27,7 @@ from dolfinx_nts.interaction.prescribed import times, told
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.state import State
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError
 
 #: From nodal vectors at the end of a step (n, k, 3) and the times of both its ends [s].

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.interaction.kinematics import Kinematics
 from dolfinx_nts.state import State
+from dolfinx_nts.types import FloatArray, IntArray, Settings
 
 
 class StepWarning(NamedTuple):
@@ -79,7 +79,7 @@ class Joint:
     mid_step: bool = False
 
     @cached_property
-    def settings(self) -> Mapping[str, Any]:
+    def settings(self) -> Settings:
         """Numbers and texts by name that it was made with, for JSON and the same on all ranks.
 
         A checkpoint goes on only with equal ones. Without any, name and kind alone are compared.

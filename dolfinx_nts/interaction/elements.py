@@ -10,11 +10,11 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 _EPS = float(np.finfo(float).eps)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.state import State
+from dolfinx_nts.types import FloatArray, OfTime
 
 #: A run warns of a larger turn in a step [rad]: a steady one is short by a twelfth of its cube.
 FAR_TURN = 1.0
@@ -48,7 +48,7 @@ class Kinematics(NamedTuple):
 
 
 def differenced(
-    make: Callable[[float], Any], bodies: Sequence[int], state: State, dt: float
+    make: OfTime, bodies: Sequence[int], state: State, dt: float
 ) -> Kinematics | None:
     """Kinematics of elements between points, from residuals and tangents. Collective.
 

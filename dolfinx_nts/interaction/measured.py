@@ -15,11 +15,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.measures import Gradient
+from dolfinx_nts.types import BoolArray, FloatArray, Settings
 
 
 class Kind(Protocol):
@@ -98,7 +98,7 @@ class Law(Protocol):
     """Which force D acts along a measure; it has no multiplier."""
 
     @property
-    def settings(self) -> Mapping[str, Any]:
+    def settings(self) -> Settings:
         """What it was made of, for restarts."""
 
     def pull(self, move: Move) -> tuple[FloatArray, FloatArray]:
@@ -128,7 +128,7 @@ class HoldingLaw(Protocol):
     """Which equation the multiplier of a measure satisfies."""
 
     @property
-    def settings(self) -> Mapping[str, Any]:
+    def settings(self) -> Settings:
         """What it was made of, for restarts."""
 
     def row(self, start: FloatArray, end: FloatArray, force: FloatArray, unit: float) -> Row:

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step, over
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -17,6 +16,7 @@ from dolfinx_nts.interaction.kinematics import Kinematics, differenced, has_cons
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 _EPS = float(np.finfo(float).eps)
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.parallel import gather_rows, raise_together
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Part of a cell by which a point may lie beside it, and of coordinates that their rounding is.
 _ON_CELL, _ROUNDING = 1e-9, 4 * np.finfo(np.float64).eps

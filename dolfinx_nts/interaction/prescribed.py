@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
+from dolfinx_nts.types import BoolArray, FloatArray
 
 #: Where functions are asked, over the step, from the end at which rates are sought: near to it
 #: for the velocity, so that few kinks lie between, and evenly for the acceleration, which rounding

@@ -12,13 +12,13 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.interaction.constraint_elements import Equations
 from dolfinx_nts.interaction.constraints import Arm, Constraints, Upright
 from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.kernels import quadratic
 from dolfinx_nts.parallel import rank_of
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import require_name, require_same, vector
 
 Times = tuple[float, ...]
@@ -98,15 +98,15 @@ class Between(Joint, ABC):
 
     def __init__(
         self,
-        a: Any,
-        b: Any,
+        a: Body | None,
+        b: Body | None,
         points: tuple[str, Any, Any],
         name: str | None,
     ) -> None:
         self.ends = a, b
         kind = type(self).__name__
         self.name = named(kind, self.ends, name)
-        if a is b:
+        if a is not None and a is b:
             raise ValueError(
                 f"a=b={a.name!r}: a {kind} joins two bodies; pass another one, or None for the "
                 "ground"

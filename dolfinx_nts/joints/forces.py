@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.coupling import Joint, Slopes
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.measured import Measure, Measured, Move, holds
@@ -21,6 +20,7 @@ from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import rank_of
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StepFailedError, require_same, vector
 
 #: Part of their distance from the origin within which two points are one.

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.joints.between import (
     ROUNDED,
     Between,
@@ -54,8 +55,8 @@ class Spherical(Between):
 
     def __init__(
         self,
-        a: Any,
-        b: Any,
+        a: Body | None,
+        b: Body | None,
         *,
         point: Any,
         displacement: Callable[[float], Any] | None = None,
@@ -86,7 +87,9 @@ class _WithAxis(Between):
         ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
-    def __init__(self, a: Any, b: Any, *, point: Any, axis: Any, name: str | None = None) -> None:
+    def __init__(
+        self, a: Body | None, b: Body | None, *, point: Any, axis: Any, name: str | None = None
+    ) -> None:
         super().__init__(a, b, ("point", point, point), name)
         self.axis = direction(f"axis of {self.name!r}", axis)
         axes = triad(self.axis)
@@ -136,8 +139,8 @@ class Revolute(_WithAxis):
 
     def __init__(
         self,
-        a: Any,
-        b: Any,
+        a: Body | None,
+        b: Body | None,
         *,
         point: Any,
         axis: Any,
@@ -215,8 +218,8 @@ class Prismatic(_WithAxis):
 
     def __init__(
         self,
-        a: Any,
-        b: Any,
+        a: Body | None,
+        b: Body | None,
         *,
         point: Any,
         axis: Any,
@@ -272,7 +275,9 @@ class Universal(Between):
         ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
-    def __init__(self, a: Any, b: Any, *, point: Any, axes: Any, name: str | None = None) -> None:
+    def __init__(
+        self, a: Body | None, b: Body | None, *, point: Any, axes: Any, name: str | None = None
+    ) -> None:
         super().__init__(a, b, ("point", point, point), name)
         if floats(axes).shape != (2, 3):
             raise ValueError(f"axes={axes!r} of {self.name!r}: pass two vectors")
@@ -310,7 +315,9 @@ class Fixed(Between):
         ValueError: An argument is out of range, or a body is a continuum and so has no directions.
     """
 
-    def __init__(self, a: Any, b: Any, *, point: Any, name: str | None = None) -> None:
+    def __init__(
+        self, a: Body | None, b: Body | None, *, point: Any, name: str | None = None
+    ) -> None:
         super().__init__(a, b, ("point", point, point), name)
         self.m_a, self.m_b = self.directions(np.eye(3))
 
@@ -346,8 +353,8 @@ class Distance(Between):
 
     def __init__(
         self,
-        a: Any,
-        b: Any,
+        a: Body | None,
+        b: Body | None,
         *,
         points: Any,
         length: float | Number | None = None,

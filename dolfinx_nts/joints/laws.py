@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.measured import Move, Row, holds
 from dolfinx_nts.joints.forces import Between
 from dolfinx_nts.kernels import measures as kernel
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import (
     call_together,
     is_finite,

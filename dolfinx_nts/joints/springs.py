@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.joints.forces import AboutAxis, Between, BetweenPoints, Stiff, Viscous
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import (
     call_together,
     is_finite,
@@ -114,8 +115,8 @@ class Spring(_Stores, BetweenPoints):
 
     def __init__(
         self,
-        a: Any,
-        b: Any,
+        a: Body | None,
+        b: Body | None,
         points: Any,
         *,
         stiffness: float | None = None,
@@ -162,7 +163,8 @@ class Damper(BetweenPoints):
     entry = ("damping_dissipation", 1.0)
 
     def __init__(
-        self, a: Any, b: Any, points: Any, *, damping: float, name: str | None = None
+        self, a: Body | None, b: Body | None, points: Any, *, damping: float,
+        name: str | None = None,
     ) -> None:
         super().__init__((a, b), name)
         require_positive("damping", damping, "N s/m")
@@ -197,8 +199,8 @@ class TorsionSpring(_Stores, AboutAxis):
 
     def __init__(
         self,
-        a: Any,
-        b: Any,
+        a: Body | None,
+        b: Body | None,
         *,
         axis: Any,
         stiffness: float | None = None,
@@ -240,7 +242,7 @@ class TorsionDamper(AboutAxis):
     entry = ("damping_dissipation", 1.0)
 
     def __init__(
-        self, a: Any, b: Any, *, axis: Any, damping: float, name: str | None = None
+        self, a: Body | None, b: Body | None, *, axis: Any, damping: float, name: str | None = None
     ) -> None:
         super().__init__((a, b), name)
         require_positive("damping", damping, "N m s")

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import quadratic as energy
+from dolfinx_nts.types import FloatArray
 
 #: d_3 and d_2 of K_1, and cyclic.
 _CYCLES = ((3, 2), (1, 3), (2, 1))

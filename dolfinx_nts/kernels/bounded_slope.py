@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray, IntArray
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: What may hold a higher value is divided so many times into so many parts, until the highest is
 #: known to this part of it.

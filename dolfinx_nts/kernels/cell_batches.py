@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.kernels import library
+from dolfinx_nts.types import FloatArray, IntArray
 
 _LOOP = Path(__file__).with_name("cell_batches.c")
 #: The processor's own instructions. A fused product and sum rounds once where C rounds twice.

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.kernels import (
     discrete_gradient,
     facets,
@@ -20,6 +19,7 @@ from dolfinx_nts.kernels import (
     patches,
     triangle_patches,
 )
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Squared sine of an angle between two edges that is rounding only.
 COLLINEAR = 1e-14

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.kernels import library
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 class Law(NamedTuple):

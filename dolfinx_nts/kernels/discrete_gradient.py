@@ -7,13 +7,13 @@ what makes the energy balance of the energy-momentum scheme exact (theory sectio
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import ufl
+from ufl.core.expr import Expr
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.kernels.strain_energy import StrainEnergy
+from dolfinx_nts.types import BoolArray, FloatArray
 
 _EPS = float(np.finfo(float).eps)
 
@@ -52,13 +52,13 @@ def gauss(points: int) -> tuple[FloatArray, FloatArray]:
     return tau, weight
 
 
-def mean_value_stress(energy: StrainEnergy, e0: Any, e1: Any, points: int) -> Any:
+def mean_value_stress(energy: StrainEnergy, e0: Expr, e1: Expr, points: int) -> Expr:
     """S = int_0^1 dW/dE(E_0 + tau (E_1 - E_0)) dtau by Gauss points (UFL)."""
     tau, weight = _GAUSS[points]
     return combine(weight, [energy.stress(e0 + t * (e1 - e0)) for t in tau.tolist()])
 
 
-def gonzalez_stress(energy: StrainEnergy, e0: Any, e1: Any) -> Any:
+def gonzalez_stress(energy: StrainEnergy, e0: Expr, e1: Expr) -> Expr:
     """Discrete derivative of W between E_0 and E_1 after Gonzalez (2000) (UFL).
 
     S = dW(Em) + [W(E_1) - W(E_0) - dW(Em) : DE] / (DE : DE) DE. The bracket is O(DE^3). It is taken
@@ -85,7 +85,7 @@ def gonzalez_stress(energy: StrainEnergy, e0: Any, e1: Any) -> Any:
     return path.middle + bracket / (size + 1e-200) * de
 
 
-def combine(weights: FloatArray, values: list[Any]) -> Any:
+def combine(weights: FloatArray, values: list[Expr]) -> Expr:
     """Weighted sum of UFL expressions or forms."""
     first, *rest = (w * v for w, v in zip(weights.tolist(), values, strict=True))
     return sum(rest, start=first)

@@ -19,9 +19,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.kernels import patches, triangle_patches
 from dolfinx_nts.kernels.vectors import cross, solve_2x2
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 EPS = float(np.finfo(np.float64).eps)
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels.discrete_gradient import resolved_mean
+from dolfinx_nts.types import FloatArray
 
 #: Length [m] that keeps 0/0 away where a length is 0; far below any other.
 _NO_LENGTH = 1e-100

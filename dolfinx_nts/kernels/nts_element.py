@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import discrete_gradient, facets, patches, triangle_patches
 from dolfinx_nts.kernels.vectors import solve_2x2
+from dolfinx_nts.types import FloatArray
 
 #: Constraints per pair: the gap and five augmented ones (43).
 NUM_CONSTRAINTS = 6

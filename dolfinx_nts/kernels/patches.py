@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Control points of a patch.
 NUM_POINTS = 16
@@ -31,7 +31,7 @@ _DERIVATIVES = np.array(
     ]
 )
 _CORNER = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-#: Row and column of each control point in the 4 x 4 grid.
+#: BalanceRow and column of each control point in the 4 x 4 grid.
 _ROW, _COLUMN = (
     np.concatenate(
         [

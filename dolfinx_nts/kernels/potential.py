@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import ufl
 from ufl.algorithms import expand_derivatives
+from ufl.core.expr import Expr
 
 from dolfinx_nts.kernels.discrete_gradient import combine, gauss
 
@@ -20,18 +21,18 @@ class Potential(NamedTuple):
     """
 
     energy: Callable[..., Any]
-    strains: Callable[[Any], tuple[Any, ...]]
+    strains: Callable[[Expr], tuple[Expr, ...]]
 
-    def __call__(self, u: Any) -> Any:
+    def __call__(self, u: Expr) -> ufl.Form:
         """Pi(u)."""
         return self.energy(*self.strains(u))
 
-    def virtual_work(self, u: Any, w: Any) -> Any:
+    def virtual_work(self, u: Expr, w: Expr) -> ufl.Form:
         """dPi(u)/du in the direction of the test function w."""
         p = ufl.Coefficient(w.ufl_function_space())
         return _at_zero(ufl.derivative(self(u + p), p, w), p)
 
-    def mean_virtual_work(self, u0: Any, u1: Any, w: Any, points: int) -> Any:
+    def mean_virtual_work(self, u0: Expr, u1: Expr, w: Expr, points: int) -> ufl.Form:
         """Discrete gradient of Pi in the direction of the test function w.
 
         int_0^1 dPi/ds(s_0 + tau (s_1 - s_0)) dtau : Ds(u_m)[w] by Gauss points. Strains of degree
@@ -51,6 +52,6 @@ class Potential(NamedTuple):
         return _at_zero(ufl.derivative(combine(weight, energies), p, w), p)
 
 
-def _at_zero(form: Any, p: Any) -> Any:
+def _at_zero(form: ufl.Form, p: Expr) -> ufl.Form:
     """A form, with its derivatives carried out, where the Coefficient p is zero."""
     return ufl.replace(expand_derivatives(form), {p: ufl.zero(p.ufl_shape)})

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels.shell import POINTS, shapes
+from dolfinx_nts.types import FloatArray
 
 
 def _coefficients() -> FloatArray:

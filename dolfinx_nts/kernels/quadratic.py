@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import quadratic
+from dolfinx_nts.types import FloatArray
 
 
 def factors(weights: FloatArray, constants: FloatArray, y: FloatArray) -> FloatArray:

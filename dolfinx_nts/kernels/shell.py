@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.kernels import quadratic as energy
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.types import FloatArray
 
 #: Corners in the plane of xi, eta.
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])

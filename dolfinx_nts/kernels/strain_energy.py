@@ -11,8 +11,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import ufl
+from ufl.core.expr import Expr
 
 from dolfinx_nts.kernels.precise import cofactor, determinant, invariants
+from dolfinx_nts.types import OfTime
 
 
 class Isotropic:
@@ -21,23 +23,23 @@ class Isotropic:
     def check(self) -> None:
         """Raise ValueError if a parameter is out of its range; asked whenever one has changed."""
 
-    def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
+    def of_invariants(self, i1: Expr, i2: Expr, i3: Expr) -> Expr:
         """W [J/m^3]."""
         raise NotImplementedError(f"{type(self).__name__} needs a method of_invariants")
 
-    def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
+    def slopes(self, i1: Expr, i2: Expr, i3: Expr) -> tuple[Expr, Expr, Expr]:
         """Derivatives of W by the three [Pa]; written out they cost less."""
         variables = tuple(ufl.variable(i) for i in (i1, i2, i3))
         energy = self.of_invariants(*variables)
         first, second, third = (ufl.diff(energy, i) for i in variables)
         return first, second, third
 
-    def __call__(self, c: Any) -> Any:
+    def __call__(self, c: Expr) -> Expr:
         """W(C) [J/m^3]."""
         return self.of_invariants(*invariants(0.5 * (c - ufl.Identity(3))))
 
 
-def green_strain(h: Any) -> Any:
+def green_strain(h: Expr) -> Expr:
     """E = sym H + H^T H / 2 of a displacement gradient H, free of cancellation (UFL)."""
     return ufl.sym(h) + 0.5 * (h.T * h)
 
@@ -56,9 +58,9 @@ class Path(NamedTuple):
         difference: W(E_1) - W(E_0).
     """
 
-    power: Callable[[float], Any]
-    middle: Any
-    difference: Any
+    power: OfTime
+    middle: Expr
+    difference: Expr
 
 
 class OfC:
@@ -68,27 +70,27 @@ class OfC:
         function: Any callable C -> UFL scalar.
     """
 
-    def __init__(self, function: Callable[[Any], Any]) -> None:
+    def __init__(self, function: Callable[[Expr], Expr]) -> None:
         self._function = function
 
-    def __call__(self, e: Any) -> Any:
+    def __call__(self, e: Expr) -> Expr:
         """W(E)."""
         return self._function(self.argument(e))
 
-    def argument(self, e: Any) -> Any:
+    def argument(self, e: Expr) -> Expr:
         """The tensor that W is rounded relative to."""
         return ufl.Identity(3) + 2 * e
 
-    def stress(self, e: Any) -> Any:
+    def stress(self, e: Expr) -> Expr:
         """dW/dE, symmetric: the second Piola-Kirchhoff stress."""
         c = ufl.variable(self.argument(e))
         return 2 * ufl.sym(ufl.diff(self._function(c), c))
 
-    def along(self, e0: Any, e1: Any) -> Path:
+    def along(self, e0: Expr, e1: Expr) -> Path:
         """W between two strains."""
         c0, c1 = self.argument(e0), self.argument(e1)
 
-        def power(tau: float) -> Any:
+        def power(tau: float) -> Expr:
             t = ufl.variable(ufl.as_ufl(tau))  # dW : DC, without a derivative by a tensor
             return ufl.diff(self._function(c0 + t * (c1 - c0)), t)
 
@@ -106,19 +108,19 @@ class OfInvariants:
     def __init__(self, material: Isotropic) -> None:
         self._material = material
 
-    def __call__(self, e: Any) -> Any:
+    def __call__(self, e: Expr) -> Expr:
         """W(E)."""
         return self._material.of_invariants(*invariants(e))
 
-    def argument(self, e: Any) -> Any:
+    def argument(self, e: Expr) -> Expr:
         """The tensor that W is rounded relative to."""
         return e
 
-    def stress(self, e: Any) -> Any:
+    def stress(self, e: Expr) -> Expr:
         """dW/dE, symmetric: the second Piola-Kirchhoff stress."""
         return self._stress(e, invariants(e))
 
-    def along(self, e0: Any, e1: Any) -> Path:
+    def along(self, e0: Expr, e1: Expr) -> Path:
         """W between two strains, where the invariants are polynomials of tau."""
         a, da = 2 * e0, 2 * (e1 - e0)
         cof, dcof = cofactor(a), cofactor(da)
@@ -132,10 +134,10 @@ class OfInvariants:
         )
         polynomials = (i1, i2, i3)
 
-        def at(tau: float) -> list[Any]:
+        def at(tau: float) -> list[Expr]:
             return [_polynomial(i, tau) for i in polynomials]
 
-        def power(tau: float) -> Any:
+        def power(tau: float) -> Expr:
             rates = [_polynomial([k * c for k, c in enumerate(i)][1:], tau) for i in polynomials]
             first, *rest = (
                 s * r for s, r in zip(self._material.slopes(*at(tau)), rates, strict=True)
@@ -145,14 +147,14 @@ class OfInvariants:
         end, start = (self._material.of_invariants(*at(tau)) for tau in (1.0, 0.0))
         return Path(power, self._stress(0.5 * (e0 + e1), at(0.5)), end - start)
 
-    def _stress(self, e: Any, i: Sequence[Any]) -> Any:
+    def _stress(self, e: Expr, i: Sequence[Any]) -> Expr:
         """dW/dE where the invariants are known."""
         a = 2 * e
         first, second, third = self._material.slopes(*i)
         return 2 * ((first + second * i[0]) * ufl.Identity(3) - second * a + third * cofactor(a))
 
 
-def _polynomial(coefficients: Sequence[Any], x: float) -> Any:
+def _polynomial(coefficients: Sequence[Any], x: float) -> Expr:
     """Sum of c_k x^k."""
     value = coefficients[-1]
     for c in coefficients[-2::-1]:

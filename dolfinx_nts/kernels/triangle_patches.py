@@ -23,8 +23,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.kernels.patches import SHARP, neighbours
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Patches over a facet.
 PIECES = 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.types import FloatArray
 
 _ONE, _TWO = [1, 2, 0], [2, 0, 1]
 

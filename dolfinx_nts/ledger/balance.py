@@ -10,12 +10,13 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.solid.inversion import smallest_dets
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import BalanceRow, FloatArray
 
 if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem
@@ -169,14 +170,14 @@ def _ends(system: System, state: State) -> Iterator[tuple[Any, FloatArray, Float
     return zip(batches.bodies, batches.join(state.u), batches.join(state.v), strict=True)
 
 
-def _of_body(body: Any, u: FloatArray, v: FloatArray) -> FloatArray:
+def _of_body(body: Body, u: FloatArray, v: FloatArray) -> FloatArray:
     """This rank's part of a body's energies and momenta, shape (8,)."""
     momentum = body.inertia(v)
     energies = [0.5 * float(v @ momentum), body.potential(u)]
     return np.concatenate([energies, *_momenta(body, u, momentum)])
 
 
-def _momenta(body: Any, u: FloatArray, momentum: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _momenta(body: Body, u: FloatArray, momentum: FloatArray) -> tuple[FloatArray, FloatArray]:
     """This rank's part of a body's linear and angular momentum."""
     return body.linear_momentum(momentum), body.angular_momentum(u, momentum)
 
@@ -288,13 +289,13 @@ def unknown_row(system: System) -> dict[str, Any]:
 
 
 def next_row(
-    first: float, last: Mapping[str, Any], measured: Mapping[str, Any], terms: Mapping[str, float]
+    first: float, last: BalanceRow, measured: BalanceRow, terms: Mapping[str, float]
 ) -> dict[str, Any]:
     """Row of an accepted step; work, dissipation, defect and ledger residual are cumulative.
 
     Args:
         first: Energy that the ledger is opened with [J].
-        last: Row before the step.
+        last: BalanceRow before the step.
         measured: `measure` of the new state.
         terms: `step_terms` of the step.
     """

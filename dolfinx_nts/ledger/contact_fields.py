@@ -10,12 +10,13 @@ from mpi4py import MPI
 import numpy as np
 from dolfinx import fem
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 
 if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem
@@ -59,7 +60,7 @@ def labels(system: System) -> list[str]:
 
 
 def at_nodes(
-    system: System, state: State, loads: ContactLoads | None, body: Any
+    system: System, state: State, loads: ContactLoads | None, body: Body
 ) -> dict[str, FloatArray]:
     """Contact fields at the nodes of a body's mesh that this rank owns. Collective.
 
@@ -132,7 +133,7 @@ def _of_slave(
     return fields
 
 
-def functions(body: Any, fields: dict[str, FloatArray]) -> dict[str, Any]:
+def functions(body: Body, fields: dict[str, FloatArray]) -> dict[str, Any]:
     """DOLFINx Functions of nodal fields on the body's mesh, of its degree. Collective.
 
     Args:

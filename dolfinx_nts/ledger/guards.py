@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 from mpi4py import MPI
 
@@ -14,6 +12,7 @@ from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
+from dolfinx_nts.types import BalanceRow
 from dolfinx_nts.validation import StepFailedError
 
 #: Part of the momenta and impulses of a step by which momentum may change without an impulse ...
@@ -31,8 +30,8 @@ def check_momentum(
     problem: StepProblem,
     step: Evaluation,
     state: State,
-    before: Mapping[str, Any],
-    after: Mapping[str, Any],
+    before: BalanceRow,
+    after: BalanceRow,
 ) -> float:
     """Refuse a step whose momentum changes by more than its impulses. Every rank must call it.
 

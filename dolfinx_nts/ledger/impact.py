@@ -21,7 +21,6 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
@@ -30,6 +29,7 @@ from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StepFailedError
 
 #: What `simulate(impact=...)` may be.

@@ -10,10 +10,10 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 
 if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import contact_fields
 from dolfinx_nts.output.pictures import (
     Drawn,
@@ -23,6 +22,7 @@ from dolfinx_nts.output.pictures import (
 from dolfinx_nts.output.running import Cadence, Running
 from dolfinx_nts.output.whole_files import replace_file
 from dolfinx_nts.parallel import gather_on_root, write_on_root
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StrPath, as_path, require_bool
 
 #: Length of the longest arrow as part of the larger side of the film; forces below this part of the

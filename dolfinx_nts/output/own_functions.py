@@ -9,8 +9,9 @@ import numpy as np
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items
 
 #: A Function, or what makes one of a body, as `von_mises` does.
@@ -42,7 +43,7 @@ def _fits(given: Any) -> bool:
     return isinstance(given, fem.Function) or (callable(given) and not hasattr(given, "ufl_shape"))
 
 
-def require_meshes(functions: Sequence[Own], bodies: Iterable[Any]) -> None:
+def require_meshes(functions: Sequence[Own], bodies: Iterable[Body]) -> None:
     """Raise ValueError if a Function is on the mesh of none of the bodies."""
     known = [body.mesh.ufl_domain() for body in bodies]
     for k, given in enumerate(functions):
@@ -52,7 +53,7 @@ def require_meshes(functions: Sequence[Own], bodies: Iterable[Any]) -> None:
             )
 
 
-def of_body(functions: Sequence[Own], body: Any, taken: Iterable[str]) -> list[OwnField]:
+def of_body(functions: Sequence[Own], body: Body, taken: Iterable[str]) -> list[OwnField]:
     """What is to be written of a body. Collective.
 
     Args:
@@ -85,7 +86,7 @@ def of_body(functions: Sequence[Own], body: Any, taken: Iterable[str]) -> list[O
     return found
 
 
-def _made(what: str, make: Callable[[Any], fem.Function], body: Any) -> Any:
+def _made(what: str, make: Callable[[Any], fem.Function], body: Body) -> Any:
     """The Function that a callable makes of a body. Collective."""
     function: Any = make(body)
     wrong = not isinstance(function, fem.Function)
@@ -94,7 +95,7 @@ def _made(what: str, make: Callable[[Any], fem.Function], body: Any) -> Any:
     return function
 
 
-def _field(what: str, function: Any, body: Any) -> OwnField:
+def _field(what: str, function: Any, body: Body) -> OwnField:
     space, shape = function.function_space, function.ufl_shape
     function.x.scatter_forward()
     values = function.x.array.reshape(-1, int(np.prod(shape, dtype=int)))

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import balance as ledger
 from dolfinx_nts.output.whole_files import replace_file
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StrPath
 
 Balance = Mapping[str, FloatArray]

@@ -6,9 +6,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import is_whole, require_positive
 
 

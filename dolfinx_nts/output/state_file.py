@@ -41,11 +41,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: Arrays of a file by their place in it, on rank 0; empty elsewhere.
 Tables = dict[str, npt.NDArray[Any]]

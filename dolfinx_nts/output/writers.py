@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.ledger import balance as ledger
 from dolfinx_nts.ledger import contact_fields, resultants
 from dolfinx_nts.output.own_functions import Own, checked, of_body, require_meshes
 from dolfinx_nts.output.running import Cadence, Running
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 from dolfinx_nts.parallel import gather_on_root, on_root, write_on_root
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StrPath, as_path
 
 
@@ -66,7 +67,7 @@ class _Series:
 
     def __init__(
         self,
-        body: Any,
+        body: Body,
         index: int,
         contacts: Mapping[str, int],
         folder: Path,

@@ -17,7 +17,7 @@ from dolfinx_nts.validation import is_finite, require_bool, require_same
 _WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
 
 
-def check_scheme(system: Any, integrator: Any, newton: Any, petsc_options: Any) -> None:
+def check_scheme(system: System, integrator: Any, newton: Any, petsc_options: Any) -> None:
     """Raise where the equations of steps, or their solver, are not asked for as they should be.
 
     Arguments are those of `Stepper`.
@@ -85,7 +85,7 @@ def check_impact(system: System, integrator: Integrator, impact: Any, restitutio
     check_massless(system, integrator, impact)
 
 
-def same_run(system: Any, **options: Any) -> None:
+def same_run(system: System, **options: Any) -> None:
     """Raise a ValueError on all ranks unless options and scene are the same there. Collective.
 
     Called before all that depends on them; ranks with other steps would wait for each other for

@@ -15,6 +15,7 @@ from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.run.start import carried_forces
 from dolfinx_nts.run.trial import Trial
 from dolfinx_nts.state import State
+from dolfinx_nts.types import BalanceRow
 
 
 class Ledger:
@@ -82,19 +83,19 @@ class Ledger:
         change, self._material_change, self._restated = self._material_change, 0.0, None
         return change
 
-    def before(self, state: State) -> Mapping[str, Any]:
+    def before(self, state: State) -> BalanceRow:
         """What `measure` finds at t_n, which the table has but for changes of materials."""
         if not self._kept:
             return balance.momenta(self._system, state)
         return self._restated or self._last_row()
 
-    def measure(self, state: State) -> Mapping[str, Any]:
+    def measure(self, state: State) -> BalanceRow:
         """Momenta of a state, and energies if they are kept. Collective."""
         if not self._kept:
             return balance.momenta(self._system, state)
         return balance.measure(self._system, state, self._known)
 
-    def _last_row(self) -> Mapping[str, Any]:
+    def _last_row(self) -> BalanceRow:
         """The table's last row, read from the table only if `enter` did not write it."""
         rows = self._solution.rows
         if self._last is None or self._last[0] is not rows or self._last[1] != len(rows):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION
 from dolfinx_nts.integrators import Static
@@ -32,6 +31,7 @@ from dolfinx_nts.solve.instability import releasing_motions
 from dolfinx_nts.start.free_motion import free_motion
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System, cut_off
+from dolfinx_nts.types import FloatArray, Options
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -428,7 +428,7 @@ def _pseudo_times(load_steps: Any, begin: float) -> list[float]:
     )
 
 
-def _begin(start: Any, system: Any) -> tuple[Any, float]:
+def _begin(start: Any, system: System) -> tuple[Any, float]:
     """What an equilibrium goes on from, and its pseudo time. Collective.
 
     Args:
@@ -462,7 +462,7 @@ def equilibrium(
     load_steps: int | Sequence[float] | FloatArray = 1,
     stabilization: float | None = None,
     newton: Newton | None = None,
-    petsc_options: Mapping[str, Any] | None = None,
+    petsc_options: Options | None = None,
     output: Sequence[Writer] = (),
     progress: bool = False,
     watch_overlap: bool = True,

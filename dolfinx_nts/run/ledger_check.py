@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from mpi4py import MPI
 
@@ -16,6 +15,7 @@ from dolfinx_nts.ledger import balance
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.solve.accuracy import EXACT
+from dolfinx_nts.types import BalanceRow
 
 #: What the ledger may miss of the energy, over the tolerance of Newton's method ...
 _PER_TOLERANCE = 10.0
@@ -68,16 +68,16 @@ class LedgerCheck:
         self._largest, self._whole, self._rounding, self._first = memory
 
     def hold(
-        self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
-        row: Mapping[str, Any], impulses: float,
+        self, problem: StepProblem, step: Evaluation, before: BalanceRow,
+        row: BalanceRow, impulses: float,
     ) -> None:  # fmt: skip
         """Warn if a step's ledger misses too much, or contact brought energy. Collective.
 
         Args:
             problem: Equations of the step.
             step: Their solution.
-            before: Row of the balance table before it.
-            row: Row of the step.
+            before: BalanceRow of the balance table before it.
+            row: BalanceRow of the step.
             impulses: Of all forces in the step, the sum of their absolute values [kg m/s].
         """
         energy = self._measure(problem, step, before, row)
@@ -111,8 +111,8 @@ class LedgerCheck:
         self._solution.warn("ledger", row["time"], missing, text, grave=doubtful)
 
     def _measure(
-        self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
-        row: Mapping[str, Any],
+        self, problem: StepProblem, step: Evaluation, before: BalanceRow,
+        row: BalanceRow,
     ) -> float:  # fmt: skip
         """Note the largest energies; return that at the end of the step [J]. Collective.
 
@@ -147,8 +147,8 @@ class LedgerCheck:
         return energy / self._largest if self._largest else np.inf
 
     def _tell_gain(
-        self, problem: StepProblem, step: Evaluation, before: Mapping[str, Any],
-        row: Mapping[str, Any], energy: float,
+        self, problem: StepProblem, step: Evaluation, before: BalanceRow,
+        row: BalanceRow, energy: float,
     ) -> None:  # fmt: skip
         """Warn if contact has brought energy, in this step or in all. Collective."""
         total = row["impact_restored"] - row["contact_defect"]

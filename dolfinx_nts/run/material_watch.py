@@ -6,8 +6,8 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 
 
 class MaterialWatch:

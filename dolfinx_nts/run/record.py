@@ -12,10 +12,10 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.ledger import resultants
 from dolfinx_nts.ledger.balance import CHANGES, COLUMNS, Switch, Switches
 from dolfinx_nts.run.run_warnings import RunWarning, RunWarnings
+from dolfinx_nts.types import FloatArray
 
 Row = dict[str, Any]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from dolfinx_nts.parallel import first_problem
@@ -19,6 +19,7 @@ from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.solve.accuracy import ACCURACY, Newton
 from dolfinx_nts.system import System
+from dolfinx_nts.types import Options
 from dolfinx_nts.validation import (
     OutputError,
     StepFailedError,
@@ -47,7 +48,7 @@ def simulate(
     dt: float,
     t_end: float,
     newton: Newton | None = None,
-    petsc_options: Mapping[str, Any] | None = None,
+    petsc_options: Options | None = None,
     output: Sequence[Writer] = (),
     progress: bool = False,
     start: Solution | Saved | None = None,

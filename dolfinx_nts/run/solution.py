@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.ledger import contact_fields
 from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.parallel import on_root, write_on_root
@@ -17,6 +17,7 @@ from dolfinx_nts.run.run_warnings import RunWarnings
 from dolfinx_nts.run.step_size import PaceMemory
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StrPath, as_path
 
 
@@ -36,7 +37,7 @@ class Solution(Record):
     #: Whether its state moves, or a run from it begins with the bodies' initial velocities.
     moving: ClassVar[bool] = True
 
-    def contact_fields(self, body: Any) -> dict[str, Any]:
+    def contact_fields(self, body: Body) -> dict[str, Any]:
         """Results of a body's contacts at the last accepted state as DOLFINx Functions. Collective.
 
         During a run a writer of one's own calls it of `stepper.solution`. By name, to which the

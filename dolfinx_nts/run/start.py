@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.equations.problem import StepProblem
@@ -19,6 +18,7 @@ from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
 from dolfinx_nts.start import consistent
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import UserFunctionError, is_finite
 
 #: Part of the speed of its bodies by which a joint may be violated at the start as meshes do it,
@@ -140,7 +140,7 @@ def refuse_moved_meshes(system: System) -> None:
         raise_together(system.comm, text if _is_moved(body) else None)
 
 
-def _is_moved(body: Any) -> bool:
+def _is_moved(body: Body) -> bool:
     """Return whether this rank's nodes of a mesh are elsewhere than the body was made with."""
     made = body.made_on
     return bool(made is not None and made != places_of(body.mesh))

@@ -16,12 +16,12 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.equations.scales import box_of
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import known_options
 
 #: Error of a step in powers of h, one more than the order of the integrators that it takes.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.motion import motion_of
 from dolfinx_nts.bodies.solid.inversion import describe, smallest_dets
 from dolfinx_nts.equations.problem import StepProblem
@@ -13,6 +12,7 @@ from dolfinx_nts.interaction.kinematics import FAR_TURN
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.state import State
+from dolfinx_nts.types import FloatArray
 
 #: As `FAR_TURN`, of a flexible body, by its spin: as it turns it stretches, and turns more slowly.
 _STRETCHED = 0.95

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 from typing import Any, ClassVar
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import jumps
 from dolfinx_nts.contact.hidden_facets import hidden_facets
@@ -47,6 +46,7 @@ from dolfinx_nts.start.massless_start import off_balance, thick_layer
 from dolfinx_nts.start.unresolved import DamperWatch, tell_unresolved
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System, is_like
+from dolfinx_nts.types import FloatArray, Options
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -105,7 +105,7 @@ class Stepper:
         integrator: Any,
         *,
         newton: Newton | None = None,
-        petsc_options: Mapping[str, Any] | None = None,
+        petsc_options: Options | None = None,
         start: Solution | Saved | None = None,
         start_time: float | None = None,
         sleep: bool = False,

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.ledger.impact import Impact
@@ -17,6 +16,7 @@ from dolfinx_nts.parallel import global_max
 from dolfinx_nts.solve.newton import StepSolver
 from dolfinx_nts.start.consistent import Fitted
 from dolfinx_nts.state import State
+from dolfinx_nts.types import BalanceRow, FloatArray
 from dolfinx_nts.validation import StepFailedError
 
 #: Searches for contact, each along the motion that came of the one before.
@@ -37,7 +37,7 @@ class Trial(NamedTuple):
 
     step: Evaluation
     state: State
-    measured: Mapping[str, Any]
+    measured: BalanceRow
     impulses: float
     impact: Impact | None
     fitted: Fitted | None

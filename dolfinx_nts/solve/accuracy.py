@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from dolfinx_nts.solve.linear_solver import SOLVERS, choose
 from dolfinx_nts.system import System
+from dolfinx_nts.types import Options
 from dolfinx_nts.validation import is_finite, is_whole, known_options, require_bool
 
 #: Coordinates of shells from which a Krylov solver is worth it where they are stiff and steps long.
@@ -89,7 +89,7 @@ class Newton:
             return self.reuse
         return inertia and _sizes(system, inertia)[0] >= _LARGE
 
-    def preset(self, system: System, inertia: bool, given: Mapping[str, Any]) -> str:
+    def preset(self, system: System, inertia: bool, given: Options) -> str:
         """Preset of the linear solver to begin with; arguments as of `choose`."""
         if self.linear_solver != "auto":
             return self.linear_solver

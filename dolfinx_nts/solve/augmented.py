@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.solve.linear_solver import PARTS
+from dolfinx_nts.types import FloatArray
 
 
 def augmented(tangent: FloatArray, stiffness: FloatArray) -> FloatArray:
@@ -61,7 +62,7 @@ class AugmentedMatrix:
     def __init__(
         self,
         problem: StepProblem,
-        bodies: Sequence[Any],
+        bodies: Sequence[Body],
         around: Callable[[Any], FloatArray] | None = None,
     ) -> None:
         laid, batches = problem.laid, problem.batches
@@ -112,7 +113,7 @@ class AugmentedMatrix:
         diagonal.destroy()
         return found
 
-    def split_bodies(self, snes: PETSc.SNES, operator: Any) -> None:
+    def split_bodies(self, snes: PETSc.SNES, operator: PETSc.Mat) -> None:
         """Tell continua, for a multigrid, from other bodies. Collective, before the first solve.
 
         Args:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.elements import over
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max, global_sum
+from dolfinx_nts.types import FloatArray
 
 #: Rounding of a sum of elements' forces over the norm of all of them: their own rounding and that
 #: of the solution, which the elements' stiffness passes on.

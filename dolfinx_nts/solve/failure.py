@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation
 from dolfinx_nts.parallel import global_sum
@@ -138,7 +139,7 @@ def contact_on(problem: StepProblem, e: Evaluation, flips: Sequence[Any], body: 
     )
 
 
-def _body_note(body: Any, terms: BodyTerms) -> tuple[str, float, str]:
+def _body_note(body: Body, terms: BodyTerms) -> tuple[str, float, str]:
     """Name, weight and text of where the body's equation is worst solved."""
     r = np.nan_to_num(np.abs(terms.residual), nan=np.inf)
     r[body.fixed] = 0.0

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation, free
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.solve.augmented import AugmentedMatrix
+from dolfinx_nts.types import FloatArray
 
 #: Coordinates up to which the factors of one more matrix cost little beside the solution.
 _MOST = 20_000
@@ -85,7 +86,7 @@ def _sticking(problem: StepProblem, step: Evaluation) -> tuple[Any, ...]:
     return parts
 
 
-def _is_symmetric(matrix: Any) -> bool:
+def _is_symmetric(matrix: PETSc.Mat) -> bool:
     """Whether forces have a potential, as those of loads that follow the body have not."""
     skew = matrix.transpose(PETSc.Mat())
     skew.axpy(-1.0, matrix)
@@ -95,7 +96,7 @@ def _is_symmetric(matrix: Any) -> bool:
 
 
 def _no_stiffness(
-    problem: StepProblem, step: Evaluation, matrix: Any, turning: FloatArray
+    problem: StepProblem, step: Evaluation, matrix: PETSc.Mat, turning: FloatArray
 ) -> FloatArray:
     """What counts as none at each coordinate of all bodies, as `matrix` has them. Collective.
 
@@ -132,7 +133,7 @@ def _unbalanced(problem: StepProblem, step: Evaluation) -> FloatArray:
     return left
 
 
-def _of_rigid(body: Any, size: FloatArray, turning: FloatArray) -> FloatArray:
+def _of_rigid(body: Body, size: FloatArray, turning: FloatArray) -> FloatArray:
     """The same of a rigid body, shape (num_owned,)."""
     found, places = np.zeros_like(size), np.repeat(body.places, 3)
     for kind in (places, ~places):
@@ -141,7 +142,7 @@ def _of_rigid(body: Any, size: FloatArray, turning: FloatArray) -> FloatArray:
     return found
 
 
-def _negative_pivots(matrix: Any, none: FloatArray) -> int:
+def _negative_pivots(matrix: PETSc.Mat, none: FloatArray) -> int:
     """Of a symmetric matrix, whose diagonal is raised by what counts as none. Collective."""
     diagonal = matrix.getDiagonal()
     diagonal.array_w[:] += none

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from petsc4py import PETSc
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.solid.inversion import describe, forbidden, smallest_dets
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.types import FloatArray
 
 #: An update that would leave less than this part of the smallest det F of a body is halved, ...
 _KEPT_DET = 0.1
@@ -52,7 +51,7 @@ class InversionGuard:
         """Whether no body with these smallest det F is inside out that must not be."""
         return bool((forbidden(self._problem.system, dets) > 0.0).all())
 
-    def shorten(self, x: Any, y: Any) -> bool:
+    def shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Scale an update y that SNES subtracts from x; tells whether it did. Collective."""
         if not self._careful:
             return False

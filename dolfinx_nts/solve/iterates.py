@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from petsc4py import PETSc
 
-from dolfinx_nts.arrays import IntArray
 from dolfinx_nts.contact.coulomb import Rub
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, everywhere, global_max, global_sum
+from dolfinx_nts.types import IntArray
 
 #: Iterations in a row without fewer changes of the active set before one changes at a time.
 _PATIENCE = 4
@@ -68,7 +67,7 @@ class Iterates:
         self._pivots = pivots and self._problem.integrator.inertia
         self._fewest, self._patience = np.inf, _PATIENCE
 
-    def at(self, x: Any) -> Evaluation:
+    def at(self, x: PETSc.Vec) -> Evaluation:
         """Evaluation at an iterate, reused while SNES asks for the same one. Collective.
 
         Args:
@@ -99,7 +98,7 @@ class Iterates:
         self.last = new
         return new
 
-    def _slid(self, last: Evaluation | None, new: Evaluation, x: Any) -> Evaluation:
+    def _slid(self, last: Evaluation | None, new: Evaluation, x: PETSc.Vec) -> Evaluation:
         """The new iterate of nodes that hardly rub, or slip once it is settled which touch.
 
         Collective.
@@ -130,7 +129,7 @@ class Iterates:
             self._sliding = 0
             self._problem.couplings.contacts.rub(Rub.LAW)
 
-    def _pivoted(self, last: Evaluation, new: Evaluation, x: Any) -> Evaluation:
+    def _pivoted(self, last: Evaluation, new: Evaluation, x: PETSc.Vec) -> Evaluation:
         """The new iterate, with one change of the last one's active set if all do not settle.
 
         Collective.

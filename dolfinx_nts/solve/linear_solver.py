@@ -15,6 +15,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.schur import SchurApproximation
 from dolfinx_nts.solve.model_problem import model_problem
+from dolfinx_nts.types import Options
 
 _BODIES = "fieldsplit_bodies_"
 _CONSTRAINTS = "fieldsplit_constraints_"
@@ -136,7 +137,7 @@ _WORTH = {"krylov": (60, 0.4), "multigrid": (10, 0.5)}
 
 
 def choose(
-    size: int, contact: bool, inertia: bool, given: Mapping[str, Any], mixed: bool = False
+    size: int, contact: bool, inertia: bool, given: Options, mixed: bool = False
 ) -> str:
     """Preset to begin with, but "direct" where that is as good or the user asks for it.
 
@@ -197,7 +198,7 @@ class SolverOptions:
         comm: MPI.Comm,
         preset: str,
         condense: bool,
-        given: Mapping[str, Any],
+        given: Options,
         limit: int | None = None,
         workspace: int | None = None,
     ) -> None:
@@ -305,7 +306,7 @@ class SolverOptions:
         except PETSc.Error as error:
             raise self._refused(error) from error
 
-    def check(self, snes: PETSc.SNES, matrix: Any, source: Any) -> None:
+    def check(self, snes: PETSc.SNES, matrix: PETSc.Mat, source: PETSc.Mat) -> None:
         """Raise on every rank if PETSc asks for one of the user's options nowhere in a solve.
 
         Nothing is solved yet: most options are asked for when the solver is set up. If some are
@@ -394,18 +395,18 @@ class SchurInverse:
     A alone needs more terms. Without M it is F^-1.
     """
 
-    def create(self, pc: Any) -> None:
+    def create(self, pc: PETSc.PC) -> None:
         """Called by PETSc, as the other methods are."""
         self._factors = PETSc.PC().create(pc.comm)
         self._between: Any = None
         self._work: tuple[Any, ...] = ()
 
-    def setFromOptions(self, pc: Any) -> None:
+    def setFromOptions(self, pc: PETSc.PC) -> None:
         """Options of the factorisation."""
         self._factors.setOptionsPrefix(f"{pc.getOptionsPrefix() or ''}{_FACTORS}")
         self._factors.setFromOptions()
 
-    def setUp(self, pc: Any) -> None:
+    def setUp(self, pc: PETSc.PC) -> None:
         """Factorise anew."""
         _, first = pc.getOperators()
         if self._between:
@@ -416,7 +417,7 @@ class SchurInverse:
         if not self._work:
             self._work = first.createVecs()
 
-    def apply(self, _pc: Any, x: Any, y: Any) -> None:
+    def apply(self, _pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Approximate S y = x."""
         if not self._between:
             self._factors.apply(x, y)
@@ -426,7 +427,7 @@ class SchurInverse:
         self._between.mult(a, b)
         self._factors.apply(b, y)
 
-    def destroy(self, _pc: Any) -> None:
+    def destroy(self, _pc: PETSc.PC) -> None:
         """Free what `create` and `setUp` made."""
         for each in (self._factors, self._between, *self._work):
             if each:
@@ -445,7 +446,7 @@ def set_schur(snes: PETSc.SNES, approximation: SchurApproximation) -> None:
     snes.getKSP().getPC().setFieldSplitSchurPreType(user, approximation.first)
 
 
-def take_bodies(snes: PETSc.SNES, operator: Any, bodies: Sequence[Any], split: bool) -> None:
+def take_bodies(snes: PETSc.SNES, operator: PETSc.Mat, bodies: Sequence[Any], split: bool) -> None:
     """Let this rank's preconditioner take whole bodies. Collective, before the first solve.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,6 +27,7 @@ from dolfinx_nts.solve.jacobian_reuse import KeptTangents
 from dolfinx_nts.solve.lent_stiffness import LentStiffness
 from dolfinx_nts.solve.linear_solver import keep_bodies, set_schur, take_bodies
 from dolfinx_nts.solve.presets import Presets
+from dolfinx_nts.types import Options
 from dolfinx_nts.validation import StepFailedError
 
 logger = logging.getLogger(__name__)
@@ -66,7 +67,7 @@ class StepSolver:
     """
 
     def __init__(
-        self, problem: StepProblem, newton: Newton, preset: str, petsc_options: Mapping[str, Any]
+        self, problem: StepProblem, newton: Newton, preset: str, petsc_options: Options
     ) -> None:
         self.problem, self.newton = problem, newton
         self._presets = Presets(
@@ -320,21 +321,21 @@ class StepSolver:
             set_schur(self.snes, self.matrix.schur())
 
     # ---- SNES callbacks
-    def _function(self, _snes: Any, x: Any, f: Any) -> None:
+    def _function(self, _snes: Any, x: PETSc.Vec, f: PETSc.Vec) -> None:
         try:
             f.array_w[:] = self.problem.residual(self.iterates.at(x))
         except StepFailedError as error:
             self._raised = error
             raise
 
-    def _jacobian(self, _snes: Any, x: Any, _j: Any, _p: Any) -> None:
+    def _jacobian(self, _snes: Any, x: PETSc.Vec, _j: Any, _p: Any) -> None:
         e = self.iterates.at(x)
         if e is not self._assembled:
             if self._lent.at(e, wanders=self._wanders):
                 self._tangents.due = True
             self.assemble(e)
 
-    def _check_update(self, x: Any, y: Any) -> bool:
+    def _check_update(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Hold prescribed coordinates, which a multigrid moves a little, and shorten updates."""
         y.array_w[self.problem.laid.held] = 0.0
         return self._upright.shorten(x, y)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from petsc4py import PETSc
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.linear_solver import ITERATIVE, SolverOptions, most_iterations
 from dolfinx_nts.system import System
+from dolfinx_nts.types import Options
 
 #: Part of the tolerance that an iteration aims at if it may be the last: a step that only just
 #: converges would leave its whole tolerance to the ledger, where factors leave rounding.
@@ -42,7 +44,7 @@ def _mumps_factors(pc: Any) -> Any:
 _HAS_KLU = PETSc.Sys.hasExternalPackage("suitesparse")
 
 
-def _is_chain(body: Any) -> bool:
+def _is_chain(body: Body) -> bool:
     """Whether a body's matrix is as sparse as that of a line: rigid bodies and beams."""
     return body.bound or (body.mesh is not None and body.mesh.topology.dim == 1)
 
@@ -70,7 +72,7 @@ class Presets:
         system: System,
         newton: Newton,
         first: str,
-        given: Mapping[str, Any],
+        given: Options,
         condense: bool,
         inertia: bool,
     ) -> None:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
@@ -24,6 +23,7 @@ from dolfinx_nts.interaction.point_elements import PointPart
 from dolfinx_nts.ledger import resultants
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
+from dolfinx_nts.types import FloatArray
 
 #: Linear solves of a start; what prescribed values change in the first step slows them down.
 _TIMES = 8

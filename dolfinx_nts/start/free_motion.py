@@ -9,9 +9,9 @@ from mpi4py import MPI
 import numpy as np
 import scipy.linalg
 
-from dolfinx_nts.arrays import BoolArray, FloatArray
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Newmark
@@ -19,6 +16,7 @@ from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.newton import StepSolver
 from dolfinx_nts.state import State
+from dolfinx_nts.types import BoolArray, Options
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 logger = logging.getLogger(__name__)
@@ -35,7 +33,7 @@ _RESTS = 0.5
 
 
 def with_resting_forces(
-    problem: StepProblem, state: State, dt: float, newton: Newton, options: Mapping[str, Any]
+    problem: StepProblem, state: State, dt: float, newton: Newton, options: Options
 ) -> State:
     """The state with the forces of contacts that carry from the start on. Collective.
 

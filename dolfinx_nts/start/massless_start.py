@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mpi4py import MPI
 
 import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
+from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.start.consistent import accelerating_forces
 from dolfinx_nts.state import State
@@ -24,7 +23,7 @@ _ROUNDED = 1e3 * float(np.finfo(float).eps)
 _SLOW = 0.4
 
 
-def check_massless(system: System, integrator: Any, impact: str) -> None:
+def check_massless(system: System, integrator: Integrator, impact: str) -> None:
     """Raise a ValueError on every rank where massless nodes make no sense. Collective.
 
     Args:

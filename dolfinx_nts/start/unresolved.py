@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.coupling import Slopes
 from dolfinx_nts.interaction.kinematics import has_constraints
 from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.start import consistent
 from dolfinx_nts.state import State
+from dolfinx_nts.types import FloatArray
 
 #: Largest omega h that counts as resolved: its phase comes out short by 7 %.
 _PHASE = 1.0

@@ -30,11 +30,11 @@ from petsc4py import PETSc
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.forms import CellForm, assemble_vector
 from dolfinx_nts.kernels.strain_energy import strain_energy
 from dolfinx_nts.output import writers as output
 from dolfinx_nts.solve.linear_solver import SolverOptions
+from dolfinx_nts.types import BalanceRow, FloatArray
 from dolfinx_nts.validation import known_options, require_positive
 
 #: Of a residual, relative to the forces of the step.
@@ -61,7 +61,7 @@ class Feature:
 
     Attributes:
         name: What is on.
-        against: Row it is compared with.
+        against: BalanceRow it is compared with.
         place: Of the cubes, one of `PLACES`.
         contact: Whether a contact is declared.
         friction: Coulomb's coefficient [-].
@@ -419,7 +419,7 @@ def _row(
     }
 
 
-def write(rows: Sequence[Mapping[str, Any]], folder: Path, title: str) -> None:
+def write(rows: Sequence[BalanceRow], folder: Path, title: str) -> None:
     """Print the table and write it as CSV; on one rank."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "economy.csv").open("w", newline="", encoding="utf-8") as file:

@@ -14,7 +14,7 @@ import ufl
 from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.types import FloatArray
 
 #: Young's modulus [Pa], density [kg/m^3] and edge [m] of the cubes.
 _YOUNG, _DENSITY, _EDGE = 1e6, 1e3, 1.0

@@ -29,8 +29,8 @@ import numpy as np
 from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.study.scene_runs import load
+from dolfinx_nts.types import BalanceRow, FloatArray
 
 #: Way to treat impacts -> mass of slave nodes and options of `simulate`.
 WAYS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
@@ -340,7 +340,7 @@ def table(only: Sequence[str] = (), ways: Sequence[str] = (), comm: MPI.Comm = M
     return rows
 
 
-def line(row: Mapping[str, Any]) -> str:
+def line(row: BalanceRow) -> str:
     """A row of the table as text."""
     cells = [f"{row[name]:.3g}" if name in row else "" for name in COLUMNS]
     return f"| {row['problem']} | {row['way']} | {' | '.join(cells)} | {row['status'][:200]} |"

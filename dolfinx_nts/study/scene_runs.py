@@ -19,8 +19,9 @@ from mpi4py import MPI
 import numpy as np
 
 import dolfinx_nts as nts
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.solve.accuracy import ACCURACY
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import require_bool, require_positive
 
 INTEGRATORS = {"energy-momentum": nts.EnergyMomentum(), "midpoint": nts.Midpoint()}
@@ -82,7 +83,7 @@ class Motion:
         """Nothing is open."""
 
 
-def affine(body: Any) -> tuple[FloatArray, float, float]:
+def affine(body: Body) -> tuple[FloatArray, float, float]:
     """Return the factors of u . M for the means of a body, (num_owned, 12); M; X . M X."""
     place = body.places.astype(float)[:, None]
     x, one = body.reference.reshape(-1, 3), np.kron(place, np.eye(3))

@@ -36,6 +36,7 @@ import numpy as np
 import dolfinx_nts as nts
 from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.study.extreme_scenes import MATERIALS, Case, Scene, closing, long_run, strips
+from dolfinx_nts.types import BalanceRow
 
 INTEGRATORS: Mapping[str, Any] = {
     "energy-momentum": nts.EnergyMomentum(),
@@ -186,13 +187,13 @@ def chart(
     return rows
 
 
-def _scheme(row: Mapping[str, Any]) -> str:
+def _scheme(row: BalanceRow) -> str:
     """Integrator of a row, and its level of accuracy if that is not "exact"."""
     level = row["accuracy"]
     return str(row["integrator"]) + ("" if level == "exact" else f", {level}")
 
 
-def summary(rows: Sequence[Mapping[str, Any]]) -> str:
+def summary(rows: Sequence[BalanceRow]) -> str:
     """Markdown: how many runs ended how, and all runs with a column for each integrator.
 
     A run's number in brackets is the largest part of the energy that nothing accounts for, or the
@@ -213,7 +214,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _in_words(rows: Sequence[Mapping[str, Any]]) -> str:
+def _in_words(rows: Sequence[BalanceRow]) -> str:
     """Outcomes of one scheme's levels, e.g. "completed (2e-14, 1e-10)"."""
     told: dict[str, list[str]] = {}
     for row in rows:
@@ -223,7 +224,7 @@ def _in_words(rows: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(f"{outcome} ({', '.join(numbers)})" for outcome, numbers in told.items())
 
 
-def picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+def picture(rows: Sequence[BalanceRow], path: Path) -> None:
     """A field for each axis: values across, schemes down, outcomes as colours."""
     import matplotlib as mpl
 

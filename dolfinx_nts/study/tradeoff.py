@@ -33,6 +33,7 @@ import numpy as np
 from dolfinx_nts.run.run_file import versions
 from dolfinx_nts.study import economy
 from dolfinx_nts.study.scene_runs import check, check_value, measure
+from dolfinx_nts.types import BalanceRow
 
 #: Choices a run is made with if none are given.
 DEFAULT: Mapping[str, list[Any]] = {
@@ -51,8 +52,8 @@ def grid(vary: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 def compare(
     scene: str,
     vary: Mapping[str, Sequence[Any]],
-    fixed: Mapping[str, Any],
-    reference: Mapping[str, Any],
+    fixed: BalanceRow,
+    reference: BalanceRow,
     comm: MPI.Comm,
 ) -> list[dict[str, Any]]:
     """Rows of all runs, the reference first.
@@ -88,7 +89,7 @@ def _label(choices: Mapping[str, Any]) -> str:
     return ", ".join(f"{k}={v}" for k, v in choices.items())
 
 
-def recommend(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, Mapping[str, Any] | None]]:
+def recommend(rows: Sequence[BalanceRow]) -> list[tuple[float, Mapping[str, Any] | None]]:
     """The cheapest run for each of the `TARGETS`, if there is one."""
     picks = []
     for target in TARGETS:
@@ -97,7 +98,7 @@ def recommend(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, Mapping[st
     return picks
 
 
-def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
+def recommendation(rows: Sequence[BalanceRow]) -> str:
     """Return what `recommend` picks, a line for each target."""
     return "\n".join(
         f"trajectory within {target:g}: "
@@ -106,7 +107,7 @@ def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def write(rows: Sequence[Mapping[str, Any]], folder: Path, title: str) -> None:
+def write(rows: Sequence[BalanceRow], folder: Path, title: str) -> None:
     """Write table, plot and recommendation; on one rank."""
     folder.mkdir(parents=True, exist_ok=True)
     names = list(dict.fromkeys(name for row in rows for name in row))
@@ -120,7 +121,7 @@ def write(rows: Sequence[Mapping[str, Any]], folder: Path, title: str) -> None:
     plot(rows, folder / "tradeoff.png", title)
 
 
-def plot(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
+def plot(rows: Sequence[BalanceRow], path: Path, title: str) -> None:
     """Work-precision plot: error of the trajectory over seconds, a curve per choice."""
     import matplotlib
 

@@ -22,7 +22,7 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 #: Floors from below: files, and folders that stand for all of theirs.
 LEVELS = [
-    {"arrays", "parallel", "validation", "mpi_first", "dolfinx_compat", "forms", "kernels"},
+    {"types", "parallel", "validation", "mpi_first", "dolfinx_compat", "forms", "kernels"},
     {"integrators"},
     {"state"},
     {"interaction"},

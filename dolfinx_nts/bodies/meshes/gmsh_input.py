@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray, IntArray
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: Gmsh element type -> cell name, DOLFINx vertex k = Gmsh vertex order[k].
 _GMSH_CELLS = {4: ("tetrahedron", [0, 1, 2, 3]), 5: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}

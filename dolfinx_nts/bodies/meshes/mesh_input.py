@@ -26,12 +26,12 @@ from dolfinx import mesh as dolfinx_mesh
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.meshes.gmsh_input import Input, Volume, listed, read_gmsh
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.bodies.solid.continuum import Continuum
 from dolfinx_nts.bodies.solid.parameters import Parameter
 from dolfinx_nts.parallel import on_root
+from dolfinx_nts.types import FloatArray, IntArray
 from dolfinx_nts.validation import is_whole
 
 _CORNERS = {"tetrahedron": 4, "hexahedron": 8}

@@ -14,9 +14,9 @@ from dolfinx import mesh as dolfinx_mesh
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.meshes.mesh_check import refuse_repeated
 from dolfinx_nts.parallel import gather_on_root
+from dolfinx_nts.types import FloatArray, IntArray
 from dolfinx_nts.validation import is_whole, require_positive
 
 _CORNERS = {"interval": 2, "triangle": 3, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}

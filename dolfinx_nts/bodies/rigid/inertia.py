@@ -9,9 +9,9 @@ import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.solid.parameters import Parameter, is_number
 from dolfinx_nts.forms import compile_forms
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import floats
 
 #: Part of the largest moment by which given moments and axes may miss what they must satisfy.

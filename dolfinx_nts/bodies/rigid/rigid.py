@@ -14,7 +14,6 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
@@ -32,6 +31,7 @@ from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross, range_of
 from dolfinx_nts.parallel import gather_rows, raise_together, rank_of
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values
 from dolfinx_nts.validation import (
     UserFunctionError,
     known_options,
@@ -96,8 +96,8 @@ class RigidBody(Body):
         mesh: Mesh,
         *,
         density: Parameter,
-        velocity: Any = (0.0, 0.0, 0.0),
-        angular_velocity: Any = (0.0, 0.0, 0.0),
+        velocity: Values = (0.0, 0.0, 0.0),
+        angular_velocity: Values = (0.0, 0.0, 0.0),
         force: VectorInTime = (0.0, 0.0, 0.0),
         torque: VectorInTime = (0.0, 0.0, 0.0),
         motion: VectorInTime | None = None,
@@ -130,8 +130,8 @@ class RigidBody(Body):
         centre: Any = (0.0, 0.0, 0.0),
         axes: Any = None,
         *,
-        velocity: Any = (0.0, 0.0, 0.0),
-        angular_velocity: Any = (0.0, 0.0, 0.0),
+        velocity: Values = (0.0, 0.0, 0.0),
+        angular_velocity: Values = (0.0, 0.0, 0.0),
         force: VectorInTime = (0.0, 0.0, 0.0),
         torque: VectorInTime = (0.0, 0.0, 0.0),
         motion: VectorInTime | None = None,
@@ -184,8 +184,8 @@ class RigidBody(Body):
         inertia: Inertia,
         *,
         name: str,
-        velocity: Any,
-        angular_velocity: Any,
+        velocity: Values,
+        angular_velocity: Values,
         force: VectorInTime,
         torque: VectorInTime,
         motion: VectorInTime | None,
@@ -334,7 +334,7 @@ class RigidBody(Body):
 
     def surface(
         self,
-        marker: Any,
+        marker: Marker,
         tag: int | None = None,
         *,
         smoothing: bool = False,
@@ -380,7 +380,7 @@ class RigidBody(Body):
         return self._loads.none and not (overridden or self._drive.moves or self._drive.turns)
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         return dict(self._loads.settings)
 
@@ -421,7 +421,7 @@ class RigidBody(Body):
         u = self._u0 + self._theta * (u1 - self._u0)
         return (self.reference + u).reshape(4, 3)[1:]
 
-    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """Return mass M less stiffness times the derivative of the torque's forces."""
         self.check_alive()
         if self._matrix is None:

@@ -7,15 +7,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import turns_of
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: Coordinates of a rigid body.
 WIDTH = 12
@@ -110,7 +111,7 @@ class RigidBatch(Body):
         """Gravity [N]."""
         return self.weight(gravity)
 
-    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """Return mass M."""
         if self._matrix is None:
             # In the 3 x 3 blocks of nodes, as those of other bodies are.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -11,13 +11,13 @@ from mpi4py import MPI
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.rigid.inertia import misfit_of_axes
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray, OfTime
 from dolfinx_nts.validation import UserFunctionError, agree, call_together, floats, vector_in_time
 
-VectorInTime = Sequence[float] | FloatArray | Callable[[float], Any]
+VectorInTime = Sequence[float] | FloatArray | OfTime
 
 #: Part of a torque along an axis without inertia that counts as none.
 _ALONG = 1e-6

@@ -12,10 +12,10 @@ from dolfinx import mesh as dolfinx_mesh
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.bodies.meshes.mesh_check import check_any_mesh
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, nodes_and_cells
 from dolfinx_nts.kernels.beam import shares
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import at_points, floats
 
 #: Cosine of the largest angle between neighbouring cells, 60 degrees.

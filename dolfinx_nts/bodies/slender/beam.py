@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from dolfinx.mesh import Mesh
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.slender.axis import axis_of, check_line
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
@@ -19,6 +18,7 @@ from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import beam as kernel
 from dolfinx_nts.kernels.quadratic import Elements
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values
 from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
 Vector = Sequence[float] | FloatArray
@@ -73,7 +73,7 @@ class Beam(DirectorBody):
         section: Section,
         *,
         direction: Any = None,
-        velocity: Any = (0.0, 0.0, 0.0),
+        velocity: Values = (0.0, 0.0, 0.0),
         angular_velocity: Vector = (0.0, 0.0, 0.0),
         bcs: Sequence[Clamp | Dirichlet] = (),
         forces: Sequence[Load] = (),
@@ -115,7 +115,7 @@ class Beam(DirectorBody):
         return sine * (4.0 - cosine) / 3.0, (4.0 * cosine - 2.0 * cosine**2 + 1.0) / 3.0
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         return {"section": self.section, **super().settings}
 
@@ -132,7 +132,7 @@ class Beam(DirectorBody):
         outline = np.array(self.section.outline, dtype=np.float64).reshape(-1, 2)
         return of_beam(self._skeleton, outline / self.length)
 
-    def surface(self, marker: Any = None, *, smoothing: bool = False) -> Surface:
+    def surface(self, marker: Marker = None, *, smoothing: bool = False) -> Surface:
         """A part of the skin for contact: the section's outline along the axis, and its ends.
 
         Collective.

@@ -16,7 +16,6 @@ from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
@@ -31,6 +30,7 @@ from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.kernels.vectors import range_of
 from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray, Marker, Settings, Values
 from dolfinx_nts.validation import at_points, vector, vectors
 
 #: Turn between neighbouring nodes [rad] from which on failed steps name it.
@@ -108,7 +108,7 @@ class DirectorBody(Body):
         masses: FloatArray,
         bcs: Sequence[Clamp | Dirichlet],
         forces: Sequence[Load | Pressure],
-        velocity: Any,
+        velocity: Values,
         spin: FloatArray,
     ) -> None:
         """Set up all but the mesh.
@@ -178,7 +178,7 @@ class DirectorBody(Body):
         of_nodes = np.broadcast_to(sums, (owned, corners, len(self._masses), 3))
         self.nodal_mass: FloatArray = self._gather(of_nodes)
 
-    def _set_up_velocity(self, velocity: Any, spin: FloatArray) -> None:
+    def _set_up_velocity(self, velocity: Values, spin: FloatArray) -> None:
         x, d = self._skeleton.x[self._here], self._skeleton.directors[self._here]
         if callable(velocity):
             speed = at_points(self.comm, f"velocity of {self.name!r}", velocity, x.T, (3,)).T
@@ -337,7 +337,7 @@ class DirectorBody(Body):
         skin = Skin(used, facets, original, points.combine(points.reference), rows, points)
         return Surface(self, skin, smoothing, self._touching)
 
-    def _marked(self, marker: Any, facets: BoolArray, x: FloatArray) -> BoolArray:
+    def _marked(self, marker: Marker, facets: BoolArray, x: FloatArray) -> BoolArray:
         """Which of some facets of the skin a user's marker selects, shape (m,). Collective.
 
         Args:
@@ -395,7 +395,7 @@ class DirectorBody(Body):
         self._pressures.begin(moment.time, moment.ramp)
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         return self._conditions.settings
 
@@ -449,7 +449,7 @@ class DirectorBody(Body):
         none = np.zeros(len(tau))
         return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
 
-    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """Return mass M + stiffness K, the same matrix in each call. Collective."""
         if self._matrix is None:
             self._set_up_matrix()

@@ -8,8 +8,8 @@ import numpy as np
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.parallel import gather_rows
+from dolfinx_nts.types import FloatArray, IntArray
 
 
 class DirectorMesh(NamedTuple):

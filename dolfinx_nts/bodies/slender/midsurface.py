@@ -10,10 +10,10 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.meshes.mesh_check import check_any_mesh
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, nodes_and_cells
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.types import FloatArray, IntArray
 
 #: Corners of a cell in DOLFINx's order as they follow each other.
 _CYCLIC = [0, 1, 3, 2]

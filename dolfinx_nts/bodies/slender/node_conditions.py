@@ -10,10 +10,10 @@ from mpi4py import MPI
 
 import numpy as np
 
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet, Meetings, VectorInTime, takes_place
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.bodies.slender.pressure import Pressure
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray, Marker, Settings
 from dolfinx_nts.validation import at_points, is_whole, items, known_options, vector_in_time
 
 #: Nodes that a message names.
@@ -75,7 +75,7 @@ class NodeConditions:
         self.loads(0.0, 1.0)
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         return {"bcs": self._values, "forces": self._values_of_loads}
 
@@ -110,7 +110,7 @@ class NodeConditions:
         self.still: IntArray = self.fixed[np.isin(self._condition, still)]
         self.free_directors: IntArray = np.flatnonzero((owner[:, 3:] < 0).any(axis=1))
 
-    def _chosen(self, what: str, where: Any) -> BoolArray:
+    def _chosen(self, what: str, where: Marker) -> BoolArray:
         """Nodes of all ranks where a condition holds; it must hold somewhere. Collective."""
         if not callable(where):
             raise TypeError(f"{what}={where!r}: pass a function x (3, n) -> bool (n,)")
@@ -204,7 +204,7 @@ class Clamp:
         ValueError: Unknown component.
     """
 
-    where: Any
+    where: Marker
     components: tuple[int, ...] = (0, 1, 2)
 
     def __post_init__(self) -> None:
@@ -225,7 +225,7 @@ class Load:
         turns: Whether it is a moment.
     """
 
-    where: Any
+    where: Marker
     value: VectorInTime
     unit: ClassVar[str]
     per_length: ClassVar[bool]
@@ -242,7 +242,7 @@ class PointForce(Load):
         value: [N]: a vector, or a function of time.
     """
 
-    where: Any
+    where: Marker
     value: VectorInTime
     unit, per_length, turns = "N", False, False
 
@@ -257,7 +257,7 @@ class PointMoment(Load):
         value: [N m]: a vector, or a function of time.
     """
 
-    where: Any
+    where: Marker
     value: VectorInTime
     unit, per_length, turns = "N m", False, True
 
@@ -274,7 +274,7 @@ class LineForce(Load):
     """
 
     value: VectorInTime
-    where: Any = None
+    where: Marker = None
     unit, per_length, turns = "N/m", True, False
 
 
@@ -289,5 +289,5 @@ class LineMoment(Load):
     """
 
     value: VectorInTime
-    where: Any = None
+    where: Marker = None
     unit, per_length, turns = "N m/m", True, True

@@ -11,9 +11,9 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.kernels import pressure as kernel
+from dolfinx_nts.types import FloatArray, Marker
 from dolfinx_nts.validation import (
     at_points,
     is_finite,
@@ -46,7 +46,7 @@ class Pressure:
     """
 
     value: float | Callable[[float], float]
-    where: Any = None
+    where: Marker = None
     follower: bool = True
 
     def __post_init__(self) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import floats, is_finite, known_options, require_positive
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from dolfinx.mesh import Mesh
 
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
 from dolfinx_nts.bodies.slender.director_mesh import SIDES, Hull, of_shell
@@ -20,6 +19,7 @@ from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import shell as kernel
 from dolfinx_nts.kernels.quadratic import Elements
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values
 from dolfinx_nts.validation import (
     is_finite,
     known_options,
@@ -84,7 +84,7 @@ class Shell(DirectorBody):
         poisson: float,
         thickness: float,
         density: float,
-        velocity: Any = (0.0, 0.0, 0.0),
+        velocity: Values = (0.0, 0.0, 0.0),
         angular_velocity: Vector = (0.0, 0.0, 0.0),
         bcs: Sequence[Clamp | Dirichlet] = (),
         forces: Sequence[Load | Pressure] = (),
@@ -126,7 +126,7 @@ class Shell(DirectorBody):
         return 2.0 * float(np.sin(0.5 * turn)), float(np.cos(0.5 * turn))
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         own = {name: getattr(self, name) for name in ("young", "poisson", "thickness", "density")}
         return {**own, **super().settings}
@@ -144,7 +144,7 @@ class Shell(DirectorBody):
         return of_shell(self._skeleton)
 
     def surface(
-        self, marker: Any = None, *, side: str = "top", smoothing: bool = False
+        self, marker: Marker = None, *, side: str = "top", smoothing: bool = False
     ) -> Surface:
         """A part of the skin for contact, half a thickness from the middle surface. Collective.
 

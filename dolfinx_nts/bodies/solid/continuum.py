@@ -13,7 +13,6 @@ from dolfinx import mesh as dolfinx_mesh
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
 from dolfinx_nts.bodies.solid.materials import misfit, with_constants
@@ -23,6 +22,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
     items,
@@ -91,8 +91,8 @@ class Continuum(UflBody):
         material: Callable[[Any], Any],
         *,
         density: Parameter,
-        velocity: Any = (0.0, 0.0, 0.0),
-        displacement: Any = (0.0, 0.0, 0.0),
+        velocity: Values = (0.0, 0.0, 0.0),
+        displacement: Values = (0.0, 0.0, 0.0),
         bcs: Sequence[Dirichlet] = (),
         name: str = "body",
         degree: int = 1,
@@ -207,7 +207,7 @@ class Continuum(UflBody):
 
     # ---- as of Body
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
         own = {"material": self.material, "density": self.density, "degree": self.degree}

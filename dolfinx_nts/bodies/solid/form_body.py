@@ -18,6 +18,7 @@ from dolfinx_nts.bodies.solid.ufl_body import UflBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import Values
 from dolfinx_nts.validation import is_whole, known_options
 
 #: Part of the mass that rounding may add where two directions, or two orders of nodes, differ.
@@ -88,8 +89,8 @@ class FormBody(UflBody):
         strain: Callable[[Any], Any] | None = None,
         density: Parameter | None = None,
         mass: Callable[[Any, Any], Any] | None = None,
-        velocity: Any = (0.0, 0.0, 0.0),
-        displacement: Any = (0.0, 0.0, 0.0),
+        velocity: Values = (0.0, 0.0, 0.0),
+        displacement: Values = (0.0, 0.0, 0.0),
         bcs: Sequence[Dirichlet] = (),
         name: str = "body",
         quadrature_degree: int | None = None,

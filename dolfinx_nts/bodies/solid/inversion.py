@@ -13,10 +13,11 @@ import numpy as np
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, load
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray
 
 #: det(dx/dxi) at the points of a cell, from its nodes' positions, as FFCx would write it.
 _KERNEL = """
@@ -159,7 +160,7 @@ def forbidden(system: Any, dets: FloatArray) -> FloatArray:
     return np.where(allowed, np.inf, dets)
 
 
-def describe(body: Any, u: FloatArray) -> tuple[str, str]:
+def describe(body: Body, u: FloatArray) -> tuple[str, str]:
     """Where a body's smallest det F is, and what may prevent it, see `Body`. Collective.
 
     Args:

@@ -26,9 +26,9 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import BoolArray, FloatArray, IntArray
 from dolfinx_nts.interaction.points import of_nodes
 from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 
 class MassMatrix:
@@ -313,7 +313,7 @@ def waves(
     Args:
         potential: Strain energy on this rank [J] by displacements of its nodes (n, 3) [m].
         x: Reference positions [m], shape (n, 3).
-        mass: Row sums of the consistent mass [kg], shape (n,).
+        mass: BalanceRow sums of the consistent mass [kg], shape (n,).
         massless: Nodes that have lost theirs, shape (n,).
         comm: Communicator.
     """

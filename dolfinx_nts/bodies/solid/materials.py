@@ -30,6 +30,7 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 from ufl.constantvalue import RealValue
+from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from dolfinx_nts.bodies.solid.parameters import (
@@ -55,7 +56,7 @@ def _check_elastic(young: Any, poisson: Any) -> None:
     require_parameter("poisson", poisson, lambda v: is_finite(v) and -1 < v < 0.5, wanted)
 
 
-def misfit(expressions: Iterable[Any], domain: Any) -> str | None:
+def misfit(expressions: Iterable[Expr], domain: Any) -> str | None:
     """Return what keeps UFL expressions from being compiled on a mesh, in words, if anything does.
 
     Args:
@@ -95,16 +96,16 @@ class StVenantKirchhoff(Isotropic):
         _check_elastic(self.young, self.poisson)
 
     @cached_property
-    def moduli(self) -> tuple[Any, ...]:
+    def moduli(self) -> tuple[Expr, ...]:
         """Lame's mu and lambda [Pa]."""
         return _lame(self.young, self.poisson)
 
-    def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
+    def of_invariants(self, i1: Expr, i2: Expr, i3: Expr) -> Expr:
         """W [J/m^3], with tr E = I_1/2 and E : E = (I_1^2 - 2 I_2)/4."""
         mu, lam = self.moduli
         return lam / 8 * i1**2 + mu / 4 * (i1**2 - 2 * i2)
 
-    def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
+    def slopes(self, i1: Expr, i2: Expr, i3: Expr) -> tuple[Expr, Expr, Expr]:
         """Derivatives of W [Pa]."""
         mu, lam = self.moduli
         return (lam / 4 + mu / 2) * i1, -mu / 2, ufl.as_ufl(0)
@@ -135,17 +136,17 @@ class NeoHookean(Isotropic):
         _check_elastic(self.young, self.poisson)
 
     @cached_property
-    def moduli(self) -> tuple[Any, ...]:
+    def moduli(self) -> tuple[Expr, ...]:
         """Lame's mu and lambda [Pa]."""
         return _lame(self.young, self.poisson)
 
-    def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
+    def of_invariants(self, i1: Expr, i2: Expr, i3: Expr) -> Expr:
         """W [J/m^3]."""
         mu, lam = self.moduli
         d = i1 + i2 + i3
         return mu / 2 * (log1p_remainder(d) - i2 - i3) + lam / 8 * log1p(d) ** 2
 
-    def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
+    def slopes(self, i1: Expr, i2: Expr, i3: Expr) -> tuple[Expr, Expr, Expr]:
         """Derivatives of W [Pa]."""
         mu, lam = self.moduli
         d = i1 + i2 + i3
@@ -189,11 +190,11 @@ class MooneyRivlin(Isotropic):
         require_positive_parameter("c", self.c, "Pa")
 
     @cached_property
-    def moduli(self) -> tuple[Any, ...]:
+    def moduli(self) -> tuple[Expr, ...]:
         """The coefficients a, b and c [Pa]."""
         return self.a, self.b, self.c
 
-    def of_invariants(self, i1: Any, i2: Any, i3: Any) -> Any:
+    def of_invariants(self, i1: Expr, i2: Expr, i3: Expr) -> Expr:
         """W [J/m^3]."""
         a, b, c = self.moduli
         d = i1 + i2 + i3
@@ -202,7 +203,7 @@ class MooneyRivlin(Isotropic):
         isochoric = linear * (log1p_remainder(d) - i3) - (a + b) * i2
         return isochoric + c / 2 * change**2
 
-    def slopes(self, i1: Any, i2: Any, i3: Any) -> tuple[Any, Any, Any]:
+    def slopes(self, i1: Expr, i2: Expr, i3: Expr) -> tuple[Expr, Expr, Expr]:
         """Derivatives of W [Pa]."""
         a, b, c = self.moduli
         d = i1 + i2 + i3
@@ -211,7 +212,7 @@ class MooneyRivlin(Isotropic):
         return first, first - (a + b), first - linear
 
 
-def with_constants(material: Any, mesh: Mesh) -> Any:
+def with_constants(material: Any, mesh: Mesh) -> Expr:
     """A material of this package with its numbers in a Constant: all moduli share compiled forms.
 
     Args:

@@ -9,8 +9,8 @@ import numpy as np
 from dolfinx import fem
 from ufl.corealg.traversal import traverse_unique_terminals
 
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import is_finite
 
 #: What a parameter may be; the latter two of a scalar, a Function e.g. of degree 0.

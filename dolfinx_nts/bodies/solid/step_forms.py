@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
+from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.static import EQUILIBRIUM
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import FloatArray
 
 
 def checked_form(
@@ -124,7 +125,7 @@ class StepForms:
 
     def tangent(
         self, u1: FloatArray, mass: float, stiffness: float, masks: Any, diagonal: float
-    ) -> Any:
+    ) -> PETSc.Mat:
         """Return mass M + stiffness K, the same matrix in each call.
 
         Args:

@@ -12,9 +12,9 @@ from mpi4py import MPI
 import numpy as np
 import ufl
 from dolfinx import fem
+from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.arrays import FloatArray, IntArray
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.meshes.mesh_check import pieces_of, places_of
@@ -37,6 +37,7 @@ from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points, in_mesh
 from dolfinx_nts.parallel import gather_on_root, raise_together
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values
 from dolfinx_nts.validation import (
     UserFunctionError,
     require_bool,
@@ -116,7 +117,7 @@ class UflBody(Body):
 
     def surface(
         self,
-        marker: Any,
+        marker: Marker,
         tag: int | None = None,
         *,
         smoothing: bool = False,
@@ -242,7 +243,7 @@ class UflBody(Body):
         self.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         return float(ends.sum(axis=0).max())
 
-    def _stand(self, bcs: Sequence[Dirichlet], velocity: Any, displacement: Any) -> None:
+    def _stand(self, bcs: Sequence[Dirichlet], velocity: Values, displacement: Values) -> None:
         """Set conditions, and displacement and velocity at the start."""
         self._supports = Supports(self.comm, self.space, bcs, self.name)
         self.fixed, self.driven = self._supports.fixed, self._supports.driven
@@ -343,7 +344,7 @@ class UflBody(Body):
             force += self.weight(gravity)
         return force - self._forms.extra(u1)
 
-    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> Any:
+    def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """Return mass M + stiffness K, the same matrix in each call."""
         self.check_alive()
         diagonal = mass * self._mean(self.nodal_mass)
@@ -392,7 +393,7 @@ class UflBody(Body):
         return self._determinants.smallest(self._forms.with_ghosts(u))
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         constants = [t.value for t in self._parameters if isinstance(t, fem.Constant)]
         return {"bcs": self._supports.settings, "constants in the material": constants}
