@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.output import Fields
 from dolfinx_nts.output.pictures import picture
@@ -59,7 +60,7 @@ class Block(nts.Body):
         slope = ufl.derivative(work, self.u, du)
         self._force, self._stiffness = compile_forms([work, slope])
         self._vector, self._matrix = (
-            compat.create_vector(self.space), compat.create_matrix(self._stiffness)
+            petsc_compat.create_vector(self.space), petsc_compat.create_matrix(self._stiffness)
         )  # fmt: skip
         self.num_owned = 3 * self.space.dofmap.index_map.size_local
         self.reference = self.space.tabulate_dof_coordinates().ravel()[: self.num_owned]
@@ -79,7 +80,7 @@ class Block(nts.Body):
 
     def stiffness(self):
         """PETSc matrix of their derivatives [N/m]."""
-        compat.assemble_matrix(self._matrix, self._stiffness, self._bcs, MU)
+        petsc_compat.assemble_matrix(self._matrix, self._stiffness, self._bcs, MU)
         return self._matrix
 
     def prescribed(self, time):

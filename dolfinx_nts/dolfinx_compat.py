@@ -7,7 +7,7 @@ import hashlib
 import importlib
 import logging
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from mpi4py import MPI
 
 import cffi
 import dolfinx
-import dolfinx.fem.petsc as fem_petsc
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -35,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
 #: UFL-owned elements, AdjacencyList dofmaps.
-_OLD = VERSION < (0, 8)
+OLD = VERSION < (0, 8)
 _SHARED = mesh.GhostMode.shared_facet
 
 
@@ -64,7 +63,7 @@ def create_mesh(comm: MPI.Comm, cells: npt.ArrayLike, x: npt.ArrayLike, cell_typ
     cells, x = np.ascontiguousarray(cells, np.int64), np.ascontiguousarray(x, np.float64)
     _refuse_whole(comm, cells, x)
     degree = 2 if (cell_type, cells.shape[1]) == ("interval", 3) else 1
-    if _OLD:
+    if OLD:
         cell = ufl.Cell(cell_type, geometric_dimension=x.shape[1])
         domain = ufl.Mesh(ufl.VectorElement("Lagrange", cell, degree))
         return mesh.create_mesh(comm, cells, x, domain, _SHARED, mesh.create_cell_partitioner())
@@ -95,7 +94,7 @@ def _refuse_whole(comm: MPI.Comm, cells: IntArray, x: FloatArray) -> None:
 
 def model_to_mesh(model: Any, comm: MPI.Comm, rank: int = 0) -> tuple[Any, Any, Any]:
     """Gmsh model -> (mesh, cell tags, facet tags), with shared-facet ghosts in every version."""
-    if _OLD:
+    if OLD:
         gmshio = importlib.import_module("dolfinx.io.gmshio")
         m, ct, ft = gmshio.model_to_mesh(model, comm, rank, 3)
         return m, ct, ft
@@ -113,7 +112,7 @@ def _table(a: Any, layout: Any) -> IntArray:
 def geometry_dofmap(msh: Mesh) -> IntArray:
     """Geometry nodes of the cells, shape (cells, nodes)."""
     g = msh.geometry
-    if _OLD:
+    if OLD:
         return _table(g.dofmap, g.cmap.create_dof_layout())
     nodes: IntArray = g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap
     return nodes
@@ -127,7 +126,7 @@ def coordinate_map(msh: Mesh) -> Any:
 
 def cell_dofs(space: fem.FunctionSpace) -> IntArray:
     """Blocked dofs of the cells, shape (cells, dofs)."""
-    if _OLD:
+    if OLD:
         return _table(space.dofmap.list, space.dofmap.dof_layout)
     dofs: IntArray = space.dofmap.list
     return dofs
@@ -142,7 +141,7 @@ def entities_to_geometry(msh: Mesh, dim: int, entities: npt.ArrayLike) -> IntArr
     if not entities.size:  # 0.9 raises SIGFPE on an empty list
         kind = cpp.mesh.cell_entity_type(t.cell_type, dim, 0)
         return np.empty((0, cpp.mesh.cell_num_vertices(kind)), np.int32)
-    if _OLD:
+    if OLD:
         nodes: IntArray = cpp.mesh.entities_to_geometry(_cpp_mesh(msh), dim, entities, False)
     else:
         nodes = mesh.entities_to_geometry(msh, dim, entities)
@@ -251,7 +250,7 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
 
 def vector_space(msh: Mesh, degree: int) -> fem.FunctionSpace:
     """Continuous Lagrange space of 3-vectors."""
-    if _OLD:
+    if OLD:
         with _told_compiler("an element"):
             return fem.VectorFunctionSpace(msh, ("Lagrange", degree), dim=3)
     return fem.functionspace(msh, ("Lagrange", degree, (3,)))
@@ -260,7 +259,7 @@ def vector_space(msh: Mesh, degree: int) -> fem.FunctionSpace:
 def lagrange_degree(space: fem.FunctionSpace) -> int | None:
     """Degree of a continuous Lagrange space of 3-vectors, None of any other."""
     element = space.ufl_element()
-    if _OLD:
+    if OLD:
         family, degree, broken = element.family(), element.degree(), False
     elif not hasattr(element, "basix_element"):
         return None
@@ -274,7 +273,7 @@ def lagrange_degree(space: fem.FunctionSpace) -> int | None:
 def is_nodal(space: fem.FunctionSpace, msh: Mesh) -> bool:
     """Return whether a space is of Lagrange elements with one block at each corner of a cell."""
     element = space.ufl_element()
-    if _OLD:
+    if OLD:
         scalar = (*element.sub_elements(), element)[0]
         broken = scalar.family() not in ("Lagrange", "Q")
     else:
@@ -285,7 +284,7 @@ def is_nodal(space: fem.FunctionSpace, msh: Mesh) -> bool:
 
 def scalar_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
     """Scalar space of the family ("Lagrange" or "DG")."""
-    if _OLD:
+    if OLD:
         with _told_compiler("an element"):
             return fem.FunctionSpace(msh, (family, degree))
     return fem.functionspace(msh, (family, degree))
@@ -293,7 +292,7 @@ def scalar_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
 
 def cell_vector_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
     """Space of 3-vectors of the family ("DG")."""
-    if _OLD:
+    if OLD:
         with _told_compiler("an element"):
             return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
     return fem.functionspace(msh, (family, degree, (3,)))
@@ -301,7 +300,7 @@ def cell_vector_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
 
 def tensor_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
     """Space of 3 x 3 tensors of the family ("Lagrange" or "DG")."""
-    if _OLD:
+    if OLD:
         with _told_compiler("an element"):
             return fem.TensorFunctionSpace(msh, (family, degree), shape=(3, 3))
     return fem.functionspace(msh, (family, degree, (3, 3)))
@@ -318,8 +317,8 @@ def node_blocks(mesh: Mesh, space: fem.FunctionSpace) -> IntArray:
 def cells_near(msh: Mesh, x: FloatArray, padding: float) -> list[list[int]]:
     """This rank's own cells whose boxes, padded [m], hold each point (n, 3)."""
     dim = msh.topology.dim
-    make = geometry.BoundingBoxTree if _OLD else geometry.bb_tree
-    collide = geometry.compute_collisions if _OLD else geometry.compute_collisions_points
+    make = geometry.BoundingBoxTree if OLD else geometry.bb_tree
+    collide = geometry.compute_collisions if OLD else geometry.compute_collisions_points
     found = collide(make(msh, dim, padding=padding), np.ascontiguousarray(x, dtype=np.float64))
     owned = msh.topology.index_map(dim).size_local
     return [[int(c) for c in found.links(i) if c < owned] for i in range(len(x))]
@@ -351,7 +350,7 @@ _PATIENCE = 600
 
 def _jit_options() -> tuple[dict[str, Any], dict[str, Any]]:
     """DOLFINx's options of the compiler, as they are and as they are by default."""
-    named = "PARAMETERS" if _OLD else "OPTIONS"
+    named = "PARAMETERS" if OLD else "OPTIONS"
     defaults = getattr(jit, f"DOLFINX_DEFAULT_JIT_{named}")
     chosen = getattr(jit, f"get_{named.lower()}")()
     return chosen, {name: default[0] for name, default in defaults.items()}
@@ -384,11 +383,11 @@ def compile_forms(forms: Iterable[Any]) -> Iterator[tuple[Any, Path]]:
     """Compiled forms one by one, each with FFCx's C code of it."""
     options = jit_options()
     given: dict[str, Any] = {"jit_options": options}
-    if _OLD:
+    if OLD:
         given = {"jit_params": options, "form_compiler_params": {}}
     with _told_compiler("forms of a material or mesh that is new here") as sources:
         for form in map(canonical, forms):
-            if _OLD:
+            if OLD:
                 # Compiling a form sets this on its mesh, and so would change the next signature.
                 for domain in form.ufl_domains():
                     domain.ufl_coordinate_element()._sub_element._variant = "equispaced"
@@ -409,7 +408,7 @@ def functions(form: Any, compiled: Any) -> list[Any]:
         compiled: By DOLFINx.
     """
     given, made = form.coefficients(), compiled.ufcx_form
-    place = made.original_coefficient_position if _OLD else made.original_coefficient_positions
+    place = made.original_coefficient_position if OLD else made.original_coefficient_positions
     return [given[place[k]] for k in range(made.num_coefficients)]
 
 
@@ -433,211 +432,8 @@ def plain_dofs(space: fem.FunctionSpace, cells: int) -> IntArray | None:
     if space.element.needs_dof_transformations:
         return None
     dofs = space.dofmap.list
-    if _OLD:
+    if OLD:
         if len(dofs.array) != dofs.num_nodes * space.dofmap.dof_layout.num_dofs:
             return None
         dofs = _table(dofs, space.dofmap.dof_layout)
     return np.asarray(dofs[:cells])
-
-
-#: One for all meshes of the same ranks in the same order, see `petsc_communicator`.
-_COMMUNICATORS: list[Any] = [MPI.COMM_SELF, MPI.COMM_WORLD]
-
-
-def petsc_communicator(comm: MPI.Comm) -> MPI.Comm:
-    """Communicator of the same ranks, one for all meshes, for PETSc's objects.
-
-    In parallel PETSc frees what Python has dropped in `free_dropped` alone, by communicator. Each
-    mesh has its own, which may be gone by then; and MPICH has only 2,048.
-    """
-    for known in _COMMUNICATORS:
-        if MPI.Comm.Compare(known, comm) in (MPI.IDENT, MPI.CONGRUENT):
-            return known
-    _COMMUNICATORS.append(comm.Dup())
-    return _COMMUNICATORS[-1]
-
-
-def free_dropped(comm: MPI.Comm) -> None:
-    """Free what PETSc made on a communicator and Python has dropped; all ranks call it."""
-    if comm.size > 1:
-        PETSc.garbage_cleanup(comm)
-
-
-def create_vector(space: fem.FunctionSpace) -> PETSc.Vec:
-    """New zero ghosted PETSc vector in the layout of the space."""
-    blocks, size = space.dofmap.index_map, space.dofmap.index_map_bs
-    b = PETSc.Vec().createGhost(
-        np.asarray(blocks.ghosts, dtype=PETSc.IntType), (size * blocks.size_local, None),
-        bsize=size, comm=petsc_communicator(space.mesh.comm),
-    )  # fmt: skip
-    b.set(0.0)
-    return b
-
-
-def add_vector(values: FloatArray, form: Any) -> None:
-    """Add a compiled linear form to this rank's values, ghosts included."""
-    form = getattr(form, "_cpp_object", form)
-    packed = cpp.fem.pack_constants(form), cpp.fem.pack_coefficients(form)
-    cpp.fem.assemble_vector(values, form, *packed)
-
-
-def sum_ghosts(b: PETSc.Vec) -> None:
-    """Add values at ghosts of a PETSc vector to their owners."""
-    b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
-
-
-def create_matrix(form: Any) -> PETSc.Mat:
-    """New PETSc matrix with the sparsity of a bilinear form."""
-    pattern = fem.create_sparsity_pattern(form)
-    if _OLD:
-        pattern.assemble()
-    else:
-        pattern.finalize()
-    return cpp.la.petsc.create_matrix(petsc_communicator(form.mesh.comm), pattern)
-
-
-def dense_matrix(comm: MPI.Comm, size: int) -> PETSc.Mat:
-    """New PETSc AIJ matrix of nodes, 3 x 3 blocks, with room for all entries of a rank's own.
-
-    Args:
-        comm: MPI communicator.
-        size: Rows and columns on this rank.
-    """
-    return PETSc.Mat().createAIJ(((size, None), (size, None)), nnz=(size, 0), bsize=3, comm=comm)
-
-
-def coo_matrix(comm: MPI.Comm, size: int, rows: npt.ArrayLike, cols: npt.ArrayLike) -> PETSc.Mat:
-    """New PETSc AIJ matrix of nodes, 3 x 3 blocks, for `set_values_coo`.
-
-    Args:
-        comm: MPI communicator.
-        size: Rows and columns on this rank.
-        rows: Global numbers of the triplets that this rank sets, whoever owns them.
-        cols: Likewise.
-    """
-    a = PETSc.Mat().create(comm)
-    a.setSizes(((size, None), (size, None)))
-    a.setBlockSize(3)
-    a.setType("aij")
-    set_preallocation_coo(a, rows, cols)
-    return a
-
-
-def without_zeros(a: PETSc.Mat) -> PETSc.Mat:
-    """Copy of an assembled matrix without the zeros stored in it; MatFilter only since 3.20."""
-    rows, cols, values = a.getValuesCSR()
-    kept = values != 0.0
-    start = np.concatenate([[0], np.cumsum(kept)])[rows]
-    return with_entries(a, start, cols[kept], values[kept])
-
-
-def with_entries(a: PETSc.Mat, start: IntArray, cols: IntArray, values: FloatArray) -> PETSc.Mat:
-    """PETSc AIJ matrix of the sizes of another with other entries of this rank's rows.
-
-    Args:
-        a: The other one.
-        start: Where each row starts among the entries, and their number, shape (rows + 1,).
-        cols: Global columns.
-        values: Values.
-    """
-    csr = (start.astype(PETSc.IntType), cols.astype(PETSc.IntType), values)
-    return PETSc.Mat().createAIJ(a.getSizes(), csr=csr, comm=a.comm)
-
-
-def assemble_matrix(a: PETSc.Mat, form: Any, bcs: Sequence[Any], diagonal: float) -> None:
-    """Assemble a bilinear form; rows and columns of bcs hold only the given diagonal."""
-    a.zeroEntries()
-    fem_petsc.assemble_matrix(a, form, list(bcs), diagonal)
-    a.assemble()
-
-
-# ---- what petsc4py 3.18 and 3.22 do not bind
-_lib: Any = None
-_INT: Any = np.ctypeslib.as_ctypes_type(PETSc.IntType)
-
-
-def _petsc_library() -> Any:
-    """The PETSc library this process already has loaded."""
-    global _lib  # noqa: PLW0603
-    if _lib is None:
-        with open("/proc/self/maps", encoding="utf-8") as maps:
-            names = (x.split()[-1] for x in maps if "libpetsc_" in x or "libpetsc." in x)
-            path = next(names)
-        _lib = ctypes.CDLL(path)
-        count, pointer = ctypes.c_ssize_t, ctypes.c_void_p
-        _lib.MatSetPreallocationCOO.argtypes = (pointer, count, pointer, pointer)
-        _lib.MatSetValuesCOO.argtypes = (pointer, pointer, ctypes.c_int)
-        _lib.PetscOptionsUsed.argtypes = (pointer, ctypes.c_char_p, pointer)
-        _lib.MatMPIAIJGetSeqAIJ.argtypes = (pointer,) * 4
-        _lib.MatSeqAIJGetCSRAndMemType.argtypes = (pointer,) * 5
-    return _lib
-
-
-def set_preallocation_coo(a: PETSc.Mat, rows: npt.ArrayLike, cols: npt.ArrayLike) -> None:
-    """Declare the triplets of a matrix; negative indices are ignored, duplicates summed."""
-    rows = np.array(rows, dtype=PETSc.IntType)  # copies: PETSc may permute them
-    cols = np.array(cols, dtype=PETSc.IntType)
-    if hasattr(a, "setPreallocationCOO"):
-        a.setPreallocationCOO(rows, cols)
-        return
-    i, j = rows.ctypes.data, cols.ctypes.data
-    if error := _petsc_library().MatSetPreallocationCOO(a.handle, rows.size, i, j):
-        raise PETSc.Error(error)
-
-
-def set_values_coo(a: PETSc.Mat, values: npt.ArrayLike) -> None:
-    """Replace the values of a matrix whose triplets were declared."""
-    values = np.ascontiguousarray(values, dtype=PETSc.ScalarType)
-    if hasattr(a, "setValuesCOO"):
-        a.setValuesCOO(values, PETSc.InsertMode.INSERT_VALUES)
-        return
-    mode = int(PETSc.InsertMode.INSERT_VALUES)
-    if error := _petsc_library().MatSetValuesCOO(a.handle, values.ctypes.data, mode):
-        raise PETSc.Error(error)
-
-
-def csr_parts(a: PETSc.Mat) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
-    """This rank's rows of an assembled AIJ matrix; unlike `getValuesCSR` nothing is copied.
-
-    Args:
-        a: The matrix; the arrays are its own and are valid while it lives with this pattern.
-
-    Returns:
-        Of the part in the rank's own columns and, if there are several ranks, of that in the
-        others': row pointer, column within the part, number of each such column, value.
-    """
-    (rows, width), lib = a.getLocalSize(), _petsc_library()
-    numbers: list[IntArray] = [np.arange(width) + a.getOwnershipRangeColumn()[0]]
-    parts = [ctypes.c_void_p(a.handle)]
-    if a.getType() == "mpiaij":
-        parts = [ctypes.c_void_p(), ctypes.c_void_p()]
-        away = ctypes.POINTER(_INT)()
-        if error := lib.MatMPIAIJGetSeqAIJ(a.handle, *map(ctypes.byref, (*parts, away))):
-            raise PETSc.Error(error)
-    result: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
-    for part in parts:
-        pointer, column = ctypes.POINTER(_INT)(), ctypes.POINTER(_INT)()
-        value = ctypes.POINTER(ctypes.c_double)()
-        arrays = map(ctypes.byref, (pointer, column, value))
-        if error := lib.MatSeqAIJGetCSRAndMemType(part, *arrays, None):
-            raise PETSc.Error(error)
-        start = np.ctypeslib.as_array(pointer, (rows + 1,))
-        count = start[-1]
-        columns = _view(column, count)
-        if result:
-            numbers.append(_view(away, columns.max(initial=-1) + 1))
-        result.append((start, columns, numbers[-1], _view(value, count)))
-    return result
-
-
-def _view(pointer: Any, count: int) -> Any:
-    """Array of a C array, whose pointer may be NULL if it is empty."""
-    return np.ctypeslib.as_array(pointer, (int(count),)) if count else np.empty(0, pointer._type_)
-
-
-def option_used(name: str) -> bool:
-    """Return whether PETSc has asked for an option of its global database."""
-    used = ctypes.c_int(0)  # PetscBool is an enum, since 3.24 a C99 bool; zero is false in both
-    if error := _petsc_library().PetscOptionsUsed(None, name.encode(), ctypes.byref(used)):
-        raise PETSc.Error(error)
-    return bool(used.value)

@@ -12,6 +12,7 @@ import numpy as np
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.kernels import library
 from dolfinx_nts.kernels.cell_batches import CellBatches, Field, Shape, difference, load
 from dolfinx_nts.types import FloatArray, IntArray
@@ -113,7 +114,7 @@ class CellForm:
     def add(self, values: FloatArray) -> None:
         """Add the linear form to this rank's values, ghosts included."""
         if self.batches is None:
-            compat.add_vector(values, self._compiled)
+            petsc_compat.add_vector(values, self._compiled)
         else:
             self.batches.add(compat.constants(self._compiled), values)
 
@@ -140,4 +141,4 @@ def assemble_vector(b: Any, form: CellForm) -> None:
     with b.localForm() as here:
         here.set(0.0)
         form.add(here.array_w)
-    compat.sum_ghosts(b)
+    petsc_compat.sum_ghosts(b)

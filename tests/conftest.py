@@ -27,7 +27,7 @@ import numpy as np
 import processes
 import pytest
 
-from dolfinx_nts import dolfinx_compat
+from dolfinx_nts import dolfinx_compat, petsc_compat
 
 PATIENCE = 20.0
 """Time [s] that a failing rank waits for the others before it aborts the run."""
@@ -183,7 +183,7 @@ def pytest_runtest_protocol(item, nextitem):
     yield
     if COMM.size > 1:
         gc.collect()
-        dolfinx_compat.free_dropped(MPI.COMM_WORLD)
+        petsc_compat.free_dropped(MPI.COMM_WORLD)
 
 
 def pytest_collectreport(report):

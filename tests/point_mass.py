@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from rotations import rotation
 
 import dolfinx_nts as nts
-from dolfinx_nts.contact.surfaces import locate_facets
+from dolfinx_nts.contact.skins import locate_facets
 
 COMM = MPI.COMM_WORLD
 MASS, SPEED, STEP = 2.5, 3.0, 0.02

@@ -14,7 +14,8 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.contact.surfaces import Surface, boundary_of_mesh, skin_of_mesh
+from dolfinx_nts.contact.skins import boundary_of_mesh, skin_of_mesh
+from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points

@@ -17,7 +17,7 @@ from dolfinx.mesh import Mesh
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.nodal_values import at_nodes
-from dolfinx_nts.contact.surfaces import locate_facets
+from dolfinx_nts.contact.skins import locate_facets
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.types import FloatArray, IntArray, Marker
 from dolfinx_nts.validation import (

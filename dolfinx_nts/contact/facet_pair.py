@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.contact import search
+from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.facet_elements import FacetElements
 from dolfinx_nts.contact.pair import (
     MARGIN,
@@ -204,7 +204,7 @@ class FacetPair(ContactPair, master=Surface):
             found = _replace(found, other)
         aimed = motion.aimed
         if self.is_long(motion.reach):
-            hit, _ = search.first_hits(
+            hit, _ = passages.first_hits(
                 x, slave_path, corners, master_path[self.master.facets]
             )
             aimed = np.where(hit >= 0, hit, aimed)
@@ -451,7 +451,7 @@ class FacetPair(ContactPair, master=Surface):
     ) -> IntArray:
         """`missed` of nodes that have passed a facet, with arguments as of `_round_edges`."""
         at = self.master.facets
-        hit, _ = search.first_hits(x, slave_path, master[at], master_path[at])
+        hit, _ = passages.first_hits(x, slave_path, master[at], master_path[at])
         node = np.flatnonzero((hit >= 0) & (hit != held))
         end, moved = (x + slave_path)[node], master + master_path
         start = np.zeros((len(node), 2))

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations import node_blocks
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
@@ -70,7 +70,7 @@ class Triplets:
         self.matrix = PETSc.Mat().create(comm)
         self.matrix.setSizes(((size[0], None), (size[1], None)))
         self.matrix.setType("aij")
-        compat.set_preallocation_coo(self.matrix, np.concatenate(rows), np.concatenate(cols))
+        petsc_compat.set_preallocation_coo(self.matrix, np.concatenate(rows), np.concatenate(cols))
 
     def set(self, tangents: FloatArray) -> None:
         """Replace all values. Collective.
@@ -79,7 +79,8 @@ class Triplets:
             tangents: All entries of all elements' tangents, one after the other.
         """
         of_bodies = [values for body in self._bodies for values in body.values()]
-        compat.set_values_coo(self.matrix, np.concatenate([tangents[self._index], *of_bodies]))
+        values = np.concatenate([tangents[self._index], *of_bodies])
+        petsc_compat.set_values_coo(self.matrix, values)
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
@@ -99,7 +100,7 @@ class _OfBody:
         self._aij = matrix
         if matrix.getType() not in {"seqaij", "mpiaij"}:
             self._aij = matrix.convert("aij", out=PETSc.Mat())
-        self._parts = compat.csr_parts(self._aij)
+        self._parts = petsc_compat.csr_parts(self._aij)
 
     def numbers(self) -> Iterator[tuple[IntArray, IntArray]]:
         """Rows and columns of the entries of each part."""
@@ -111,7 +112,7 @@ class _OfBody:
         """Their values as the body's matrix is now."""
         if self._aij is not self._given:
             self._given.convert("aij", out=self._aij)
-            self._parts = compat.csr_parts(self._aij)
+            self._parts = petsc_compat.csr_parts(self._aij)
         return [part[3] for part in self._parts]
 
     def destroy(self) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.interaction.points import of_nodes
 from dolfinx_nts.types import IntArray
 
@@ -55,7 +55,7 @@ def _pattern(a: Any) -> Pattern | None:
 
 def _find_pattern(a: Any) -> Pattern | None:
     parts = []
-    for pointer, column, number, _ in compat.csr_parts(a):
+    for pointer, column, number, _ in petsc_compat.csr_parts(a):
         length = np.diff(pointer).reshape(-1, 3)
         if len(number) % 3 or (length % 3).any() or (length != length[:, :1]).any():
             return None
@@ -144,7 +144,7 @@ class NodeBlocks:
         if matrix.assembled:
             matrix.zeroEntries()
         for a, rows, parts in zip(self._bodies, self._rows, self._patterns, strict=True):
-            csr = compat.csr_parts(a)
+            csr = petsc_compat.csr_parts(a)
             for (start, node), (*_, values) in zip(parts, csr, strict=True):
                 for chunk in _chunks(start):
                     here = start[chunk.start : chunk.stop + 1]

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 
 class SchurApproximation:
-    """Schur complements D - C W B and D - C W A W B, approximate: see `linear_solver.SchurInverse`.
+    """Schur complements D - C W B and D - C W A W B, approximate: see `fieldsplit.SchurInverse`.
 
     They take the coordinates alone that elements touch: A is their block of the bodies' matrix, W
     the diagonal matrix of one over the sums of the moduli of its rows, D the constraints' own

@@ -12,7 +12,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
 from dolfinx_nts.bodies.solid.stress import von_mises
-from dolfinx_nts.contact.surfaces import oriented_nodes
+from dolfinx_nts.contact.skins import oriented_nodes
 from dolfinx_nts.output.plots import save_figure
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.types import FloatArray

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import itertools
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from mpi4py import MPI
 
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.equations.assembly import StepMatrix
-from dolfinx_nts.equations.schur import SchurApproximation
+from dolfinx_nts.solve.fieldsplit import BODIES, CONSTRAINTS, FACTORS, SchurInverse, name_parts
 from dolfinx_nts.solve.model_problem import model_problem
 from dolfinx_nts.types import Options
 
-_BODIES = "fieldsplit_bodies_"
-_CONSTRAINTS = "fieldsplit_constraints_"
-#: What `SchurInverse` factorises with.
-_FACTORS = "factors_"
-#: Name under which the first matrix stores the second approximation.
-_SECOND = "dolfinx_nts_second"
 #: What `Newton.linear_solver` may be.
 SOLVERS = ("auto", "direct", "krylov", "multigrid")
 #: Those that MUMPS may take over from.
@@ -54,16 +48,16 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pc_fieldsplit_type": "schur",
         "pc_fieldsplit_schur_fact_type": "upper",
         "pc_fieldsplit_schur_precondition": "selfp",
-        _BODIES + "ksp_type": "preonly",
-        _BODIES + "pc_type": "bjacobi",
-        _BODIES + "sub_pc_type": "icc",
-        _CONSTRAINTS + "ksp_type": "preonly",
-        _CONSTRAINTS + "pc_type": "python",
-        _CONSTRAINTS + "pc_python_type": f"{__name__}.SchurInverse",
-        _CONSTRAINTS + _FACTORS + "pc_type": "lu",
-        _CONSTRAINTS + _FACTORS + "pc_factor_mat_solver_type": "mumps",
+        BODIES + "ksp_type": "preonly",
+        BODIES + "pc_type": "bjacobi",
+        BODIES + "sub_pc_type": "icc",
+        CONSTRAINTS + "ksp_type": "preonly",
+        CONSTRAINTS + "pc_type": "python",
+        CONSTRAINTS + "pc_python_type": f"{SchurInverse.__module__}.SchurInverse",
+        CONSTRAINTS + FACTORS + "pc_type": "lu",
+        CONSTRAINTS + FACTORS + "pc_factor_mat_solver_type": "mumps",
         # Of a user who takes LU for the first of the two approximations alone.
-        _CONSTRAINTS + "pc_factor_mat_solver_type": "mumps",
+        CONSTRAINTS + "pc_factor_mat_solver_type": "mumps",
     },
 }
 # Without inertia: the field split takes the augmented matrix, see `augmented.py`, whose lower
@@ -76,30 +70,30 @@ _MULTIGRID = {
 }
 PRESETS["multigrid"] = PRESETS["krylov"] | {
     "pc_fieldsplit_schur_precondition": "a11",
-    **{_BODIES + k: v for k, v in _MULTIGRID.items()},
-    _CONSTRAINTS + "pc_type": "bjacobi",
-    _CONSTRAINTS + "sub_pc_type": "lu",
+    **{BODIES + k: v for k, v in _MULTIGRID.items()},
+    CONSTRAINTS + "pc_type": "bjacobi",
+    CONSTRAINTS + "sub_pc_type": "lu",
 }
 #: Parts of the bodies where not all of them are for a multigrid.
 PARTS = ("continua", "others")
 _MIXED = {
-    _BODIES + "pc_type": "fieldsplit",
-    _BODIES + "pc_fieldsplit_type": "symmetric_multiplicative",
-    **{f"{_BODIES}fieldsplit_{PARTS[0]}_{k}": v for k, v in _MULTIGRID.items()},
-    f"{_BODIES}fieldsplit_{PARTS[1]}_ksp_type": "preonly",
-    f"{_BODIES}fieldsplit_{PARTS[1]}_pc_type": "lu",
-    f"{_BODIES}fieldsplit_{PARTS[1]}_pc_factor_mat_solver_type": "mumps",
+    BODIES + "pc_type": "fieldsplit",
+    BODIES + "pc_fieldsplit_type": "symmetric_multiplicative",
+    **{f"{BODIES}fieldsplit_{PARTS[0]}_{k}": v for k, v in _MULTIGRID.items()},
+    f"{BODIES}fieldsplit_{PARTS[1]}_ksp_type": "preonly",
+    f"{BODIES}fieldsplit_{PARTS[1]}_pc_type": "lu",
+    f"{BODIES}fieldsplit_{PARTS[1]}_pc_factor_mat_solver_type": "mumps",
 }
 #: On several ranks the preconditioner of bodies is additive Schwarz with an overlap of one node,
 #: which halves the iterations of smooth motion; without overlap it gains nothing.
-_PARTS = {_BODIES + "pc_type": "asm"}
+_PARTS = {BODIES + "pc_type": "asm"}
 #: The same where each rank takes whole bodies: as few iterations as on one rank. Their numbering
 #: is that of the parts, which makes incomplete factors poor; of blocks PETSc reorders LU's only.
 _WHOLE = _PARTS | {
-    _BODIES + "pc_asm_type": "basic",
-    _BODIES + "pc_asm_overlap": 0,
-    _BODIES + "sub_pc_type": "ilu",
-    _BODIES + "sub_pc_factor_mat_ordering_type": "rcm",
+    BODIES + "pc_asm_type": "basic",
+    BODIES + "pc_asm_overlap": 0,
+    BODIES + "sub_pc_type": "ilu",
+    BODIES + "sub_pc_factor_mat_ordering_type": "rcm",
 }
 # Chains of rigid bodies and beams: factors hardly fill in, and KLU, made for circuits, takes half
 # of the time that MUMPS spends on thousands of small fronts.
@@ -171,7 +165,7 @@ def most_iterations(preset: str, size: int) -> int:
 #: In place of the preset's where the augmented unknowns are condensed: without zeros on its
 #: diagonal their small block needs no pivoting, and starting MUMPS takes longer than all else.
 _CONDENSED: Mapping[str, Mapping[str, Any]] = {
-    "krylov": {_CONSTRAINTS + _FACTORS + "pc_type": "redundant"},
+    "krylov": {CONSTRAINTS + FACTORS + "pc_type": "redundant"},
 }
 #: PETSc's errors "no support", "unknown type", "missing factor": an option has a wrong value.
 _WRONG_VALUE = (56, 86, 92)
@@ -214,7 +208,7 @@ class SolverOptions:
             known[WORKSPACE] = workspace
             self._given.pop(WORKSPACE, None)
         if condense and preset in _CONDENSED:
-            known = {k: v for k, v in known.items() if not k.startswith(_CONSTRAINTS + _FACTORS)}
+            known = {k: v for k, v in known.items() if not k.startswith(CONSTRAINTS + FACTORS)}
             known |= _CONDENSED[preset]
         self._preset = known
         self._all = {**known, **self._given}
@@ -249,7 +243,7 @@ class SolverOptions:
 
         If so, their preconditioner is the preset's, or has a matrix of its own.
         """
-        own = any(k.startswith(("pc_", _BODIES)) for k in self._given)
+        own = any(k.startswith(("pc_", BODIES)) for k in self._given)
         return self.split and (self.augmented or not own)
 
     @property
@@ -285,12 +279,12 @@ class SolverOptions:
         options = {k: k for k in self._all}
         if matrix is None and self.split:
             outer = {k: k for k in self._all if not k.startswith(("pc_", "fieldsplit_"))}
-            inner = [k for k in self._all if k.startswith(_BODIES)]
-            own = {k.removeprefix(_BODIES): k for k in inner if not k.startswith(_BODIES + "ksp_")}
+            inner = [k for k in self._all if k.startswith(BODIES)]
+            own = {k.removeprefix(BODIES): k for k in inner if not k.startswith(BODIES + "ksp_")}
             options = outer | own
         self._set(snes, options)
         if matrix is not None and self.split:
-            _split(snes, *matrix.field_sets(num_bodies))
+            name_parts(snes, *matrix.field_sets(num_bodies))
 
     def _set(self, snes: PETSc.SNES, options: Mapping[str, str]) -> None:
         """Give a SNES options (name -> the user's name) under a prefix that no other one has."""
@@ -349,7 +343,7 @@ class SolverOptions:
         return ValueError(f"petsc_options={given!r}: {why}; correct the value")
 
     def _forget_used(self) -> None:
-        used = {name for key, name in self._entered.items() if compat.option_used(key)}
+        used = {name for key, name in self._entered.items() if petsc_compat.option_used(key)}
         self._unchecked -= set().union(*self._comm.allgather(used))
 
     def _solve_model(self) -> None:
@@ -361,7 +355,7 @@ class SolverOptions:
         snes.setJacobian(lambda *_: None, matrix, matrix)
         self._set(snes, {k: k for k in self._all})
         if split:
-            _split(snes, *parts)
+            name_parts(snes, *parts)
         snes.solve(None, x)
         for a in (snes, x, f, matrix):
             a.destroy()
@@ -378,103 +372,3 @@ def _remove(entered: dict[str, str], prefixes: list[str]) -> None:
     _free.extend(prefixes)
     entered.clear()
     prefixes.clear()
-
-
-def _split(snes: PETSc.SNES, *parts: tuple[str, Any]) -> None:
-    snes.getKSP().getPC().setFieldSplitIS(*parts)
-    for _, index in parts:
-        index.destroy()
-
-
-class SchurInverse:
-    """Preconditioner of the constraints: S^-1 ~ F^-1 M F^-1 from two approximations of S.
-
-    With F = D - C W B and M = D - C W A W B this is Newton's (Schulz's) step from F^-1 towards the
-    inverse of D - C (2 W - W A W) B. Where A W maps what B spans into itself, and D = 0, it is
-    exact (the least-squares commutator): about so with consistent mass, for which a polynomial in
-    A alone needs more terms. Without M it is F^-1.
-    """
-
-    def create(self, pc: PETSc.PC) -> None:
-        """Called by PETSc, as the other methods are."""
-        self._factors = PETSc.PC().create(pc.comm)
-        self._between: Any = None
-        self._work: tuple[Any, ...] = ()
-
-    def setFromOptions(self, pc: PETSc.PC) -> None:
-        """Options of the factorisation."""
-        self._factors.setOptionsPrefix(f"{pc.getOptionsPrefix() or ''}{_FACTORS}")
-        self._factors.setFromOptions()
-
-    def setUp(self, pc: PETSc.PC) -> None:
-        """Factorise anew."""
-        _, first = pc.getOperators()
-        if self._between:
-            self._between.destroy()
-        self._between = first.query(_SECOND)
-        self._factors.setOperators(first)
-        self._factors.setUp()
-        if not self._work:
-            self._work = first.createVecs()
-
-    def apply(self, _pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Approximate S y = x."""
-        if not self._between:
-            self._factors.apply(x, y)
-            return
-        a, b = self._work
-        self._factors.apply(x, a)
-        self._between.mult(a, b)
-        self._factors.apply(b, y)
-
-    def destroy(self, _pc: PETSc.PC) -> None:
-        """Free what `create` and `setUp` made."""
-        for each in (self._factors, self._between, *self._work):
-            if each:
-                each.destroy()
-
-
-def set_schur(snes: PETSc.SNES, approximation: SchurApproximation) -> None:
-    """Give a Schur field split what its constraints are preconditioned with.
-
-    Args:
-        snes: The SNES.
-        approximation: For `SchurInverse`, whose matrix is the first of the two.
-    """
-    approximation.first.compose(_SECOND, approximation.second)
-    user = PETSc.PC.SchurPreType.USER
-    snes.getKSP().getPC().setFieldSplitSchurPreType(user, approximation.first)
-
-
-def take_bodies(snes: PETSc.SNES, operator: PETSc.Mat, bodies: Sequence[Any], split: bool) -> None:
-    """Let this rank's preconditioner take whole bodies. Collective, before the first solve.
-
-    Args:
-        snes: Configured with `whole`.
-        operator: What it solves with.
-        bodies: Numbers of each body in the bodies' part of the operator.
-        split: Whether the preconditioner is a field split.
-    """
-    ksp = snes.getKSP()
-    ksp.setOperators(operator, operator)
-    pc = ksp.getPC()
-    if split:
-        pc.setUp()
-        pc = pc.getFieldSplitSubKSP()[0].getPC()
-    index = [numbers.astype(PETSc.IntType) for numbers in bodies]
-    parts = [PETSc.IS().createGeneral(numbers, comm=PETSc.COMM_SELF) for numbers in index]
-    pc.setASMLocalSubdomains(len(parts), parts)
-    for part in parts:
-        part.destroy()
-
-
-def keep_bodies(snes: PETSc.SNES, keep: bool) -> None:
-    """Whether a field split keeps the bodies' preconditioner when the matrix changes.
-
-    Args:
-        snes: Has solved a linear system before.
-        keep: Keep it, or make it anew from now on.
-    """
-    pc = snes.getKSP().getPC()
-    if pc.getType() == "fieldsplit":
-        pc.getFieldSplitSubKSP()[0].getPC().setReusePreconditioner(keep)

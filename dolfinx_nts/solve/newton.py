@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.least_norm import NullSpace, form_tree
@@ -21,11 +21,11 @@ from dolfinx_nts.solve.accuracy import EXACT, Newton
 from dolfinx_nts.solve.augmented import AugmentedMatrix
 from dolfinx_nts.solve.convergence import leaves_work, ratios
 from dolfinx_nts.solve.failure import contact_on, diagnosis, used_up
+from dolfinx_nts.solve.fieldsplit import keep_bodies, set_schur, take_bodies
 from dolfinx_nts.solve.inversion_guard import InversionGuard
 from dolfinx_nts.solve.iterates import Iterates
 from dolfinx_nts.solve.jacobian_reuse import KeptTangents
 from dolfinx_nts.solve.lent_stiffness import LentStiffness
-from dolfinx_nts.solve.linear_solver import keep_bodies, set_schur, take_bodies
 from dolfinx_nts.solve.presets import Presets
 from dolfinx_nts.types import Options
 from dolfinx_nts.validation import StepFailedError
@@ -292,7 +292,7 @@ class StepSolver:
 
     def _configure(self) -> None:
         assert self.matrix is not None
-        compat.free_dropped(self.problem.system.comm)  # what earlier runs left
+        petsc_compat.free_dropped(self.problem.system.comm)  # what earlier runs left
         self.snes = PETSc.SNES().create(self.problem.system.comm)
         self._f = self.problem.x.duplicate()
         self.snes.setFunction(self._function, self._f)

@@ -30,6 +30,7 @@ from petsc4py import PETSc
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.forms import CellForm, assemble_vector
 from dolfinx_nts.kernels.strain_energy import strain_energy
 from dolfinx_nts.output import writers as output
@@ -205,9 +206,10 @@ class PlainBody:
         # As a plain loop has it: DOLFINx evaluates it.
         self._work = CellForm(*forms[0], None)
         self._tangent, mass = (form for form, _ in forms[1:])
-        self._mass, self._a = compat.create_matrix(mass), compat.create_matrix(self._tangent)
-        compat.assemble_matrix(self._mass, mass, (), 0.0)
-        self._force = compat.create_vector(space)
+        self._mass = petsc_compat.create_matrix(mass)
+        self._a = petsc_compat.create_matrix(self._tangent)
+        petsc_compat.assemble_matrix(self._mass, mass, (), 0.0)
+        self._force = petsc_compat.create_vector(space)
         self._x, self._f = self._a.createVecs()
         self._first, self._change = self._x.duplicate(), self._x.duplicate()
         self.snes = PETSc.SNES().create(self._a.comm)
@@ -247,7 +249,7 @@ class PlainBody:
 
     def _jacobian(self, _snes: Any, x: Any, a: Any, _p: Any) -> None:
         self._fill(x)
-        compat.assemble_matrix(a, self._tangent, (), 0.0)
+        petsc_compat.assemble_matrix(a, self._tangent, (), 0.0)
 
     def destroy(self) -> None:
         """Free the PETSc objects."""

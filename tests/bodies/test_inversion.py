@@ -325,7 +325,7 @@ def test_contact_is_named_before_the_cell_that_it_crushes(pressed):
 @pytest.mark.parametrize("held", [True, False], ids=["held", "on a plane"])
 def test_a_load_step_that_ends_nearly_inside_out_says_so(held, monkeypatch):
     """Newton's method ends there, or the relaxations; under 1 g, nothing is near it."""
-    monkeypatch.setattr("dolfinx_nts.run.equilibrium._RELAXATIONS", 10)
+    monkeypatch.setattr("dolfinx_nts.run.load_steps._RELAXATIONS", 10)
 
     def load(times_g):
         if not held:

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.pair import Motion
-from dolfinx_nts.contact.surfaces import locate_facets
+from dolfinx_nts.contact.skins import locate_facets
 
 COMM = MPI.COMM_WORLD
 GRAVITY, MU, STEP = 9.81, 0.2, 0.01

@@ -338,7 +338,7 @@ def test_equilibrium_names_a_rigid_body_that_may_slide():
 @pytest.mark.fast_on_ranks()
 def test_equilibrium_names_the_body_that_falls(monkeypatch):
     """Of two, that which has no support, after ten relaxations as after all."""
-    monkeypatch.setattr("dolfinx_nts.run.equilibrium._RELAXATIONS", 10)
+    monkeypatch.setattr("dolfinx_nts.run.load_steps._RELAXATIONS", 10)
     brick = rigid((0, 0, 0), (0.2, 0.1, 0.05), (2, 2, 1), name="brick")
     loose = nts.RigidBody.from_inertia(1.0, (1, 1, 1), (0, 0, 5), name="loose", comm=COMM)
     pair = nts.ContactPair(slave=below(brick), master=FLOOR)

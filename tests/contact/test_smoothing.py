@@ -9,7 +9,7 @@ from point_mass import PointSurface, Sledge
 from scenes import UNITS
 
 import dolfinx_nts as nts
-from dolfinx_nts.contact.surfaces import locate_facets
+from dolfinx_nts.contact.skins import locate_facets
 
 COMM = MPI.COMM_WORLD
 FACETS, RADIUS, WEIGHT = 16, 1.0, 1e3

@@ -11,7 +11,7 @@ from scenes import RUBBER, box
 from scipy.interpolate import LinearNDInterpolator
 
 import dolfinx_nts as nts
-from dolfinx_nts.contact import search
+from dolfinx_nts.contact import passages
 
 COMM = MPI.COMM_WORLD
 
@@ -59,7 +59,7 @@ def test_first_hits_against_all_pairs(corners, seed):
     facets = np.stack([origin + a * side[:, 0] + b * side[:, 1] for a, b in shape], axis=1)
     shift = random.normal(size=(40, 1, 3))
     points, motion = random.uniform(-1.5, 1.5, (80, 3)), 1.5 * random.normal(size=(80, 3))
-    found, when = search.first_hits(points, motion, facets, np.tile(shift, (1, corners, 1)))
+    found, when = passages.first_hits(points, motion, facets, np.tile(shift, (1, corners, 1)))
     parts = [[0, 1, 2], [0, 2, 3]][: corners - 2]
     for x, d, f, t in zip(points, motion, found, when, strict=True):
         times = [
@@ -78,7 +78,7 @@ def test_hits_on_a_facet_that_turns():
     end[..., 0], end[..., 2] = corners[..., 2], corners[..., 0]
     # The corners move evenly, so that after a part t the facet lies along (1 - t, 0, t).
     points = np.array([[0.3, 0.5, 0.3], [0.3, 0.5, -0.3]])
-    found, when = search.first_hits(points, np.zeros((2, 3)), corners, end - corners)
+    found, when = passages.first_hits(points, np.zeros((2, 3)), corners, end - corners)
     assert found.tolist() == [0, -1]
     assert abs(when[0] - 0.5) < 1e-15
 
@@ -114,7 +114,7 @@ def test_no_path_slips_between_facets_that_turn(corners, angle):
     a, b = random.uniform(0.05, 0.3, (2, n))
     start, end = foot + a[:, None] * z, (foot - b[:, None] * z) @ turn.T
     corner = x[facets]
-    hit, when = search.first_hits(start, end - start, corner, corner @ turn.T - corner)
+    hit, when = passages.first_hits(start, end - start, corner, corner @ turn.T - corner)
     assert (hit >= 0).all()
     height = (1 - when) * a * (1 - when + when * c) - when * b * (when + c * (1 - when))
     assert np.abs(height).max() < 1e-14
@@ -135,7 +135,7 @@ def test_no_path_slips_through_a_sheet_that_crumples(corners):
     n = 30_000
     start = np.column_stack([random.uniform(-1.6, 1.6, (n, 2)), np.full(n, 0.21)])
     path = np.column_stack([random.uniform(-0.1, 0.1, (n, 2)), np.full(n, -0.42)])
-    hit, _ = search.first_hits(start, path, x[facets], motion[facets])
+    hit, _ = passages.first_hits(start, path, x[facets], motion[facets])
     assert (hit >= 0).all()
 
 
@@ -147,7 +147,7 @@ def test_first_hits_of_facets_that_turn_against_all_pairs(corners):
     facets = random.uniform(-1, 1, (60, 1, 3)) + 0.6 * random.normal(size=(60, corners, 3))
     moved = 0.7 * random.normal(size=(60, corners, 3))
     points, motion = random.uniform(-1, 1, (60, 3)), random.normal(size=(60, 3))
-    found, when = search.first_hits(points, motion, facets, moved)
+    found, when = passages.first_hits(points, motion, facets, moved)
     parts, at = [[0, 1, 2], [0, 2, 3]][: corners - 2], np.array([0.0, 0.3, 0.7, 1.0])
 
     def times(x, d, start, change):

@@ -15,7 +15,7 @@ from twins.determinants import determinants
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts import forms
+from dolfinx_nts import forms, petsc_compat
 from dolfinx_nts.bodies.solid.inversion import Determinants
 from dolfinx_nts.bodies.solid.step_forms import fill
 from dolfinx_nts.kernels import cell_batches, library
@@ -59,7 +59,7 @@ def without_batches(form):
 
 def entries(form, space):
     """A linear form with all contributions of other ranks."""
-    vector = compat.create_vector(space)
+    vector = petsc_compat.create_vector(space)
     forms.assemble_vector(vector, form)
     found = vector.array_r.copy()
     vector.destroy()

@@ -19,6 +19,7 @@ from rotations import rotation
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.kernels import discrete_gradient as dg
 from dolfinx_nts.kernels.strain_energy import strain_energy
@@ -78,7 +79,7 @@ class Point:
         work = ufl.inner(stress(energy, self.e0, self.e1), ufl.grad(w)) * dx
         self.work, self.energy = compile_forms([work, energy(self.e1) * dx])
         self.nodes = unit_nodes(space.tabulate_dof_coordinates())
-        self.vector = compat.create_vector(space)
+        self.vector = petsc_compat.create_vector(space)
 
     def stress(self, c0, c1):
         return self.stress_between((c0 - EYE) / 2, (c1 - EYE) / 2)

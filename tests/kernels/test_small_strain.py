@@ -15,6 +15,7 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.kernels import precise
 from dolfinx_nts.kernels.strain_energy import strain_energy
@@ -100,7 +101,7 @@ class Point:
         space = compat.tensor_space(mesh, "DG", 0)
         stress = ufl.inner(w.stress(self.e), ufl.TestFunction(space)) * dx
         self.energy, self.stress = compile_forms([w(self.e) * dx, stress])
-        self.vector = compat.create_vector(space)
+        self.vector = petsc_compat.create_vector(space)
 
     def __call__(self, e):
         self.e.value[:] = e

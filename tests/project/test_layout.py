@@ -22,7 +22,8 @@ PACKAGE = ROOT / "dolfinx_nts"
 
 #: Floors from below: files, and folders that stand for all of theirs.
 LEVELS = [
-    {"types", "parallel", "validation", "mpi_first", "dolfinx_compat", "forms", "kernels"},
+    {"types", "parallel", "validation", "mpi_first", "dolfinx_compat", "petsc_compat", "forms",
+     "kernels"},
     {"integrators"},
     {"state"},
     {"interaction"},
@@ -41,7 +42,7 @@ LEVELS = [
 ]
 LEVEL = {name: level for level, names in enumerate(LEVELS) for name in names}
 #: What the kernels do without.
-KNOW_RANKS = {"parallel", "dolfinx_compat"}
+KNOW_RANKS = {"parallel", "dolfinx_compat", "petsc_compat"}
 
 
 def named(path):
@@ -152,7 +153,7 @@ def test_level_0_knows_neither_mpi_nor_petsc(module):
 #: What makes PETSc matrices.
 MATRICES = {
     "equations.assembly", "equations.schur", "equations.mass_solves", "solve.model_problem",
-    "solve.instability", "dolfinx_compat",
+    "solve.instability", "petsc_compat",
 }  # fmt: skip
 
 

@@ -10,10 +10,10 @@ from measures import difference
 from petsc4py import PETSc
 
 import dolfinx_nts as nts
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.equations import node_blocks
 from dolfinx_nts.equations.assembly import StepMatrix
-from dolfinx_nts.solve import linear_solver
+from dolfinx_nts.solve import fieldsplit, linear_solver
 from dolfinx_nts.solve.presets import Presets
 
 COMM = MPI.COMM_WORLD
@@ -188,7 +188,7 @@ def test_schur_complement():
         spreads.append(values.real.max() / values.real.min())
     assert spreads[0] < 2 < 4 < spreads[1]
 
-    linear_solver.set_schur(stepper.solver.snes, schur)
+    fieldsplit.set_schur(stepper.solver.snes, schur)
     part = stepper.solver.snes.getKSP().getPC()
     part.setUp()
     x, y = schur.first.createVecs()
@@ -343,7 +343,7 @@ def test_rows_of_a_matrix_without_copying():
             a.setValue(i, j, rng.uniform(1, 2))
     a.assemble()
     whole = np.zeros((local, a.getSize()[1]))
-    for pointer, column, number, value in compat.csr_parts(a):
+    for pointer, column, number, value in petsc_compat.csr_parts(a):
         row = np.repeat(np.arange(local), np.diff(pointer))
         whole[row, number[column]] += value
     pointer, column, value = a.getValuesCSR()

@@ -16,7 +16,7 @@ from processes import in_fresh_python
 from scenes import rubbing_blocks
 
 import dolfinx_nts as nts
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.forms import compile_forms
@@ -280,8 +280,8 @@ def test_frictionless_contact_has_no_tangential_unknowns():
 @pytest.mark.mpi
 def test_mass_matrix_without_zeros_is_the_same():
     body = economy.Economy(COMM, 2).system(FEATURE["active"]).bodies[0]
-    full = compat.create_matrix(body_mass := mass_form(body))
-    compat.assemble_matrix(full, body_mass, (), 0.0)
+    full = petsc_compat.create_matrix(body_mass := mass_form(body))
+    petsc_compat.assemble_matrix(full, body_mass, (), 0.0)
     x, y = full.createVecs()
     x.array_w[:] = np.random.default_rng(COMM.rank).standard_normal(body.num_owned)
     full.mult(x, y)

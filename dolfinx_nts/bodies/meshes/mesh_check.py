@@ -14,7 +14,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts.contact.surfaces import flux, oriented_nodes
+from dolfinx_nts.contact.skins import oriented_nodes
+from dolfinx_nts.contact.surfaces import flux
 from dolfinx_nts.parallel import gather_rows, raise_together
 from dolfinx_nts.types import FloatArray, IntArray
 

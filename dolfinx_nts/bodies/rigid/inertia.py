@@ -8,7 +8,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.solid.parameters import Parameter, is_number
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.types import FloatArray
@@ -79,8 +79,8 @@ def inertia_of(space: fem.FunctionSpace, density: Parameter) -> Inertia:
     v, w = ufl.TrialFunction(space), ufl.TestFunction(space)
     dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
     (form,) = compile_forms([rho * ufl.inner(v, w) * dx])
-    matrix = compat.create_matrix(form)
-    compat.assemble_matrix(matrix, form, (), 0.0)
+    matrix = petsc_compat.create_matrix(form)
+    petsc_compat.assemble_matrix(matrix, form, (), 0.0)
     owned = 3 * space.dofmap.index_map.size_local
     x = space.tabulate_dof_coordinates()[: owned // 3]
     right, left = matrix.createVecs()

@@ -14,6 +14,7 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
@@ -25,7 +26,8 @@ from dolfinx_nts.bodies.solid.parameters import (
     require_positive_parameter,
     values_of,
 )
-from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.contact.skins import locate_facets, skin_of_mesh
+from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
@@ -193,7 +195,7 @@ class RigidBody(Body):
     ) -> None:
         """Set up what both constructors share."""
         self.name, self._inertia = name, inertia
-        self.comm = compat.petsc_communicator(comm)
+        self.comm = petsc_compat.petsc_communicator(comm)
         self.mass, self.centre, self.moments = inertia.mass, inertia.centre, inertia.moments
         self.length = inertia.length
         linear = vector("velocity", velocity, "m/s")
@@ -425,7 +427,7 @@ class RigidBody(Body):
         """Return mass M less stiffness times the derivative of the torque's forces."""
         self.check_alive()
         if self._matrix is None:
-            self._matrix = compat.dense_matrix(self.comm, self.num_owned)
+            self._matrix = petsc_compat.dense_matrix(self.comm, self.num_owned)
         constant = not self._loads.turn
         if constant and self._holds == (mass, self._matrix.stateGet()):
             return self._matrix

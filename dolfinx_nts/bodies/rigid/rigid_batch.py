@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import turns_of
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
@@ -118,11 +118,11 @@ class RigidBatch(Body):
             last = self.comm.scan(self.num_owned)
             rows = np.repeat(np.arange(last - self.num_owned, last), 3)
             cols = 3 * (rows // 3) + np.tile(np.arange(3), self.num_owned)
-            self._matrix = compat.coo_matrix(self.comm, self.num_owned, rows, cols)
+            self._matrix = petsc_compat.coo_matrix(self.comm, self.num_owned, rows, cols)
         if self._holds != (mass, self._matrix.stateGet()):
             diagonal = mass * (self.nodal_mass + self._lent)
             blocks = diagonal[:, None] * np.tile(np.eye(3), (self.num_owned // 3, 1))
-            compat.set_values_coo(self._matrix, blocks.ravel())
+            petsc_compat.set_values_coo(self._matrix, blocks.ravel())
             self._holds = mass, self._matrix.stateGet()
         return self._matrix
 

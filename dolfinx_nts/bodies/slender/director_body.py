@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
@@ -23,7 +24,8 @@ from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, Hull
 from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load, NodeConditions
 from dolfinx_nts.bodies.slender.pressure import Pressure, Pressures
-from dolfinx_nts.contact.surfaces import Skin, Surface, Touching, in_order
+from dolfinx_nts.contact.skins import Skin, in_order
+from dolfinx_nts.contact.surfaces import Surface, Touching
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
@@ -94,7 +96,7 @@ class DirectorBody(Body):
     def _set_up_mesh(self, mesh: Mesh, name: str, degree: int = 1) -> None:
         """What fields live on."""
         self.name, self.mesh, self.degree = name, mesh, degree
-        self.comm = compat.petsc_communicator(mesh.comm)
+        self.comm = petsc_compat.petsc_communicator(mesh.comm)
         self.made_on = places_of(mesh)
         self.low_dets = float(np.cos(self._turn_that_leaves(_TOLD))), float(np.cos(_NAMED))
         self.space = compat.vector_space(mesh, degree)
@@ -479,7 +481,7 @@ class DirectorBody(Body):
         places = np.repeat(self.places, 3)
         total = self.comm.allreduce(np.array([scale[places].sum(), places.sum()]))
         diagonal[self.fixed] = total[0] / total[1] or 1.0
-        compat.set_values_coo(
+        petsc_compat.set_values_coo(
             self._matrix, np.concatenate([values.ravel(), of_moments.ravel(), diagonal])
         )
         return self._matrix
@@ -498,7 +500,7 @@ class DirectorBody(Body):
             *(np.broadcast_arrays(a[..., :, None], a[..., None, :]) for a in (numbers, directors)),
             strict=True,
         )
-        self._matrix = compat.coo_matrix(
+        self._matrix = petsc_compat.coo_matrix(
             self.comm, self.num_owned,
             *(np.concatenate([*(a.ravel() for a in both), own]) for both in (rows, cols)),
         )  # fmt: skip

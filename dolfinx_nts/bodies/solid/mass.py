@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.interaction.points import of_nodes
 from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
@@ -53,14 +53,14 @@ class MassMatrix:
 
     def assemble(self) -> None:
         """Assemble it, anew where what the form is made of has changed. Collective."""
-        full = compat.create_matrix(self._form)
-        compat.assemble_matrix(full, self._form, (), 0.0)
+        full = petsc_compat.create_matrix(self._form)
+        petsc_compat.assemble_matrix(full, self._form, (), 0.0)
         if self.matrix is None:
             self._in, self._out = full.createVecs()
         else:
             self.matrix.destroy()
         # Directions do not mix: two of three entries of the blocks are zero.
-        self.matrix = compat.without_zeros(full)
+        self.matrix = petsc_compat.without_zeros(full)
         full.destroy()
         self._sum_up()
         self.nodal_before = self.nodal
@@ -229,7 +229,7 @@ def _parents(mass: Any, level: IntArray, x: FloatArray) -> Any:
     cols = [column for nodes in parents for column in of_nodes(nodes).T]
     start = np.concatenate([[0], np.cumsum(counts)])
     columns = np.concatenate([np.empty(0, int), *cols])
-    return compat.with_entries(mass, start, columns, 1.0 / np.repeat(counts, counts))
+    return petsc_compat.with_entries(mass, start, columns, 1.0 / np.repeat(counts, counts))
 
 
 def _at_nodes(mass: Any, nodes: npt.NDArray[Any], values: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.integrators import Integrator
@@ -91,7 +92,7 @@ class StepForms:
         self._factors = fem.Constant(space.mesh, np.zeros(2))
         # Change of the velocity with u_1; time.
         self._rate, self._time = (fem.Constant(space.mesh, 0.0) for _ in range(2))
-        self._vector = compat.create_vector(space)
+        self._vector = petsc_compat.create_vector(space)
         self._size, self._alone = self._vector.getLocalSize(), space.mesh.comm.size == 1
         self._matrix: Any = None
 
@@ -104,7 +105,7 @@ class StepForms:
         """Set the state at t_n."""
         self._work, self._tangent, self._extra_work = self._compiled(rule)
         if self._matrix is None:
-            self._matrix = compat.create_matrix(self._tangent)
+            self._matrix = petsc_compat.create_matrix(self._tangent)
         fill(self._u0, moment.u0)
         if self._extra is not None:
             self._rate.value, self._time.value = moment.rate, moment.time
@@ -137,7 +138,7 @@ class StepForms:
         """
         fill(self._u1, u1)
         self._factors.value = mass, stiffness
-        compat.assemble_matrix(self._matrix, self._tangent, masks, diagonal)
+        petsc_compat.assemble_matrix(self._matrix, self._tangent, masks, diagonal)
         return self._matrix
 
     def forces(self, rule: Integrator, u0: FloatArray, u1: FloatArray) -> FloatArray:
@@ -155,8 +156,8 @@ class StepForms:
             u.x.array[:] = 0.0
         self._factors.value, self._rate.value = (0.0, 1.0), 0.0
         # The matrix of the step may be kept from an earlier one.
-        matrix = compat.create_matrix(tangent)
-        compat.assemble_matrix(matrix, tangent, (), 0.0)
+        matrix = petsc_compat.create_matrix(tangent)
+        petsc_compat.assemble_matrix(matrix, tangent, (), 0.0)
         diagonal = matrix.getDiagonal()
         found: FloatArray = diagonal.array_r.copy()
         for petsc_object in (diagonal, matrix):

@@ -8,6 +8,7 @@ import ufl
 from dolfinx import fem
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.kernels.strain_energy import green_strain
 
@@ -75,7 +76,7 @@ def _cell_means(body: Any, value: Any, name: str) -> Any:
         one = ufl.as_tensor([[1.0] * 3] * 3)
     dx = ufl.Measure("dx", body.mesh, metadata={"quadrature_degree": 2 * body.degree})
     forms = compile_forms([ufl.inner(value, q) * dx, ufl.inner(one, q) * dx])
-    result, vector = fem.Function(space, name=name), compat.create_vector(space)
+    result, vector = fem.Function(space, name=name), petsc_compat.create_vector(space)
     sums = []
     for form in forms:
         assemble_vector(vector, form)

@@ -15,6 +15,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
+from dolfinx_nts import petsc_compat
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.meshes.mesh_check import pieces_of, places_of
@@ -30,7 +31,8 @@ from dolfinx_nts.bodies.solid.parameters import (
     values_of,
 )
 from dolfinx_nts.bodies.solid.step_forms import ExtraForm, StepForms, checked_form, fill
-from dolfinx_nts.contact.surfaces import Surface, locate_facets, skin_of_mesh
+from dolfinx_nts.contact.skins import locate_facets, skin_of_mesh
+from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.rule import choose
@@ -79,7 +81,7 @@ class UflBody(Body):
         self.name, self.space, self.degree, self._extra_form = name, space, degree, extra_form
         self.mesh = space.mesh
         self.made_on = places_of(self.mesh)
-        self.comm = compat.petsc_communicator(self.mesh.comm)
+        self.comm = petsc_compat.petsc_communicator(self.mesh.comm)
         # DOLFINx makes C identifiers of the names.
         stem = re.sub(r"\W", "_", name, flags=re.ASCII)
         self.u, self.v = (fem.Function(space, name=f"{stem}_{s}") for s in "uv")

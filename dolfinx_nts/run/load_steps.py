@@ -1,0 +1,392 @@
+"""Load steps: states at rest, one after the other, each relaxed from the last."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from dolfinx_nts.contact.pair import INITIAL_PENETRATION
+from dolfinx_nts.integrators import Static
+from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.ledger import balance, resultants
+from dolfinx_nts.ledger.contact_fields import ContactLoads
+from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.run.ledger_check import NOT_FINITE
+from dolfinx_nts.run.solution import Equilibrium
+from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
+from dolfinx_nts.run.stepper import Stepper
+from dolfinx_nts.run.trial import solved, state_after
+from dolfinx_nts.solve.convergence import unrest
+from dolfinx_nts.solve.instability import releasing_motions
+from dolfinx_nts.start.free_motion import free_motion
+from dolfinx_nts.state import State
+from dolfinx_nts.system import System, cut_off
+from dolfinx_nts.types import FloatArray
+from dolfinx_nts.validation import (
+    StepFailedError,
+    UserFunctionError,
+)
+
+#: A load step is dropped if a slave ends this part of a facet behind one of which it was no
+#: candidate.
+_MISSED = 0.1
+#: Relaxations of one load step before it counts as without equilibrium.
+_RELAXATIONS = 100
+#: Below this part of the forces the stabilization no longer moves nodes to other facets.
+_NEARLY_AT_REST = 1e-2
+#: A failed relaxation is repeated with a stiffer stabilization, up to this.
+_STIFFEST = 10.0
+#: A relaxation that leaves less than this part of the stabilization's force ...
+_RELIEVED = 0.5
+#: ... lowers the next one's stiffness by this. So does one of few iterations whose force stays, as
+#: that of a body that swings or falls far, ...
+_RELIEF, _EASY = 0.1, 10
+#: ... as far as the next one then moves by less than this part of the scene.
+_FAR = 0.3
+#: Contacts are sought anew once bodies have moved by this part of the scene, or while more than
+#: `_NEARLY_AT_REST` is left.
+_NEAR = 0.05
+#: Part of the stored energy that the work of load steps may miss without a word.
+_OPEN = 0.1
+#: Rounding of work over that of forces times the size of the scene.
+_ROUNDING = 16 * float(np.finfo(float).eps)
+
+
+class _Relaxed:
+    """What the relaxations of a load step took.
+
+    Args:
+        system: The scene.
+
+    Attributes:
+        of_joints: Columns of the balance table for energy that leaves through joints.
+        lost: By column, what left in all relaxations but the last one [J].
+        driven: External work that the ledgers of each joint's elements name in all of them, this
+            rank's part [J], shape (joints,).
+    """
+
+    def __init__(self, system: System) -> None:
+        self.of_joints = {name for joint in system.joints for name in joint.losses}
+        self.lost = dict.fromkeys(("friction_dissipation", *self.of_joints), 0.0)
+        self.driven = np.zeros(len(system.joints))
+
+
+class LoadStepper(Stepper):
+    """Stepper in pseudo time; a step is relaxed until nothing of the stabilization is left."""
+
+    makes = Equilibrium
+    solution: Equilibrium
+
+    def __init__(
+        self, system: System, stabilization: float, end: float, **options: Any
+    ) -> None:
+        super().__init__(system, Static(), **options)
+        self._stabilization, self._end = stabilization, end
+        still = tuple(np.zeros_like(u) for u in self.state.u)
+        self.solution.rates = self._of_start("rates") or still
+        self.solution.forces = self._of_start("forces") or still
+        self._solved: Evaluation | None = None
+        #: Work of each load, support, joint and obstacle and of overlap [J]; the largest energy.
+        self._worked: FloatArray | float = 0.0
+        self._largest = 0.0
+        resting = replace(self.state, v=still)
+        self._accept(system.with_overlap(resting, self._left(self.state.time)))
+        self._ledger.open(self.state, self._start)
+
+    def _of_start(self, name: str) -> tuple[FloatArray, ...]:
+        """`rates` or `forces` of the bodies in the equilibrium that this one goes on from."""
+        values = getattr(self._start, name, ())
+        if self._start is None or not values:
+            return ()
+        index = {body.name: k for k, body in enumerate(self._start.system.bodies)}
+        return tuple(values[index[body.name]] for body in self.system.bodies)
+
+    def start(self, dt: float) -> None:
+        """Nothing moves at the start, but the user may change a material; later calls do nothing.
+
+        Args:
+            dt: First load step, in pseudo time.
+        """
+        if self._started:
+            return
+        self._call_before(dt)
+        self._materials.changed()
+        self._ledger.open(self.state, self._start)
+        self._tell_cut_off()
+        self._started = True
+
+    def _step(self, dt: float, time: float) -> None:
+        # The problem is about to begin another step, which may fail.
+        self._solved = None
+        self._prepare(dt)
+        old = self.state
+        step, state, iterations, relaxed = self._relax(dt, time)
+        rates = tuple((a - b) / dt for a, b in zip(state.u, old.u, strict=True))
+        forces = [t.external.copy() for t in step.bodies]
+        local = []
+        for k, (body, t) in enumerate(zip(self.system.bodies, step.bodies, strict=True)):
+            forces[k][body.fixed] += t.residual[body.fixed]
+            mean = 0.5 * (forces[k] + self.solution.forces[k])
+            local.append(float(mean @ (state.u[k] - old.u[k])))
+        self.solution.rates, self.solution.forces = rates, tuple(forces)
+        local += self._joints_works(old, state, relaxed.driven)
+        local.append(self._interference_work(old, state))
+        *works, pressed = self.system.comm.allreduce(np.array(local)).tolist()
+        forces_now, before = resultants.of_step(self.problem, step), self.solution.rows[-1]
+        terms = balance.step_terms(self.problem, step)
+        for name, lost in relaxed.lost.items():
+            terms[name] += lost
+        for k, pair in enumerate(self.system.contacts):
+            mean = 0.5 * (before["contact_forces"][k] + forces_now["contact_forces"][k])
+            start, end = pair.path(old.time, time)
+            works.append(float(mean @ (end - start)))
+        terms |= {"external_work": sum(works), "interference_work": pressed}
+        terms |= {"time": time, "newton_iterations": iterations}
+        terms |= {"contact_defect": 0.0, "material_change": self._ledger.take_change()}
+        rows, measured = self.solution.rows, balance.measure(self.system, state)
+        row = balance.next_row(float(rows.column("energy")[0]), before, measured, terms)
+        rows.append(row | forces_now)
+        self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
+        # A drive that lifts a weight does the work that the weight takes.
+        self._worked = self._worked + np.array([*works, pressed])
+        worked = float(np.abs(self._worked).sum())
+        self._largest = max(self._largest, abs(row["potential"]), worked)
+        missing, size = abs(row["ledger_residual"]), self._largest
+        loads = sum(float(np.abs(t.external).sum()) for t in step.bodies)
+        pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
+        pressed += self.system.comm.allreduce(loads)
+        rounding = _ROUNDING * self.problem.rounded_length * pressed
+        if not missing <= _OPEN * size + rounding:
+            text = (
+                f"work and stored energy differ by {missing:.3g} of {size:.3g}: "
+                f"{self._remedy_of_ledger()}"
+            )
+            endless = not np.isfinite(missing)
+            text = NOT_FINITE if endless else text
+            self.solution.warn("ledger", time, missing, text, grave=endless)
+        self._accept(state)
+        tell_inversion(self.solution, self.problem, step, state)
+        tell_couplings(self.solution, self.problem, step, state)
+        self._solved = step
+        self.look()
+
+    def _remedy_of_ledger(self) -> str:
+        """Why the ledger is open, and what closes it."""
+        if self._start is None and self.solution.rows[0]["potential"] > self._largest * _OPEN:
+            return (
+                "the first load step starts from a displacement with that much energy, such as "
+                "Dirichlet values other than 0 at t=0, which act at once; let them be functions "
+                "of the pseudo time, e.g. value=lambda t: (0, 0, 0.1 * t)"
+            )
+        return "work is that of the mean forces of each load step; use more load steps"
+
+    def _joints_works(self, old: State, new: State, told: FloatArray) -> list[float]:
+        """External work of what each joint prescribes in a load step on this rank [J]. Collective.
+
+        Args:
+            old: At its start.
+            new: At its end.
+            told: What the ledgers of each joint's elements say, shape (joints,).
+        """
+        works = np.zeros(len(told))
+        for coupling, (k, *_) in self.problem.couplings.joints:
+            # Several that are evaluated together prescribe nothing.
+            found = coupling.load_step_work(old.joints[k], new.joints[k], old.time, new.time)
+            works[k] = told[k] if found is None else found
+        return works.tolist()
+
+    def _left(self, time: float) -> float:
+        """Part of the overlap at the start that is left at a pseudo time."""
+        return 1.0 - self.problem.integrator.ramp(time)
+
+    def _interference_work(self, old: State, new: State) -> float:
+        """Work on this rank of overlap that a load step presses out [J], of the mean forces."""
+        pressed = self._left(old.time) - self._left(new.time)
+        both = zip(old.contacts, new.contacts, strict=True)
+        return pressed * sum(float(b.overlap @ (a.force + b.force)) / 2.0 for a, b in both)
+
+    def _look_inside(self, last: bool) -> None:
+        """Look, unless overlap is left that a contact is to resolve. Collective."""
+        both = zip(self.system.contacts, self.state.contacts, strict=True)
+        asked = any(p.interference == "resolve" and bool(c.overlap.any()) for p, c in both)
+        if not (self._left(self.state.time) and anywhere(self.system.comm, asked)):
+            super()._look_inside(last)
+
+    def look(self, *, last: bool = False) -> None:
+        """Look as `Stepper` does, and at the end for motions that nothing resists and for loads."""
+        super().look(last=last)
+        if last:
+            self._tell_free_motion()
+            self._tell_unstable()
+            self._tell_part_of_loads()
+
+    def _tell_free_motion(self) -> None:
+        """Warn of motions that nothing resists; stabilization would leave them at rest."""
+        if self._stabilization or self._solved is None:
+            return
+        found = free_motion(self.problem, self.solver, self._solved)
+        if found:
+            self.solution.warn(
+                "free motion", self.state.time, 1.0,
+                f"{found}: how far it has moved so is chance; hold it by a Dirichlet condition, "
+                "a joint or prescribed motion, or pass "
+                "stabilization=0.1, which leaves it where it is",
+                grave=True,
+            )  # fmt: skip
+
+    def _tell_unstable(self) -> None:
+        """Warn of a state that a small disturbance leads away from, as a buckled one."""
+        if self._stabilization or self._solved is None or self._slips():
+            return
+        number = releasing_motions(self.problem, self._solved)
+        if number:
+            self.solution.warn(
+                "unstable equilibrium", self.state.time, float(number),
+                f"{number} independent motion{'s' if number > 1 else ''} away from this state "
+                "release energy: it is an equilibrium, but not a stable one, and a small "
+                "disturbance leads elsewhere, as in buckling or tipping; to find where, begin with "
+                "a small displacement= in that direction, or disturb the loads",
+            )  # fmt: skip
+
+    def _slips(self) -> bool:
+        """Whether nodes slip with friction, whose forces have no potential. Collective."""
+        both = zip(self.system.contacts, self.state.contacts, strict=True)
+        slip = any(p.friction and bool(((c.force > 0.0) & ~c.stick).any()) for p, c in both)
+        return anywhere(self.system.comm, slip)
+
+    def _tell_cut_off(self) -> None:
+        """Warn if an overlap that is to be resolved may be that of flat facets alone."""
+        contacts = self.system.contacts
+        if all(pair.interference != "resolve" for pair in contacts):
+            return
+        for pair, depth in zip(contacts, self.system.penetration(self.state), strict=True):
+            if pair.interference == "resolve" and (text := cut_off(pair, depth)):
+                deep = float(depth.max())
+                self.solution.warn(
+                    "flat facets", self.state.time, deep,
+                    f"contact {pair.name!r}: nodes start inside by up to {deep:.3g} of a facet; "
+                    + text,
+                    about=(pair.name,),
+                )  # fmt: skip
+
+    def _tell_part_of_loads(self) -> None:
+        """Warn if the load steps were asked to end before all of the constant loads act."""
+        now = self.state.time
+        if not now == self._end < 1.0:
+            return
+        if self.problem.loads.grow():
+            self.solution.warn(
+                "part of the loads", now, 1.0 - now,
+                f"load_steps end at t={now:.6g}, with {100 * now:.3g} % of the constant loads "
+                "(gravity and loads that are no functions of time); all of them act at t=1",
+            )  # fmt: skip
+        depths = self.system.penetration(self.state)
+        deep = max((float(d.max(initial=0.0)) for d in depths), default=0.0)
+        if deep > INITIAL_PENETRATION:
+            self.solution.warn(
+                "part of the interference", now, deep,
+                f"load_steps end at t={now:.6g}, where {100 * (1.0 - now):.3g} % of the overlap "
+                f"at the start is left, up to {deep:.3g} of a facet; none is at t=1",
+            )  # fmt: skip
+
+    def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, _Relaxed]:
+        """Solution of a load step, its state, Newton iterations, what the relaxations took.
+
+        Each relaxation starts where the last one ended and is held there a little by the
+        stabilization: a proximal-point iteration, whose limit knows nothing of it.
+        """
+        problem, kept, iterations, last = self.problem, self.state, 0, np.inf
+        search, since, lowest, way, moved = True, 0.0, 0.0, 0.0, 0.0
+        size = problem.lengths.radius + problem.lengths.director
+        relaxed = _Relaxed(self.system)
+        slipped = [contact.slip for contact in kept.contacts]
+        problem.stabilization.share = self._stabilization
+        state = replace(kept, v=self.solution.rates)
+        try:
+            for _ in range(_RELAXATIONS):
+                try:
+                    step = self._solve(state, dt, search)
+                    reached = state_after(problem, step, time)
+                    if search:  # else slip still counts from the last search
+                        relaxed.lost["friction_dissipation"] += since
+                        slipped = [contact.slip for contact in state.contacts]
+                    contacts = tuple(
+                        new._replace(slip=start + new.slip - old.slip)
+                        for start, old, new in zip(
+                            slipped, state.contacts, reached.contacts, strict=True
+                        )
+                    )
+                    reached = replace(reached, contacts=contacts)
+                    self._check_missed(reached)
+                except UserFunctionError:
+                    raise
+                except StepFailedError as failure:
+                    # Bodies in search of each other move by load over stabilization, whatever dt.
+                    if not 0.0 < problem.stabilization.share < _STIFFEST:
+                        unheld = self._unheld(state, dt)
+                        advises = bool(unheld) or failure.advises
+                        raise StepFailedError(f"{unheld}{failure}", advises=advises) from failure
+                    problem.stabilization.share /= _RELIEF
+                    lowest = problem.stabilization.share
+                    continue
+                iterations += step.iterations
+                relaxed.driven += balance.told_by_joints(problem, step)
+                state, dt = reached, 0.0
+                left, restless = unrest(problem, step)
+                if left <= 1.0:
+                    return step, state, iterations, relaxed
+                terms = balance.step_terms(problem, step)
+                since = terms["friction_dissipation"]
+                for name in relaxed.of_joints:
+                    relaxed.lost[name] += terms[name]
+                moved = float(problem.lengths.motion_of(step).max()) / size
+                share = problem.stabilization.share
+                if left < _RELIEVED * last:
+                    problem.stabilization.share *= _RELIEF
+                elif step.iterations <= _EASY:
+                    lower = share * min(max(_RELIEF, moved / _FAR), 1.0)
+                    problem.stabilization.share = max(lower, min(lowest, share))
+                last, way = left, moved if search else way + moved
+                # A node on an edge could change its facet for ever, and its place with it.
+                search = left * self.newton.rtol > _NEARLY_AT_REST or way > _NEAR
+        finally:
+            problem.stabilization.share = 0.0
+        raise self.solver.with_flat(
+            f"step from t={kept.time:.6g}: body {restless!r} is not at rest after {_RELAXATIONS} "
+            f"relaxations, the last of which moves it by {moved * size:.3g}, {moved:.2g} of the "
+            "scene; nothing holds it, or it hops from facet to facet",
+            step,
+        )
+
+    def _unheld(self, state: State, dt: float) -> str:
+        """What nothing resists where a failed load step starts, or nothing. Collective."""
+        if self.problem.stabilization.share:
+            return ""
+        self.problem.begin(state, dt)
+        self.solver.prepare()
+        start = self.problem.evaluate(self.problem.x)
+        found = free_motion(self.problem, self.solver, start)
+        if not found:
+            return ""
+        return (
+            f"{found}, where the step starts: hold it by a Dirichlet condition, a joint or contact "
+            "that touches there, or pass stabilization=0.1; "
+        )
+
+    def _solve(self, state: State, dt: float, search: bool) -> Evaluation:
+        """Solution from a state; contact is sought as far as the bodies turn out to move."""
+        self.problem.begin(state, dt, search=search)
+        return solved(self.problem, self.solver) if search else self.solver.solve()
+
+    def _check_missed(self, state: State) -> None:
+        """Raise if a slave went through a facet whose candidate it was not."""
+        depths = self.system.penetration(state, self._left(state.time))
+        for pair, depth in zip(self.system.contacts, depths, strict=True):
+            if depth.max(initial=0.0) > _MISSED:
+                node = int(pair.slave.original[depth.argmax()])
+                raise StepFailedError(
+                    f"step from t={self.state.time:.6g}: contact {pair.name!r}: node {node} passed "
+                    f"by its facet and ended {depth.max():.3g} of a facet inside the master"
+                )
