@@ -204,5 +204,6 @@ class ContactTerms:
         """Contribution of the elements at an iterate. Collective."""
         laid, elements = self._layout, self._search.elements
         own = laid.own_values(x.array_r, elements)
-        places = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
-        return evaluate_together(self._system.comm, elements, places, own)
+        return evaluate_together(
+            self._system.comm, elements, laid.positions(x, elements), own
+        )

@@ -354,7 +354,7 @@ class StepProblem:
             values: This rank's part of it.
         """
         laid, elements = self.laid, self.elements
-        positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
+        positions = laid.positions(x, elements)
         own = laid.own_values(values, elements)
         parts = evaluate_together(self.system.comm, elements, positions, own)
         contacts, touching = self.couplings.contacts, len(self.couplings.contacts.elements)

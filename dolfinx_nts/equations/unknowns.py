@@ -183,7 +183,10 @@ class Unknowns:
 
     def positions(self, x: Any, elements: Sequence[Any]) -> list[FloatArray]:
         """Positions that each batch depends on [m], see `Elements.evaluate`. Collective."""
-        both = zip([c.reference() for c in elements], self.at_elements(x, elements), strict=True)
+        references = [c.reference() for c in elements]
+        if not self.blocks:
+            return references
+        both = zip(references, self.at_elements(x, elements), strict=True)
         return [reference + u.reshape(reference.shape) for reference, u in both]
 
     def at_elements(self, x: Any, elements: Sequence[Any]) -> list[FloatArray]:

@@ -166,7 +166,11 @@ def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
         new = part.active & ~(old.force[batch.candidates.node] > 0.0)
         force = np.where(new, -part.multiplier[:, 0], 0.0)
         lost = float(force @ batch.candidates.gap) / problem.factor
-        gradient, normal = batch.gap_slopes(part)
+        # Where a gap is closed, a change of the foot or of the normal does not change it.
+        rows = part.tangent[:, batch.gap_row, : batch.num_coordinates]
+        gradient, slave = rows / batch.law.scale[:, None], batch.attachment.sides[0]
+        own = gradient[:, : 3 * slave.nodes.shape[1]].reshape(*slave.nodes.shape, 3)
+        normal = (own * slave.places[:, :, None]).sum(axis=1)
         place = batch.pair.origin + part.place
         found.append(_New(batch, gradient, rate * force, place, normal, lost))
     return found

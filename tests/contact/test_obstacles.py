@@ -115,7 +115,7 @@ def test_work_of_the_force_is_the_change_of_the_gap(name, integrator):
     force, dx = -part.residual[0, :3], pair.x - Pair.start(name)
     change = part.gap[0] - pair.step.candidates.gap[0]
     assert force @ (dx - dc) == pytest.approx(0.7 * MASS * change, abs=1e-15)
-    assert pair.step.external_work(part) == pytest.approx(force @ dc, abs=1e-15)
+    assert pair.step.ledger(part, 1.0)["external_work"] == pytest.approx(force @ dc, abs=1e-15)
 
 
 # ---- one mass
