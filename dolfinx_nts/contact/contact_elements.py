@@ -49,6 +49,7 @@ class ContactElements(Batch):
     attachment: Attachment
     measure: ContactMeasure
     law: ContactLaw
+    combination = None
 
     def select(self, chosen: BoolArray) -> ContactElements:
         """The pairs chosen by a mask of shape (n,), itself if that chooses all."""

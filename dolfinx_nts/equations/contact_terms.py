@@ -139,8 +139,9 @@ class ContactTerms:
             out[laid.of_body(k)] = rest
         if laid.own:
             both = zip(self._search.elements, parts, strict=True)
-            rows = [c.rows(part, "constraints").ravel() for c, part in both]
-            out[laid.of_elements("constraints")] = np.concatenate(rows)
+            rows = [c.rows(part, "constraints") for c, part in both]
+            found = laid.own_rows("constraints", self._search.elements, rows)
+            out[laid.of_elements("constraints")] = found
         return out
 
     def jacobian(self, x: Any, matrices: Sequence[Any]) -> Any:

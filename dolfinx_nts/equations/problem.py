@@ -214,7 +214,9 @@ class StepProblem:
         self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
         elements = self.elements
         widths = np.array([list(c.widths.values()) for c in elements])
-        numbers = (np.array(self.awake), widths, *(a for c in elements for a in c.points()))
+        combined = [a for c in elements if c.combination is not None for a in c.combination]
+        places = [a for c in elements for a in c.points()]
+        numbers = (np.array(self.awake), widths, *places, *combined)
         if not everywhere(system.comm, _equal(numbers, self._numbers)):
             self.destroy()
             of = self.couplings.bodies
@@ -408,8 +410,8 @@ class StepProblem:
         laid.write([terms.residual for terms in e.terms], out)
         out[laid.held] = 0.0
         for name in laid.own:
-            rows = [c.rows(p, name).ravel() for c, p in zip(self.elements, e.parts, strict=True)]
-            out[laid.of_elements(name)] = np.concatenate(rows)
+            rows = [c.rows(p, name) for c, p in zip(self.elements, e.parts, strict=True)]
+            out[laid.of_elements(name)] = laid.own_rows(name, self.elements, rows)
         return out
 
     def body_tangents(self, e: Evaluation) -> list[Any]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.interaction.combination import Combination, num_multipliers, of_multipliers
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step, over
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -39,6 +40,7 @@ class PointElements:
 
     name: str
     sides: tuple[Points, ...]
+    combination: ClassVar[Combination | None] = None
 
     @property
     def num_elements(self) -> int:
@@ -109,7 +111,7 @@ class PointElements:
 
     def largest(self, part: Any) -> list[float]:
         """The largest row of its constraints, which are lengths [m], and its extent."""
-        rows = self.rows(part, "constraints")
+        rows = of_multipliers(self, self.rows(part, "constraints"))
         return [0.0, float(np.abs(rows).max(initial=0.0)), 0.0, self.extent]
 
     def ratios(
@@ -211,8 +213,7 @@ class EveryStep:
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Zero."""
-        batch = self.elements[k]
-        return np.zeros((batch.num_elements, batch.widths["constraints"]))
+        return np.zeros(num_multipliers(self.elements[k]))
 
     def warnings(self, parts: Sequence[Any]) -> list[StepWarning]:
         """Nothing to warn of."""

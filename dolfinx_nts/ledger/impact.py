@@ -218,7 +218,7 @@ def _response(
         lend = SHIFT * np.abs(slope).max(axis=2, initial=0.0)
         tangent[:, range(-width, 0), range(-width, 0)] = -lend
         tangents.append(tangent)
-        lent.append(lend.ravel())
+        lent.append(lend)
     matrix = StepMatrix(laid.layout, masses, laid.blocks)
     matrix.assemble(tangents)
     right, rows = np.zeros(laid.layout.num_owned), laid.of_elements("constraints")
@@ -226,7 +226,9 @@ def _response(
     saddle = Saddle(matrix.operator)
     for _ in range(_SOLVES):
         solution = saddle.solve(right)
-        right[rows] = -np.concatenate(lent) * solution[rows]
+        own = laid.own_values(solution, elements)
+        left = [-a * of["constraints"] for a, of in zip(lent, own, strict=True)]
+        right[rows] = laid.own_rows("constraints", elements, left)
     solution[laid.held] = 0.0
     change = batches.split(laid.read(solution, impulses))
     saddle.destroy()
