@@ -197,7 +197,7 @@ class ContactElements(Batch):
             gap=gap,
             slip=slip.value if slip else np.empty((len(x), 0)),
             coupling=obeyed.residual[:, : 3 * x.shape[1]].reshape(x.shape),
-            place=x[:, 0],
+            place=x[:, 0] + self.attachment.path[1],
         )
 
     def _together(
@@ -255,7 +255,7 @@ class ContactElements(Batch):
             part: Solution of the step.
             theta: Where between t_n and t_{n+1} the forces act.
         """
-        start = self.measure.start[:, 0]
+        start = self.measure.start[:, 0] + self.attachment.path[0]
         x = self.pair.origin + start + theta * (part.place - start)
         total: FloatArray = cross(x, part.force).sum(axis=0)
         return total

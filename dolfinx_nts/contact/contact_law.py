@@ -95,7 +95,7 @@ class Contribution(NamedTuple):
         force: Contact force on the slave [kg m], shape (n, 3).
         tangential: The same less its part along the normal.
         coupling: h^2/2 G^T lambda of the measure's points [kg m], shape (n, points, 3).
-        place: Slave at t_{n+1} relative to `Attachment.path` in the pair's frame [m], (n, 3).
+        place: Slave at t_{n+1} in the pair's frame [m], shape (n, 3).
         end: The multipliers at t_{n+1}: those of the step, but for massless nodes.
     """
 
