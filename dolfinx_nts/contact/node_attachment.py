@@ -61,10 +61,10 @@ class NodeAttachment(Batch):
     @cached_property
     def sides(self) -> tuple[Points, ...]:
         """Nodes that the slaves depend on, and those of the masters."""
-        slave = self.slave.material.part(self.node)
+        slave = self.slave.material.select(self.node)
         if self.master is None:
             return (slave,)
-        return slave, self.master.facet_nodes.part(self.patch)
+        return slave, self.master.facet_nodes.select(self.patch)
 
     @cached_property
     def weights(self) -> FloatArray | None:

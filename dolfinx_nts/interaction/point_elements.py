@@ -31,7 +31,7 @@ class PointElements:
     """What elements between points of bodies have in common, see `Elements`.
 
     A subclass adds `evaluate`, which ranks without elements call, too. `body.points` gives the same
-    points on all ranks; keep each on one rank by `part`.
+    points on all ranks; keep each on one rank by `select`.
 
     Attributes:
         name: For messages.

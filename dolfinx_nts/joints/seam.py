@@ -61,7 +61,7 @@ class Seam(Joint):
         nodes, first = np.unique(edge.material.nodes[:, 0], return_index=True)
         mine = np.flatnonzero(np.arange(len(nodes)) % shell.comm.size == shell.comm.rank)
         self.numbers = edge.original[first][mine] // 2
-        held = edge.material.part(first)
+        held = edge.material.select(first)
         at = points_of(f"edge of {self.name!r}", shell, held.reference[:, 0])
         product = np.einsum("ni,ni->n", at.reference[:, 1], held.reference[:, 1])
         lengths = shell.length * other.length
@@ -72,7 +72,7 @@ class Seam(Joint):
                 f"edge: meets shell {shell.name!r} at {np.rad2deg(np.arcsin(sine.min())):.3g} "
                 f"degrees at x={x}, where 20 or more tell how directors turn; make one mesh of both"
             )
-        self._sides: tuple[Points, ...] = (at.part(mine), held.part(mine))
+        self._sides: tuple[Points, ...] = (at.select(mine), held.select(mine))
         self._scale, self._product = np.sqrt(lengths), product[mine]
         numbers = np.sort(edge.original[first] // 2).astype(np.int64)
         #: What a restart compares.

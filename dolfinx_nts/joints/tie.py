@@ -77,7 +77,7 @@ class Tie(Joint):
         at = points_of(f"surface of {self.name!r}", body, surface.reference)
         if not body.rigid:
             _check_covered(self.name, body, surface, at)
-        self._sides: tuple[Points, ...] = (at.part(mine), surface.material.part(mine))
+        self._sides: tuple[Points, ...] = (at.select(mine), surface.material.select(mine))
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run: one element a point, with the three components."""

@@ -65,7 +65,7 @@ class Cord(nts.Joint):
         node, one = np.zeros((2, 1), dtype=int), np.ones((2, 1))
         self.sides = tuple(
             nts.Points(body, node, one, np.tile(p, (2, 1, 1)), np.zeros((2, 1, 3), bool), one > 0)
-            .part(here)
+            .select(here)
             for body, p in zip(bodies, x, strict=True)
         )
         lengths = np.linalg.norm(np.array(x) - PINS, axis=1)
