@@ -66,12 +66,12 @@ class ContactElements(Batch):
         """Candidates on this rank."""
         return len(self.candidates.node)
 
-    @property
+    @cached_property
     def num_coordinates(self) -> int:
         """Coordinates of the nodes that slave and master of a pair depend on."""
         return sum(3 * side.nodes.shape[1] for side in self.attachment.sides)
 
-    @property
+    @cached_property
     def widths(self) -> dict[str, int]:
         """Own unknowns of a pair by field."""
         augmented, constraints = self.measure.num_augmented, self.law.num_constraints
@@ -92,7 +92,7 @@ class ContactElements(Batch):
         """Unknowns are forces."""
         return 1.0
 
-    @property
+    @cached_property
     def extent(self) -> float:
         """Length beside the displacements whose rounding enters the gaps [m]."""
         path = float(np.abs(self.attachment.path).max())

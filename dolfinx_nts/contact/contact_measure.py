@@ -8,8 +8,8 @@ Edges that meet, for one, have the gap of facets, see `tests/contact/test_edges.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from typing import Any, NamedTuple, Protocol, Self
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -24,16 +24,18 @@ BoolArray = npt.NDArray[np.bool_]
 class Batch:
     """What inherits from it is a dataclass whose arrays have the element as axis 0."""
 
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
     def select(self, chosen: BoolArray) -> Self:
         """Some of the elements, chosen by a mask of shape (n,)."""
         changed: dict[str, Any] = {}
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
             if isinstance(value, np.ndarray):
-                changed[field.name] = value[chosen]
+                changed[name] = value[chosen]
             elif hasattr(value, "select"):
-                changed[field.name] = value.select(chosen)
-        return replace(self, **changed)  # type: ignore[type-var]
+                changed[name] = value.select(chosen)
+        return replace(self, **changed)
 
 
 class Slip(NamedTuple):

@@ -205,6 +205,5 @@ class ContactTerms:
         """Contribution of the elements at an iterate. Collective."""
         laid, elements = self._layout, self._search.elements
         own = laid.own_values(x.array_r, elements)
-        return evaluate_together(
-            self._system.comm, elements, laid.positions(x, elements), own
-        )
+        places = laid.positions(x, elements)
+        return evaluate_together(self._system.comm, elements, places, own)

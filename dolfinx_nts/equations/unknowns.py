@@ -117,15 +117,15 @@ class Unknowns:
                 numbers.append(offset[name] + np.arange(shape[0] * shape[1]).reshape(shape))
             stops = np.cumsum([0, *(n.shape[1] for n in numbers)])
             pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
+            columns, weights = [np.arange(a, b) for a, b in pairwise(stops)], None
             if "constraints" in self.own:
                 pattern[stops[-2] :, stops[-2] :] = c.pattern
-            columns = [np.arange(a, b) for a, b in pairwise(stops)]
-            weights, both = None, c.combination
-            if both is not None:
-                columns[-1] = columns[-1].repeat(both.weight.shape[2])
-                weights = both.weight.reshape(len(both.weight), len(columns[-1]))
-                new = offset["constraints"] + both.number.reshape(weights.shape)
-                numbers[-1] = np.where(weights == 0.0, -1, new)
+                if c.combination is not None:
+                    number, weight, _ = c.combination
+                    columns[-1] = columns[-1].repeat(weight.shape[2])
+                    weights = weight.reshape(len(weight), len(columns[-1]))
+                    new = offset["constraints"] + number.reshape(weights.shape)
+                    numbers[-1] = np.where(weights == 0.0, -1, new)
             for name in self.own:
                 offset[name] += _size(c, name)
             fields = (*(field for field, _ in of_bodies), *self.own.values())
@@ -230,10 +230,9 @@ class Unknowns:
         self, name: str, elements: Sequence[Any], rows: Sequence[FloatArray]
     ) -> FloatArray:
         """Rows of a field of own unknowns, from those of each batch's elements (n, width)."""
-        both = zip(elements, rows, strict=True)
         if name == "constraints":
-            return np.concatenate([of_multipliers(c, row) for c, row in both])
-        return np.concatenate([row.ravel() for _, row in both])
+            rows = [of_multipliers(c, row) for c, row in zip(elements, rows, strict=True)]
+        return np.concatenate([row.ravel() for row in rows])
 
     def gross_forces(
         self, elements: Sequence[Any], parts: Sequence[Any], bodies: int
