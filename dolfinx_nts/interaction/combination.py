@@ -17,6 +17,7 @@ class Combination(NamedTuple):
     The rows of the multipliers are those of the constraints times C^T: what holds is a sum of
     measures, and the work is that of the sum. All elements that a multiplier stands in are on
     its rank; one with multipliers of two ranks is on both, there with theirs, as it is linear.
+    The multigrid and the check of an equilibrium's stability take each constraint for one alone.
 
     Attributes:
         number: Multipliers in each constraint, among the batch's on this rank, shape (n, m, s).
