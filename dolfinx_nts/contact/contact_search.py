@@ -12,8 +12,7 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
-from dolfinx_nts.contact.contact_laws import Contribution
-from dolfinx_nts.contact.coulomb import Rub, no_pull
+from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.shared_nodes import held_before
 from dolfinx_nts.interaction.coupling import StepWarning
@@ -117,7 +116,7 @@ class ContactSearch:
     def _choose(self) -> None:
         """Give unknowns to the candidates that are awake."""
         both = list(zip(self._found, self._with_unknowns, strict=True))
-        self.elements, self.idle = [c.part(a) for c, a in both], [c.part(~a) for c, a in both]
+        self.elements, self.idle = [c.select(a) for c, a in both], [c.select(~a) for c, a in both]
         self.idle_gaps = [np.empty(0) for _ in self.idle]
         watching = any(c.num_elements for c in self.idle)
         self._watching = anywhere(self._comm, watching)
@@ -183,30 +182,31 @@ class ContactSearch:
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia else None,
         )
-        found = found.part(~self._foreign[k][found.node])
+        found = found.select(~self._foreign[k][found.node])
         overlap, ramp = self._old[k].overlap[found.node], step.integrator.ramp
         start, end = step.state.time, step.state.time + step.dt
         found = found._replace(gap=found.gap + (1.0 - ramp(start)) * overlap)
-        elements: ContactElements = replace(
-            pair.elements(found, positions, path, step), overlap=(1.0 - ramp(end)) * overlap
-        )
+        elements: ContactElements = pair.elements(found, positions, path, step)
         gap = _EPS * (elements.extent + float(max(step.length[b] for b in bodies)))
-        if elements.strong:
+        if elements.law.strong:
             # Else nodes whose gap is the rounding of given coordinates would stick.
             gap += _EPS * pair.given
         # The sign of a force that is rounding must not decide on stick or slip.
         force = step.force_rounding(bodies) if pair.friction else 0.0
-        elements = replace(elements, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
+        law = replace(
+            elements.law, overlap=(1.0 - ramp(end)) * overlap, rounding=_TOUCH * gap,
+            force_rounding=_TOUCH * force,
+        )  # fmt: skip
         massless = self._massless[k][found.node]
-        if not (step.integrator.inertia and massless.any()):
-            return elements
-        old, before = self._old[k], np.zeros((len(massless), 3))
-        carried = elements.multipliers(old.force[found.node], old.tangential[found.node])
-        before[:, 0] = step.factor * carried[:, 0]
-        if pair.friction:
-            before[:, 1:] = step.factor * carried[:, -2:]
-        before[~massless] = np.nan
-        return replace(elements, before=before)
+        if step.integrator.inertia and massless.any():
+            old, before = self._old[k], np.zeros((len(massless), 3))
+            carried = elements.multipliers(old.force[found.node], old.tangential[found.node])
+            before[:, 0] = step.factor * carried[:, 0]
+            if pair.friction:
+                before[:, 1:] = step.factor * carried[:, -2:]
+            before[~massless] = np.nan
+            law = replace(law, before=before)
+        return replace(elements, law=law)
 
     def _drop_doubles(self) -> None:
         """Keep one of two pairs that keep a node out of the same fixed surface.
@@ -220,14 +220,14 @@ class ContactSearch:
                 continue
             one, two = (c.pair.slave.points[c.pair.slave.share[c.candidates.node]] for c in (a, b))
             _, ia, ib = np.intersect1d(one, two, return_indices=True)
-            ca, cb = a.candidates.part(ia), b.candidates.part(ib)
+            ca, cb = a.candidates.select(ia), b.candidates.select(ib)
             double = np.einsum("ni,ni->n", ca.normal, cb.normal) > 1.0 - _ONE
             double &= np.abs(ca.gap - cb.gap) < _ONE * np.minimum(ca.length, cb.length)
             double &= a.immovable[ia] & b.immovable[ib]
             stay = self._old[i].force[ca.node] >= self._old[j].force[cb.node]
             for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
                 if len(there):
-                    self._found[k] = c.part(~np.isin(np.arange(c.num_elements), there))
+                    self._found[k] = c.select(~np.isin(np.arange(c.num_elements), there))
 
     def _may_touch(self, k: int, c: ContactElements, had: BoolArray) -> BoolArray:
         """Return which need unknowns: all within reach, and those that had them in the last step.
@@ -240,12 +240,12 @@ class ContactSearch:
             return np.ones(c.num_elements, dtype=bool)
         node, reach = c.candidates.node, self._reach(k, self._step.motion)
         force = self._old[k].force[node]
-        if c.strong:
+        if c.law.strong:
             closes = self._gap(k, c, self._step.first) < -_SURELY * reach
             return closes | (force > no_pull(self._old[k].tangential[node]))
         # What goes to and fro at the limit would change the layout in every step.
         # All nodes that rest, or none: rounding of their gaps must not decide which carry forces.
-        near = reach + c.rounding if c.pair.redundant else reach
+        near = reach + c.law.rounding if c.pair.redundant else reach
         awake: BoolArray = had[node] | (c.candidates.gap < near) | (force > 0.0)
         return awake
 
@@ -257,7 +257,7 @@ class ContactSearch:
         u1 = [terms.u1 for terms in e.bodies]
         self.idle_gaps = [self._gap(k, c, u1) for k, c in enumerate(self.idle)]
         closed = [
-            ~(gap >= -c.gap_rounding) for c, gap in zip(self.idle, self.idle_gaps, strict=True)
+            ~(gap >= -c.law.gap_rounding) for c, gap in zip(self.idle, self.idle_gaps, strict=True)
         ]
         if not anywhere(self._comm, any(c.any() for c in closed)):
             return False
@@ -319,7 +319,7 @@ class ContactSearch:
     def smallest(self, parts: Sequence[Contribution]) -> dict[str, float]:
         """The smallest gap of an accepted step on this rank, infinite without candidates."""
         both = zip(self.elements, parts, strict=True)
-        gaps = [part.gap - c.overlap for c, part in both] + self.idle_gaps
+        gaps = [part.gap - c.law.overlap for c, part in both] + self.idle_gaps
         return {"min_gap": min((float(g.min(initial=np.inf)) for g in gaps), default=np.inf)}
 
     def warnings(self, parts: Sequence[Contribution]) -> list[StepWarning]:
@@ -387,7 +387,7 @@ class ContactSearch:
         c, old = self.elements[k], self._carried[k]
         node = c.candidates.node
         forces = c.multipliers(old.force[node], old.tangential[node])
-        multipliers: FloatArray = self._step.factor * forces / c.scale[:, None]
+        multipliers: FloatArray = self._step.factor * forces / c.law.scale[:, None]
         return multipliers
 
     @property
@@ -409,7 +409,7 @@ class ContactSearch:
         """
         by_law = self.elements
         self.elements = [
-            replace(c, imposed=on, rubs=Rub.STICKS if stick else c.rubs)
+            replace(c, law=replace(c.law, imposed=on, rubs=Rub.STICKS if stick else c.law.rubs))
             for c, on in zip(by_law, active, strict=True)
         ]
         try:
@@ -419,7 +419,7 @@ class ContactSearch:
 
     def rub(self, how: Rub) -> None:
         """What candidates with friction that touch obey from the next iterate on."""
-        self.elements = [replace(c, rubs=how) for c in self.elements]
+        self.elements = [replace(c, law=replace(c.law, rubs=how)) for c in self.elements]
 
     def flight_gaps(self) -> list[FloatArray]:
         """Gaps of each contact's candidates after free flight over the step [m]. Collective."""
@@ -428,4 +428,5 @@ class ContactSearch:
     def _gap(self, k: int, c: ContactElements, u: Sequence[FloatArray]) -> FloatArray:
         """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
         moved = c.pair.positions([u[b] for b in self.bodies[k]])
-        return c.gap(c.pair.points(moved, c.candidates))
+        points = c.pair.points(moved, c.candidates) - self._paths[k][1]
+        return c.measure.gap(points)

@@ -168,7 +168,7 @@ class Watched:
             with_one, with_two = ((facets == own[i, end]).any(axis=1) for end in (0, 1))
             others = ~(with_one & with_two)
             inside[i] = winding(found.place[i], x[facets[others]]) > 1.0
-        return found.part(inside)
+        return found.select(inside)
 
     def _worst(self, found: Found, k: int) -> Iterator[Finding]:
         """The worst node and the worst edge of side k in the other one."""

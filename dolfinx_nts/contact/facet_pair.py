@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import passages, search
-from dolfinx_nts.contact.facet_elements import FacetElements
+from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
+from dolfinx_nts.contact.facet_gap import FacetGap
+from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.pair import (
     MARGIN,
     NO_CANDIDATES,
@@ -157,30 +159,29 @@ class FacetPair(ContactPair, master=Surface):
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
         stays[node], stays[lost] = known[node], False
-        hidden, deepest = found.part(beside), (0.0, -1)
+        hidden, deepest = found.select(beside), (0.0, -1)
         if len(hidden.node):
             depth = -hidden.gap / hidden.length
             node = self.slave.share[hidden.node[depth.argmax()]]
             deepest = float(depth.max()), int(self.slave.original[node])
-        found = found.part(~beside)
+        found = found.select(~beside)
         stays[found.node] = True
         return Found(found, stays, cover, deepest)
 
     def elements(
         self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step
-    ) -> FacetElements:
+    ) -> ContactElements:
         """Equations of candidates in a step. Collective."""
-        rule, master = step.integrator, self.master
-        return FacetElements(
-            pair=self,
-            candidates=found,
-            contact_gradient=rule.contact_gradient,
-            condense=step.condense,
-            x0=self.points(positions, found),
-            scale=step.scale(self.slave, self.bodies)[self.slave.share[found.node]],
-            theta=rule.theta,
-            master_scale=step.scale(master, self.bodies)[master.patches[found.patch]],
-        )
+        attachment = NodeAttachment(
+            slave=self.slave, node=self.slave.share[found.node], master=self.master,
+            facet=found.facet, patch=found.patch,
+        )  # fmt: skip
+        measure = FacetGap(
+            start=self.points(positions, found), xi=found.xi, normal=found.normal,
+            length=found.length, rule=step.integrator.contact_gradient,
+            theta=step.integrator.theta, condense=step.condense,
+        )  # fmt: skip
+        return elements_of(self, found, attachment, measure, step)
 
     def _along_paths(
         self, found: Candidates, x: FloatArray, master: FloatArray, motion: Motion
@@ -240,7 +241,7 @@ class FacetPair(ContactPair, master=Surface):
         beyond = np.flatnonzero(excess.max(axis=1) > search.PREFERENCE)
         if not beyond.size:
             return found
-        near, excess, moved = found.part(beyond), excess[beyond], master + master_path
+        near, excess, moved = found.select(beyond), excess[beyond], master + master_path
         end = (x + slave_path)[near.node]
         far, best = self._gap_at(near.facet, near.xi, end, moved), near.facet.copy()
         for edge in range(nc):
@@ -288,9 +289,9 @@ class FacetPair(ContactPair, master=Surface):
         near = self._sharp[found.facet] & (beyond + 4.0 * reach / found.length > _ASIDE)
         if not near.any():
             return found
-        some = found.part(near)
+        some = found.select(near)
         end, moved = (x + slave_path)[some.node], master + master_path
-        some = some.part(self._gap_at(some.facet, some.xi, end, moved) < 0.0)
+        some = some.select(self._gap_at(some.facet, some.xi, end, moved) < 0.0)
         if not some.node.size:
             return found
         node = some.node
@@ -486,7 +487,7 @@ class FacetPair(ContactPair, master=Surface):
         if reach is not None:
             over, beyond = self._over_facet(facet, xi, reach / length)
             legal &= over & (gap > -MARGIN * length) & (gap < reach + MARGIN * length)
-        found = Candidates(node, facet, patch, xi, normal, gap, length).part(legal)
+        found = Candidates(node, facet, patch, xi, normal, gap, length).select(legal)
         return found, node[beyond]
 
     def _projected(

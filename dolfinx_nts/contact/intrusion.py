@@ -68,7 +68,7 @@ class Found(NamedTuple):
     facet: IntArray
     middle: BoolArray
 
-    def part(self, chosen: IntArray | BoolArray) -> Found:
+    def select(self, chosen: IntArray | BoolArray) -> Found:
         """Some of them, by number or by a mask."""
         return Found._make(a[chosen] for a in self)
 
@@ -332,7 +332,7 @@ def intrusions(a: Placed, b: Placed, least: float = LEAST) -> Found:
     deep = depth > np.where(middle, limit, least * size)
     # Where the middle of a body is passed, half its thickness is the depth.
     size = np.where(middle, np.maximum(depth / size, 0.5), depth / size)
-    crossing = Found(a.boundary.edges[near], place, depth, size, facet, middle).part(deep)
+    crossing = Found(a.boundary.edges[near], place, depth, size, facet, middle).select(deep)
     return Found._make(np.concatenate(pair) for pair in zip(inside, crossing, strict=True))
 
 

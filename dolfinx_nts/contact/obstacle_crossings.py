@@ -49,7 +49,7 @@ class _Near(NamedTuple):
         between: BoolArray = self.depth - np.maximum(self.corner, 0.0) > self.limit
         return between
 
-    def part(self, chosen: BoolArray) -> _Near:
+    def select(self, chosen: BoolArray) -> _Near:
         """Some of them."""
         return _Near._make(a[chosen] for a in self)
 
@@ -124,8 +124,8 @@ class ObstacleContact:
         gap = self.contact.master.gap(x).value
         near, pause = self._facets(watched.surface, watched.facets, x, gap)
         held = watched.held[near.facet]
-        found = self._of_slave(near.part(near.deep & held), moved)
-        found = found or self._of_rest(near.part(near.between & ~held), moved)
+        found = self._of_slave(near.select(near.deep & held), moved)
+        found = found or self._of_rest(near.select(near.between & ~held), moved)
         if watched.points.size:
             nodes, clear = self._nodes(x, gap, moved)
             found, pause = found + nodes, pause.shorter(clear)
@@ -188,7 +188,7 @@ class ObstacleContact:
         free = np.flatnonzero(~belong(whole, self._slaves) & (gap >= -LEAST * scale))
         rest = np.flatnonzero(~_shared(whole, self._slaves))
         begun, _ = self._facets(whole, rest, x, gap)
-        begun = begun.part(begun.deep)
+        begun = begun.select(begun.deep)
         held = _shared(whole, [slave])
         facets = np.append(np.flatnonzero(held), np.setdiff1d(rest, begun.facet))
         crossed = self._at_start(whole, begun)
@@ -278,7 +278,7 @@ class ObstacleContact:
 
     def _at_start(self, surface: Surface, deep: _Near) -> list[Finding]:
         """The deepest of the rest's facets at the start that has no node in the obstacle."""
-        deep = deep.part(deep.corner <= 0.0)
+        deep = deep.select(deep.corner <= 0.0)
         if not (deep.facet.size and np.isfinite(self.contact.master.width)):
             return []
         remedy = (

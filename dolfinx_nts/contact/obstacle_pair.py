@@ -6,7 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dolfinx_nts.contact.obstacle_elements import ObstacleElements
+from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
+from dolfinx_nts.contact.node_attachment import NodeAttachment
+from dolfinx_nts.contact.obstacle_gap import ObstacleGap
 from dolfinx_nts.contact.obstacles import Obstacle
 from dolfinx_nts.contact.pair import (
     INITIAL_PENETRATION,
@@ -90,20 +92,17 @@ class ObstaclePair(ContactPair, master=Obstacle):
 
     def elements(
         self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step
-    ) -> ObstacleElements:
+    ) -> ContactElements:
         """Equations of candidates in a step. Collective."""
-        rule = step.integrator
-        return ObstacleElements(
-            pair=self,
-            obstacle=self.obstacle,
-            candidates=found,
-            contact_gradient=rule.contact_gradient,
-            condense=step.condense,
-            x0=self.points(positions, found) - path[0],
-            scale=step.scale(self.slave, self.bodies)[self.slave.share[found.node]],
-            theta=rule.theta,
-            displacement=path,
+        attachment = NodeAttachment(
+            slave=self.slave, node=self.slave.share[found.node], path=(path[0], path[1])
         )
+        measure = ObstacleGap(
+            obstacle=self.obstacle, start=self.points(positions, found) - path[0],
+            normal=found.normal, length=found.length, rule=step.integrator.contact_gradient,
+            theta=step.integrator.theta,
+        )  # fmt: skip
+        return elements_of(self, found, attachment, measure, step)
 
     def missed(
         self,

@@ -47,7 +47,7 @@ class Candidates(NamedTuple):
     gap: FloatArray
     length: FloatArray
 
-    def part(self, chosen: IntArray | BoolArray) -> Candidates:
+    def select(self, chosen: IntArray | BoolArray) -> Candidates:
         """Return some of the candidates, by number or by a mask."""
         return Candidates._make(a[chosen] for a in self)
 

@@ -29,11 +29,13 @@ class Entries(NamedTuple):
         where: Where they stand among all entries of all tangents, one after the other.
         rows: Their rows in the matrix.
         cols: Their columns there.
+        weights: What they are multiplied by, see `ElementBlocks`; None: nothing.
     """
 
     where: IntArray
     rows: IntArray
     cols: IntArray
+    weights: FloatArray | None = None
 
 
 class Triplets:
@@ -59,8 +61,12 @@ class Triplets:
         to_whole: Callable[[int, IntArray], IntArray] | None = None,
     ) -> None:
         none = np.empty(0, np.int64)
-        rows, cols = ([none, *(part[i] for part in parts)] for i in (1, 2))
+        rows, cols = [none, *(p.rows for p in parts)], [none, *(p.cols for p in parts)]
         self._index = np.concatenate([none, *(part.where for part in parts)])
+        self._weights: FloatArray | None = None
+        if any(part.weights is not None for part in parts):
+            each = (np.ones(len(p.where)) if p.weights is None else p.weights for p in parts)
+            self._weights = np.concatenate([*each])
         self._bodies = [_OfBody(a) for a in bodies]
         for k, body in enumerate(self._bodies):
             assert to_whole is not None
@@ -79,8 +85,10 @@ class Triplets:
             tangents: All entries of all elements' tangents, one after the other.
         """
         of_bodies = [values for body in self._bodies for values in body.values()]
-        values = np.concatenate([tangents[self._index], *of_bodies])
-        petsc_compat.set_values_coo(self.matrix, values)
+        own = tangents[self._index]
+        if self._weights is not None:
+            own *= self._weights
+        petsc_compat.set_values_coo(self.matrix, np.concatenate([own, *of_bodies]))
 
     def destroy(self) -> None:
         """Free the PETSc objects; the bodies' matrices stay theirs."""
@@ -203,7 +211,10 @@ class StepMatrix:
             where = rows[0][i] * size + cols[0][j]
             row, col = rows[1][:, i], cols[1][:, j]
             kept, start = (row >= 0) & (col >= 0), first + size**2 * np.arange(len(row))
-            found.append(Entries((start[:, None] + where)[kept], row[kept], col[kept]))
+            weights = None
+            if block.weights is not None:
+                weights = (_weights(block, rows[0])[:, i] * _weights(block, cols[0])[:, j])[kept]
+            found.append(Entries((start[:, None] + where)[kept], row[kept], col[kept], weights))
             first += size**2 * len(row)
         return found
 
@@ -282,7 +293,7 @@ class StepMatrix:
             columns, numbers = [np.empty(0, np.int64)], [np.empty((count, 0))]
             for field, where, number in zip(*element[:3], strict=True):
                 if field in fields:
-                    columns.append(np.arange(where.start, where.stop))
+                    columns.append(where)
                     moved = own.to_system(fields.index(field), number)
                     numbers.append(np.where(number < 0, -1, moved))
             result.append((np.concatenate(columns), np.concatenate(numbers, axis=1).astype(int)))
@@ -327,6 +338,16 @@ class StepMatrix:
         made += [self.operator] if self._split and self.operator else []
         for a in (*self._parts, *made):
             a.destroy()
+
+
+def _weights(block: ElementBlocks, columns: IntArray) -> FloatArray:
+    """Weights of a combined batch's columns, as of `StepMatrix._numbers`, shape (n, columns)."""
+    weights, last = block.weights, block.columns[-1]
+    assert weights is not None
+    out = np.ones((len(weights), len(columns)))
+    if len(columns) and columns[-1] == last[-1]:
+        out[:, -len(last) :] = weights
+    return out
 
 
 def _joined(tangents: Sequence[FloatArray]) -> FloatArray:

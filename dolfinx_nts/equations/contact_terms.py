@@ -140,8 +140,9 @@ class ContactTerms:
             out[laid.of_body(k)] = rest
         if laid.own:
             both = zip(self._search.elements, parts, strict=True)
-            rows = [c.rows(part, "constraints").ravel() for c, part in both]
-            out[laid.of_elements("constraints")] = np.concatenate(rows)
+            rows = [c.rows(part, "constraints") for c, part in both]
+            found = laid.own_rows("constraints", self._search.elements, rows)
+            out[laid.of_elements("constraints")] = found
         return out
 
     def jacobian(self, x: PETSc.Vec, matrices: Sequence[Any]) -> Any:
@@ -205,5 +206,5 @@ class ContactTerms:
         """Contribution of the elements at an iterate. Collective."""
         laid, elements = self._layout, self._search.elements
         own = laid.own_values(x.array_r, elements)
-        places = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
+        places = laid.positions(x, elements)
         return evaluate_together(self._system.comm, elements, places, own)

@@ -9,7 +9,7 @@ import numpy as np
 
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.contact.contact_elements import ContactElements
-from dolfinx_nts.contact.contact_laws import Contribution
+from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
 from dolfinx_nts.equations.least_norm import hanging
 from dolfinx_nts.interaction.constraints import Constraints

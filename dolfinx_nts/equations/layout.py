@@ -66,13 +66,17 @@ class ElementBlocks(NamedTuple):
 
     Attributes:
         fields: Field of each part.
-        columns: Slice of each part in the element's unknowns.
+        columns: Columns of each part in the element's unknowns; one of a constraint with several
+            multipliers occurs as often.
         numbers: Numbers in the field, shape (n, columns); negative ones are left out.
         pattern: Which entries of an element's tangent can be non-zero, shape (r, r); all of those
             that couple coordinates of bodies with anything.
+        weights: Of the multipliers, the last part, in the constraints, shape (n, columns); None:
+            they are one.
     """
 
     fields: tuple[int, ...]
-    columns: tuple[slice, ...]
+    columns: tuple[IntArray, ...]
     numbers: tuple[IntArray, ...]
     pattern: npt.NDArray[np.bool_]
+    weights: npt.NDArray[np.float64] | None = None

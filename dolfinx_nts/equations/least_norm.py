@@ -18,6 +18,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import lsqr
 
 from dolfinx_nts.equations.unknowns import Unknowns
+from dolfinx_nts.interaction.combination import num_multipliers
 from dolfinx_nts.types import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -98,23 +99,27 @@ class NullSpace:
     ) -> None:
         places, entries, scales, start, count = [], [], [np.empty(0)], 0, 0
         for batch, numbers, part in zip(elements, bodies, parts, strict=True):
-            n, m = batch.num_elements, batch.widths["constraints"]
-            if batch.bilateral and n * m:
-                places.append(np.arange(start, start + n * m))
+            n, m, size = batch.num_elements, batch.widths["constraints"], num_multipliers(batch)
+            if batch.bilateral and size:
+                places.append(np.arange(start, start + size))
                 scale = np.broadcast_to(batch.force_scale, n)
-                scales.append(np.repeat(scale, m))
-                rows = np.arange(count, count + n * m).reshape(n, 1, m)
-                count += n * m
+                if batch.combination is None:
+                    rows, weight = np.arange(size).reshape(n, m, 1), np.ones((n, m, 1))
+                    scales.append(np.repeat(scale, m))
+                else:  # one multiplier may have forces of several units
+                    (rows, weight, _), scale = batch.combination, np.ones(n)
+                    scales.append(np.ones(size))
                 both = zip(numbers, batch.dofs(), strict=True)
                 columns = np.concatenate([laid.numbers_of(k, dofs) for k, dofs in both], axis=1)
+                force = part.tangent[:, : batch.num_coordinates, -m:, None] * weight[:, None]
                 found = np.broadcast_arrays(
-                    rows,
-                    columns[:, :, None],
-                    part.tangent[:, : batch.num_coordinates, -m:] / scale[:, None, None],
-                )
+                    count + rows[:, None], columns[:, :, None, None],
+                    force / scale[:, None, None, None],
+                )  # fmt: skip
+                count += size
                 some = (found[1] >= 0) & (found[2] != 0.0)
                 entries.append([array[some] for array in found])
-            start += n * m
+            start += size
         none = [np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)]
         local = [np.concatenate(arrays) for arrays in zip(none, *entries, strict=True)]
         ranks = comm.allgather((count, local))

@@ -210,7 +210,9 @@ class StepProblem:
         self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
         elements = self.elements
         widths = np.array([list(c.widths.values()) for c in elements])
-        numbers = (np.array(self.awake), widths, *(a for c in elements for a in c.points()))
+        combined = [a for c in elements if c.combination is not None for a in c.combination]
+        places = [a for c in elements for a in c.points()]
+        numbers = (np.array(self.awake), widths, *places, *combined)
         if not everywhere(system.comm, _equal(numbers, self._numbers)):
             self.destroy()
             of = self.couplings.bodies
@@ -350,7 +352,7 @@ class StepProblem:
             values: This rank's part of it.
         """
         laid, elements = self.laid, self.elements
-        positions = laid.positions(x, elements) if laid.blocks else [np.empty(0)] * len(elements)
+        positions = laid.positions(x, elements)
         own = laid.own_values(values, elements)
         parts = evaluate_together(self.system.comm, elements, positions, own)
         contacts, touching = self.couplings.contacts, len(self.couplings.contacts.elements)
@@ -404,8 +406,8 @@ class StepProblem:
         laid.write([terms.residual for terms in e.terms], out)
         out[laid.held] = 0.0
         for name in laid.own:
-            rows = [c.rows(p, name).ravel() for c, p in zip(self.elements, e.parts, strict=True)]
-            out[laid.of_elements(name)] = np.concatenate(rows)
+            rows = [c.rows(p, name) for c, p in zip(self.elements, e.parts, strict=True)]
+            out[laid.of_elements(name)] = laid.own_rows(name, self.elements, rows)
         return out
 
     def body_tangents(self, e: Evaluation) -> list[PETSc.Mat]:

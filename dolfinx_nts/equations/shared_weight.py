@@ -20,8 +20,9 @@ import scipy.sparse.linalg
 from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts.contact.contact_elements import ContactElements
-from dolfinx_nts.contact.contact_laws import Contribution
+from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.kernels.compiled_law import wrenches
 from dolfinx_nts.types import FloatArray, IntArray
 
 #: Square of the singular values that count as zero, over that of the largest.
@@ -94,7 +95,7 @@ class SharedWeight:
         for batch, numbers, part, x in zip(elements, bodies, parts, places, strict=True):
             on = np.flatnonzero(part.active)
             if on.size and _is_rigid(batch.pair):
-                scale = batch.scale[on]
+                scale = batch.law.scale[on]
                 found.append(_rows(batch, numbers, part, x, on, closed(batch)))
                 chosen.append((part, on, batch.gap_row, scale))
         own = _joined(found)
@@ -127,10 +128,15 @@ def _rows(
     on: IntArray,
     closed: float,
 ) -> _Rows:
-    push = np.zeros((len(on), 2, 6))
-    for k, wrench in enumerate(batch.wrenches(part, x, on)):
-        push[:, k] = wrench
-    gap = part.residual[on, batch.gap_row] / batch.scale[on]
+    push, start, scale = np.zeros((len(on), 2, 6)), 0, batch.law.scale[on]
+    rows = part.tangent[on, batch.gap_row, : batch.num_coordinates] / scale[:, None]
+    y = x[on]
+    force = rows.reshape(y.shape)
+    for k, side in enumerate(batch.attachment.sides):
+        here = slice(start, start + side.nodes.shape[1])
+        push[:, k] = wrenches(y[:, here], force[:, here], side.places[on], side.fixed[on])
+        start = here.stop
+    gap = part.residual[on, batch.gap_row] / scale
     return _Rows(
         np.tile([numbers[0], numbers[-1]], (len(on), 1)),
         push,

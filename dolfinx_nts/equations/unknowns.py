@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from petsc4py import PETSc
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
+from dolfinx_nts.interaction.combination import num_multipliers, of_multipliers
 from dolfinx_nts.types import FloatArray, IntArray
 
 #: Fields of the elements' own unknowns; the first is left out where nobody has any.
@@ -52,7 +54,7 @@ class Unknowns:
             batches.bodies[j].num_owned if self._chosen is None or j else int(self._chosen.sum())
             for j in self.awake
         ]
-        local = [sum(c.num_elements * c.widths[name] for c in elements) for name in _OWN]
+        local = [sum(_size(c, name) for c in elements) for name in _OWN]
         there = comm.allreduce(np.array([*local, sum(c.num_elements for c in elements)]))
         self.own: dict[str, int] = {}
         for name, size, total in zip(_OWN, local, there[:-1], strict=True):
@@ -110,17 +112,23 @@ class Unknowns:
             numbers = [number for _, number in of_bodies]
             for name in self.own:
                 shape = c.num_elements, c.widths[name]
-                new = offset[name] + np.arange(shape[0] * shape[1])
-                numbers.append(new.reshape(shape))
-                offset[name] += new.size
-            widths = [n.shape[1] for n in numbers]
-            stops = np.cumsum(widths)
+                numbers.append(offset[name] + np.arange(shape[0] * shape[1]).reshape(shape))
+            stops = np.cumsum([0, *(n.shape[1] for n in numbers)])
             pattern = np.ones((stops[-1], stops[-1]), dtype=bool)
+            columns, weights = [np.arange(a, b) for a, b in pairwise(stops)], None
             if "constraints" in self.own:
                 pattern[stops[-2] :, stops[-2] :] = c.pattern
-            columns = tuple(slice(int(b - w), int(b)) for w, b in zip(widths, stops, strict=True))
+                if c.combination is not None:
+                    number, weight, _ = c.combination
+                    columns[-1] = columns[-1].repeat(weight.shape[2])
+                    weights = weight.reshape(len(weight), len(columns[-1]))
+                    new = offset["constraints"] + number.reshape(weights.shape)
+                    numbers[-1] = np.where(weights == 0.0, -1, new)
+            for name in self.own:
+                offset[name] += _size(c, name)
             fields = (*(field for field, _ in of_bodies), *self.own.values())
-            blocks.append(ElementBlocks(fields, columns, tuple(numbers), pattern))
+            block = ElementBlocks(fields, tuple(columns), tuple(numbers), pattern, weights)
+            blocks.append(block)
         return blocks
 
     # ---- bodies
@@ -181,7 +189,10 @@ class Unknowns:
 
     def positions(self, x: PETSc.Vec, elements: Sequence[Any]) -> list[FloatArray]:
         """Positions that each batch depends on [m], see `Elements.evaluate`. Collective."""
-        both = zip([c.reference() for c in elements], self.at_elements(x, elements), strict=True)
+        references = [c.reference() for c in elements]
+        if not self.blocks:
+            return references
+        both = zip(references, self.at_elements(x, elements), strict=True)
         return [reference + u.reshape(reference.shape) for reference, u in both]
 
     def at_elements(self, x: PETSc.Vec, elements: Sequence[Any]) -> list[FloatArray]:
@@ -203,13 +214,23 @@ class Unknowns:
             of_field = values[self.of_elements(name)] if name in self.own else None
             start = 0
             for own, c in zip(out, elements, strict=True):
-                shape = c.num_elements, c.widths[name]
-                stop = start + shape[0] * shape[1]
-                own[name] = (
-                    np.zeros(shape) if of_field is None else of_field[start:stop].reshape(shape)
-                )
+                shape, stop = (c.num_elements, c.widths[name]), start + _size(c, name)
+                if of_field is None:
+                    own[name] = np.zeros(shape)
+                elif name == "constraints" and c.combination is not None:
+                    own[name] = c.combination.of_constraints(of_field[start:stop])
+                else:
+                    own[name] = of_field[start:stop].reshape(shape)
                 start = stop
         return out
+
+    def own_rows(
+        self, name: str, elements: Sequence[Any], rows: Sequence[FloatArray]
+    ) -> FloatArray:
+        """Rows of a field of own unknowns, from those of each batch's elements (n, width)."""
+        if name == "constraints":
+            rows = [of_multipliers(c, row) for c, row in zip(elements, rows, strict=True)]
+        return np.concatenate([row.ravel() for row in rows])
 
     def gross_forces(
         self, elements: Sequence[Any], parts: Sequence[Any], bodies: int
@@ -254,6 +275,13 @@ def _of_awake(
     if there.all() or not there.any():
         return None, None
     return np.cumsum(there) - 1, np.repeat(np.isin(rigid.own, list(awake)), WIDTH)
+
+
+def _size(batch: Any, name: str) -> int:
+    """Own unknowns of a batch of elements on this rank."""
+    if name == "constraints":
+        return num_multipliers(batch)
+    return int(batch.num_elements * batch.widths[name])
 
 
 def _coordinate_rows(elements: Sequence[Any], parts: Sequence[Any]) -> FloatArray:

@@ -84,7 +84,7 @@ class _Rows:
                 return type(given)(*(a[chosen] for a in given))
             return given[chosen] if isinstance(given, np.ndarray) else given
 
-        sides = tuple(side.part(chosen) for side in self.sides)
+        sides = tuple(side.select(chosen) for side in self.sides)
         others = {f.name: some(getattr(self, f.name)) for f in fields(self) if f.name != "sides"}
         return _Rows(sides, **others)
 

@@ -162,7 +162,7 @@ class Coupling(Protocol):
         """
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
-        """Constraints' unknowns of elements k as in the last step, shape (n, constraints).
+        """Multipliers of elements k as in the last step, in order, shape (n, constraints) if own.
 
         Args:
             k: Number among `elements`.

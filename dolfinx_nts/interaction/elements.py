@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx_nts.integrators import Integrator
+from dolfinx_nts.interaction.combination import Combination
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.state import State
@@ -128,6 +129,10 @@ class Elements(Protocol):
     @property
     def pattern(self) -> BoolArray:
         """Which constraints stand in the rows of which, shape (m, m)."""
+
+    @property
+    def combination(self) -> Combination | None:
+        """How unknowns of its constraints follow from multipliers; None: each has its own."""
 
     @property
     def bilateral(self) -> bool:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dolfinx_nts.interaction.combination import of_multipliers
 from dolfinx_nts.state import State
 from dolfinx_nts.types import FloatArray, OfTime
 
@@ -100,10 +101,12 @@ def differenced(
     for at, part in (*parts, (batch, ahead), (batch, behind)):
         length = float(at.largest(part)[1])
         if length > 0.0:
-            unit = float(np.abs(at.rows(part, "constraints")).max()) / length
+            joined = of_multipliers(batch, at.rows(part, "constraints"))
+            unit = float(np.abs(joined).max()) / length
     doubts = 2.0 * np.array([g - coarse[0], rate - coarse[1]])
     size, doubt = (
-        np.abs(values).max(axis=(1, 2), initial=0.0) / unit for values in (found[:2], doubts)
+        np.array([np.abs(of_multipliers(batch, a)).max(initial=0.0) for a in values]) / unit
+        for values in (found[:2], doubts)
     )
     extent, speed = (float(np.abs(values).max(initial=0.0)) for values in (y, v))
     rounding = ROUNDED * extent * np.abs(_FINE[:2]).sum(axis=1) * np.array([1.0, 1.0 / dt])

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from dolfinx_nts.interaction.combination import Combination, num_multipliers, of_multipliers
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step, over
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -26,7 +27,7 @@ class PointElements:
     """What elements between points of bodies have in common, see `Elements`.
 
     A subclass adds `evaluate`, which ranks without elements call, too. `body.points` gives the same
-    points on all ranks; keep each on one rank by `part`.
+    points on all ranks; keep each on one rank by `select`.
 
     Attributes:
         name: For messages.
@@ -35,6 +36,7 @@ class PointElements:
 
     name: str
     sides: tuple[Points, ...]
+    combination: ClassVar[Combination | None] = None
 
     @property
     def num_elements(self) -> int:
@@ -105,7 +107,7 @@ class PointElements:
 
     def largest(self, part: Any) -> list[float]:
         """The largest row of its constraints, which are lengths [m], and its extent."""
-        rows = self.rows(part, "constraints")
+        rows = of_multipliers(self, self.rows(part, "constraints"))
         return [0.0, float(np.abs(rows).max(initial=0.0)), 0.0, self.extent]
 
     def ratios(
@@ -207,8 +209,7 @@ class EveryStep:
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Zero."""
-        batch = self.elements[k]
-        return np.zeros((batch.num_elements, batch.widths["constraints"]))
+        return np.zeros(num_multipliers(self.elements[k]))
 
     def warnings(self, parts: Sequence[Any]) -> list[StepWarning]:
         """Nothing to warn of."""

@@ -64,14 +64,14 @@ class Points:
     def _flat(self) -> IntArray:
         return self.dofs.reshape(len(self), 3 * self.nodes.shape[1])
 
-    def part(self, chosen: Any) -> Points:
+    def select(self, chosen: Any) -> Points:
         """Return some of the points, chosen by numbers, a slice or a mask; ranks may differ."""
         arrays = (self.nodes, self.weights, self.reference, self.fixed, self.places)
         return Points(self.body, *(a[chosen] for a in arrays))
 
     def columns(self, chosen: IntArray) -> Points:
         """Return the points by some of the nodes each depends on; the others have no weight."""
-        return self.part((slice(None), chosen))
+        return self.select((slice(None), chosen))
 
     @cached_property
     def _table(self) -> tuple[IntArray, IntArray]:

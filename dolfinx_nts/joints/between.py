@@ -244,7 +244,7 @@ class Between(Joint, ABC):
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run. Collective."""
-        sides = [side.part(slice(self._here)) for side in self.sides]
+        sides = [side.select(slice(self._here)) for side in self.sides]
         equations, _ = self._in_step((0.0,))
         found, n = self.arm(), self._here
         arm = None if found is None else Arm(found.weights[None][:n], found.constant[None][:n])

@@ -64,7 +64,7 @@ class Between(Joint):
         length: float = 1.0,
     ) -> None:  # fmt: skip
         """Set the measure: vectors of all nodes' weights (k,) and a constant (3,) each."""
-        here = tuple(side.part(slice(self._here)) for side in sides)
+        here = tuple(side.select(slice(self._here)) for side in sides)
         weights, constants = (np.array(part) for part in zip(*rows, strict=True))
         self.measure = Measure(kind, here, weights, constants, length)
 

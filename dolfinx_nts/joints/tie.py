@@ -78,7 +78,7 @@ class Tie(Joint):
         at = points_of(f"surface of {self.name!r}", body, surface.reference)
         if not body.rigid:
             _check_covered(self.name, body, surface, at)
-        self._sides: tuple[Points, ...] = (at.part(mine), surface.material.part(mine))
+        self._sides: tuple[Points, ...] = (at.select(mine), surface.material.select(mine))
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run: one element a point, with the three components."""
@@ -154,7 +154,7 @@ class Seam(Joint):
         nodes, first = np.unique(edge.material.nodes[:, 0], return_index=True)
         mine = np.flatnonzero(np.arange(len(nodes)) % shell.comm.size == shell.comm.rank)
         self.numbers = edge.original[first][mine] // 2
-        held = edge.material.part(first)
+        held = edge.material.select(first)
         at = points_of(f"edge of {self.name!r}", shell, held.reference[:, 0])
         product = np.einsum("ni,ni->n", at.reference[:, 1], held.reference[:, 1])
         lengths = shell.length * other.length
@@ -165,7 +165,7 @@ class Seam(Joint):
                 f"edge: meets shell {shell.name!r} at {np.rad2deg(np.arcsin(sine.min())):.3g} "
                 f"degrees at x={x}, where 20 or more tell how directors turn; make one mesh of both"
             )
-        self._sides: tuple[Points, ...] = (at.part(mine), held.part(mine))
+        self._sides: tuple[Points, ...] = (at.select(mine), held.select(mine))
         self._scale, self._product = np.sqrt(lengths), product[mine]
         numbers = np.sort(edge.original[first] // 2).astype(np.int64)
         #: What a restart compares.

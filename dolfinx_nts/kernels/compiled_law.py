@@ -11,13 +11,13 @@ from dolfinx_nts.types import BoolArray, FloatArray
 
 
 class Law(NamedTuple):
-    """Laws of contact and friction of the pairs in a step, see `ContactLaws` and `Coulomb`.
+    """Laws of contact and friction of the pairs in a step, see `ContactLaw`.
 
     Attributes:
-        scale: As of `ContactLaws`, shape (n,).
+        scale: As of `ContactLaw`, shape (n,).
         yielding: The part of it that slave and foot move against each other, shape (n,).
         none: Contact force that counts as none [kg m], shape (n,).
-        before: As of `ContactLaws`.
+        before: As of `ContactLaw`.
         size: Unknowns of a pair.
         row: That of its gap.
         friction: Whether there is any.

@@ -1,6 +1,6 @@
 /* The element of node-to-surface contact, pair after pair.
 
-   `condensed` is contact/facet_elements.py, _condensed, with kernels/nts_element.py, element, of the
+   `condensed` is contact/facet_gap.py, _condensed, with kernels/nts_element.py, element, of the
    mean-value rule, which have the numbers of the formulas and are compared with this by
    tests/kernels/test_compiled.py. */
 

@@ -165,7 +165,11 @@ def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
         new = part.active & ~(old.force[batch.candidates.node] > 0.0)
         force = np.where(new, -part.multiplier[:, 0], 0.0)
         lost = float(force @ batch.candidates.gap) / problem.factor
-        gradient, normal = batch.gap_slopes(part)
+        # Where a gap is closed, a change of the foot or of the normal does not change it.
+        rows = part.tangent[:, batch.gap_row, : batch.num_coordinates]
+        gradient, slave = rows / batch.law.scale[:, None], batch.attachment.sides[0]
+        own = gradient[:, : 3 * slave.nodes.shape[1]].reshape(*slave.nodes.shape, 3)
+        normal = (own * slave.places[:, :, None]).sum(axis=1)
         place = batch.pair.origin + part.place
         found.append(_New(batch, gradient, rate * force, place, normal, lost))
     return found
@@ -213,7 +217,7 @@ def _response(
         lend = SHIFT * np.abs(slope).max(axis=2, initial=0.0)
         tangent[:, range(-width, 0), range(-width, 0)] = -lend
         tangents.append(tangent)
-        lent.append(lend.ravel())
+        lent.append(lend)
     matrix = StepMatrix(laid.layout, masses, laid.blocks)
     matrix.assemble(tangents)
     right, rows = np.zeros(laid.layout.num_owned), laid.of_elements("constraints")
@@ -221,7 +225,9 @@ def _response(
     saddle = Saddle(matrix.operator)
     for _ in range(_SOLVES):
         solution = saddle.solve(right)
-        right[rows] = -np.concatenate(lent) * solution[rows]
+        own = laid.own_values(solution, elements)
+        left = [-a * of["constraints"] for a, of in zip(lent, own, strict=True)]
+        right[rows] = laid.own_rows("constraints", elements, left)
     solution[laid.held] = 0.0
     change = batches.split(laid.read(solution, impulses))
     saddle.destroy()

@@ -168,7 +168,7 @@ class Pace:
             closing = (end < 0.0) & (gap > 0.0) & ~late
             part = gap[closing] / (gap[closing] - end[closing])
             apart = part * problem.dt > self.shortest
-            force = -c.scale[closing] * end[closing] / problem.factor
+            force = -c.law.scale[closing] * end[closing] / problem.factor
             lost += float((force * gap[closing])[apart].sum())
             first = min(first, float(part[apart].min(initial=1.0)))
         lost, first = comm.allreduce(lost), comm.allreduce(first, op=MPI.MIN)

@@ -89,12 +89,12 @@ def used_up(problem: StepProblem, e: Evaluation) -> str:
     both = zip(problem.couplings.touching(e), problem.couplings.bodies, strict=False)
     for (contact, part, old), of in both:
         bodies = list(of)
-        if not contact.num_tangential:  # may hold the body against sliding, as a wall does
+        if not contact.law.num_tangential:  # may hold the body against sliding, as a wall does
             local[bodies, 0] += part.active.sum()
             continue
         local[bodies, 1] += part.active.sum()
-        local[bodies, 2] += (part.active & contact.sticks(part)).sum()
-        local[bodies, 3] += contact.coulomb.coefficient * old.force.sum()
+        local[bodies, 2] += (part.active & contact.law.sticks(part)).sum()
+        local[bodies, 3] += contact.law.coefficient * old.force.sum()
         local[bodies, 4:] += old.tangential.sum(axis=0)
     local[:, 0] += [len(body.fixed) for body in system.bodies]
     for linked in system.joint_bodies:
@@ -129,7 +129,8 @@ def contact_on(problem: StepProblem, e: Evaluation, flips: Sequence[Any], body: 
         times = changes.sum(axis=0) + part.active
         i = int(times.argmax())
         how = f"flips {changes[:, i].sum()} times" if changes[:, i].any() else "carries"
-        found.append((int(times[i]), f"contact {contact.name!r} {how} at {contact.place(i)}"))
+        where = contact.attachment.place(i)
+        found.append((int(times[i]), f"contact {contact.name!r} {how} at {where}"))
     most, text = max(f for part in problem.system.comm.allgather([(0, ""), *found]) for f in part)
     if not most:
         return ""

@@ -59,7 +59,7 @@ class LentStiffness:
         """Whether nodes slip with friction, whose forces have no potential. Collective."""
         contacts = self._problem.couplings.touching(e)
         slip = any(
-            c.num_tangential and bool((part.active & ~c.sticks(part)).any())
+            c.law.num_tangential and bool((part.active & ~c.law.sticks(part)).any())
             for c, part, _ in contacts
         )
         return anywhere(self._problem.system.comm, slip)

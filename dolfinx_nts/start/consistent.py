@@ -233,21 +233,20 @@ def _solve(
         known = state.a if order else state.v
         changed = tuple(x + dx for x, dx in zip(known, total, strict=True))
         now = replace(state, a=changed) if order else replace(state, v=changed)
-        rows = [found.rows[1 + order].ravel() for _, _, found in _constraints(problem, now, dt)]
-        right[held] = -np.concatenate(rows)
+        rows = [found.rows[1 + order] for _, _, found in _constraints(problem, now, dt)]
+        right[held] = -laid.own_rows("constraints", elements, rows)
         unknown = unknown + saddle.solve(right)
         unknown[laid.held] = 0.0
         total = batches.split(laid.read(unknown, pushes))
         right[:] = 0.0
-    multipliers = unknown[held]
+    multipliers = laid.own_values(unknown, elements)
     saddle.destroy()
     matrix.destroy()
     laid.destroy()
-    pulls, first = {}, 0
-    for batch, tangent in zip(elements, tangents, strict=True):
-        n, width = batch.num_elements, batch.widths["constraints"]
-        own = multipliers[first : first + n * width].reshape(n, width)
-        first += own.size
+    pulls = {}
+    for batch, tangent, values in zip(elements, tangents, multipliers, strict=True):
+        own = values["constraints"]
+        width = own.shape[1]
         force = np.einsum("nma,nm->na", tangent[:, -width:, :-width], own)
         pulls[id(batch)] = PointPart(force, tangent)
     return total, pulls

@@ -88,7 +88,7 @@ def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:
     flight = problem.couplings.contacts.flight_gaps()
     for after, (c, part, old) in zip(flight, problem.couplings.touching(step), strict=True):
         new, node = c.history(part, problem.factor, old), c.candidates.node
-        push = problem.factor * new.force[node] / c.scale
+        push = problem.factor * new.force[node] / c.law.scale
         rests = np.zeros(len(new.force), dtype=bool)
         rests[node] = _closed(c) & (c.candidates.gap - after <= _RESTS * push)
         force = np.where(rests, new.force, 0.0)

@@ -317,7 +317,7 @@ def test_jacobian(rule, friction):
         x[here] = own.ravel()
     evaluation = problem.evaluate(problem.x)
     assert 0 < evaluation.parts[0].active.sum() < len(gap)
-    assert (problem.elements[0].before[:, 0] < 0.0).any()
+    assert (problem.elements[0].law.before[:, 0] < 0.0).any()
     stepper.solver.assemble(evaluation)
     x, step, count = problem.x.array_r.copy(), 1e-4, problem.unknowns.layout.counts.shape[1]
     expected = np.zeros((len(x), len(x)))

@@ -119,7 +119,7 @@ def at_rest(shape):
     (x,) = problem.unknowns.positions(problem.x, problem.elements)
     node = contact.candidates.node
     force, tangential = run.state.contacts[0].force[node], run.state.contacts[0].tangential[node]
-    multiplier = contact.multipliers(force, tangential) / contact.scale[:, None]
+    multiplier = contact.multipliers(force, tangential) / contact.law.scale[:, None]
     problem.destroy()
     return contact, x, multiplier
 
@@ -134,7 +134,7 @@ def evaluate(contact, x, multiplier):
 def test_rows_are_regular_at_the_edge_of_sticking(shape):
     """Nodes that have not slipped yet but are at Coulomb's bound, as at the start of a step."""
     contact, x, multiplier = at_rest(shape)
-    tangents = contact._tangents
+    tangents = contact.measure.tangents
     dual = np.linalg.solve(tangents @ tangents.transpose(0, 2, 1), tangents)
     length = np.linalg.norm(np.einsum("na,nai->ni", multiplier[:, -2:], dual), axis=1)
     edge = (1 + 1e-5) * 0.6 * -multiplier[:, 0] / length

@@ -115,10 +115,25 @@ def test_work_of_the_force_is_the_change_of_the_gap(name, integrator):
     force, dx = -part.residual[0, :3], pair.x - Pair.start(name)
     change = part.gap[0] - pair.step.candidates.gap[0]
     assert force @ (dx - dc) == pytest.approx(0.7 * MASS * change, abs=1e-15)
-    assert pair.step.external_work(part) == pytest.approx(force @ dc, abs=1e-15)
+    assert pair.step.ledger(part, 1.0)["external_work"] == pytest.approx(force @ dc, abs=1e-15)
 
 
 # ---- one mass
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", CONTACT_RULES)
+def test_moment_of_an_obstacle_that_moves_is_that_of_its_force_where_the_mass_is(integrator):
+    """A floor slides under a mass at (1, 0, 0) and lifts it; its force is along z."""
+    start = np.array([1.0, 0.0, 0.0])
+    floor = nts.Plane((0, 0, 0), (0, 0, 1), motion=lambda t: (40 * t * t, 30 * t * t, t * t))
+    body = PointMass(COMM, MASS, start, (0.0, 0.0, 0.0))
+    pair = nts.ContactPair(PointSurface(body, start), floor)
+    system = nts.System([body], contacts=[pair], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, CONTACT_RULES[integrator], dt=0.01, t_end=0.1)
+    force, moment = run.contact_forces[1:, 0], run.contact_moments[1:, 0]
+    assert (force[:, 2] > 0.0).sum() >= 5
+    assert np.abs(moment - np.cross(start, force)).max() < 1e-12 * force.max()
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("theta", [0.0, 0.1, 0.49, 0.5, 0.51, 1.0])
 @pytest.mark.parametrize("integrator", CONTACT_RULES)

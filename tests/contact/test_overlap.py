@@ -132,13 +132,13 @@ def test_nodes_and_edges_inside_are_those_of_brute_force(seed, nc):
         assert np.abs(found.depth - b.depth(found.place)).max(initial=0.0) < 1e-13
         size = found.depth / scale
         assert np.allclose(found.size, np.where(found.middle, np.maximum(size, 0.5), size))
-        node = found.part(found.is_node)
+        node = found.select(found.is_node)
         deep = b.depth(a.x)
         assert sorted(node.nodes[:, 0]) == np.flatnonzero(deep > least * scale).tolist()
         edges = a.boundary.edges[(deep[a.boundary.edges] <= least * scale).all(axis=1)]
         t = np.linspace(0, 1, 401)[:, None]
         most = np.array([b.depth((1 - t) * a.x[i] + t * a.x[j]).max() for i, j in edges])
-        told = {tuple(e): d for e, d in zip(*found.part(~found.is_node)[:3:2], strict=True)}
+        told = {tuple(e): d for e, d in zip(*found.select(~found.is_node)[:3:2], strict=True)}
         for edge, depth in zip(map(tuple, edges), most, strict=True):
             if abs(depth / (least * scale) - 1) > 0.02:
                 assert (edge in told) == (depth > least * scale)

@@ -72,7 +72,7 @@ class Spring(nts.Joint):
         self.name, self.bodies, self.stiffness, self.damping = name, (a, b), stiffness, damping
         here = slice(0 if a.comm.rank else 1)
         self._sides = tuple(
-            body.points(x).part(here) for body, x in zip((a, b), points, strict=True)
+            body.points(x).select(here) for body, x in zip((a, b), points, strict=True)
         )
         rest = float(np.linalg.norm(np.subtract(*points)))
         self.length = rest if length is None else length
@@ -387,7 +387,7 @@ class Drive(nts.Joint):
         self.name, self.bodies = name, (body,)
         self.rates = (speed, acceleration)
         side = body.points(x)
-        self.side = side if COMM.rank == 0 else side.part(slice(0))
+        self.side = side if COMM.rank == 0 else side.select(slice(0))
 
     def coupling(self, bodies):
         def make(step, history):
@@ -766,7 +766,7 @@ class Pushes(nts.Joint):
     def __init__(self, body, x, push, name="pushes", wrap=lambda batch: batch):
         self.name, self.bodies, self.push, self._wrap = name, (body,), push, wrap
         self._here = slice(None) if COMM.rank == 0 else slice(0)
-        self._sides = [body.points(both).part(self._here) for both in x]
+        self._sides = [body.points(both).select(self._here) for both in x]
 
     def coupling(self, bodies):
         def make(step, history):

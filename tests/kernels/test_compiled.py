@@ -1,8 +1,6 @@
 """The compiled kernels against their twins in NumPy, and what is told without a compiler."""
 
-import types
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 from mpi4py import MPI
 
@@ -13,9 +11,10 @@ from measures import relative
 from twins import closest, laws, obstacle, points
 
 import dolfinx_nts as nts
-from dolfinx_nts.contact.coulomb import Rub, Together
-from dolfinx_nts.contact.facet_elements import FacetElements
-from dolfinx_nts.contact.obstacle_elements import ObstacleElements
+from dolfinx_nts.contact.contact_law import ContactLaw, Rub, Together
+from dolfinx_nts.contact.facet_gap import FacetGap
+from dolfinx_nts.contact.obstacle_gap import ObstacleGap
+from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.kernels import compiled, compiled_law, facets, library
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.parallel import need_kernels
@@ -23,8 +22,8 @@ from dolfinx_nts.parallel import need_kernels
 N = 40
 
 
-def pairs(nc, friction, rule, condense=True):
-    """Elements of warped facets with slaves near them, and what they are evaluated with."""
+def pairs(nc, friction, rule):
+    """Gaps of warped facets to slaves near them, and what they are evaluated with."""
     rng = np.random.default_rng(nc)
     control = FLAT[nc] + 0.1 * rng.normal(size=(N, nc, 3))
     xi = CENTRE[nc] + 0.1 * rng.normal(size=(N, 2))
@@ -32,23 +31,18 @@ def pairs(nc, friction, rule, condense=True):
     slave = foot + 0.05 * rng.normal(size=(N, 1)) * normal
     x0 = np.concatenate([slave[:, None], control], axis=1)
     x1 = x0 + 0.1 * rng.normal(size=x0.shape)
-    candidates = types.SimpleNamespace(
-        node=np.arange(N), normal=normal, xi=xi, length=facets.size(control)
-    )
-    master = types.SimpleNamespace(patches=np.zeros((1, nc)))
-    elements = FacetElements(
-        pair=types.SimpleNamespace(friction=friction, master=master), candidates=candidates,
-        contact_gradient=rule, condense=condense, x0=x0, scale=np.ones(N), theta=0.5,
-        master_scale=np.ones(1),
+    measure = FacetGap(
+        start=x0, xi=xi, normal=normal, length=facets.size(control), rule=rule, theta=0.5,
+        condense=True,
     )  # fmt: skip
-    return elements, x1, rng.normal(size=(N, elements.num_constraints))
+    return measure, x1, rng.normal(size=(N, 3 if friction else 1))
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("nc", KINDS)
 def test_elements_are_those_of_numpy(nc, friction):
-    elements, x, multiplier = pairs(nc, friction, "mean-value")
-    here, there = elements._compiled(x, multiplier), elements._condensed(x, multiplier)
+    measure, x, multiplier = pairs(nc, friction, "mean-value")
+    here, there = measure._compiled(x, multiplier), measure._condensed(x, multiplier)
     for found, expected in zip(here[:3], there[:3], strict=True):
         assert relative(found, expected) < 1e-13
     assert (here[3] is None) == (there[3] is None) == (not friction)
@@ -68,33 +62,33 @@ LAWS = {
 
 
 def batches(law, *, shared, prescribed, massless):
-    """Elements of quadrilaterals in all states: off, stick and slip, with and without force."""
+    """Gaps to quadrilaterals in all states: off, stick and slip, with and without force."""
     friction, options = LAWS[law]
     rng = np.random.default_rng(8)
-    elements, x, multiplier = pairs(4, friction, "mean-value")
-    fixed, its = rng.uniform(size=(2, N, 3)) < (0.5 if prescribed else 0.0)
-    slave = types.SimpleNamespace(fixed=fixed, share=np.arange(N))
-    master = types.SimpleNamespace(
-        patches=np.tile(np.arange(4), (N, 1)), weights=None, fixed=np.tile(its[:4], (1, 1))
-    )
-    pair = types.SimpleNamespace(
-        friction=friction, slave=slave, master=master, redundant=shared, yields=not shared
-    )
-    candidates = types.SimpleNamespace(**vars(elements.candidates), patch=np.arange(N))
-    before = None
+    measure, x, multiplier = pairs(4, friction, "mean-value")
+    slips, before = None, None
+    if friction:
+        free = rng.uniform(size=(N, 3)) * (rng.uniform(size=(N, 3)) > (0.3 if prescribed else 0.0))
+        slips = PrescribedSlip(
+            start=measure.start, foot=measure.foot, normal=measure.normal,
+            tangents=measure.tangents, free=free,
+        )  # fmt: skip
     if massless:
         before = rng.normal(size=(N, 3))
         before[::5, 1:] *= 0.01
         before[::2] = np.nan
     # Prescribed slips that vanish, small and large forces, none, and gaps of rounding.
-    x[::5] = elements.x0[::5]
+    x[::5] = measure.start[::5]
     multiplier *= 10.0 ** rng.integers(-3, 1, (N, 1))
     multiplier[::7, 0] = 0.0
     multiplier[::5, 1:] *= 0.01
-    return replace(
-        elements, pair=pair, candidates=candidates, scale=rng.uniform(0.5, 2.0, N), before=before,
-        master_scale=rng.uniform(1.0, 2.0, (N, 4)), rounding=1e-9, force_rounding=1e-9, **options
-    ), x, multiplier  # fmt: skip
+    scale = rng.uniform(0.5, 2.0, N)
+    obeyed = ContactLaw(
+        friction=friction, yields=not shared, redundant=shared, row=15, num_normal=1, scale=scale,
+        yielding=scale * rng.uniform(0.3, 1.0, N), size=measure.length, prescribed=slips,
+        rounding=1e-9, force_rounding=1e-9, before=before, **options,
+    )  # fmt: skip
+    return measure, obeyed, x, multiplier
 
 
 @pytest.mark.parametrize("massless", [False, True])
@@ -102,18 +96,20 @@ def batches(law, *, shared, prescribed, massless):
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("law", LAWS)
 def test_laws_are_those_of_numpy(law, shared, prescribed, massless):
-    elements, x, multiplier = batches(
+    measure, obeyed, x, multiplier = batches(
         law, shared=shared, prescribed=prescribed, massless=massless
     )
     together = Together(0.7, 1e-7, 2e-7) if shared else Together(0.0, 0.0, 0.0)
 
-    residual, tangent, gap, slip = elements._element(x, None, multiplier)
-    gap[::3] = residual[::3, -elements.num_constraints] = 0.0
+    measured = measure.evaluate(x, None, multiplier)
+    measured.gap[::3] = measured.residual[::3, obeyed.row] = 0.0
 
-    def arrays():
-        return residual.copy(), tangent.copy(), gap, slip, multiplier, together
+    def arguments():
+        residual, tangent = measured.residual.copy(), measured.tangent.copy()
+        found = measured._replace(residual=residual, tangent=tangent)
+        return x, found, multiplier, together
 
-    here, there = elements._laws(x, *arrays()), laws.laws(elements, x, *arrays())
+    here, there = obeyed.obey(*arguments()), laws.laws(obeyed, *arguments())
     for name, expected in there._asdict().items():
         found = getattr(here, name)
         if expected.dtype == bool:
@@ -124,9 +120,9 @@ def test_laws_are_those_of_numpy(law, shared, prescribed, massless):
             assert (error <= 1e-13 * size).all()
     assert here.active.any() and not here.active.all()
     assert np.isfinite(here.residual).all() and np.isfinite(here.tangent).all()
-    if elements.num_tangential and law != "rubs hardly":
+    if obeyed.num_tangential and law != "rubs hardly":
         assert (here.active & here.stick).any()
-        assert (here.active & ~here.stick).any() or np.isinf(elements.pair.friction)
+        assert (here.active & ~here.stick).any() or np.isinf(obeyed.friction)
 
 
 @pytest.mark.parametrize("rule", ["mean-value", "direct"])
@@ -141,16 +137,12 @@ def test_obstacles_are_those_of_numpy(shape, friction, rule):
     }[shape]
     x0 = rng.normal(size=(N, 1, 3))
     x = x0 + 0.1 * rng.normal(size=x0.shape)
-    candidates = types.SimpleNamespace(
-        node=np.arange(N), normal=master.gap(x0[:, 0]).gradient[:, 0]
-    )
-    elements = ObstacleElements(
-        pair=types.SimpleNamespace(friction=friction), candidates=candidates,
-        contact_gradient=rule, condense=False, x0=x0, scale=np.ones(N), theta=0.5,
-        obstacle=master, displacement=np.zeros((2, 3)),
+    measure = ObstacleGap(
+        obstacle=master, start=x0, normal=master.gap(x0[:, 0]).gradient[:, 0], length=np.ones(N),
+        rule=rule, theta=0.5,
     )  # fmt: skip
-    multiplier = rng.normal(size=(N, elements.num_constraints))
-    here, there = elements._element(x, None, multiplier), obstacle.element(elements, x, multiplier)
+    multiplier = rng.normal(size=(N, 3 if friction else 1))
+    here, there = measure.evaluate(x, None, multiplier), obstacle.element(measure, x, multiplier)
     assert (here[3] is None) == (there[3] is None) == (not friction)
     pairs = zip([*here[:3], *(here[3] or ())], [*there[:3], *(there[3] or ())], strict=True)
     for found, expected in pairs:
@@ -158,17 +150,15 @@ def test_obstacles_are_those_of_numpy(shape, friction, rule):
 
 
 def test_an_obstacle_of_the_users_own_may_have_numbers_of_any_kind():
-    elements = ObstacleElements(
-        pair=types.SimpleNamespace(friction=0.3),
-        candidates=types.SimpleNamespace(node=np.arange(3), normal=np.tile([0.0, 0, 1], (3, 1))),
-        contact_gradient="direct", condense=False, x0=np.ones((3, 1, 3)), scale=np.ones(3),
-        theta=0.5, obstacle=Table(), displacement=np.zeros((2, 3)),
+    measure = ObstacleGap(
+        obstacle=Table(), start=np.ones((3, 1, 3)), normal=np.tile([0.0, 0, 1], (3, 1)),
+        length=np.ones(3), rule="direct", theta=0.5,
     )  # fmt: skip
-    x, multiplier = 1.1 * elements.x0, np.arange(9.0).reshape(3, 3)
-    here, there = elements._element(x, None, multiplier), obstacle.element(elements, x, multiplier)
+    x, multiplier = 1.1 * measure.start, np.arange(9.0).reshape(3, 3)
+    here, there = measure.evaluate(x, None, multiplier), obstacle.element(measure, x, multiplier)
     for found, expected in zip([*here[:3], *here[3]], [*there[:3], *there[3]], strict=True):
         assert np.abs(found - expected).max() < 1e-14
-    assert elements._normal(x).dtype == np.float64
+    assert here.normal.dtype == np.float64
 
 
 class Table(nts.Obstacle):
@@ -271,9 +261,9 @@ def test_closest_points_of_facets_without_area_are_those_of_numpy():
 
 
 def test_where_there_is_no_foot_nothing_is_solved():
-    elements, x, multiplier = pairs(4, 0.0, "mean-value")
+    measure, x, multiplier = pairs(4, 0.0, "mean-value")
     x[0, 1:] = x[0, 1]
-    residual = elements._compiled(x, multiplier)[0]
+    residual = measure.evaluate(x, None, multiplier).residual
     assert np.isnan(residual[0]).any() and np.isfinite(residual[1:]).all()
 
 

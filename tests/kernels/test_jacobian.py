@@ -90,7 +90,7 @@ class Linearised:
             "mixed": rng.uniform(size=len(gap)) < 0.5,
         }[active]
         margin = np.where(on, -1, 1) * rng.uniform(0.2, 0.4, len(gap))
-        force = 0.05 * rng.uniform(-1, 1, (len(gap), contact.num_constraints))
+        force = 0.05 * rng.uniform(-1, 1, (len(gap), contact.law.num_constraints))
         force[:, 0] = margin - gap
         with problem.x as x:
             x[layout.owned(fields[-1])] = force.ravel()

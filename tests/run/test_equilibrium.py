@@ -839,7 +839,7 @@ class Ratchet(nts.Joint):
     def __init__(self, body):
         side = body.points((0.5, 0.5, 1.0))
         self.bodies = (body,)
-        self.side = side if COMM.rank == 0 else side.part(slice(0))
+        self.side = side if COMM.rank == 0 else side.select(slice(0))
 
     def coupling(self, bodies):
         def make(step, history):

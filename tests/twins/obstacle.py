@@ -2,37 +2,38 @@
 
 import numpy as np
 
-from dolfinx_nts.contact.coulomb import Slip
+from dolfinx_nts.contact.contact_measure import Measured, Slip
 from dolfinx_nts.contact.obstacles import inverse
 
 
-def element(elements, x, multiplier):
-    """Residual and tangent of (x, lambda_N, lambda_T), gap and slip, as `_element` has them."""
-    master, end, middle = elements.obstacle, elements.obstacle.gap(x[:, 0]), elements._middle(x)
-    gradient, slope = middle.gradient[:, 0], elements.theta * middle.hessian
-    if not elements.direct:
-        gradient, slope = master.discrete_gradient(elements.x0[:, 0], x[:, 0])
+def element(measure, x, multiplier):
+    """Residual and tangent of (x, lambda_N, lambda_T), gap and slip, as `ObstacleGap.evaluate`."""
+    master, x0 = measure.obstacle, measure.start
+    end, middle = master.gap(x[:, 0]), master.gap((x0 + measure.theta * (x - x0))[:, 0])
+    gradient, slope = middle.gradient[:, 0], measure.theta * middle.hessian
+    if measure.rule != "direct":
+        gradient, slope = master.discrete_gradient(x0[:, 0], x[:, 0])
     normal = multiplier[:, :1]
-    residual = np.zeros((len(x), 3 + elements.num_constraints))
+    residual = np.zeros((len(x), 3 + multiplier.shape[1]))
     tangent = np.zeros((*residual.shape, residual.shape[1]))
     residual[:, :3], residual[:, 3] = normal * gradient, end.value
     tangent[:, :3, :3] = normal[:, :, None] * slope
     tangent[:, :3, 3], tangent[:, 3, :3] = gradient, end.gradient[:, 0]
-    slip = None
-    if elements.num_tangential:
-        slip = add_friction(elements, residual, tangent, middle, x, multiplier)
-    return residual, tangent, end.value, slip
+    if multiplier.shape[1] == 1:
+        return Measured(residual, tangent, end.value)
+    slip = add_friction(measure, residual, tangent, middle, x, multiplier)
+    return Measured(residual, tangent, end.value, slip, middle.gradient[:, 0])
 
 
-def add_friction(elements, residual, tangent, middle, x, multiplier):
+def add_friction(measure, residual, tangent, middle, x, multiplier):
     """Add lambda_T t^a to the rows of x; returns the slip Df^a = t^a . (x_1 - x_0).
 
-    t_a are the directions e_a of `_tangents` less their part along the normal n where the force
+    t_a are the directions e_a of `tangents` less their part along the normal n where the force
     acts. Dual to them are t^a = e_a - n_0 (n . e_a) / (n . n_0), which lie along the surface,
     too, and t^a . t_b = t^a . e_b = 1 or 0, because n_0 . e_b = 0.
     """
-    motion, e, theta = (x - elements.x0)[:, 0], elements._tangents, elements.theta
-    normal, n0, t = middle.gradient[:, 0], elements.candidates.normal, multiplier[:, -2:]
+    motion, e, theta = (x - measure.start)[:, 0], measure.tangents, measure.theta
+    normal, n0, t = middle.gradient[:, 0], measure.normal, multiplier[:, -2:]
     part, turn = np.einsum("nai,ni->na", e, normal), theta * np.matmul(e, middle.hessian)
     per_height = inverse(np.einsum("ni,ni->n", normal, n0))[:, None]
     tilt = part * per_height

@@ -208,7 +208,7 @@ class RigidBody(Body):
         self._loads.begin(0.0, 1.0, inertia.axes)
         self._set_up_nodes(linear, turning)
         self.prescribed(0.0)
-        held = self.points(self.centre).part(slice(0, int(comm.rank == self.owner)))
+        held = self.points(self.centre).select(slice(0, int(comm.rank == self.owner)))
         self._directors_held = Directors(self, held, self.length, np.arange(len(held)))
         self.joints = () if self._drive.turns else (self._directors_held,)
         self._matrix: Any = None

@@ -1,0 +1,93 @@
+"""Gap of points to a rigid obstacle, and their slip along it: the element without a facet.
+
+The points are relative to the obstacle's motion c(t), so that a moving obstacle is one at rest
+here; only the balance learns of its work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
+from dolfinx_nts.contact.obstacles import Obstacle, inverse
+from dolfinx_nts.kernels import compiled_law
+from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.types import FloatArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ObstacleGap(Batch):
+    """See `ContactMeasure`.
+
+    lambda_N, and with friction lambda_T, are all its unknowns for any integrator: the discrete
+    gradient is in closed form.
+
+    Attributes:
+        obstacle: The obstacle relative to the origin of the points.
+        start: Slave at t_n relative to the obstacle's motion [m], shape (n, 1, 3).
+        normal: Of the obstacle there, shape (n, 3).
+        length: Size of what is about the slave [m], shape (n,).
+        rule: `Integrator.contact_gradient`.
+        theta: Where between t_n and t_{n+1} the direct rule takes the contact force.
+    """
+
+    obstacle: Obstacle
+    start: FloatArray
+    normal: FloatArray
+    length: FloatArray
+    rule: str
+    theta: float
+    num_augmented = 0
+    num_normal = 1
+
+    @property
+    def extent(self) -> float:
+        """Size of the obstacle [m]."""
+        extent: float = self.obstacle.extent
+        return extent
+
+    @property
+    def foot(self) -> FloatArray:
+        """No weights."""
+        return np.empty((len(self.start), 0))
+
+    @cached_property
+    def tangents(self) -> FloatArray:
+        """Orthonormal directions along the surface at t_n, shape (n, 2, 3)."""
+        first = cross(self.normal, np.eye(3)[np.abs(self.normal).argmin(axis=1)])
+        first *= inverse(np.linalg.norm(first, axis=1))[:, None]
+        return np.stack([first, cross(self.normal, first)], axis=1)
+
+    def gap(self, x: FloatArray) -> FloatArray:
+        """Gap [m] of slaves at t_{n+1}, shape (n, 1, 3)."""
+        value: FloatArray = self.obstacle.gap(x[:, 0]).value
+        return value
+
+    def augmented(self, x: FloatArray) -> FloatArray:
+        """None."""
+        return np.empty((len(x), 0))
+
+    def evaluate(self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray) -> Measured:
+        """Residual and tangent of (x, lambda_N, lambda_T) in [kg m] and [m], gap and slip."""
+        master, end, direct = self.obstacle, self.obstacle.gap(x[:, 0]), self.rule == "direct"
+        # Without friction nothing but the direct rule asks for the middle.
+        middle = end
+        if direct or multiplier.shape[1] > 1:
+            middle = master.gap((self.start + self.theta * (x - self.start))[:, 0])
+        if direct:
+            rule = middle.gradient[:, 0], self.theta * middle.hessian
+        else:
+            rule = master.discrete_gradient(self.start[:, 0], x[:, 0])
+        residual, tangent, *slip = compiled_law.obstacle(
+            self.theta, rule, (end.value, end.gradient[:, 0]),
+            (middle.gradient[:, 0], middle.hessian),
+            self.normal, self.tangents, (x - self.start)[:, 0], multiplier,
+        )  # fmt: skip
+        gap = residual[:, 3].copy()
+        if not slip:
+            return Measured(residual, tangent, gap)
+        normal = np.asarray(middle.gradient[:, 0], dtype=np.float64)
+        return Measured(residual, tangent, gap, Slip(*slip), np.broadcast_to(normal, (len(x), 3)))
