@@ -119,7 +119,7 @@ def bars(elements, mass, closing):
 
 @pytest.mark.parametrize("elements", [(50, 50), (50, 75)])
 def test_bars(elements):
-    """Theory section 16: wherever in a step the gap closes; of the linear bars, as solid ones are."""
+    """Theory section 16: wherever in a step the gap closes; of linear bars, as solid ones are."""
     lost, rms = {}, {}
     for mass in ("consistent", "redistributed"):
         runs = [linear_bars(elements, mass, closing) for closing in (0.0, 0.25, 0.5, 0.75)]

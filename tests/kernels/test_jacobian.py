@@ -25,8 +25,8 @@ RULES = MID_STEP | GRADIENTS | {"condensed": MID_STEP["energy-momentum"]}
 #: The static rule, with a stabilization, shares the equations but not the steps.
 EQUATIONS = RULES | {"static": Static()}
 FRICTION = {"none": 0.0, "slip": 0.02, "mixed": 0.4, "stick": np.inf}
-#: Cell, friction and active set of the scenes whose whole Jacobian is tested; of smooth patches,
-#: which take longest, directions are.
+#: Cell, friction and active set of the scenes whose whole Jacobian is tested; of all others and by
+#: other rules, directions are.
 SCENES = [
     ("hex", "none", "mixed"), ("hex", "slip", "all"), ("hex", "stick", "all"),
     ("tet", "mixed", "mixed"),
@@ -114,7 +114,7 @@ class Linearised:
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize(("cell", "friction", "active"), SCENES)
-@pytest.mark.parametrize("rule", EQUATIONS)
+@pytest.mark.parametrize("rule", ["energy-momentum", "condensed"])
 @pytest.mark.fast("energy-momentum-hex-none-mixed", "condensed-hex-stick-all")
 def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active):
     system = two_blocks(cell, friction=FRICTION[friction])
