@@ -163,8 +163,9 @@ BOWLS = {
 }
 
 
-@pytest.mark.parametrize("integrator", ["energy-momentum", "gonzalez contact"])
-@pytest.mark.parametrize("bowl", BOWLS)
+@pytest.mark.parametrize(
+    ("bowl", "integrator"), [("sphere", "energy-momentum"), ("cylinder", "gonzalez contact")]
+)
 @pytest.mark.slow
 def test_sliding_in_a_bowl_keeps_the_energy(bowl, integrator):
     """Round and round without friction, from contact: nothing is lost over many steps."""

@@ -406,12 +406,11 @@ def alone(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ranks", [2, 3, 4])
-def test_impacts_on_more_ranks(ranks, on_ranks, alone, tmp_path):
+def test_impacts_on_four_ranks(on_ranks, alone, tmp_path):
     """Places and velocities to 1e-9 of those of one rank."""
     here = [str(p) for p in Path(__file__).parents[:2]]
     code = f"import sys; sys.path[:0] = {here!r}; import test_thin_contact as t; "
-    on_ranks(ranks, "-c", f"{code}t.save_impacts({str(tmp_path)!r})")
+    on_ranks(4, "-c", f"{code}t.save_impacts({str(tmp_path)!r})")
     for k, case in enumerate(CASES):
         one, several = (nts.load(folder / f"{k}.h5") for folder in (alone, tmp_path))
         for of in ("u", "v"):

@@ -433,15 +433,12 @@ def force_columns(stepper):
     return np.concatenate(columns, axis=1), np.concatenate(multipliers)
 
 
-@pytest.mark.parametrize(
-    ("thick", "masses"), [(0.0, (1, 1, 1, 1, 1)), (0.1, (1, 10, 100, 10, 1))]
-)
 @pytest.mark.slow
-def test_a_bricard_mechanism(thick, masses):
+def test_a_bricard_mechanism():
     """One equation repeats others in another way at each time: order 2, and its closure."""
     ways = []
     for dt in (1e-2, 5e-3, 2.5e-3):
-        system, bars = bricard(masses, thick=thick)
+        system, bars = bricard((1, 10, 100, 10, 1), thick=0.1)
         start = [bar.rotation.copy() for bar in bars]
         stepper = nts.Stepper(system, nts.EnergyMomentum())
         for _ in range(round(0.5 / dt)):

@@ -24,7 +24,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType
-from integrators import INTEGRATORS, MID_STEP
+from integrators import INTEGRATORS
 from scenes import box
 
 import dolfinx_nts as nts
@@ -252,8 +252,7 @@ def test_on_other_ranks(scene, integrator, mpi_tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rule", MID_STEP)
-def test_from_two_ranks_to_three(rule, on_ranks, tmp_path):
+def test_from_two_ranks_to_three(on_ranks, tmp_path):
     """The last third of a run of two ranks, made again by three, and matched by places."""
     names = ("blocks", "mechanism", "floor", "sleepers", "paced")
     code = f"""
@@ -265,9 +264,9 @@ def test_from_two_ranks_to_three(rule, on_ranks, tmp_path):
         for name in {names}:
             scene, file = t.SCENES[name](t.COMM), folder / f"{{name}}.h5"
             if first:
-                found = t.run(scene, {rule!r}, checkpoint=t.nts.Checkpoint(file, every=t.EVERY))
+                found = t.run(scene, checkpoint=t.nts.Checkpoint(file, every=t.EVERY))
             else:
-                found = t.run(scene, {rule!r}, start=t.nts.restart(t.previous(file), scene[0]))
+                found = t.run(scene, start=t.nts.restart(t.previous(file), scene[0]))
             found.save(folder / f"{{name}} {{t.COMM.size}}.h5")
     """
     for ranks in (2, 3):
