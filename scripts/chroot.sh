@@ -1,6 +1,7 @@
 #!/bin/bash
 # chroot.sh SUITE [COMMAND] | --remove: run the fast tests (or COMMAND) on a copy of this repository in a
-# minimal Debian SUITE (trixie). The root is made once and kept in
+# minimal Debian SUITE (trixie); on 2 ranks one case of each, as they look at its libraries. The root is
+# made once and kept in
 #   ${DOLFINX_NTS_ROOTS:-${XDG_CACHE_HOME:-$HOME/.cache}/dolfinx_nts}
 # and the mirror is the one this machine's apt uses (or DEBIAN_MIRROR). Every mount is made in a
 # private mount namespace, and the copy lives in memory there: nothing is left behind, however it
@@ -103,7 +104,7 @@ tar -C "$repo" -c --exclude=./.git --exclude="./.venv*" --exclude=./out --exclud
   --exclude=__pycache__ --exclude=".*_cache" . | tar -C "$work" -x --no-same-owner
 cache=/root/.cache
 [ -z "${CI:-}" ] || cache=/$work/.jit
-env -i CI="${CI:-}" PYTEST_ARGS="${PYTEST_ARGS:-}" MPI_TIMEOUT="${MPI_TIMEOUT:-}" NO_LINT=1 \
+env -i CI="${CI:-}" PYTEST_ARGS="--cases-on-ranks=1 ${PYTEST_ARGS:-}" MPI_TIMEOUT="${MPI_TIMEOUT:-}" NO_LINT=1 \
   HOME=/root LANG=C.UTF-8 TERM=dumb PATH=/usr/sbin:/usr/bin:/sbin:/bin XDG_CACHE_HOME="$cache" \
   chroot . /bin/bash -c "cd /$work && scripts/setup.sh && $command"
 '

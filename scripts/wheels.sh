@@ -1,5 +1,6 @@
 #!/bin/bash
-# The fast tests on DOLFINx of PyPI, in a virtual environment .venv-wheels with the extras of pyproject.toml.
+# The fast tests on DOLFINx of PyPI, in a virtual environment .venv-wheels with the extras of pyproject.toml;
+# on 2 ranks one case of each, as they look at its libraries.
 # Needs no root: a C compiler, and a Python of 3.12 to 3.14 with its headers. PYTHON_WHEELS chooses it;
 # without, it is one on PATH or of pyenv.
 set -euo pipefail
@@ -42,4 +43,5 @@ if ! [ -f "$venv/.made-for" ] || [ "$(cat "$venv/.made-for")" != "$wanted" ]; th
     --editable "$REPO[wheels,gmsh,tests]"
   printf '%s' "$wanted" >"$venv/.made-for"
 fi
+export PYTEST_ARGS="--cases-on-ranks=1 ${PYTEST_ARGS:-}"
 NO_LINT=1 exec "$REPO/scripts/test.sh"

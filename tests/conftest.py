@@ -37,10 +37,15 @@ if threading.current_thread() is not threading.main_thread():
     # A busy machine may make a process of xdist run its tests beside its main thread. Gmsh 4.8,
     # which sets a handler of signals, cannot be imported there.
     signal.signal = lambda number, _handler: signal.getsignal(number)
-#: On several ranks so many cases of a fast test and of a slow one run at most, spread over its
+#: On several ranks so many cases of a fast test run at most, and one of a slow one, spread over its
 #: parameters, and others in the next week. All of them run in serial, and what ranks do seldom
 #: depends on the case.
-CASES_ON_RANKS = 3, 1
+CASES_ON_RANKS = 3
+#: Files whose slow tests take longer than others of their size.
+LONG = {
+    "test_stability", "test_docs", "test_demo_output", "test_unwritten", "test_massless",
+    "test_demo_blocks", "test_demo_stability", "test_conformance", "test_impacts", "test_tradeoff",
+}  # fmt: skip
 WEEK = datetime.date.today().isocalendar().week
 FAILURES = pytest.StashKey[list[str]]()
 NOT_COLLECTED: list[str] = []
@@ -78,6 +83,7 @@ def pytest_addoption(parser):
     group = parser.getgroup("noise", "rounding as on another machine, see tests/noise.py")
     group.addoption("--noise", choices=noise.KINDS, help="what is noisy")
     group.addoption("--noise-seed", type=int, default=0, help="another seed, another machine")
+    parser.addoption("--cases-on-ranks", type=int, default=CASES_ON_RANKS, help="of a fast test")
 
 
 def pytest_report_header(config):
@@ -91,9 +97,7 @@ def pytest_report_header(config):
 def pytest_configure(config):
     if config.option.noise:
         noise.install(config.option.noise, config.option.noise_seed)
-    # Most forms of the tests are compiled once for a few small meshes: the compiler takes longer
-    # than all that they compute. Runs in processes of their own have the flags of users.
-    dolfinx_compat.C_FLAGS[0] = "-O1"
+    config.option.loadscopereorder = False  # xdist's own order, by the number of a file's tests
     if COMM.rank > 0:
         config.get_terminal_writer()._file = io.StringIO()
         # A place for tmp_path of its own: pytest's cleaning up of old ones knows nothing of ranks.
@@ -124,10 +128,10 @@ def pytest_runtest_makereport(item, call):
 def pytest_collection_modifyitems(config, items):
     """Before -m selects: mark what is not fast, and tests that start ranks of their own."""
     if "PYTEST_XDIST_WORKER" in os.environ:
-        # A process takes a file at a time: demos, whose runs are long, and large files first,
-        # because a long one as the last would leave the others idle.
+        # A process takes a file at a time: long and large ones first, because a long one as the
+        # last would leave the others idle.
         size = {path: path.stat().st_size for path in {item.path for item in items}}
-        items.sort(key=lambda i: ("demo" in i.path.name, size[i.path], i.path.name), reverse=True)
+        items.sort(key=lambda i: (i.path.stem in LONG, size[i.path], i.path.name), reverse=True)
     unknown: dict[str, set[str]] = {}
     for item in items:
         if "on_ranks" in item.fixturenames:
@@ -152,14 +156,14 @@ def pytest_collection_modifyitems(config, items):
 
 
 def _drop_cases(config, items) -> None:
-    """Leave out cases of a test beyond `CASES_ON_RANKS`, of fast and slow ones each."""
+    """Leave out cases of a test beyond `--cases-on-ranks` of the fast ones and one of the slow."""
     cases: dict[tuple[str, bool], list] = {}
     for item in items:
         slow = item.get_closest_marker("slow") is not None
         cases.setdefault((item.nodeid.split("[")[0], slow), []).append(item)
     dropped = set()
     for (_, slow), of_test in cases.items():
-        apart = -(-len(of_test) // CASES_ON_RANKS[slow])
+        apart = -(-len(of_test) // (1 if slow else config.option.cases_on_ranks))
         kept = of_test[WEEK % apart :: apart]
         dropped.update(item for item in of_test if item not in kept)
     items[:] = [item for item in items if item not in dropped]

@@ -117,23 +117,16 @@ def bars(elements, mass, closing):
     return 1 - table["energy"][-1] / table["energy"][0], rms, flips, table
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("elements", [(50, 50), (50, 75)])
 def test_bars(elements):
-    """Theory section 16: wherever in a step the gap closes."""
-    lost = {}
+    """Theory section 16: wherever in a step the gap closes; of linear bars, as solid ones are."""
+    lost, rms = {}, {}
     for mass in ("consistent", "redistributed"):
-        runs = [bars(elements, mass, closing) for closing in (0.0, 0.25, 0.5, 0.75)]
-        lost[mass] = np.mean([run[0] for run in runs])
-        if mass == "redistributed":
-            # Waves of equal meshes come back to the surface in step, and the front rings on.
-            least = (0.07 if elements[0] == elements[1] else 0.03) * 150
-            assert all(run[1] < least and run[2] == 2 for run in runs)
-            for run in runs:
-                assert drift(run[3], "linear_momentum") < 1e-12
-                assert np.abs(run[3]["ledger_residual"]).max() < 1e-12 * run[3]["energy"][0]
-        else:
-            assert max(run[1] for run in runs) > 0.2 * 150
+        runs = [linear_bars(elements, mass, closing) for closing in (0.0, 0.25, 0.5, 0.75)]
+        lost[mass], rms[mass] = np.mean([run[0] for run in runs]), max(run[1] for run in runs)
+    # Waves of equal meshes come back to the surface in step, and the front rings on.
+    assert rms["redistributed"] < (0.07 if elements[0] == elements[1] else 0.03) * 150
+    assert rms["consistent"] > 0.2 * 150
     assert lost["redistributed"] < min(2.1e-3, 0.6 * lost["consistent"])
 
 
@@ -143,10 +136,12 @@ def test_bars(elements):
 @pytest.mark.parametrize("mass", ["consistent", "redistributed"])
 def test_solid_bars_are_the_linear_ones(elements, mass):
     """What they lose and how their force deviates is the method's, not the solid's."""
-    lost, rms, flips, _ = bars(elements, mass, 0.25)
+    lost, rms, flips, table = bars(elements, mass, 0.25)
     wanted, deviation = linear_bars(elements, mass, 0.25)
     assert lost == pytest.approx(wanted, abs=2e-5)
     assert rms == pytest.approx(deviation, rel=2e-3) and flips == 2
+    assert drift(table, "linear_momentum") < 1e-12
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][0]
 
 
 def test_equal_bars_ring_in_a_mode_of_their_joint():

@@ -111,6 +111,7 @@ def test_a_strip_of_too_few_beams_is_told():
     assert "more load steps" not in run.status
 
 
+@pytest.mark.slow
 def test_a_strip_of_too_few_shells_is_told():
     """An element bears EI / length at most, if it does not stretch."""
     moment = 2 * np.pi * 1.2e6 * 0.1**3 / 12 / 12.0

@@ -37,8 +37,7 @@ def bounce(body, integrator, t_end=0.012, output=()):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", RULES.values(), ids=RULES)
-@pytest.mark.fast("energy-momentum", "newmark")
-@pytest.mark.fast_on_ranks("energy-momentum")
+@pytest.mark.fast("energy-momentum")
 def test_a_continuum_of_ones_own_forms(integrator):
     mesh = box()
     space = compat.vector_space(mesh, 1)
@@ -163,6 +162,7 @@ def test_energy_is_kept_as_far_as_the_points_are_exact():
     assert drift(one, "angular_momentum") < 1e-11
 
 
+@pytest.mark.slow
 def test_tangent():
     body = membrane(power=4)
     # The points of the test before, whose forms are compiled.

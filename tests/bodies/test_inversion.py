@@ -191,8 +191,7 @@ SCENES = {
 @pytest.mark.mpi
 @pytest.mark.parametrize("accuracy", ["exact", "balanced"])
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.fast_on_ranks("squeeze-balanced")
-@pytest.mark.fast("squeeze-balanced", "1e6 g-balanced")
+@pytest.mark.fast("1e6 g-balanced")
 def test_no_step_ends_inside_out(name, accuracy, evaluations):
     """The run stops with a sentence, soon, and what it has accepted is not inside out."""
     system, integrator, dt, t_end = SCENES[name]()

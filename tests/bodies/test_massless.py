@@ -183,7 +183,7 @@ def test_what_makes_no_sense_is_refused():
         nts.Stepper(nts.System([body, other], contacts=[pair]), nts.Midpoint())
 
 
-def impact(integrator, *, mass="redistributed", dt=2e-3, t_end=0.2, **options):
+def impact(integrator, *, mass="redistributed", dt=2e-3, t_end=0.12, **options):
     """Two blocks, and how often slave nodes went on or off, and how rough their force is.
 
     Returns:
@@ -227,25 +227,25 @@ def test_without_such_nodes_there_is_no_massless_defect():
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.slow
-def test_small_blocks_lose_little(friction):
+def test_small_blocks_lose_little():
     """On any number of ranks; with consistent mass contact takes 5 %, at any step."""
     integrator, cells = nts.EnergyMomentum(), (4, 2)
-    table, changes, _ = impact(integrator, cells=cells, friction=friction, dt=4e-3, t_end=0.12)
+    table, changes, _ = impact(integrator, cells=cells, friction=0.3, dt=4e-3)
     check_kept(table, integrator)
     first, last = table["energy"][0], table["energy"][-1]
     # 25 nodes come and leave once, but for a few.
     assert 50 <= changes < 60 and table["active"].max() == 25 and table["active"][-1] == 0
     taken = table["friction_dissipation"][-1]
-    assert 0.99 * first < last + taken and (taken > 1e-3 * first) == (friction > 0)
+    assert 0.99 * first < last + taken and taken > 1e-3 * first
     lost = table["contact_defect"] + table["massless_defect"] + table["friction_dissipation"]
     assert np.abs(first - table["energy"] - lost).max() < 1e-12 * first
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
+@pytest.mark.parametrize(
+    ("integrator", "friction"), [(nts.EnergyMomentum(), 0.0), (nts.Midpoint(), 0.3)], ids=MID_STEP
+)
 def test_blocks(integrator, friction):
     """Benchmark B1: 5.1 % lost with consistent mass, in contact forces that alternate."""
     table, changes, rough = impact(integrator, friction=friction)
@@ -268,7 +268,7 @@ def test_massless_nodes_do_not_alternate():
     for dt in (4e-3, 2e-3):
         stepper = nts.Stepper(two_blocks.scene(COMM, mass="redistributed"), nts.EnergyMomentum())
         body, found = stepper.system.bodies[0], []
-        for _ in range(round(0.8 / dt)):
+        for _ in range(round(0.5 / dt)):
             u = stepper.advance(dt).u[0]
             body.begin_step(stepper.problem.integrator, nts.EvaluationPoint(u, 0.0))
             force = np.abs(body.internal(u))

@@ -151,16 +151,12 @@ def moved(body):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(
-    ("n", "up", "back"), [(16, 6.70470, -3.29297), (32, 6.70129, -3.29052)], ids=["16", "32"]
-)
-@pytest.mark.fast_on_ranks("16")
-def test_the_cantilever_of_sze(n, up, back):
+def test_the_cantilever_of_sze():
     force = nts.LineForce((0, 0, 4), where=at(0, 10.0))
-    body = strip(n, forces=[force])
+    body = strip(16, forces=[force])
     run = nts.equilibrium(nts.System([body]), load_steps=10)
     assert run.status == "completed"
-    assert moved(body)[-1] == pytest.approx((back, 0, up), abs=6e-6)
+    assert moved(body)[-1] == pytest.approx((-3.29297, 0, 6.70470), abs=6e-6)
     assert run.reactions["shell"][-1].ravel() == pytest.approx((0, 0, -4), abs=1e-7)
 
 
@@ -335,13 +331,12 @@ def test_many_shells_take_a_krylov_solver_in_dynamics():
     chosen = [nts.Newton().preset(s, inertia, {}) for s, inertia in both]
     assert chosen == ["direct", "direct", "direct", "krylov"]
     found = []
-    for solver, reuse in (("auto", None), ("auto", False), ("direct", False)):
+    for solver, reuse in (("auto", None), ("direct", False)):
         run, x = fly(EM, 0.02, 0.04, nts.Newton(linear_solver=solver, reuse=reuse), n=(20, 16))
         assert run.status == "completed" and max(off(run)) < 1e-12
         found.append(x)
-    *krylov, direct = found
-    for x in krylov:
-        assert x == pytest.approx(direct, abs=1e-11)
+    krylov, direct = found
+    assert krylov == pytest.approx(direct, abs=1e-11)
 
 
 def off(run):
@@ -353,7 +348,7 @@ def off(run):
     )
 
 
-TIMES = [(0.01, 0.1), (0.1, 0.5), (0.01, 5), (0.05, 5), (0.1, 5)]
+TIMES = [(0.01, 0.1), (0.1, 0.5), (0.1, 5)]
 
 
 @pytest.mark.mpi

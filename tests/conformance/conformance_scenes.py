@@ -4,6 +4,7 @@ A new body, coupling or law needs a scene here: what holds for all is then held 
 """
 
 import numpy as np
+from dolfinx import fem
 from scenes import green, saint_venant
 
 import dolfinx_nts as nts
@@ -201,8 +202,10 @@ def in_a_bore(frame):
     block = nts.Continuum(
         mesh, law, density=DENSITY, velocity=frame.place(0.3, 0, -1.2), name="block"
     )
-    space = compat.vector_space(frame.grid("tetrahedron", (2, 0, 0), (2.4, 0.3, 0.3), (1, 1, 1)), 1)
-    stored = saint_venant(modulus, RUBBER["poisson"])
+    mesh = frame.grid("tetrahedron", (2, 0, 0), (2.4, 0.3, 0.3), (1, 1, 1))
+    space = compat.vector_space(mesh, 1)
+    # A Constant, so that all units share the compiled forms.
+    stored = saint_venant(fem.Constant(mesh, modulus), RUBBER["poisson"])
     own = nts.FormBody(
         space, energy=lambda e: stored(e), strain=green, density=DENSITY,
         velocity=frame.place(0, 1.0, -1.0), name="own",

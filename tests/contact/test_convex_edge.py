@@ -112,7 +112,7 @@ def gear(teeth, x0, turn, spin, torque, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", ["pinion", "wheel", "both", "between"])
+@pytest.mark.parametrize("way", ["pinion", "between"])
 def test_spur_gears_turn_each_other(way):
     """Nodes were held in the plane of a tooth's tip beside the tooth, and the pair jammed.
 
@@ -122,13 +122,9 @@ def test_spur_gears_turn_each_other(way):
     driving, resisting = 2.0, 1.0
     pinion, of_pinion, first = gear(16, 0.0, 0.0, 20.0, driving, "pinion")
     wheel, of_wheel, second = gear(24, 0.0803, np.pi / 24, -20 / 1.5, resisting, "wheel")
-    there = nts.ContactPair(slave=of_pinion, master=of_wheel)
-    back = nts.ContactPair(slave=of_wheel, master=of_pinion)
-    pairs = {
-        "pinion": [there], "wheel": [back], "both": [there, back],
-        "between": [nts.ContactPair.between(of_pinion, of_wheel)],
-    }[way]  # fmt: skip
-    system = nts.System([pinion, wheel], contacts=pairs, joints=[first, second])
+    couple = nts.ContactPair if way == "pinion" else nts.ContactPair.between
+    pair = couple(of_pinion, of_wheel)
+    system = nts.System([pinion, wheel], contacts=[pair], joints=[first, second])
     run = nts.simulate(
         system, nts.EnergyMomentum(), dt=1e-4, t_end=0.024, accuracy="balanced",
         project_start=True,

@@ -1,6 +1,5 @@
 """Coulomb friction: the law alone, and what two blocks that rub against each other must keep."""
 
-import functools
 import math
 
 from mpi4py import MPI
@@ -117,21 +116,9 @@ def run(system, integrator="energy-momentum", t_end=0.08, **options):
     return result
 
 
-@functools.cache
-def reference(integrator):
-    """Balance table of the two blocks with mu = 0.3, which others are compared with."""
-    return run(rubbing_blocks(0.3), integrator).balance
-
-
-@functools.cache
-def to_rounding(integrator):
-    """The same as far as Newton goes; a small scale weighs the direction of the slip little."""
-    return run(rubbing_blocks(0.3), integrator, newton=TO_ROUNDING).balance
-
-
 @pytest.mark.mpi
 @pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
-@pytest.mark.parametrize("friction", [0.1, 0.3, math.inf])
+@pytest.mark.parametrize("friction", [0.3, math.inf])
 @pytest.mark.parametrize("integrator", CONTACT_RULES)
 @pytest.mark.fast("energy-momentum-0.3-hexahedron")
 @pytest.mark.fast_on_ranks()
@@ -168,17 +155,6 @@ def test_stick_and_slip_occur_together_and_h_may_change():
     assert np.diff(table["friction_dissipation"]).min() > -1e-15 * energy
 
 
-@pytest.mark.parametrize("factor", [4e-4, 1e-2, 4.0])
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.slow
-def test_result_does_not_depend_on_the_algorithmic_scale(integrator, factor, monkeypatch):
-    expected = to_rounding(integrator)
-    nominal = contact_law.TANGENTIAL_SCALE
-    monkeypatch.setattr(contact_law, "TANGENTIAL_SCALE", factor * nominal)
-    table = run(rubbing_blocks(0.3), integrator, newton=TO_ROUNDING).balance
-    assert difference(expected, table) < 1e-9
-
-
 @pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
 @pytest.mark.slow
 def test_a_solution_is_one_for_any_algorithmic_scale(integrator, monkeypatch):
@@ -203,31 +179,6 @@ def test_a_solution_is_one_for_any_algorithmic_scale(integrator, monkeypatch):
         problem.rtol = problem_rtol
     stepper.close()
     assert both >= 3
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.slow
-def test_result_does_not_depend_on_the_direction_in_space(integrator, seed):
-    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    turn = q * np.sign(np.diag(r))
-    turn[:, 0] *= np.linalg.det(turn)
-    a, b = reference(integrator), run(rubbing_blocks(0.3, turn=turn), integrator).balance
-    for name in ("linear_momentum", "angular_momentum"):
-        b[name] = b[name] @ turn
-    assert difference(a, b) < 1e-9
-
-
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.slow
-def test_result_does_not_depend_on_the_numbering_of_facets(integrator):
-    """The same master facets start at another corner and come in another order."""
-    bodies, pair = (scene := rubbing_blocks(0.3)).bodies, scene.contacts[0]
-    turned = np.array([np.roll(f, k) for k, f in enumerate(pair.master.facets)])[::-1].copy()
-    pair.master.facets = pair.master.patches = turned
-    again = nts.ContactPair(slave=pair.slave, master=pair.master, friction=0.3)
-    table = run(nts.System(bodies, contacts=[again]), integrator).balance
-    assert difference(reference(integrator), table) < 1e-9
 
 
 @pytest.mark.slow

@@ -512,7 +512,7 @@ def test_a_node_that_must_slip_is_not_tried_as_stuck_and_as_free_for_ever(tilt, 
 
 
 @pytest.mark.slow
-def test_a_cube_is_thrown_tumbles_and_slides_for_2000_steps():
+def test_a_cube_is_thrown_tumbles_and_slides_for_1000_steps():
     """It bounces off an elastic plate on corners and edges and ends sliding and sticking."""
     kind = {"cell_type": CellType.hexahedron, "ghost_mode": GhostMode.shared_facet}
     small = create_box(COMM, [[0, 0, 0.05], [0.2, 0.2, 0.25]], [1, 1, 1], **kind)
@@ -529,10 +529,10 @@ def test_a_cube_is_thrown_tumbles_and_slides_for_2000_steps():
     faces = cube.surface(lambda x: np.full(x.shape[1], True))
     pair = nts.ContactPair(faces, floor.surface(lambda x: x[2] > -1e-9), friction=0.3)
     system = nts.System([cube, floor], contacts=[pair], gravity=DOWN)
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=1.5e-3, t_end=3.0)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1.5e-3, t_end=1.5)
     assert run.status == "completed"
     table, energy = run.balance, run.balance["energy"][0]
-    assert len(table["time"]) >= 2001
+    assert len(table["time"]) >= 1001
     assert np.abs(np.diff(table["ledger_residual"])).max() <= 1e-11 * energy
     assert np.abs(table["ledger_residual"]).max() <= 1e-10 * energy
     assert np.diff(table["friction_dissipation"]).min() >= -1e-15 * energy

@@ -100,7 +100,7 @@ def test_a_ball_is_pressed_into_a_block_and_let_go():
 def test_relaxations_lose_no_slip_and_no_dissipation():
     """A stabilized load step gets there in several parts, each with a slip of its own."""
     plain, stabilized = (
-        nts.equilibrium(on_floor(0.3, 0.05), load_steps=10, stabilization=value)
+        nts.equilibrium(on_floor(0.3, 0.05), load_steps=5, stabilization=value)
         for value in (None, 0.1)
     )
     for run in (plain, stabilized):

@@ -178,8 +178,9 @@ BOWLS = {
 }
 
 
-@pytest.mark.parametrize("integrator", ["energy-momentum", "gonzalez contact"])
-@pytest.mark.parametrize("bowl", BOWLS)
+@pytest.mark.parametrize(
+    ("bowl", "integrator"), [("sphere", "energy-momentum"), ("cylinder", "gonzalez contact")]
+)
 @pytest.mark.slow
 def test_sliding_in_a_bowl_keeps_the_energy(bowl, integrator):
     """Round and round without friction, from contact: nothing is lost over many steps."""
@@ -215,8 +216,9 @@ def test_without_gravity_a_mass_in_a_sphere_follows_a_great_circle(integrator):
     assert angle[0] == pytest.approx(STEP, rel=STEP**2)
 
 
-@pytest.mark.parametrize("integrator", ["midpoint", "energy-momentum"])
-@pytest.mark.parametrize("bowl", BOWLS)
+@pytest.mark.parametrize(
+    ("bowl", "integrator"), [("sphere", "midpoint"), ("cylinder", "energy-momentum")]
+)
 @pytest.mark.slow
 def test_small_oscillations_have_the_period_of_a_pendulum(bowl, integrator):
     """2 pi sqrt(R/g) (1 + A^2/16), at second order in the step."""

@@ -671,7 +671,7 @@ def test_a_ball_between_nodes_is_found_by_its_gap_alone(nc, known):
     rng = np.random.default_rng(0)
     corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float)[None, :nc]
     found_any = 0
-    for _ in range(300):
+    for _ in range(100):
         x, y = np.sort(rng.uniform(0.1, 0.9, 2))[::-1]
         centre, r = np.array((x, y, rng.uniform(-0.1, 0.1))), rng.uniform(0.02, 0.4)
         depth, limit = r - abs(centre[2]), 0.2 * r
@@ -680,7 +680,7 @@ def test_a_ball_between_nodes_is_found_by_its_gap_alone(nc, known):
             _, found = intrusion.sunk(ball, corners, np.array([limit]))
             assert abs(found[0] - depth) < 0.011 * depth
             found_any += 1
-    assert found_any > 100
+    assert found_any > 33
 
 
 @pytest.mark.parametrize("far", [1.0, 30.0])

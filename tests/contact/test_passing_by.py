@@ -57,7 +57,7 @@ def test_a_block_falls_once_it_has_left_the_table():
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("number", range(24))
+@pytest.mark.parametrize("number", range(12))
 @pytest.mark.fast("0", "1", "2", "3")
 @pytest.mark.fast_on_ranks("1")
 def test_boxes_that_pass_at_random(number):

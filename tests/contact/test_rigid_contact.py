@@ -101,11 +101,9 @@ def test_a_leaning_weight_divides_by_least_norm():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("friction", [0.0, 0.3])
-@pytest.mark.parametrize("nodes", [2, 3, 10])
-def test_a_box_rests_for_a_thousand_steps(nodes, friction):
-    body = rigid((0, 0, 0), (1, 1, 1), (nodes - 1, nodes - 1, 1))
-    pair = nts.ContactPair(slave=below(body), master=FLOOR, friction=friction)
+def test_a_box_rests_for_a_thousand_steps():
+    body = rigid((0, 0, 0), (1, 1, 1), (2, 2, 1))
+    pair = nts.ContactPair(slave=below(body), master=FLOOR, friction=0.3)
     system = nts.System([body], contacts=[pair], gravity=(0, 0, -G))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=10.0)
     weight = body.mass * G
@@ -232,9 +230,9 @@ def test_a_tower_of_five_stands():
 
 
 @pytest.mark.slow
-def test_a_tower_of_five_stands_for_ten_seconds():
+def test_a_tower_of_five_stands_for_three_seconds():
     system = tower()
-    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-2, t_end=10.0)
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-2, t_end=3.0)
     assert run.status == "completed"
     assert max(np.abs(b.position - b.centre).max() for b in system.bodies) < 1e-10
 
@@ -409,15 +407,15 @@ def ball(facets, radius=0.1):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("make", "gyration"),
+    ("make", "facets", "gyration"),
     # Radius of gyration over the radius, squared, of a round body whose hollow is 0.6 as wide.
-    [(disc, 0.5 * (1 + 0.6**2)), (ball, 0.4 * (1 - 0.6**5) / (1 - 0.6**3))],
+    [(disc, 192, 0.5 * (1 + 0.6**2)), (ball, 96, 0.4 * (1 - 0.6**5) / (1 - 0.6**3))],
     ids=["roller", "ball"],
 )
-def test_rolling_in_a_bore_swings_as_rolling_says(make, gyration):
-    """192 facets, from rest at 0.3 rad: a quarter of its period, elliptic integral and all."""
+def test_rolling_in_a_bore_swings_as_rolling_says(make, facets, gyration):
+    """From rest at 0.3 rad: a quarter of its period, elliptic integral and all."""
     radius, bore, tilt = 0.1, 0.5, 0.3
-    mesh, turn = make(192), Rotation.from_rotvec((0, -tilt, 0)).as_matrix()
+    mesh, turn = make(facets), Rotation.from_rotvec((0, -tilt, 0)).as_matrix()
     place = (bore - radius) * np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
     mesh.geometry.x[:] = (mesh.geometry.x - (0, 0, radius)) @ turn.T + place
     body = nts.RigidBody(mesh, density=1e3, name="roller")

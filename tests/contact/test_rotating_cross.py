@@ -31,9 +31,10 @@ def test_energy_momentum_conserves_and_midpoint_does_not():
 
 @pytest.mark.slow
 def test_midpoint_blows_up_with_large_steps():
-    results = demo.main(t_end=5.0)
-    for dt in (0.01, 0.02, 0.05, 0.1):
-        check_conserved(results["energy-momentum", dt], 5.0)
+    times = {0.01: 2.0, 0.02: 2.0, 0.05: 5.0, 0.1: 5.0}
+    results = demo.main(steps=(0.01, 0.02), t_end=2.0) | demo.main(steps=(0.05, 0.1), t_end=5.0)
+    for dt, t_end in times.items():
+        check_conserved(results["energy-momentum", dt], t_end)
         assert results["midpoint", dt]["angular_momentum_drift"] < 1e-11
     drift = [results["midpoint", dt]["energy_drift"] for dt in (0.01, 0.02)]
     assert np.log2(drift[1] / drift[0]) == pytest.approx(2, abs=0.1)

@@ -131,8 +131,7 @@ def test_changes_of_facet_on_a_flat_plate_cost_nothing(variant):
     assert np.abs(others).max() <= 1e-12 * work
 
 
-@pytest.mark.parametrize("part", [0.2137, 0.1137])
-@pytest.mark.parametrize("shape", ["convex", "concave"])
+@pytest.mark.parametrize(("shape", "part"), [("convex", 0.2137), ("concave", 0.1137)])
 @pytest.mark.slow
 def test_what_a_change_of_facet_costs_on_a_cylinder(shape, part):
     """At a slope of the angle between facets, the way beyond an edge is a height."""
@@ -168,12 +167,9 @@ def test_smoothing_of_uneven_facets(shape):
 
 @pytest.mark.parametrize(
     ("shape", "part", "uneven"),
-    [
-        *[("convex", 0.2137, 0.0), ("concave", 0.1137, 0.0), ("convex", 0.1137, 0.25)],
-        *[("dome", 0.2137, 0.0), ("dome", 0.2137, 0.25)],
-    ],
+    [("concave", 0.1137, 0.0), ("convex", 0.1137, 0.25), ("dome", 0.2137, 0.25)],
 )
-@pytest.mark.fast("dome-0.2137-0.25")
+@pytest.mark.slow
 def test_smoothing_of_triangles(shape, part, uneven):
     """Changes of facet cost a thousandth, and so do those of the pieces of a facet."""
     changes, others, table = slide(shape, "middle", part, uneven=uneven, triangles=True)

@@ -163,22 +163,20 @@ def test_a_bead_at_the_side_of_a_ring_hangs_by_infinite_friction(name, integrato
     assert np.linalg.norm(run.balance["linear_momentum"][-1]) < 1e-4 * MASS
 
 
-@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.slow
-def test_strong_friction_has_a_limit(integrator):
+def test_strong_friction_has_a_limit():
     """A soft disc released at the side of a ring, whose nodes press next to nothing there."""
-
-    runs = [_disc(mu, integrator) for mu in (1e4, 1e5, 1e6)]
+    runs = [_disc(mu) for mu in (1e4, 1e6)]
     for run in runs:
         assert run.status == "completed" and not run.warnings
-    near, nearer, limit = (run.balance["energy"][-1] for run in runs)
-    assert abs(near - limit) < 2e-2 * limit and abs(nearer - limit) < 2e-2 * limit
+    near, limit = (run.balance["energy"][-1] for run in runs)
+    assert abs(near - limit) < 2e-2 * limit
     # Without a limit a node neither sticks, by a pull, nor leaves, as it would enter the ring.
-    endless = _disc(np.inf, integrator).status
+    endless = _disc(np.inf).status
     assert "infinite friction may let it neither stick nor leave: try friction=1e4" in endless
 
 
-def _disc(friction, integrator):
+def _disc(friction):
     mesh = create_box(
         COMM, [np.array([-0.2, 0, -0.2]), np.array([0.2, 0.1, 0.2])], (8, 1, 8),
         CellType.hexahedron, ghost_mode=GhostMode.shared_facet,
@@ -193,7 +191,7 @@ def _disc(friction, integrator):
     ring = nts.Cylinder((0, 0, 0), (0, 1, 0), 1.0, inside=True)
     pair = nts.ContactPair(rim, ring, friction=friction)
     system = nts.System([disc], contacts=[pair], gravity=(0, 0, -GRAVITY))
-    return nts.simulate(system, integrator, dt=1e-2, t_end=0.2)
+    return nts.simulate(system, nts.EnergyMomentum(), dt=1e-2, t_end=0.2)
 
 
 @pytest.mark.mpi

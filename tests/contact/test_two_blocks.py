@@ -55,20 +55,19 @@ VARIANTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.fast("tetrahedra")
 def test_ledger_closes_for(variant):
     integrator, scene = VARIANTS[variant]
-    result = two_blocks.figures(impact(integrator=integrator, **scene))
+    result = two_blocks.figures(impact(integrator=integrator, t_end=0.12, **scene))
     assert_conserved(result)
     assert 0.04 < result["energy_lost"] < 0.06
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steepness", [30.0, 100.0])
-def test_ledger_closes_for_a_steep_energy(steepness):
+def test_ledger_closes_for_a_steep_energy():
     """Stiffening makes the impact harder, so activation costs more than in the variants above."""
-    result = two_blocks.figures(impact(material=fung(steepness)))
+    result = two_blocks.figures(impact(material=fung(30.0)))
     assert_conserved(result)
     assert result["energy_lost"] > 0.06
 
@@ -120,44 +119,6 @@ def test_bodies_of_a_micrometre():
         assert np.allclose(run["energy"] / metre**3, runs[0]["energy"], rtol=1e-9, atol=0)
 
 
-@pytest.mark.slow
-@pytest.mark.mpi
-@pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
-def test_metres_millimetres_micrometres(integrator):
-    """Mass in kg and time in s stay; lengths, and with them pressure and density, are converted."""
-    runs = [
-        impact(
-            integrator=integrator,
-            t_end=0.12,  # the impact ends at 0.1 s
-            metre=m,
-            density=1e3 / m**3,
-            material=nts.NeoHookean(young=1e6 / m, poisson=0.3),
-        ).balance
-        for m in (1.0, *UNITS)
-    ]
-    for run, metre in zip(runs[1:], UNITS, strict=True):
-        assert np.array_equal(run["newton_iterations"], runs[0]["newton_iterations"])
-        assert np.array_equal(run["active"], runs[0]["active"])
-        assert np.allclose(run["energy"] / metre**2, runs[0]["energy"], rtol=1e-9, atol=0)
-        scales = {
-            "linear_momentum": metre,
-            "angular_momentum": metre**2,
-            "contact_defect": metre**2,
-        }
-        for name, scale in scales.items():
-            before = runs[0][name]
-            assert np.abs(run[name] / scale - before).max() <= 1e-9 * np.abs(before).max(), name
-
-
-@pytest.mark.slow
-@pytest.mark.mpi
-def test_condensation_changes_nothing():
-    full, condensed = (
-        impact(t_end=0.08, newton=nts.Newton(condense=c)).balance for c in (False, True)
-    )
-    assert np.abs(full["energy"] - condensed["energy"]).max() <= 1e-12 * full["energy"][0]
-
-
 @pytest.mark.mpi
 @pytest.mark.fast_on_ranks()
 def test_field_split_finds_the_same_solution():
@@ -176,9 +137,9 @@ def test_field_split_finds_the_same_solution():
         "fieldsplit_constraints_pc_type": "lu",
         "fieldsplit_constraints_pc_factor_mat_solver_type": "mumps",
     }
-    system = two_blocks.scene(COMM)
+    system = two_blocks.scene(COMM, cells=(4, 2))
     run = nts.simulate(system, ENERGY_MOMENTUM, dt=2e-3, t_end=0.04, petsc_options=options)
-    direct = impact(t_end=0.04)
+    direct = impact(t_end=0.04, cells=(4, 2))
     assert run.status == "completed"
     energy = direct.balance["energy"]
     assert np.abs(run.balance["energy"] - energy).max() <= 1e-11 * energy[0]
@@ -192,7 +153,7 @@ def test_field_split_finds_the_same_solution():
 def test_krylov_follows_the_direct_solver(integrator, condense):
     steppers = [
         nts.Stepper(
-            two_blocks.scene(COMM),
+            two_blocks.scene(COMM, cells=(4, 2)),
             integrator,
             # What Newton's default tolerance leaves adds up to more than the difference sought.
             newton=nts.Newton(rtol=1e-14, linear_solver=solver, condense=condense),

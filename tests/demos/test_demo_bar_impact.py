@@ -119,12 +119,11 @@ def test_bar_follows_the_linear_bar():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("elements", REFERENCE)
-def test_impact(elements):
+def test_impact():
+    """Of the coarsest bar; the linear one, which it follows, has the others' figures, too."""
+    elements = 50
     energy, rebound = REFERENCE[elements]
-    # The finest costs most of all: by one rule, as the others show that both do the same.
-    rules = ("energy-momentum",) if elements == max(REFERENCE) else tuple(demo.INTEGRATORS)
-    results = demo.main(elements=elements, integrators=rules)
+    results = demo.main(elements=elements)
     for result in results.values():
         check_impact(result, elements)
         assert result["energy"] == pytest.approx(energy, abs=3e-4)
@@ -136,16 +135,16 @@ def test_impact(elements):
 def test_dropped_bar():
     elements = 50
     dt = demo.LENGTH / elements / demo.WAVE
-    results = demo.main(elements=elements, gravity=True)
-    for result in results.values():
-        assert result["status"] == "completed" and result["retries"] == 0
-        np.testing.assert_allclose(result["contact_start"], [1, 11 / 3], atol=2.01 * dt)
-        np.testing.assert_allclose(result["contact_end"], [5 / 3, 13 / 3], atol=3.01 * dt)
-        np.testing.assert_allclose(result["impulse"], 0.266667, rtol=1 / elements)
-        assert result["gap_error"] < 5 / elements
-        assert result["rebound"] == pytest.approx(0, abs=2 / elements)
-        assert 1 - 1 / elements < result["energy"] <= 1 + 1e-6
-    assert results["energy-momentum"]["ledger"] < 1e-12
+    rules = ("energy-momentum",)
+    (result,) = demo.main(elements=elements, gravity=True, integrators=rules).values()
+    assert result["status"] == "completed" and result["retries"] == 0
+    np.testing.assert_allclose(result["contact_start"], [1, 11 / 3], atol=2.01 * dt)
+    np.testing.assert_allclose(result["contact_end"], [5 / 3, 13 / 3], atol=3.01 * dt)
+    np.testing.assert_allclose(result["impulse"], 0.266667, rtol=1 / elements)
+    assert result["gap_error"] < 5 / elements
+    assert result["rebound"] == pytest.approx(0, abs=2 / elements)
+    assert 1 - 1 / elements < result["energy"] <= 1 + 1e-6
+    assert result["ledger"] < 1e-12
 
 
 @pytest.mark.slow

@@ -18,8 +18,7 @@ def test_closed_forms_are_the_benchmarks():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", demo.INTEGRATORS)
-@pytest.mark.fast("energy-momentum")
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_rest_on_an_elastic_plate(integrator):
     mesh, floor = demo.block_mesh(COMM, SMALL), {"floor": "elastic"}
     figures, motion = demo.stop(mesh, floor, dt=4e-3, integrator=integrator)

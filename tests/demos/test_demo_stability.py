@@ -8,10 +8,9 @@ import stability as demo
 @pytest.mark.parametrize("scene", list(demo.STEPS))
 def test_newmark_doubles_the_energy_that_energy_momentum_keeps(scene):
     steps = {scene: demo.STEPS[scene] * 3 // 4}
-    r = demo.main(steps=steps, integrators=("energy-momentum", "midpoint", "newmark"))[scene]
+    r = demo.main(steps=steps, integrators=("energy-momentum", "newmark"))[scene]
     assert r["energy-momentum"]["status"] == "completed"
     assert r["energy-momentum"]["missing"] <= 1e-8
-    assert r["midpoint"]["steps"] == steps[scene]
     # When a cell turns inside out depends on rounding and ranks, that the energy grows does not.
     assert r["newmark"]["status"] != "completed" and r["newmark"]["gained"] > 1.0
 

@@ -45,7 +45,7 @@ def test_a_blow_closes_the_ledger():
 
 @pytest.mark.slow
 def test_the_plate_rings_at_its_first_frequency():
-    found = drum_stick.main(comm=MPI.COMM_SELF)
+    found = drum_stick.main(comm=MPI.COMM_SELF, dt=1e-4)
     assert found["status"] == "completed" and found["ledger"] < 1e-11
     assert found["last_contact"] < 2e-3
     assert found["peak_frequency"] == pytest.approx(found["first_frequency"], rel=0.05)
@@ -65,7 +65,7 @@ def test_leaves_that_slide_on_each_other():
 @pytest.mark.slow
 @pytest.mark.parametrize("search", [leaf_spring.SEARCH, {}], ids=["l2", "whole steps"])
 @pytest.mark.parametrize("steps", [5, 10])
-@pytest.mark.parametrize("cells", [4, 8, 12])
+@pytest.mark.parametrize("cells", [4, 12])
 def test_leaves_slide_in_any_steps(monkeypatch, cells, steps, search):
     """No rounding at the clamp decides whether load steps are solved."""
     monkeypatch.setattr(leaf_spring, "SEARCH", search)

@@ -100,7 +100,7 @@ def test_whole_collision_keeps_the_balance(demo):
 
 @pytest.mark.slow
 def test_midpoint_keeps_the_momenta_but_not_the_energy(demo):
-    result = demo["main"](integrator="midpoint", dt=0.1)
+    result = demo["main"](integrator="midpoint", dt=0.1, t_end=3.0)
     assert result["linear_momentum_drift"] <= 1e-12
     assert result["angular_momentum_drift"] <= 1e-12
     assert result["ledger"] > 1e-4

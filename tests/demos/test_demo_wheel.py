@@ -14,7 +14,7 @@ def test_the_step_is_smooth():
 
 
 @pytest.mark.mpi
-@pytest.mark.fast_on_ranks()
+@pytest.mark.slow
 def test_rolls_on_the_flat():
     """The way over the angle is the radius of the tread's length, and the axle is lower."""
     r = demo.main(facets=24, dt=4e-3, duration=0.08)
@@ -27,7 +27,7 @@ def test_rolls_on_the_flat():
 @pytest.mark.slow
 def test_over_the_step():
     """More is lost than lifting takes, and ledger and momenta know where it is."""
-    r = demo.main()
+    r = demo.main(dt=4e-3)
     assert r["status"] == "completed" and r["retries"] == 0
     assert r["effective"] == pytest.approx(r["tread"], rel=2e-3)
     assert r["pressed"] == pytest.approx(1.0, abs=0.03) and r["slipped"] < 0.03

@@ -38,7 +38,7 @@ def rates(results):
 @pytest.mark.parametrize("integrator", FREE)
 @pytest.mark.slow
 def test_free_flight(integrator):
-    results = [run(flying_block, integrator, 0.4, n)[:2] for n in (40, 80, 160)]
+    results = [run(flying_block, integrator, 0.4, n)[:2] for n in (20, 40, 80)]
     for values in zip(*results, strict=True):
         order, errors = rates(values)
         assert np.abs(order - 2.0).max() < 0.1, (order, errors)

@@ -56,8 +56,9 @@ def assert_closed(run):
     assert (np.diff(table["friction_dissipation"]) >= -1e-14 * top).all()
 
 
-@rules
-@pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.parametrize(
+    ("rule", "unit"), zip(MID_STEP.values(), (1.0, 1e-3), strict=True), ids=MID_STEP
+)
 def test_friction_stops_a_disc(rule, unit):
     """omega = omega_0 - b t/I, until it stands; all of its energy is dissipated."""
     bound, spin = 0.3 * unit**5, 5.0
@@ -96,12 +97,11 @@ def test_a_pendulum_rests_on_its_limit():
     assert rest.reactions["hinge limits"][-1, 1, 1] == pytest.approx(-moment, rel=1e-9)
 
 
-@rules
-def test_a_pendulum_bounces_on_its_limit_until_friction_has_it(rule):
+def test_a_pendulum_bounces_on_its_limit_until_friction_has_it():
     """It never passes the limit, and gains nothing there; at rest, friction and limit carry it."""
     seen = []
     body, system = pendulum(limits=(-np.inf, 0.5), friction=nts.JointFriction(bound=1.0))
-    stepper = nts.Stepper(system, rule)
+    stepper = nts.Stepper(system, nts.EnergyMomentum())
     for _ in range(250):
         stepper.advance(1e-2)
         seen.append(angle(body))
@@ -131,7 +131,7 @@ def test_a_controller_holds_an_angle(rule):
     """T = -k (a - a_0) - d da/dt rests where k (a - a_0) is the moment of the weight."""
     stiff, damping, wanted = 50.0, 10.0, 0.3
     body, system = pendulum(motor=lambda t, a, rate: -stiff * (a - wanted) - damping * rate)
-    run = nts.simulate(system, rule, dt=0.01, t_end=4.0)
+    run = nts.simulate(system, rule, dt=0.02, t_end=4.0)
     rest = brentq(lambda a: stiff * (a - wanted) - MASS * G * ARM * np.cos(a), 0.0, 1.0)
     assert angle(body) == pytest.approx(rest, abs=1e-6)
     if rule in MID_STEP.values():

@@ -203,11 +203,9 @@ def heavy_top(dt, integrator, unit=1.0):
     return np.linalg.norm(top.position / far - right), run.balance
 
 
-@pytest.mark.parametrize(("dt", "known"), [(4e-3, 5.919e-3), (2e-3, 1.488e-3), (1e-3, 3.726e-4)])
-@pytest.mark.fast("0.004-0.005919")
-def test_a_heavy_top_precesses(dt, known):
-    error, table = heavy_top(dt, nts.EnergyMomentum())
-    assert abs(error / known - 1.0) < 5e-4
+def test_a_heavy_top_precesses():
+    error, table = heavy_top(4e-3, nts.EnergyMomentum())
+    assert error == pytest.approx(5.919e-3, rel=5e-4)
     assert np.abs(table["ledger_residual"]).max() < 1e-12 * table["energy"][0]
 
 
@@ -435,15 +433,12 @@ def force_columns(stepper):
     return np.concatenate(columns, axis=1), np.concatenate(multipliers)
 
 
-@pytest.mark.parametrize(
-    ("thick", "masses"), [(0.0, (1, 1, 1, 1, 1)), (0.1, (1, 10, 100, 10, 1))]
-)
 @pytest.mark.slow
-def test_a_bricard_mechanism(thick, masses):
+def test_a_bricard_mechanism():
     """One equation repeats others in another way at each time: order 2, and its closure."""
     ways = []
     for dt in (1e-2, 5e-3, 2.5e-3):
-        system, bars = bricard(masses, thick=thick)
+        system, bars = bricard((1, 10, 100, 10, 1), thick=0.1)
         start = [bar.rotation.copy() for bar in bars]
         stepper = nts.Stepper(system, nts.EnergyMomentum())
         for _ in range(round(0.5 / dt)):

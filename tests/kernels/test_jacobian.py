@@ -1,6 +1,5 @@
 """The Jacobian of a step against differences of its residual, and the convergence it gives."""
 
-import itertools
 from dataclasses import replace
 
 from mpi4py import MPI
@@ -25,15 +24,13 @@ SMOOTH = "smooth", "curved"
 RULES = MID_STEP | GRADIENTS | {"condensed": MID_STEP["energy-momentum"]}
 #: The static rule, with a stabilization, shares the equations but not the steps.
 EQUATIONS = RULES | {"static": Static()}
-ACTIVE = ("none", "all", "mixed")
 FRICTION = {"none": 0.0, "slip": 0.02, "mixed": 0.4, "stick": np.inf}
-#: Cell, friction and active set of the scenes whose whole Jacobian is tested; of smooth patches,
-#: which take longest, directions are.
+#: Cell, friction and active set of the scenes whose whole Jacobian is tested; of all others and by
+#: other rules, directions are.
 SCENES = [
-    *itertools.product(("hex",), ("none",), ACTIVE),
-    *itertools.product(("hex",), ("slip", "mixed", "stick"), ("all",)),
-    *itertools.product(("tet",), ("none", "mixed"), ("mixed",)),
-]
+    ("hex", "none", "mixed"), ("hex", "slip", "all"), ("hex", "stick", "all"),
+    ("tet", "mixed", "mixed"),
+]  # fmt: skip
 
 
 def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
@@ -117,7 +114,7 @@ class Linearised:
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
 @pytest.mark.parametrize(("cell", "friction", "active"), SCENES)
-@pytest.mark.parametrize("rule", EQUATIONS)
+@pytest.mark.parametrize("rule", ["energy-momentum", "condensed"])
 @pytest.mark.fast("energy-momentum-hex-none-mixed", "condensed-hex-stick-all")
 def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active):
     system = two_blocks(cell, friction=FRICTION[friction])
@@ -300,18 +297,17 @@ def last_change(sets):
     return last
 
 
-@pytest.mark.parametrize("turned", [False, pytest.param(True, marks=pytest.mark.mpi)])
+@pytest.mark.mpi
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.fast(
-    "hex-midpoint-False", "hex-energy-momentum-True", "smooth-gonzalez contact-True",
-    "smooth-condensed-True", "curved-condensed-False",
-)  # fmt: skip
-@pytest.mark.fast_on_ranks("smooth-gonzalez contact-True")
-def test_newton_converges_quadratically(cell, rule, turned):
+    "hex-midpoint", "hex-energy-momentum", "smooth-gonzalez contact", "curved-condensed"
+)
+@pytest.mark.fast_on_ranks("smooth-gonzalez contact")
+def test_newton_converges_quadratically(cell, rule):
     """A step that presses the blocks into each other: once the active set rests, r -> C r^2."""
     system = two_blocks(cell, gap=0.02, speed=6.0)
-    state = rotated_state(system) if turned else system.initial_state()
+    state = rotated_state(system)
     norms, _, sets, _ = convergence(system, rule, state, 0.02)
     assert COMM.allreduce(int(sum(s.sum() for s in sets[-1]))) >= 3
     r = norms[last_change(sets) :] / norms.max()

@@ -80,7 +80,7 @@ def test_flexible_cubes_keep_energy_and_momenta(accuracy):
     energy = []
     for impact in ("published", "restored"):
         run = nts.simulate(
-            cubes(), nts.EnergyMomentum(), dt=1e-3, t_end=0.1, impact=impact, accuracy=accuracy
+            cubes(), nts.EnergyMomentum(), dt=2e-3, t_end=0.1, impact=impact, accuracy=accuracy
         )
         table = run.balance
         energy.append(table["energy"] / table["energy"][0] - 1.0)
@@ -95,7 +95,7 @@ def test_flexible_cubes_keep_energy_and_momenta(accuracy):
 
 def test_friction_is_all_that_an_impact_costs():
     """Its work is what energy is missing."""
-    run = nts.simulate(cubes(0.3), nts.EnergyMomentum(), dt=1e-3, t_end=0.1, impact="restored")
+    run = nts.simulate(cubes(0.3), nts.EnergyMomentum(), dt=2e-3, t_end=0.1, impact="restored")
     table = run.balance
     energy, taken = table["energy"], table["friction_dissipation"]
     assert taken[-1] > 1e-3 * energy[0]
@@ -222,7 +222,7 @@ def ball(cells, low, rigid=False, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("restitution", [0.5, 0.8, 1.0])
+@pytest.mark.parametrize("restitution", [0.5, 1.0])
 def test_a_bouncing_ball_rises_by_its_restitution(restitution):
     """B24: e^(2 n) of the height from which it fell, and the ledger names what it lost."""
     height, gravity = 1.0, 9.81
@@ -230,9 +230,9 @@ def test_a_bouncing_ball_rises_by_its_restitution(restitution):
     pair = nts.ContactPair(slave=body.surface(lambda x: x[2] < height + 0.5), master=FLOOR)
     system = nts.System([body], contacts=[pair], gravity=(0, 0, -gravity))
     fall = np.sqrt(2 * height / gravity)
-    hits = fall * (1 + 2 * np.cumsum([0.0, restitution, restitution**2]))
+    hits = fall * (1 + 2 * np.cumsum([0.0, restitution]))
     run = nts.simulate(
-        system, nts.EnergyMomentum(), dt=1e-3, t_end=hits[2] + restitution**3 * fall,
+        system, nts.EnergyMomentum(), dt=1e-3, t_end=hits[1] + restitution**2 * fall,
         impact="restored", restitution=restitution,
     )  # fmt: skip
     table, size = run.balance, body.mass * gravity * height

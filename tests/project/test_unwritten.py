@@ -262,12 +262,12 @@ def test_a_restart_that_ends_otherwise_is_seen(tmp_path, monkeypatch):
 
 # ---- the scenes
 @pytest.mark.slow
-@pytest.mark.parametrize("part", range(4))
-def test_two_hundred_scenes(part):
+@pytest.mark.parametrize("part", range(2))
+def test_a_hundred_scenes(part):
     """Fifty for each seed, as later draws are variations of earlier ones."""
     if COMM.size > 1:
         pytest.skip("takes no less time on 2 ranks")
-    counts, failures = run_many(max(50, SCENES // 4), 4 * SEED + part)
+    counts, failures = run_many(max(50, SCENES // 2), 2 * SEED + part)
     print(dict(counts))
     assert not failures, "\n".join(failures)
     # It is no test if nearly all are refused, or nothing touches.
@@ -287,17 +287,17 @@ def test_scenes_that_go_on_from_a_checkpoint(tmp_path):
             file.unlink()
         return judge_restart(scene, comm, tmp_path / "run.h5")
 
-    counts, failures = run_many(max(50, SCENES // 10), 200 + SEED, judged)
+    counts, failures = run_many(max(30, SCENES // 10), 200 + SEED, judged)
     assert not failures, "\n".join(failures)
-    assert counts["completed"] > 20
+    assert counts["completed"] > 12
 
 
 @pytest.mark.mpi
 @pytest.mark.slow
 def test_scenes_on_all_ranks():
-    counts, failures = run_many(max(40, SCENES // 10), 100 + SEED)
+    counts, failures = run_many(max(20, SCENES // 10), 100 + SEED)
     assert not failures, "\n".join(failures)
-    assert counts["completed"] > 10
+    assert counts["completed"] > 5
 
 
 @pytest.mark.slow

@@ -535,12 +535,15 @@ def test_the_choice_changes_no_solution(condense):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("friction", [(0.3, 0.0), (0.0, 0.3), (0.3, 0.3)])
 @pytest.mark.parametrize(
-    ("integrator", "fine"),
-    [(nts.Midpoint(), 1), (nts.EnergyMomentum(), 1), (nts.EnergyMomentum(), 2)],
-)
-@pytest.mark.fast("integrator1-1-friction2")
+    ("integrator", "fine", "friction"),
+    [
+        (nts.Midpoint(), 1, (0.3, 0.0)), (nts.EnergyMomentum(), 1, (0.0, 0.3)),
+        (nts.EnergyMomentum(), 1, (0.3, 0.3)), (nts.EnergyMomentum(), 2, (0.3, 0.3)),
+    ],
+    ids=["floor", "wall", "both", "fine"],
+)  # fmt: skip
+@pytest.mark.fast("both")
 @pytest.mark.fast_on_ranks()
 def test_nodes_with_more_constraints_than_coordinates(integrator, fine, friction):
     """A block slides along a floor into a wall: nodes of its edge stick to one and touch both.

@@ -326,7 +326,6 @@ import dolfinx, dolfinx.fem.petsc
 before = set(sys.modules)
 import dolfinx_nts as nts
 from dolfinx.mesh import CellType, create_box
-nts.dolfinx_compat.C_FLAGS[0] = "-O1"  # as the tests, which have compiled these forms
 mesh = create_box(MPI.COMM_WORLD, [[0, 0, 0], [1, 1, 1]], [1] * 3, CellType.hexahedron)
 cube = nts.Continuum(mesh, nts.NeoHookean(1e6, 0.3), density=1e3, velocity=(0, 0, -1), name="cube")
 pair = nts.ContactPair(cube.surface(lambda x: x[2] < 1e-9), nts.Plane((0, 0, 0), (0, 0, 1)))

@@ -14,8 +14,8 @@ from dolfinx_nts.study import extreme_scenes, stability
 COMM = MPI.COMM_WORLD
 
 
-#: Axes whose runs take minutes, and those whose first or last does half of one.
-MINUTES, HEAVY = ("long",), ("mesh", "strips", "bodies")
+#: Axes whose runs take minutes or that others test, and those whose first or last does half of one.
+LEFT_OUT, HEAVY = ("long", "unit", "offset"), ("mesh", "strips", "bodies")
 #: What messages of steps that fail there may advise.
 REMEDIES = ("smaller loads or speeds may prevent it", "so make its surface the master")
 
@@ -112,7 +112,7 @@ def test_unknown_names_are_refused(option):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis", [axis for axis in stability.AXES if axis not in MINUTES])
+@pytest.mark.parametrize("axis", [axis for axis in stability.AXES if axis not in LEFT_OUT])
 def test_the_energy_momentum_scheme_is_nowhere_wrong(axis):
     """At both ends of each axis; what stops names nodes or cells and one remedy."""
     values = stability.AXES[axis][1]
