@@ -40,6 +40,7 @@ from dolfinx_nts.integrators import (
 from dolfinx_nts.interaction.coupling import Coupling, Joint, JointCoupling, Slopes, StepWarning
 from dolfinx_nts.interaction.elements import Elements, Step
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
+from dolfinx_nts.interaction.measured import HoldingLaw, Law, Move, Row
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements, PointPart
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints import (
@@ -54,6 +55,7 @@ from dolfinx_nts.joints import (
     Tie,
     Universal,
 )
+from dolfinx_nts.joints.forces import AboutAxis, BetweenPoints
 from dolfinx_nts.joints.laws import JointFriction
 from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
 from dolfinx_nts.kernels.nts_element import Gap
@@ -73,8 +75,10 @@ from dolfinx_nts.validation import OutputError, StepFailedError, UserFunctionErr
 
 __version__ = version("dolfinx_nts")
 __all__ = [
+    "AboutAxis",
     "Adapt",
     "Beam",
+    "BetweenPoints",
     "Body",
     "BodyMotion",
     "Checkpoint",
@@ -99,17 +103,20 @@ __all__ = [
     "FormBody",
     "Gap",
     "GeneralizedAlpha",
+    "HoldingLaw",
     "Integrator",
     "Isotropic",
     "Joint",
     "JointCoupling",
     "JointFriction",
+    "Law",
     "LineForce",
     "LineMoment",
     "Midpoint",
     "EvaluationPoint",
     "MooneyRivlin",
     "NeoHookean",
+    "Move",
     "Newmark",
     "Newton",
     "Obstacle",
@@ -129,6 +136,7 @@ __all__ = [
     "Rectangle",
     "Restart",
     "RigidBody",
+    "Row",
     "Saved",
     "Seam",
     "Section",

@@ -27,7 +27,7 @@ import numpy as np
 import processes
 import pytest
 
-from dolfinx_nts import dolfinx_compat, petsc_compat
+from dolfinx_nts import petsc_compat
 
 PATIENCE = 20.0
 """Time [s] that a failing rank waits for the others before it aborts the run."""

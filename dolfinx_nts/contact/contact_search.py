@@ -290,7 +290,7 @@ class ContactSearch:
         held[c.node[active]] = c.facet[active]
         motions, positions = [e.bodies[b].du for b in bodies], self._positions(k)
         try:
-            hit = pair.missed(positions, motions, path, reach, held)
+            hit = pair.missed(positions, motions, path, reach, held, self._aimed[k])
         except UserFunctionError:
             raise
         except StepFailedError as failure:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
+from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE, ConvexEdges, middles
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.pair import (
@@ -22,9 +23,10 @@ from dolfinx_nts.contact.pair import (
 )
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
-from dolfinx_nts.kernels import compiled, facets, nts_element, patches
-from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.kernels import compiled, facets, nts_element
+from dolfinx_nts.parallel import anywhere, raise_together
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+from dolfinx_nts.validation import StepFailedError
 
 #: A node may project this far (in convective coordinates) beyond an edge that the master surface
 #: ends at ...
@@ -35,10 +37,6 @@ _WEDGE = 0.5
 #: A foot is followed from piece to piece of the surface over a facet so often; then the last will
 #: do, as neighbours go on alike beyond their border.
 _MOST_PATCHES = 3
-#: A node that is held farther than this from the master, in facet sizes, is held beside it.
-_ASIDE = 1e-4
-#: A node this part of a facet behind it, or less, is outside.
-_OUTSIDE = 1e-6
 #: Weights of a foot that are rounding.
 _STILL = 1e-9
 
@@ -56,10 +54,7 @@ class FacetPair(ContactPair, master=Surface):
             )
         self.extent = max(self.extent, master.material.extent(self.origin))
         self._free_edges = master.boundary_edges
-        corners = master.reference[master.facets]
-        self._joined = patches.neighbours(master.facets, corners)
-        self._beside = patches.neighbours(master.facets, corners, sharp=-np.inf)
-        self._sharp = ((self._beside >= 0) & (self._joined < 0)).any(axis=1)
+        self._edges = ConvexEdges(master.facets, master.reference[master.facets])
 
     @cached_property
     def sag(self) -> float:
@@ -67,10 +62,7 @@ class FacetPair(ContactPair, master=Surface):
         if self.master.weights is not None or not len(self.master.facets):
             return 0.0
         corners = self.master.reference[self.master.facets]
-        middle = np.full((len(corners), 2), 1.0 / 3.0 if corners.shape[1] == 3 else 0.0)
-        place, _, normal = facets.frame(corners, middle)
-        one, edge = np.nonzero(self._joined >= 0)
-        two = self._joined[one, edge] // corners.shape[1]
+        (place, normal), (one, two, _) = middles(corners), self._edges.smooth
         cosine = np.einsum("ni,ni->n", normal[one], normal[two])
         way = np.linalg.norm(place[one] - place[two], axis=1) / facets.size(corners)[one]
         sags: FloatArray = way * np.arccos(np.clip(cosine, -1.0, 1.0)) / 8.0
@@ -155,7 +147,7 @@ class FacetPair(ContactPair, master=Surface):
         found, lost = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
         if motion is not None:
             found = self._along_paths(found, x, master, motion)
-        beside = (found.gap < -_OUTSIDE * found.length) & ~known[found.node]
+        beside = (found.gap < -OUTSIDE * found.length) & ~known[found.node]
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
         stays[node], stays[lost] = known[node], False
@@ -245,7 +237,7 @@ class FacetPair(ContactPair, master=Surface):
         end = (x + slave_path)[near.node]
         far, best = self._gap_at(near.facet, near.xi, end, moved), near.facet.copy()
         for edge in range(nc):
-            other = self._beside[near.facet, edge] // nc
+            other = self._edges.beside[near.facet, edge] // nc
             some = np.flatnonzero((excess[:, edge] > search.PREFERENCE) & (other >= 0))
             if not some.size:
                 continue
@@ -286,7 +278,7 @@ class FacetPair(ContactPair, master=Surface):
         """
         # A facet is 2 xi wide, and less along its heights; most nodes come to no edge of theirs.
         beyond = facets.edge_excess(found.xi, self.master.facets.shape[1]).max(axis=1, initial=-1.0)
-        near = self._sharp[found.facet] & (beyond + 4.0 * reach / found.length > _ASIDE)
+        near = self._edges.sharp[found.facet] & (beyond + 4.0 * reach / found.length > ASIDE)
         if not near.any():
             return found
         some = found.select(near)
@@ -329,53 +321,11 @@ class FacetPair(ContactPair, master=Surface):
             gaps.append(np.einsum("ni,ni->n", normal, place - foot))
         above, below = gaps
         length = facets.size(master[self.master.facets[facet]])
-        sinks = np.flatnonzero(good & (below < -_OUTSIDE * length) & (below < above))
+        sinks = np.flatnonzero(good & (below < -OUTSIDE * length) & (below < above))
         part = np.clip(above[sinks] / (above - below)[sinks], 0.0, 1.0)
         at, found = x[sinks] + part[:, None] * way[sinks], np.full(len(x), -1)
-        found[sinks] = self._across(at, facet[sinks], master, master_path, part)
+        found[sinks] = self._edges.across(at, facet[sinks], master, master_path, part)
         return found
-
-    def _across(
-        self,
-        points: FloatArray,
-        facet: IntArray,
-        master: FloatArray,
-        master_path: FloatArray,
-        part: FloatArray,
-    ) -> IntArray:
-        """Facets across the sharp convex edges that points (n, 3) are beyond, or -1, (n,).
-
-        Args:
-            points: [m].
-            facet: Facets in whose planes they are, shape (n,).
-            master: Points of the master at t_n [m].
-            master_path: Their motion in the step [m].
-            part: How much of that they have behind them, shape (n,).
-        """
-        at, nc = self.master.facets, self.master.facets.shape[1]
-        pairs = np.arange(len(points))
-
-        def corners(of: IntArray) -> FloatArray:
-            now: FloatArray = master[at[of]] + part[:, None, None] * master_path[at[of]]
-            return now
-
-        for k in range(_MOST_PATCHES):
-            xi, converged = compiled.project(points, corners(facet), np.zeros((len(points), 2)))
-            excess = facets.edge_excess(xi, nc)
-            edge = excess.argmax(axis=1)
-            out = converged & (excess[pairs, edge] > _ASIDE)
-            joined = self._joined[facet, edge]
-            onward = out & (joined >= 0)
-            if k == _MOST_PATCHES - 1 or not onward.any():
-                break
-            facet = np.where(onward, joined // nc, facet)
-        beside = self._beside[facet, edge]
-        out &= (beside >= 0) & (joined < 0)
-        other = np.where(out, beside // nc, 0)
-        foot, _, normal = facets.frame(corners(other), np.zeros((len(points), 2)))
-        gap = np.einsum("ni,ni->n", normal, points - foot)
-        out &= gap > _ASIDE * facets.size(master[at[other]])
-        return np.where(out, other, -1)
 
     def _gap_at(
         self, facet: IntArray, xi: FloatArray, points: FloatArray, master: FloatArray
@@ -401,46 +351,73 @@ class FacetPair(ContactPair, master=Surface):
         path: FloatArray,
         reach: float,
         held: IntArray,
+        aimed: IntArray,
     ) -> IntArray | None:
         """Do as `ContactPair`. Collective."""
-        by_edges = np.flatnonzero((held >= 0) & self._sharp[held])
-        aside = self._sharp.any() and anywhere(self.slave.body.comm, bool(by_edges.size))
+        comm = self.slave.body.comm
+        by_edges = np.flatnonzero((held >= 0) & self._edges.sharp[held])
+        let_go = np.flatnonzero((held < 0) & (aimed >= 0) & self._edges.sharp[aimed])
+        aside = self._edges.sharp.any() and anywhere(comm, bool(by_edges.size or let_go.size))
         if not (aside or self.is_long(reach)):
             return None
         x, paths = positions[0][self.slave.share], self._gather_paths(motions)
-        end, moved = x + paths[0], positions[1] + paths[1]
+        if aside:
+            self._refuse_cut_corners(x, positions[1], *paths, let_go)
         hit = np.full(len(held), -1)
         if self.is_long(reach):
             hit = self._came_through(x, positions[1], *paths, held)
         if by_edges.size:
-            behind = self._behind_edges(end[by_edges], moved, held[by_edges])
-            hit[by_edges] = np.where(behind >= 0, behind, hit[by_edges])
+            beyond = self._held_beyond(x + paths[0], positions[1], paths[1], held, by_edges)
+            hit[by_edges] = np.where(beyond >= 0, beyond, hit[by_edges])
         return hit
 
-    def _behind_edges(self, end: FloatArray, moved: FloatArray, held: IntArray) -> IntArray:
-        """Facet behind the sharp edge that nodes (n, 3) are held beyond at the end, or -1, (n,).
-
-        The plane of a facet goes on beyond its edges, the body does not.
+    def _held_beyond(
+        self,
+        end: FloatArray,
+        master: FloatArray,
+        master_path: FloatArray,
+        held: IntArray,
+        some: IntArray,
+    ) -> IntArray:
+        """Facet across the edge that some slaves are held beyond at the end, or -1, shape (n,).
 
         Args:
-            end: Nodes at the end [m].
-            moved: Points of the master there [m].
-            held: Facets that hold them, shape (n,).
+            end: This rank's slaves there [m], shape (share, 3).
+            master: Points of the master at t_n [m].
+            master_path: Their motion [m].
+            held: Facets that hold the slaves, shape (share,).
+            some: Numbers of slaves, shape (n,).
         """
-        at, nc = self.master.facets, self.master.facets.shape[1]
-        _, control, xi, converged = self._projected(end, moved, held, np.zeros((len(held), 2)))
-        out = np.flatnonzero(converged & (facets.edge_excess(xi, nc).max(axis=1) > _ASIDE))
-        found = np.full(len(held), -1)
-        if not out.size:
-            return found
-        closest = search.closest_facets(end[out], moved[at], reach=np.inf, current=held[out])
-        foot, _, normal = facets.frame(moved[at[closest.facet]], closest.xi)
-        _, _, own = facets.frame(control[out], xi[out])
-        gap = np.einsum("ni,ni->n", normal, end[out] - foot)
-        turned = np.einsum("ni,ni->n", normal, own) < patches.SHARP
-        away = turned & (gap > _ASIDE * facets.size(moved[at[closest.facet]]))
-        found[out[away]] = closest.facet[away]
+        moved, found, start = master + master_path, np.full(len(some), -1), np.zeros((len(some), 2))
+        _, _, xi, converged = self._projected(end[some], moved, held[some], start)
+        excess = facets.edge_excess(xi, self.master.facets.shape[1]).max(axis=1)
+        out = np.flatnonzero(converged & (excess > ASIDE))
+        node, whole = some[out], np.ones(len(out))
+        found[out] = self._edges.across(end[node], held[node], master, master_path, whole)
         return found
+
+    def _refuse_cut_corners(
+        self,
+        x: FloatArray,
+        master: FloatArray,
+        slave_path: FloatArray,
+        master_path: FloatArray,
+        some: IntArray,
+    ) -> None:
+        """Raise where slaves that are let go cut a corner of the master. Collective.
+
+        Arguments as of `_round_edges`, of the solved step, and numbers of these slaves.
+        """
+        cut = self._edges.cut_corners(x[some], slave_path[some], master, master_path)
+        node = self.slave.original[self.slave.share[some[cut]]]
+        text = None
+        if node.size:
+            text = (
+                f"contact {self.name!r}: node {node[0]} hits {self.master_name!r} and slides over "
+                "its edge within the step; use a smaller dt"
+            )
+        comm = self.slave.body.comm
+        raise_together(comm, text, lambda told: StepFailedError(told, advises=True))
 
     def _came_through(
         self,
@@ -461,7 +438,7 @@ class FacetPair(ContactPair, master=Surface):
         length = facets.size(moved[at[hit[node]]])
         depth = np.einsum("ni,ni->n", normal, foot - end) / length
         # A node that is held at another facet may end a little behind this one.
-        deep = depth > np.where(held[node] >= 0, MARGIN, _OUTSIDE)
+        deep = depth > np.where(held[node] >= 0, MARGIN, OUTSIDE)
         hit[np.setdiff1d(np.arange(len(hit)), node[deep | ~converged])] = -1
         return hit
 
@@ -534,7 +511,7 @@ class FacetPair(ContactPair, master=Surface):
         before, after = (facets.edge_excess(xi, nc) for xi in (c.xi, c.xi + slide))
         edge = after.argmax(axis=1)
         pairs = np.arange(len(edge))
-        joined = self._joined[c.facet, edge]
+        joined = self._edges.joined[c.facet, edge]
         # On an edge rounding must not decide: a node that stays at its facet there is within it.
         within = before.max(axis=1) <= search.PREFERENCE
         over = within & (after[pairs, edge] > search.PREFERENCE)

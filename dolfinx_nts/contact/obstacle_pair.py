@@ -111,6 +111,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
         path: FloatArray,
         reach: float,
         held: IntArray,
+        aimed: IntArray,
     ) -> IntArray | None:
         """None; raises if a node has gone through the obstacle and out of it again."""
         obstacle = self.obstacle

@@ -308,6 +308,7 @@ class ContactPair:
         path: FloatArray,
         reach: float,
         held: IntArray,
+        aimed: IntArray,
     ) -> IntArray | None:
         """For each slave of the rank the facet that should hold it, not its own, or -1. Collective.
 
@@ -319,12 +320,14 @@ class ContactPair:
             path: As of `find`.
             reach: Bound on the motion of slaves relative to the master [m].
             held: Facet that each of the rank's slaves is held at in the end, or -1, shape (share,).
+            aimed: As of `Motion`.
 
         Returns:
             Shape (share,), or None where that cannot be.
 
         Raises:
-            StepFailedError: A node has passed the master, and a shorter step is needed.
+            StepFailedError: A node has passed the master, or hits it and slides over its edge, and
+                a shorter step is needed.
         """
         raise NotImplementedError
 
