@@ -34,6 +34,7 @@ from dolfinx_nts.integrators import (
 from dolfinx_nts.interaction.coupling import Coupling, Joint, JointCoupling, Slopes, StepWarning
 from dolfinx_nts.interaction.elements import Elements, Step
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
+from dolfinx_nts.interaction.measured import HoldingLaw, Law, Move, Row
 from dolfinx_nts.interaction.point_elements import EveryStep, PointElements, PointPart
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints import (
@@ -48,6 +49,7 @@ from dolfinx_nts.joints import (
     Tie,
     Universal,
 )
+from dolfinx_nts.joints.forces import AboutAxis, BetweenPoints
 from dolfinx_nts.joints.laws import JointFriction
 from dolfinx_nts.joints.springs import Damper, Spring, TorsionDamper, TorsionSpring
 from dolfinx_nts.kernels.nts_element import Gap
@@ -67,8 +69,10 @@ from dolfinx_nts.validation import OutputError, StepFailedError, UserFunctionErr
 
 __version__ = version("dolfinx_nts")
 __all__ = [
+    "AboutAxis",
     "Adapt",
     "Beam",
+    "BetweenPoints",
     "Body",
     "BodyMotion",
     "Checkpoint",
@@ -93,17 +97,20 @@ __all__ = [
     "FormBody",
     "Gap",
     "GeneralizedAlpha",
+    "HoldingLaw",
     "Integrator",
     "Isotropic",
     "Joint",
     "JointCoupling",
     "JointFriction",
+    "Law",
     "LineForce",
     "LineMoment",
     "Midpoint",
     "EvaluationPoint",
     "MooneyRivlin",
     "NeoHookean",
+    "Move",
     "Newmark",
     "Newton",
     "Obstacle",
@@ -123,6 +130,7 @@ __all__ = [
     "Rectangle",
     "Restart",
     "RigidBody",
+    "Row",
     "Saved",
     "Seam",
     "Section",

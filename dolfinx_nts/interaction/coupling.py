@@ -72,7 +72,6 @@ class Joint:
         driven: Whether it moves bodies as prescribed by a function of time, which impacts that give
             their energy back refuse.
         parts: Joints beside it that come with it, such as its friction.
-        mid_step: Whether it asks for an integrator that carries no accelerations.
     """
 
     name: str
@@ -81,7 +80,6 @@ class Joint:
     numbers: IntArray | None = None
     driven: bool = False
     parts: tuple[Any, ...] = ()
-    mid_step: bool = False
 
     @cached_property
     def settings(self) -> Mapping[str, Any]:
@@ -90,6 +88,11 @@ class Joint:
         A checkpoint goes on only with equal ones. Without any, name and kind alone are compared.
         """
         return {}
+
+    @property
+    def mid_step(self) -> bool:
+        """Whether it asks for an integrator that carries no accelerations."""
+        return False
 
     def start(self) -> Any:
         """Return what it remembers at the start."""

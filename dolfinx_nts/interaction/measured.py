@@ -98,7 +98,11 @@ class Move(NamedTuple):
 
 
 class Law(Protocol):
-    """Which force D acts along a measure; it has no multiplier."""
+    """Which force D acts along a measure; it has no multiplier.
+
+    One that stores energy has `stored(at)`, too, the energy on this rank [J], and a D whose product
+    with the change of the measure is that of the energy. Collective.
+    """
 
     @property
     def settings(self) -> Mapping[str, Any]:

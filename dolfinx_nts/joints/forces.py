@@ -31,7 +31,9 @@ _ROUNDED = 1e-9
 
 
 class Between(Joint):
-    """What acts along one measure between two bodies has in common, see `Joint`.
+    """What acts along one measure between two bodies, see `Joint`; its class sets `law`.
+
+    It stores what its law's `stored` says, if that has one.
 
     Args:
         ends: Its bodies; None is the ground.
@@ -39,9 +41,9 @@ class Between(Joint):
 
     Attributes:
         measure: What it acts along.
-        law: What it does, see `interaction.measured`.
+        law: What it does: a `Law`, or a `HoldingLaw`, whose force is a multiplier.
         entry: Column of the ledger for the work that it takes from the bodies, and the sign with
-            which it stands there; "": none.
+            which it stands there; "": none. One that is not in every table is in `losses`, too.
     """
 
     measure: Measure
@@ -75,6 +77,16 @@ class Between(Joint):
     def settings(self) -> dict[str, Any]:
         """What a restart compares; of a user's own energy nothing."""
         return self._given | dict(self.law.settings)
+
+    @property
+    def mid_step(self) -> bool:
+        """What holds and lets go asks for an integrator that carries no accelerations."""
+        return holds(self.law)
+
+    def potential(self, u: Sequence[FloatArray], history: FloatArray) -> float:
+        """Stored energy on this rank [J]. Collective."""
+        stored = getattr(self.law, "stored", None)
+        return 0.0 if stored is None else float(stored(self._at(u, history)[1]))
 
     def start(self) -> FloatArray:
         """The turns of an angle begin with none, multipliers with zero."""
@@ -115,10 +127,25 @@ class Between(Joint):
 
 
 class BetweenPoints(Between):
-    """Along the line between two points; attributes as of `Between`."""
+    """What acts along the line between two points, whose length is the measure [m].
 
-    def _between(self, ends: tuple[Any, Any], points: Any) -> float:
-        """Set the measure; its value in the reference, exactly 0 where the points coincide."""
+    Args:
+        a: A body, or None: the ground.
+        b: A body, or None: the ground.
+        points: In the reference [m], one of a and one of b, shape (3,) each.
+        name: As of `Between`.
+
+    Attributes:
+        distance: Of the points in the reference [m], exactly 0 where they coincide.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a point lies outside of a flexible body.
+    """
+
+    def __init__(self, a: Any, b: Any, points: Any, *, name: str | None = None) -> None:
+        ends = (a, b)
+        super().__init__(ends, name)
         require_same(self.comm, points=points)
         given = _pair("points", points)
         self._given["points"] = [x.tolist() for x in given]
@@ -132,7 +159,8 @@ class BetweenPoints(Between):
         weights = np.concatenate([w for _, w in held])
         self._lay(kernel.Length, [side for side, _ in held], [(weights, constant)])
         length = float(np.linalg.norm(given[0] - given[1]))
-        return 0.0 if length <= _ROUNDED * max(map(np.linalg.norm, given)) else length
+        rounded = length <= _ROUNDED * max(map(np.linalg.norm, given))
+        self.distance = 0.0 if rounded else length
 
     def _undirected(self, reason: str) -> ValueError:
         return ValueError(
@@ -142,10 +170,22 @@ class BetweenPoints(Between):
 
 
 class AboutAxis(Between):
-    """About an axis of two bodies; attributes as of `Between`."""
+    """What acts about an axis, by the angle by which a turns relative to b since the reference.
 
-    def _about(self, ends: tuple[Any, Any], axis: Any) -> None:
-        """Set the measure: the angle by which A turns relative to B, 0 in the reference."""
+    Args:
+        a: A rigid body, or None: the ground.
+        b: A rigid body, or None: the ground.
+        axis: In the reference, of any length.
+        name: As of `Between`.
+
+    Raises:
+        TypeError: An argument is of another kind.
+        ValueError: An argument is out of range, or a body is flexible.
+    """
+
+    def __init__(self, a: Any, b: Any, *, axis: Any, name: str | None = None) -> None:
+        ends = (a, b)
+        super().__init__(ends, name)
         require_same(self.comm, axis=axis)
         m1, m2, n = triad(direction(f"axis of {self.name!r}", axis))
         self._given["axis"] = n.tolist()

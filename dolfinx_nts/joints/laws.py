@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dolfinx_nts.interaction.measured import Move, Row, holds
+from dolfinx_nts.interaction.measured import Move, Row
 from dolfinx_nts.joints.forces import Between
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.validation import (
@@ -152,7 +152,6 @@ class OnJoint(Between):
         else:
             self._on(joint, kernel.Along, (joint.n_a, joint.p_a - joint.p_b), 1.0)
         self.law, self.entry = law(self.measure.length), entry
-        self.mid_step = holds(self.law)
 
     def _on(self, joint: Any, kind: Any, vectors: tuple[Any, ...], length: float) -> None:
         """Set the measure of the joint's vectors."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,6 @@ _COMPARED, _ALIKE = 1e-2, 0.1
 
 class _Stores(Between):
     """What stores energy."""
-
-    law: Stiff
-
-    def potential(self, u: Sequence[FloatArray], history: FloatArray) -> float:
-        """Stored energy on this rank [J]. Collective."""
-        return self.law.stored(self._at(u, history)[1])
 
     def _by_stiffness(self, stiffness: Any, rest: float, unit: str) -> None:
         require_positive("stiffness", stiffness, unit)
@@ -125,9 +119,9 @@ class Spring(_Stores, BetweenPoints):
         force: Function | None = None,
         name: str | None = None,
     ) -> None:
-        super().__init__((a, b), name)
         _one_of(stiffness, energy, force, ("length", length))
-        start = self._between((a, b), points)
+        super().__init__(a, b, points, name=name)
+        start = self.distance
         if length is not None and not (is_finite(length) and length >= 0):
             raise ValueError(f"length={length!r}: must be >= 0 and finite [m]")
         if energy is not None:
@@ -165,9 +159,9 @@ class Damper(BetweenPoints):
     def __init__(
         self, a: Any, b: Any, points: Any, *, damping: float, name: str | None = None
     ) -> None:
-        super().__init__((a, b), name)
         require_positive("damping", damping, "N s/m")
-        if self._between((a, b), points) == 0.0:
+        super().__init__(a, b, points, name=name)
+        if self.distance == 0.0:
             raise self._undirected("a damper has no direction there")
         self.law = Viscous(float(damping))
 
@@ -208,9 +202,8 @@ class TorsionSpring(_Stores, AboutAxis):
         force: Function | None = None,
         name: str | None = None,
     ) -> None:
-        super().__init__((a, b), name)
         _one_of(stiffness, energy, force, ("angle", angle))
-        self._about((a, b), axis)
+        super().__init__(a, b, axis=axis, name=name)
         if angle is not None and not is_finite(angle):
             raise ValueError(f"angle={angle!r}: must be finite [rad]")
         if energy is not None:
@@ -243,7 +236,6 @@ class TorsionDamper(AboutAxis):
     def __init__(
         self, a: Any, b: Any, *, axis: Any, damping: float, name: str | None = None
     ) -> None:
-        super().__init__((a, b), name)
         require_positive("damping", damping, "N m s")
-        self._about((a, b), axis)
+        super().__init__(a, b, axis=axis, name=name)
         self.law = Viscous(float(damping))
