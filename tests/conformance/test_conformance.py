@@ -82,10 +82,10 @@ def test_each_body_coupling_and_law_of_the_package_has_a_scene():
         things = [*system.bodies, *system.joints, *(pair.master for pair in system.contacts)]
         things += [body.material for body in system.bodies if isinstance(body, nts.Continuum)]
         seen |= {type(thing) for thing in things}
-    kinds = nts.Body, nts.Joint, nts.Obstacle, nts.Isotropic
+    bases = nts.Body, nts.Joint, nts.BetweenPoints, nts.AboutAxis, nts.Obstacle, nts.Isotropic
     wanted = {
         kind for kind in vars(nts).values()
-        if isinstance(kind, type) and issubclass(kind, kinds) and kind not in kinds
+        if isinstance(kind, type) and issubclass(kind, bases) and kind not in bases
     }  # fmt: skip
     assert not wanted - seen
 
