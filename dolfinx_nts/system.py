@@ -83,7 +83,15 @@ class System:
         )
         wanted = "joints; the class of a joint of your own inherits from nts.Joint"
         given_joints = items("joints", joints, is_joint, wanted)
-        self.joints = tuple(part for joint in given_joints for part in (joint, *joint.parts))
+        with_parts = [part for joint in given_joints for part in (joint, *joint.parts)]
+        both: set[frozenset[int]] = set()
+        for k, pair in enumerate(self.contacts):
+            # Of two pairs that exchange slave and master one has the edges.
+            key = frozenset(map(id, pair.surfaces))
+            if key not in both and (parts := pair.parts(f"edges of contact {k}, {pair.name}")):
+                with_parts += parts
+                both.add(key)
+        self.joints = tuple(with_parts)
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
         self.comm = self.bodies[0].comm

@@ -19,7 +19,7 @@ ASIDE = 1e-4
 OUTSIDE = 1e-6
 #: Least cosine between normals of facets whose convex edge is one of a curved surface, such as a
 #: cylinder of twelve facets; that of an inner edge is `patches.SHARP`.
-_SHARP = 0.85
+SHARP = 0.85
 #: What hits a facet so near to a sharp edge, in ways that it slides in a step, passes beside it.
 _GRAZES = 1e-2
 #: Over so many facets of a curved surface a node is followed to its sharp edge.
@@ -46,7 +46,7 @@ class ConvexEdges:
         place, normal = middles(corners)
         rise = np.einsum("ni,ni->n", place[two] - place[one], normal[one])
         cosine = np.einsum("ni,ni->n", normal[one], normal[two])
-        turns = (rise < 0.0) & (cosine < _SHARP)
+        turns = (rise < 0.0) & (cosine < SHARP)
         self.joined[one[turns], edge[turns]] = -1
         self.sharp: BoolArray = ((self.beside >= 0) & (self.joined < 0)).any(axis=1)
 

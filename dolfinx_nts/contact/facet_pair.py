@@ -11,6 +11,7 @@ import numpy as np
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
 from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE, ConvexEdges, middles
+from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.pair import (
@@ -55,6 +56,13 @@ class FacetPair(ContactPair, master=Surface):
         self.extent = max(self.extent, master.material.extent(self.origin))
         self._free_edges = master.boundary_edges
         self._edges = ConvexEdges(master.facets, master.reference[master.facets])
+
+    def parts(self, name: str) -> tuple[EdgeContact, ...]:
+        """The contact of edges with edges, where both surfaces have any."""
+        if not self.edges:
+            return ()
+        contact = EdgeContact(self, name)
+        return (contact,) if all(len(edges.ends) for edges in contact.edges) else ()
 
     @cached_property
     def sag(self) -> float:

@@ -149,7 +149,8 @@ class OverlapWatch:
                 self._edges[k] = InnerEdges(contact.master.facets, positions[1])
             held = self._held_otherwise(k, everywhere)
             yield from filter(None, (
-                inside_rim(contact, positions, everywhere[k], held),
+                # Over a rim edges carry, where they take part.
+                None if contact.edges else inside_rim(contact, positions, everywhere[k], held),
                 in_inner_edge(self._edges[k], contact, positions, everywhere[k]),
             ))  # fmt: skip
 

@@ -16,7 +16,7 @@ from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
-from dolfinx_nts.validation import known_options
+from dolfinx_nts.validation import known_options, require_bool
 
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 MARGIN = 0.5
@@ -119,8 +119,8 @@ class ContactPair:
 
     Raises:
         TypeError: `slave` is no Surface, or `master` of no known kind.
-        ValueError: friction is negative or no number, `interference` is unknown, or the surfaces
-            share nodes.
+        ValueError: friction is negative or no number, `interference` is unknown, the surfaces
+            share nodes, or `edges` of an obstacle, which has none.
     """
 
     #: Class of pairs for each class of masters.
@@ -135,9 +135,11 @@ class ContactPair:
         return super().__new__(next(kinds, cls))
 
     def __init__(
-        self, slave: Surface, master: Any, *, friction: float = 0.0, interference: str = "refuse"
-    ) -> None:
+        self, slave: Surface, master: Any, *, friction: float = 0.0, interference: str = "refuse",
+        edges: bool = False,
+    ) -> None:  # fmt: skip
         _check_friction(friction)
+        require_bool("edges", edges)
         if not isinstance(interference, str) or interference not in INTERFERENCE:
             known = ", ".join(map(repr, INTERFERENCE))
             raise ValueError(f"interference={interference!r}: choose one of {known}")
@@ -152,6 +154,7 @@ class ContactPair:
             )
         self.slave, self.friction, self.interference = slave, float(friction), interference
         self.master: Any = master
+        self.edges = edges
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
@@ -190,6 +193,10 @@ class ContactPair:
     # ---- what a kind of master has of its own
     def _set_up(self) -> None:
         """Check the master and prepare the search."""
+
+    def parts(self, name: str) -> tuple[Any, ...]:
+        """What comes with it beside its own elements, as joints of a System with this name."""
+        return ()
 
     @property
     def sag(self) -> float:

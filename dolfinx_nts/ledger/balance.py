@@ -12,6 +12,7 @@ import numpy as np
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.solid.inversion import smallest_dets
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import global_sum
 from dolfinx_nts.state import State
@@ -20,7 +21,6 @@ from dolfinx_nts.types import BalanceRow, FloatArray
 
 if TYPE_CHECKING:
     from dolfinx_nts.equations.problem import StepProblem
-
 
 #: Columns of the balance table; momenta have three components.
 COLUMNS = (
@@ -254,13 +254,15 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
 
 
 def expelled(problem: StepProblem, step: Evaluation) -> str:
-    """The node that brings most energy in by starting behind its facet. Every rank must call it."""
+    """The node or edge that brings most energy in by starting behind. Every rank must call it."""
     best = (0.0, "")
-    for contact, part, _ in problem.couplings.touching(step):
+    for contact, part in zip(problem.elements, step.parts, strict=True):
+        if not isinstance(contact, ContactElements):
+            continue
         gain = contact.gains(part, problem.factor)
         if len(gain) and gain.max() > best[0]:
             i = int(gain.argmax())
-            where = f"node {contact.input_node(i)} of {contact.name!r}"
+            where = f"{contact.attachment.place(i)} of {contact.name!r}"
             text = f"{gain[i]:.3g} by {where}, deep by {-contact.candidates.gap[i]:.3g}"
             best = float(gain[i]), text
     return max(problem.system.comm.allgather(best))[1]

@@ -346,7 +346,7 @@ def test_a_node_that_is_moved_out_is_named(caplog):
     assert len(messages) == (COMM.rank == 0)
     for text in messages:
         assert f"bring an energy of {brought:.3g} " in text
-        assert f"{brought:.3g} by node 0 of" in text
+        assert f"{brought:.3g} by node 0 on facet 3 of" in text
         assert "deep by 0.004" in text
 
 
