@@ -85,7 +85,7 @@ def test_leaves_that_are_let_go():
 @pytest.mark.mpi
 @pytest.mark.slow
 def test_a_hook_that_snaps_behind_its_catch():
-    found = snap_fit.main(cells=8, steps=4, dt=1e-4, t_end=7e-3)
+    found = snap_fit.main(cells=8, steps=4, dt=5e-5, t_end=7e-3)
     assert found["status"] == found["snap status"] == "completed"
     for name in ("peak force", "on the flat face"):
         here, theory = found[name]
