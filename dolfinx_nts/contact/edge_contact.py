@@ -33,6 +33,8 @@ from dolfinx_nts.types import FloatArray, IntArray, Settings
 _EPS = float(np.finfo(float).eps)
 #: A gap of so many roundings of positions counts as closed.
 _TOUCH = 4.0
+#: Edges that have passed each other by this part of a facet, beside the step's motion, touch.
+_NEAR = 1e-6
 _STILL = np.zeros(3), np.zeros(3)
 
 
@@ -216,7 +218,8 @@ class EdgeCoupling(EveryStep):
         held = history.own * key + history.other
         pairs = found.own * key + found.other
         known = np.isin(pairs, held)
-        chosen = (found.inside | np.isin(pairs, will)) & (known | (found.gap > -reach))
+        ahead_of = found.gap > -reach - _NEAR * size
+        chosen = (found.inside | np.isin(pairs, will)) & (known | ahead_of)
         chosen &= self._mine[found.own]
         found = Near._make(a[chosen] for a in found)
         ends = [edges.ends[k] for edges, k in zip(contact.edges, found[:2], strict=True)]

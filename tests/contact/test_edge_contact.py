@@ -93,14 +93,14 @@ def test_edges_meet_alike_in_other_units(metre):
     np.testing.assert_allclose(ends[1] / metre, ends[0], rtol=1e-6, atol=1e-8)
 
 
-def bars(cells):
-    """A bar of tetrahedra falls on another one across, whose ends are held, edge on edge."""
+def bars(cells, **upper_options):
+    """A bar of tetrahedra above another one across, whose ends are held, edge on edge."""
     side, length, long = 0.1, 1.2, (cells, 1, 1)
     soft = {"size": (length, side, side), "cells": long, "cell": TET, "young": 5e7}
     held = [nts.Dirichlet(lambda x: np.abs(x[0]) > 0.5 * length - 1e-6)]
     lower = turned(ON_EDGE, np.zeros(3), "lower", bcs=held, **soft)
     shift = np.array([0.5 * length / cells, 0.5 * length / cells, side / HALF + 0.005])
-    upper = turned(about_z(90.0) @ ON_EDGE, shift, "upper", velocity=(0, 0, -2.0), **soft)
+    upper = turned(about_z(90.0) @ ON_EDGE, shift, "upper", **upper_options, **soft)
     pair = nts.ContactPair(
         upper.surface(everywhere), lower.surface(everywhere), friction=0.2, edges=True
     )
@@ -110,10 +110,22 @@ def bars(cells):
 @pytest.mark.mpi
 def test_crossed_bars_bounce():
     """Without edges the upper bar falls through the lower one; no look finds them inside now."""
-    system = bars(6)
+    system = bars(6, velocity=(0, 0, -2.0))
     run = nts.simulate(system, nts.EnergyMomentum(), dt=2.5e-4, t_end=0.03, accuracy="balanced")
     assert run.status == "completed" and not run.warnings.keys() & {"bodies inside each other"}
     assert nts.motion_of(system.bodies[1]).velocity[2] > 0.0
+
+
+@pytest.mark.mpi
+def test_crossed_bars_that_are_pressed_together_rest_in_balance():
+    """What presses the ends of the upper one is what its edge bears."""
+    ends = nts.Dirichlet(lambda x: np.abs(x[1] - 0.1) > 0.6 - 1e-6, lambda t: (0, 0, -0.03 * t))
+    run = nts.equilibrium(bars(6, bcs=[ends]), load_steps=2)
+    assert run.status == "completed"
+    held = run.reactions["upper"][-1].sum(axis=0)
+    borne = run.reactions["edges of contact 0, upper-lower"][-1, 0]
+    assert borne[2] > 100.0
+    assert held[2] == pytest.approx(-borne[2], rel=1e-6)
 
 
 def slide(facets):
