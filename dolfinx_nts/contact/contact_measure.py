@@ -2,7 +2,7 @@
 
 An element of contact is a measure of some points under a law. Another kind of contact is one more
 file: an `Attachment`, and a `ContactMeasure` if its gap is no function of points that there is.
-Edges that meet, for one, have the gap of facets, see `tests/contact/test_edges.py`.
+Edges that meet, for one, have the gap of facets, see `edge_contact.EdgeAttachment`.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
-"""Edges that meet edges: an attachment of its own is all that this kind of contact takes.
+"""Edges that meet edges: `EdgeAttachment` is all that their element has of its own.
 
 b(t) - a(s) of edges a and b is a parallelogram in (s, t): the gap of facets is theirs as it is.
 """
 
-from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
 
 from mpi4py import MPI
 
@@ -16,51 +14,11 @@ from measures import STENCIL
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.contact_elements import elements_of
-from dolfinx_nts.contact.contact_measure import Batch
+from dolfinx_nts.contact.edge_contact import EdgeAttachment
+from dolfinx_nts.contact.edges import SHARES
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.kernels import compiled, facets
-
-#: Weights of a_1, a_2, b_1, b_2 in x_s = a_1 and in a_1 + b_j - a_i, ij = 11, 21, 22, 12.
-SHARES = np.array(
-    [[1, 0, 0, 0], [0, 0, 1, 0], [1, -1, 1, 0], [1, -1, 0, 1], [0, 0, 0, 1]], dtype=float
-)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class EdgeAttachment(Batch):
-    """Edges of a slave and of a master, by positions of their ends in the surfaces, (n, 2) each."""
-
-    slave: Any
-    master: Any
-    own: Any
-    other: Any
-    path = np.zeros(3), np.zeros(3)
-
-    @property
-    def surfaces(self):
-        return self.slave, self.master
-
-    @property
-    def numbers(self):
-        return self.own, self.other
-
-    @property
-    def shares(self):
-        return np.broadcast_to(SHARES, (len(self.own), *SHARES.shape))
-
-    @property
-    def sides(self):
-        return tuple(
-            nts.Points(s.body, s.material.nodes[n, 0], np.ones(n.shape), s.reference[n],
-                       s.material.fixed[n, 0], np.ones(n.shape, dtype=bool))
-            for s, n in zip(self.surfaces, self.numbers, strict=True)
-        )  # fmt: skip
-
-    weights = shares
-
-    def place(self, i):
-        return f"edge of nodes {self.slave.original[self.own[i]].tolist()}"
 
 
 def ends(surface, axis, value):
