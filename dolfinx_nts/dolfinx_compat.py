@@ -36,6 +36,8 @@ VERSION = tuple(int(i) for i in dolfinx.__version__.split(".")[:2])
 #: UFL-owned elements, AdjacencyList dofmaps.
 OLD = VERSION < (0, 8)
 _SHARED = mesh.GhostMode.shared_facet
+#: What FFCx has loaded, by its C file: it lists the whole cache to load one again.
+_LOADED: dict[Path, Any] = {}
 
 
 # ---- meshes
@@ -227,8 +229,13 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
 
     def looked(*arguments: Any) -> Any:
         nonlocal told
+        source = Path(arguments[2], f"{arguments[0]}.c")
+        sources.append(source)
+        if source in _LOADED:
+            return _LOADED[source]
         found = look(*arguments)
-        sources.append(Path(arguments[2], f"{arguments[0]}.c"))
+        if found[0] is not None:
+            _LOADED[source] = found
         if found[0] is None and not told:
             logger.info("compiling %s, which is kept in %s", what, arguments[2])
             logging.disable(logging.INFO)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -89,7 +89,7 @@ class CellForm:
         self._compiled, self._source, self._cells = compiled, source, cells
         if cells is not None:
             # The C compiler works beside FFCx, which is busy with the next form.
-            self._loop = library.Beside(_load, source, cells.shape, compat.chosen_flags())
+            self._loop = library.Beside(_load, source, cells.shape, tuple(compat.chosen_flags()))
             of_cell = [f.values.reshape(-1, f.size)[f.dofs[0]].ravel() for f in cells.fields]
             self._first = np.concatenate(of_cell), compat.constants(compiled)
 
@@ -127,7 +127,8 @@ class CellForm:
         return float(total[0])
 
 
-def _load(source: Path, shape: Shape, flags: Sequence[str]) -> Any:
+@lru_cache
+def _load(source: Path, shape: Shape, flags: tuple[str, ...]) -> Any:
     """As `load`, from a file and beside it."""
     try:
         code = source.read_text()
