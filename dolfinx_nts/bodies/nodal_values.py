@@ -1,4 +1,4 @@
-"""Values that users give at all nodes of a body: vectors, functions of place, Functions."""
+"""Values at the nodes of a body that users give, and in its cells that they ask for."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.parallel import raise_together
@@ -60,3 +61,14 @@ def at_nodes(space: fem.FunctionSpace, what: str, value: Any) -> FloatArray:
     text = f"{what}: is not finite; check it for NaN"
     raise_together(space.mesh.comm, text if bad else None, UserFunctionError)
     return found
+
+
+def cell_function(mesh: Mesh, name: str, values: FloatArray) -> fem.Function:
+    """Function of degree 0 from values in this rank's cells, (n, 3) or (n, 3, 3). Collective."""
+    make = compat.cell_vector_space if values.ndim == 2 else compat.tensor_space
+    function = fem.Function(make(mesh, "DG", 0), name=name)
+    of_cells = compat.cell_dofs(function.function_space)[: len(values), 0]
+    rows = values.reshape(len(values), 3 ** (values.ndim - 1))
+    function.x.array.reshape(-1, rows.shape[1])[of_cells] = rows
+    function.x.scatter_forward()
+    return function

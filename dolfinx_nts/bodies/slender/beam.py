@@ -96,7 +96,7 @@ class Beam(DirectorBody):
 
     @property
     def _neighbours(self) -> IntArray:
-        first = np.arange(self._nodes.shape[1] - 1)
+        first = np.arange(self._cells.shape[1] - 1)
         return np.stack([first, first + 1], axis=1)
 
     def _finer(self, times: float) -> str:
@@ -153,10 +153,10 @@ class Beam(DirectorBody):
                 f"section of {self.name!r}: has no outline, so no surface; pass Section(..., "
                 "outline=[(x_1, x_2), ...]), or take one of a shape, Rectangle(b, h).section(...)"
             )
-        hull = self._hull
+        hull = self._skin.hull
         x = np.einsum("pk,pki->pi", hull.weights, self._vectors_at(hull.node))
         every = np.ones(len(hull.facets), dtype=bool)
-        return self._surface(self._marked(marker, every, x), smoothing)
+        return self._skin.surface(self._skin.marked(marker, every, x), smoothing)
 
     def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Force [N] and moment [N m] in the sections of the cells, vectors in space, (n, 3) each.
@@ -175,4 +175,4 @@ class Beam(DirectorBody):
         """
         nodes = self.points(x).nodes[:, 0] // 4
         local = self._skeleton.directors[nodes] @ direction / self.length
-        return self._points(nodes, np.column_stack([np.zeros(len(local)), local]))
+        return self.points_of(nodes, np.column_stack([np.zeros(len(local)), local]))

@@ -161,9 +161,9 @@ class Shell(DirectorBody):
         """
         require_bool("smoothing", smoothing)
         choose("side", side, SIDES)
-        x = self._skeleton.x[self._hull.node]
-        chosen = self._marked(marker, self._hull.part == SIDES.index(side), x)
-        return self._surface(chosen, smoothing)
+        x = self._skeleton.x[self._skin.hull.node]
+        chosen = self._skin.marked(marker, self._skin.hull.part == SIDES.index(side), x)
+        return self._skin.surface(chosen, smoothing)
 
     def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Forces [N/m] and moments [N] of a length, in axes of the reference, (n, 3, 3) each.
@@ -201,4 +201,4 @@ class Shell(DirectorBody):
                 f"only its director {director.tolist()} turns with it; hold it by Spherical joints "
                 "at several nodes"
             )
-        return self._points(nodes, np.array([[0.0, along / self.length]]))
+        return self.points_of(nodes, np.array([[0.0, along / self.length]]))
