@@ -1,6 +1,7 @@
 """Writers of fields, tables and films, plots and pictures."""
 
+from dolfinx_nts.output.fields import Fields
 from dolfinx_nts.output.film import Film
-from dolfinx_nts.output.writers import BalanceCSV, Fields, ForcesCSV
+from dolfinx_nts.output.tables import BalanceCSV, ForcesCSV
 
 __all__ = ["BalanceCSV", "Fields", "Film", "ForcesCSV"]

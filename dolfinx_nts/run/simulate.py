@@ -11,6 +11,7 @@ from dolfinx_nts.parallel import first_problem
 from dolfinx_nts.run.arguments import same_run
 from dolfinx_nts.run.checkpoint import Checkpoint, Saver
 from dolfinx_nts.run.interrupts import Interrupts
+from dolfinx_nts.run.paced import paced
 from dolfinx_nts.run.progress import progress_bar
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Solution
@@ -437,7 +438,7 @@ def _moves(
             for whole in stepper.in_parts(dt, end=time):
                 yield whole, whole and final
         else:
-            for _ in stepper.paced(pace, time):
+            for _ in paced(stepper, pace, time):
                 yield True, final and stepper.state.time == time
 
 

@@ -15,10 +15,12 @@ from dolfinx_nts.ledger import resultants
 from dolfinx_nts.parallel import first_problem, global_max, raise_together
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
+from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.start import consistent
+from dolfinx_nts.start.initial_contact_forces import with_resting_forces
 from dolfinx_nts.state import State
-from dolfinx_nts.system import System
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.system import System, is_like
+from dolfinx_nts.types import FloatArray, Options
 from dolfinx_nts.validation import UserFunctionError, is_finite
 
 #: Part of the speed of its bodies by which a joint may be violated at the start as meshes do it,
@@ -348,3 +350,45 @@ def consistent_start(
         "velocities that fit"
     )
     return state, None if project else (found[0], text)
+
+
+def fitting(
+    problem: StepProblem,
+    state: State,
+    dt: float,
+    *,
+    begun: Solution | None,
+    project: bool,
+    resting: tuple[Newton, Options],
+) -> tuple[State, tuple[float, str] | None]:
+    """The start with rates of prescribed motion and accelerations, which fits the joints.
+
+    Collective.
+
+    Args:
+        problem: Equations of the step.
+        state: At the start.
+        dt: First step [s].
+        begun: Run that this one goes on from.
+        project: As of `consistent_start`.
+        resting: Arguments of `with_resting_forces`.
+
+    Returns:
+        It, and what `consistent_start` has to tell of it.
+
+    Raises:
+        StepFailedError: A joint refuses a step of this length.
+    """
+    goes_on = begun is not None and begun.moving
+    state = with_prescribed_rates(problem.system, state, dt, goes_on=goes_on)
+    continues = begun is not None and goes_on and _has_joints_of(problem.system, begun.system)
+    state, moved = consistent_start(problem, state, dt, continues=continues, project=project)
+    if problem.integrator.accelerations and not state.a:
+        carried = with_resting_forces(problem, state, dt, *resting)
+        state = replace(state, a=consistent.accelerations(problem, carried, dt))
+    return state, moved
+
+
+def _has_joints_of(system: System, known: System) -> bool:
+    """Whether each joint of a system is like one of another's."""
+    return all(any(is_like(j, other) for other in known.joints) for j in system.joints)

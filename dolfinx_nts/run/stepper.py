@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import jumps
-from dolfinx_nts.contact.hidden_facets import hidden_facets
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.ledger.contact_fields import ContactLoads
@@ -24,28 +23,24 @@ from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Restart, Solution
 from dolfinx_nts.run.start import (
     check_restart,
-    consistent_start,
     first_state,
-    incomplete,
+    fitting,
     kind_of,
     note_shown,
     of_file,
     refuse_moved_meshes,
     refuse_overwritten,
     refuse_written,
-    with_prescribed_rates,
 )
-from dolfinx_nts.run.step_size import Pace
+from dolfinx_nts.run.start_warnings import tell_start
 from dolfinx_nts.run.step_warnings import tell_frictionless, tell_pieces, tell_step, tell_stressed
 from dolfinx_nts.run.trial import LastSteps, Trial, solved, state_after
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.newton import StepSolver
 from dolfinx_nts.start import consistent
-from dolfinx_nts.start.initial_contact_forces import with_resting_forces
-from dolfinx_nts.start.massless_start import off_balance, thick_layer
-from dolfinx_nts.start.unresolved import DamperWatch, tell_unresolved
+from dolfinx_nts.start.unresolved import DamperWatch
 from dolfinx_nts.state import State
-from dolfinx_nts.system import System, is_like
+from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray, Options
 from dolfinx_nts.validation import (
     StepFailedError,
@@ -57,9 +52,6 @@ from dolfinx_nts.validation import (
 
 logger = logging.getLogger(__name__)
 
-
-#: What a step chosen by its error is cut to: halves would soon end where it has failed.
-_CUT = 0.4
 #: First steps whose failure may come from how the run starts.
 _FIRST = 2
 #: Part of the energies by which a restart may differ from its checkpoint, as sums of other ranks
@@ -170,7 +162,7 @@ class Stepper:
             state = replace(state, a=())
         self._accept(state)
         self._start = start
-        self._started, self._goes_on = False, start is not None and start.moving
+        self._started = False
         if self.restart is None:
             self._ledger.open(state, start)
             tell_pieces(self.solution, state.time)
@@ -279,57 +271,6 @@ class Stepper:
                 parts -= 1
                 yield not parts
 
-    def paced(self, pace: Pace, end: float) -> Iterator[None]:
-        """Advance in steps of a pace, stopping after each.
-
-        Args:
-            pace: Sizes of the steps.
-            end: Where to stop [s].
-
-        Raises:
-            StepFailedError: Not solved even after `newton.max_retries` cuts in a row, or as in
-                `advance`.
-        """
-        self.system.check_alive()
-        self.start(pace.dt)
-        retries = 0
-        while self.state.time < end:
-            now = self.state.time
-            left = end - now
-            dt = pace.propose(left)
-            try:
-                self._begin(dt)
-                part = pace.first_touch(self.problem)
-                if part < 1.0:
-                    dt *= part
-                    self._begin(dt)
-                trial = self._attempt(end if dt == left else now + dt)
-            except UserFunctionError:
-                raise
-            except StepFailedError as failure:
-                if retries == self.newton.max_retries:
-                    raise
-                retries += 1
-                self.solution.retries += 1
-                pace.dt = _CUT * dt
-                logger.info("%s; retrying with dt=%.3g", failure, pace.dt)
-                continue
-            if not pace.accepts(self.problem, trial.step):
-                self.solution.rejected += 1
-                continue
-            # Steps below the shortest do not reset the retries, else a run might go on with them.
-            retries = 0 if dt >= pace.shortest else retries
-            self._take(trial)
-            if pace.exceeds:
-                self.solution.exceeded += 1
-                self.solution.warn(
-                    "step error", self.state.time, dt,
-                    f"a step of {dt:.3g} errs more than Adapt asks for: it is the shortest one, "
-                    "or it moves a node out from behind its facet; pass a smaller `shortest` or a "
-                    "larger `tolerance`",
-                )  # fmt: skip
-            yield
-
     def start(self, dt: float) -> None:
         """Give prescribed coordinates the rate of their motion; later calls do nothing.
 
@@ -358,24 +299,7 @@ class Stepper:
                 logger.info("%s; starting with dt=%.3g", failure, dt)
         self._accept(state)
         self._started = True
-        if moved is not None:
-            self.solution.warn("start projected", state.time, *moved)
-        doubt = incomplete(self._start)
-        if doubt:
-            self.solution.warn("start", state.time, 1.0, doubt, grave=True)
-        missing, text = off_balance(self.problem, state, dt)
-        if text:
-            self.solution.warn("massless nodes", state.time, missing, text)
-        ratio, text = thick_layer(self.system)
-        if text:
-            self.solution.warn("thick layer", state.time, ratio, text)
-        fast = tell_unresolved(self.problem, state, dt)
-        if fast:
-            self.solution.warn("unresolved", state.time, *fast)
-        masters = [state.u[bodies[-1]] for bodies in self.system.contact_bodies]
-        hidden = hidden_facets(self.system.contacts, masters)
-        if hidden:
-            self.solution.warn("hidden facets", state.time, *hidden)
+        tell_start(self.solution, self.problem, state, dt, self._start, moved)
         self._ledger.open(state, self._start)
         # Where bodies were before the first step, for one that carries them through each other.
         self.look()
@@ -384,7 +308,7 @@ class Stepper:
         """The start with rates of prescribed motion and accelerations, which fits the joints.
 
         Returns:
-            It, and what `consistent_start` has to tell of it.
+            As `fitting` does.
 
         Raises:
             StepFailedError: A joint refuses a step of this length.
@@ -392,22 +316,8 @@ class Stepper:
         self._call_before(dt)
         # What the first call sets is what the run begins with.
         self._materials.changed()
-        state = with_prescribed_rates(self.system, self.state, dt, goes_on=self._goes_on)
-        state, moved = consistent_start(
-            self.problem, state, dt, continues=self._continues, project=self._project_start
-        )
-        if self.problem.integrator.accelerations and not state.a:
-            carried = with_resting_forces(self.problem, state, dt, self.newton, self._given)
-            state = replace(state, a=consistent.accelerations(self.problem, carried, dt))
-        return state, moved
-
-    @property
-    def _continues(self) -> bool:
-        """Whether the run goes on from another one with the same joints."""
-        if not self._goes_on or self._start is None:
-            return False
-        known = self._start.system.joints
-        return all(any(is_like(j, other) for other in known) for j in self.system.joints)
+        project, resting, begun = self._project_start, (self.newton, self._given), self._start
+        return fitting(self.problem, self.state, dt, begun=begun, project=project, resting=resting)
 
     def look(self, *, last: bool = False) -> None:
         """Warn if what is in contact is inside each other; only as often as it has moved.
@@ -440,10 +350,10 @@ class Stepper:
         self.state = self.solution.state = state
 
     def _step(self, dt: float, time: float) -> None:
-        self._begin(dt)
-        self._take(self._attempt(time))
+        self.begin(dt)
+        self.take(self.attempt(time))
 
-    def _begin(self, dt: float) -> None:
+    def begin(self, dt: float) -> None:
         """Fix the equations of a step from the last accepted state."""
         self._prepare(dt)
         self.problem.begin(self.state, dt)
@@ -472,8 +382,8 @@ class Stepper:
             what = f"a changed parameter of the material of {', '.join(map(repr, names))}"
             self._ledger.restate(self.state, what, beyond=0.0)
 
-    def _attempt(self, time: float) -> Trial:
-        """Solution of the step that `_begin` fixed, if it may be accepted.
+    def attempt(self, time: float) -> Trial:
+        """Solution of the step that `begin` fixed, if it may be accepted.
 
         Args:
             time: At its end [s].
@@ -495,7 +405,7 @@ class Stepper:
             measured = ledger.measure(state)
         return Trial(step, state, measured, impulses, impact, drives)
 
-    def _take(self, trial: Trial) -> None:
+    def take(self, trial: Trial) -> None:
         """Accept a step: a row of the ledger, and the new state."""
         step, state, impact = trial.step, trial.state, trial.impact
         self._ledger.enter(self.problem, trial)

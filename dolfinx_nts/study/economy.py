@@ -30,10 +30,9 @@ from petsc4py import PETSc
 
 import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
-from dolfinx_nts import petsc_compat
+from dolfinx_nts import output, petsc_compat
 from dolfinx_nts.forms import CellForm, assemble_vector
 from dolfinx_nts.kernels.strain_energy import strain_energy
-from dolfinx_nts.output import writers as output
 from dolfinx_nts.solve.linear_solver import SolverOptions
 from dolfinx_nts.types import BalanceRow, FloatArray
 from dolfinx_nts.validation import known_options, require_positive

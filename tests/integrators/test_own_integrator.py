@@ -12,7 +12,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 from point_mass import PointMass
 
 import dolfinx_nts as nts
-from dolfinx_nts.output.writers import BalanceCSV
+from dolfinx_nts.output.tables import BalanceCSV
 
 COMM = MPI.COMM_WORLD
 

@@ -12,9 +12,9 @@ from scenes import CELLS, RUBBER, box, meeting_blocks, thrown_block
 from xdmf import read_xdmf
 
 import dolfinx_nts as nts
+from dolfinx_nts import output
 from dolfinx_nts.ledger import balance
 from dolfinx_nts.output import pictures, plots
-from dolfinx_nts.output import writers as output
 
 h5py = pytest.importorskip("h5py")
 image = pytest.importorskip("matplotlib.image")

@@ -20,8 +20,8 @@ from scenes import meeting_blocks, thrown_block
 from xdmf import read_xdmf
 
 import dolfinx_nts as nts
+from dolfinx_nts import output
 from dolfinx_nts.output import pictures
-from dolfinx_nts.output import writers as output
 from dolfinx_nts.output.whole_files import Draft, amend_file, extend_file, replace_file
 
 COMM = MPI.COMM_WORLD

@@ -14,6 +14,7 @@ from scenes import UNITS, fail_once, rubbing_blocks
 
 import dolfinx_nts as nts
 from dolfinx_nts.output import BalanceCSV
+from dolfinx_nts.run.paced import paced
 from dolfinx_nts.run.step_size import Pace, factor
 from dolfinx_nts.run.stepper import Stepper
 
@@ -300,7 +301,7 @@ def test_a_step_that_is_not_solved_is_cut_off_the_instants_of_its_halves():
     stepper = Stepper(nts.System([SpringMass()]), nts.EnergyMomentum())
     pace = Pace(nts.Adapt(tolerance=10.0), stepper.system, stepper.state, 0.1, 1.0)
     fail_once(stepper, at_call=6)
-    times = [stepper.state.time for _ in stepper.paced(pace, 1.0)]
+    times = [stepper.state.time for _ in paced(stepper, pace, 1.0)]
     steps = np.diff(times)
     assert stepper.solution.retries == 1
     assert steps[4] == pytest.approx(0.4 * steps[3]) and steps.max() == pytest.approx(0.1)

@@ -14,8 +14,7 @@ from point_mass import PointMass
 from scenes import RUBBER, bottom, box, top
 
 import dolfinx_nts as nts
-from dolfinx_nts import validation
-from dolfinx_nts.output import writers as output
+from dolfinx_nts import output, validation
 
 COMM = MPI.COMM_WORLD
 DT = 1e-3
