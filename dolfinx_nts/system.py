@@ -121,10 +121,13 @@ class System:
         if self.contacts:
             need_kernels(self.comm)
         start = self.initial_state()
+        for pair, where in zip(self.contacts, self.contact_bodies, strict=True):
+            pair.settle([start.u[b] for b in where])
         depths = self.penetration(start)
         for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
             # The search looks half a facet deep; this, the whole body.
-            depths[k] = np.maximum(depths[k], pair.depth([start.u[b] for b in where]))
+            inside = pair.depth([start.u[b] for b in where])
+            depths[k] = np.maximum(depths[k], np.where(pair.settled, 0.0, inside))
         self._check_sides(start)
         self._check_penetration(depths, jumps(self.bodies))
         self._check_enclosed(start)
@@ -421,8 +424,8 @@ def cut_off(pair: ContactPair, depth: FloatArray) -> str:
     name = pair.master.body.name
     return (
         f"that is no more than the flat facets of {name!r} cut off its curved surface: pass "
-        "smoothing=True to its surface, or take a finer mesh; interference=\"resolve\" would "
-        "press the bodies as if they overlapped by that much"
+        "smoothing=True to its surface, adjust= to the contact, or take a finer mesh; "
+        'interference="resolve" would press the bodies as if they overlapped by that much'
     )
 
 

@@ -38,6 +38,7 @@ class ContactElements(Batch):
         attachment: Which points of bodies these are.
         measure: Their gap and slip.
         law: What these obey.
+        offset: Gap that counts as none [m], shape (n,), see `ContactPair`.
     """
 
     pair: ContactPair
@@ -45,6 +46,7 @@ class ContactElements(Batch):
     attachment: Attachment
     measure: ContactMeasure
     law: ContactLaw
+    offset: FloatArray | float = 0.0
     combination = None
 
     def select(self, chosen: BoolArray) -> ContactElements:
@@ -179,7 +181,7 @@ class ContactElements(Batch):
         except Exception:  # any of an obstacle of the user's; the other ranks wait
             self._together(np.empty(0), None, np.empty((0, 1)))
             raise
-        gap = found.gap + law.overlap
+        gap = found.gap - self.offset + law.overlap
         found.residual[:, law.row], found = gap, found._replace(gap=gap)
         slip = found.slip
         together = self._together(gap, slip, multiplier)

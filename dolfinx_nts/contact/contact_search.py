@@ -206,7 +206,7 @@ class ContactSearch:
                 before[:, 1:] = step.factor * carried[:, -2:]
             before[~massless] = np.nan
             law = replace(law, before=before)
-        return replace(elements, law=law)
+        return replace(elements, law=law, offset=pair.offset[found.node])
 
     def _drop_doubles(self) -> None:
         """Keep one of two pairs that keep a node out of the same fixed surface.
@@ -429,4 +429,4 @@ class ContactSearch:
         """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
         moved = c.pair.positions([u[b] for b in self.bodies[k]])
         points = c.pair.points(moved, c.candidates) - self._paths[k][1]
-        return c.measure.gap(points)
+        return c.measure.gap(points) - c.offset

@@ -139,22 +139,23 @@ class FacetPair(ContactPair, master=Surface):
         followed: BoolArray | None = None,
     ) -> Found:
         """Search for this rank's candidates, as of `ContactPair`. Collective."""
-        reach = 0.0 if motion is None else motion.reach
+        reach = self._lift + (0.0 if motion is None else motion.reach)
         every = np.ones(len(self.slave.share), dtype=bool)
         known = every if followed is None else followed
         slaves, master = positions
         corners = master[self.master.facets]
         sizes = facets.size(corners)
         radius, cover = (reach + MARGIN * float(s) for s in (sizes.max(), sizes.min()))
+        cover -= self._lift
         # Positions of all points are known everywhere, so all ranks leave here or none.
         if search.apart(slaves, corners, radius):
-            return Found(NO_CANDIDATES, ~every, radius)
+            return Found(NO_CANDIDATES, ~every, radius - self._lift)
         x = slaves[self.slave.share]
         closest = search.closest_facets(x, corners, reach=radius, current=current)
         node = np.flatnonzero(closest.facet >= 0)
         found, lost = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
         if motion is not None:
-            found = self._along_paths(found, x, master, motion)
+            found = self._along_paths(found, x, master, motion._replace(reach=reach))
         beside = (found.gap < -OUTSIDE * found.length) & ~known[found.node]
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
@@ -166,6 +167,7 @@ class FacetPair(ContactPair, master=Surface):
             deepest = float(depth.max()), int(self.slave.original[node])
         found = found.select(~beside)
         stays[found.node] = True
+        found = found._replace(gap=found.gap - self.offset[found.node])
         return Found(found, stays, cover, deepest)
 
     def elements(
@@ -182,6 +184,20 @@ class FacetPair(ContactPair, master=Surface):
             theta=step.integrator.theta, condense=step.condense,
         )  # fmt: skip
         return elements_of(self, found, attachment, measure, step)
+
+    def _at_start(self, positions: Sequence[FloatArray], path: FloatArray) -> Candidates:
+        """As of `ContactPair`: over their closest facets, or as near to an edge of these."""
+        x, master = positions[0][self.slave.share], positions[1]
+        corners = master[self.master.facets]
+        reach = self.adjust + MARGIN * float(facets.size(corners).max(initial=0.0))
+        closest = search.closest_facets(x, corners, reach=reach)
+        node = np.flatnonzero(closest.facet >= 0)
+        found, _ = self._measure(
+            x, master, node, closest.facet[node], closest.xi[node], self.adjust
+        )
+        excess = facets.edge_excess(found.xi, corners.shape[1]).max(axis=1)
+        over = excess <= search.PREFERENCE
+        return found.select(over | (closest.distance[found.node] <= self.adjust))
 
     def _along_paths(
         self, found: Candidates, x: FloatArray, master: FloatArray, motion: Motion
@@ -444,7 +460,7 @@ class FacetPair(ContactPair, master=Surface):
         _, control, xi, converged = self._projected(end, moved, hit[node], start)
         foot, _, normal = facets.frame(control, xi)
         length = facets.size(moved[at[hit[node]]])
-        depth = np.einsum("ni,ni->n", normal, foot - end) / length
+        depth = (np.einsum("ni,ni->n", normal, foot - end) + self.offset[node]) / length
         # A node that is held at another facet may end a little behind this one.
         deep = depth > np.where(held[node] >= 0, MARGIN, OUTSIDE)
         hit[np.setdiff1d(np.arange(len(hit)), node[deep | ~converged])] = -1

@@ -82,15 +82,22 @@ class ObstaclePair(ContactPair, master=Obstacle):
     ) -> Found:
         """Candidates, as of `ContactPair`. Nothing limits the depth: what is behind is inside."""
         slave, reach = self.slave, 0.0 if motion is None else motion.reach
+        reach += self._lift
         x = positions[0][slave.share] - path[0]
         gap, length = self.obstacle.gap(x), np.sqrt(slave.area[slave.share])
         movable = ~slave.fixed[slave.share].all(axis=1)
         node = np.flatnonzero(movable & (gap.value < reach + MARGIN * length))
         only, xi = np.zeros(len(node), dtype=np.int64), np.zeros((len(node), 2))
         normal = gap.gradient[node, 0]
-        found = Candidates(node, only, only, xi, normal, gap.value[node], length[node])
-        cover = reach + MARGIN * float(np.sqrt(slave.area.min()))
+        left = gap.value[node] - self.offset[node]
+        found = Candidates(node, only, only, xi, normal, left, length[node])
+        cover = reach - self._lift + MARGIN * float(np.sqrt(slave.area.min()))
         return Found(found, np.ones(len(slave.share), dtype=bool), cover)
+
+    def _at_start(self, positions: Sequence[FloatArray], path: FloatArray) -> Candidates:
+        """As of `ContactPair`."""
+        still = Motion(self.adjust, (), np.empty(0, dtype=np.int64))
+        return self.find(positions, still.aimed, path, still).candidates
 
     def elements(
         self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step

@@ -80,6 +80,11 @@ class OverlapWatch:
             *([o.contact.slave.body, None] for o in obstacles),
             *([self._bodies[k] for k in bodies] for bodies in between),
         ]
+        # What the nodes of meshes miss each other by is no overlap.
+        self._allowed = [
+            *(o.contact.adjust for o in obstacles),
+            *(max(c.adjust for c in contacts) for contacts in between.values()),
+        ]
         self._looked: dict[int, _Looked] = {}
 
     def look(
@@ -107,10 +112,10 @@ class OverlapWatch:
         everywhere = self._everywhere(forces) if between else []
         for k, way in due:
             before, pair = self._looked.get(k), self._pairs[k]
-            if before and way > before.pause.clear + before.pause.through:
-                findings += pair.passed(before.where, now[k], way, before.pause.through)
             found, pause = pair.look(now[k])
-            findings += found
+            if before and way > before.pause.clear + before.pause.through:
+                found += pair.passed(before.where, now[k], way, before.pause.through)
+            findings += [f for f in found if f.depth > self._allowed[k]]
             if everywhere and isinstance(pair, BodyPair):
                 findings += self._of_contacts(pair, u, everywhere)
             self._looked[k] = _Looked(now[k], pause)

@@ -12,11 +12,13 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from dolfinx_nts.contact import search
 from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
+from dolfinx_nts.parallel import global_max
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
-from dolfinx_nts.validation import known_options, require_bool
+from dolfinx_nts.validation import is_finite, known_options, require_bool
 
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 MARGIN = 0.5
@@ -111,16 +113,22 @@ class ContactPair:
             to the pseudo time, until none is left at 1; the work of that is `interference_work` in
             the balance. `simulate` starts from its result. Equilibrium presses out any overlap in
             this way, also the small one that "refuse" allows.
+        adjust: Slave nodes whose gap at the start is at most this, outside or inside, touch then
+            without strain or force, as if they stood on the master: what the nodes of two meshes
+            miss each other by. The gap that they start with goes on being none; bodies are drawn
+            where their meshes are, and may be that deep inside each other without a warning. At
+            most half a facet of the master inwards [m].
 
     Attributes:
         origin: Point of space that positions are relative to [m], shape (3,).
         extent: Largest of the reference positions' components, relative to it [m].
         given: Largest of the slave's as they were given, whose rounding they have [m].
+        offset: Gap at the start that counts as none, of each slave node of `Surface.share` [m].
 
     Raises:
         TypeError: `slave` is no Surface, or `master` of no known kind.
-        ValueError: friction is negative or no number, `interference` is unknown, the surfaces
-            share nodes, or `edges` of an obstacle, which has none.
+        ValueError: friction or `adjust` is negative or no number, `interference` is unknown, the
+            surfaces share nodes, or `edges` of an obstacle, which has none.
     """
 
     #: Class of pairs for each class of masters.
@@ -136,13 +144,15 @@ class ContactPair:
 
     def __init__(
         self, slave: Surface, master: Any, *, friction: float = 0.0, interference: str = "refuse",
-        edges: bool = False,
+        adjust: float = 0.0, edges: bool = False,
     ) -> None:  # fmt: skip
         _check_friction(friction)
         require_bool("edges", edges)
         if not isinstance(interference, str) or interference not in INTERFERENCE:
             known = ", ".join(map(repr, INTERFERENCE))
             raise ValueError(f"interference={interference!r}: choose one of {known}")
+        if not (is_finite(adjust) and adjust >= 0.0):
+            raise ValueError(f"adjust={adjust!r}: pass a distance >= 0 [m]")
         if not isinstance(slave, Surface):
             other = isinstance(slave, tuple(self._kinds))
             hint = "; an obstacle is a master" if other else ""
@@ -154,7 +164,9 @@ class ContactPair:
             )
         self.slave, self.friction, self.interference = slave, float(friction), interference
         self.master: Any = master
-        self.edges = edges
+        self.edges, self.adjust = edges, float(adjust)
+        # Searches reach farther by the largest gap that counts as none.
+        self.offset, self._lift = np.zeros(len(slave.share)), 0.0
         # What is near is small: gaps keep their digits wherever in space the bodies meet.
         self.origin, self.given = slave.reference[0], float(np.abs(slave.reference).max())
         self.extent = slave.material.extent(self.origin)
@@ -263,6 +275,36 @@ class ContactPair:
             u: Owned displacements of each of `bodies` at the start [m].
         """
         return 0.0
+
+    def settle(self, u: Sequence[FloatArray]) -> None:
+        """Take the gaps at the start that count as none, see `offset`. Collective.
+
+        Args:
+            u: As of `depth`.
+        """
+        self.offset, self._lift = np.zeros(len(self.slave.share)), 0.0
+        if not self.adjust:
+            return
+        found = self._at_start(self.positions(u), self.path(0.0, 0.0))
+        rounding = search.ROUNDING * (self.adjust + self.extent)
+        near = np.abs(found.gap) <= self.adjust + rounding
+        self.offset[found.node[near]] = found.gap[near]
+        largest = np.array([self.offset.max(initial=0.0)])
+        self._lift = float(global_max(self.slave.body.comm, largest)[0])
+
+    @property
+    def settled(self) -> BoolArray:
+        """Which of all slave nodes were adjusted, shape (points,). Collective."""
+        return self.slave.at_all(self.offset != 0.0)
+
+    def _at_start(self, positions: Sequence[FloatArray], path: FloatArray) -> Candidates:
+        """This rank's slaves that may be within `adjust` of the master. Collective.
+
+        Args:
+            positions: Of all points at the start [m].
+            path: As of `find`.
+        """
+        raise NotImplementedError
 
     def encloses(self, u: Sequence[FloatArray], time: float) -> bool:
         """Return whether all of the slave's body starts inside an obstacle. Collective.

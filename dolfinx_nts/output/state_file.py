@@ -112,7 +112,7 @@ def _settings(item: Any) -> dict[str, Any]:
 
 
 def _describe_contact(pair: Any) -> dict[str, Any]:
-    found = {"name": pair.name, "friction": float(pair.friction)}
+    found = {"name": pair.name, "friction": float(pair.friction), "adjust": pair.adjust}
     for role in ("slave", "master"):
         surface = getattr(pair, role)
         facets = getattr(surface, "facets", None)

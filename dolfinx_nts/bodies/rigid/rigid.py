@@ -26,14 +26,15 @@ from dolfinx_nts.bodies.solid.parameters import (
     require_positive_parameter,
     values_of,
 )
-from dolfinx_nts.contact.skins import locate_facets, skin_of_mesh
+from dolfinx_nts.contact.facet_choice import choose_facets
+from dolfinx_nts.contact.skins import skin_of_mesh
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross, range_of
 from dolfinx_nts.parallel import gather_rows, raise_together, rank_of
-from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values, Vector
 from dolfinx_nts.validation import (
     UserFunctionError,
     known_options,
@@ -339,6 +340,8 @@ class RigidBody(Body):
         marker: Marker,
         tag: int | None = None,
         *,
+        normal: Vector | None = None,
+        angle: float | None = None,
         smoothing: bool = False,
         mass: str = "consistent",
     ) -> Surface:
@@ -348,12 +351,15 @@ class RigidBody(Body):
             marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
                 meshtags.
             tag: Value in the meshtags.
+            normal: As of `Continuum.surface`.
+            angle: As of `Continuum.surface` [degrees].
             smoothing: Whether slaves touch a smooth surface when this one is the master.
             mass: "consistent"; no node of a rigid body can lose its mass.
 
         Raises:
             TypeError: smoothing is no bool.
-            ValueError: The body has no mesh; no facet, or interior facets; mass is another one.
+            ValueError: The body has no mesh; no facet, or interior facets, or none that faces
+                `normal`; normal or angle is none; mass is another one.
         """
         require_bool("smoothing", smoothing)
         if mass != "consistent":
@@ -365,7 +371,8 @@ class RigidBody(Body):
             raise ValueError(
                 f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
             )
-        found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
+        what = f"marker of a surface of {self.name!r}"
+        found = choose_facets(self.mesh, marker, tag, normal, angle, what)
         return Surface(self, skin_of_mesh(self, found), smoothing)
 
     def motion_range(self, du: FloatArray) -> FloatArray:

@@ -31,7 +31,8 @@ from dolfinx_nts.bodies.solid.parameters import (
     values_of,
 )
 from dolfinx_nts.bodies.solid.step_forms import ExtraForm, StepForms, checked_form, fill
-from dolfinx_nts.contact.skins import locate_facets, skin_of_mesh
+from dolfinx_nts.contact.facet_choice import choose_facets
+from dolfinx_nts.contact.skins import skin_of_mesh
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
@@ -39,7 +40,7 @@ from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points, in_mesh
 from dolfinx_nts.parallel import gather_on_root, raise_together
-from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values, Vector
 from dolfinx_nts.validation import (
     UserFunctionError,
     require_bool,
@@ -122,6 +123,8 @@ class UflBody(Body):
         marker: Marker,
         tag: int | None = None,
         *,
+        normal: Vector | None = None,
+        angle: float | None = None,
         smoothing: bool = False,
         mass: str = "consistent",
     ) -> Surface:
@@ -163,12 +166,19 @@ class UflBody(Body):
             marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
                 meshtags.
             tag: Value in the meshtags.
+            normal: Choose those of the marker's facets that face this way, an outward normal of the
+                reference of any length, shape (3,); `angle` says how nearly.
+            angle: With `normal`, the largest angle between both. Without it, the feature angle: go
+                on from the marker's facets, also to others, over all edges at which the boundary
+                turns by less, so that one facet of a face without sharp edges, such as a cylinder's
+                mantle, is enough to have it all. Above 0, up to 180 [degrees].
             smoothing: Whether slaves touch a smooth surface when this one is the master.
             mass: "consistent" or "redistributed".
 
         Raises:
             TypeError: smoothing is no bool.
-            ValueError: Degree above 1, no facet, or interior facets; mass is unknown, too little of
+            ValueError: Degree above 1, no facet, or interior facets, or none that faces `normal`;
+                normal or angle is none, or normal is given alone; mass is unknown, too little of
                 the body is left beside the surface to take its mass, or the body has moved already.
         """
         require_bool("smoothing", smoothing)
@@ -183,7 +193,8 @@ class UflBody(Body):
                 f"degree={self.degree!r} of body {self.name!r}: surfaces, of contacts and of "
                 "ties, need degree 1; pass degree=1, on a finer mesh for the same accuracy"
             )
-        found = locate_facets(self.mesh, marker, tag, f"marker of a surface of {self.name!r}")
+        what = f"marker of a surface of {self.name!r}"
+        found = choose_facets(self.mesh, marker, tag, normal, angle, what)
         surface = Surface(self, skin_of_mesh(self, found), smoothing)
         if mass == "redistributed":
             self._make_massless(surface)
