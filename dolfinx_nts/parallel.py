@@ -10,10 +10,9 @@ from typing import Any, TypeVar
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts.kernels import library
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import Array, FloatArray
 
 T = TypeVar("T")
 
@@ -28,14 +27,14 @@ def rank_of(name: str, comm: MPI.Comm) -> int:
     return (stem + int(numbers[-1] if numbers else 0)) % int(comm.size)
 
 
-def gather_rows(comm: MPI.Comm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def gather_rows(comm: MPI.Comm, rows: Array) -> Array:
     """Rows of all ranks in rank order, on every rank."""
     if comm.size == 1:  # pickling takes longer than the rows
         return rows.copy()
     return np.concatenate(comm.allgather(rows))
 
 
-def gather_on_root(comm: MPI.Comm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def gather_on_root(comm: MPI.Comm, rows: Array) -> Array:
     """Rows of all ranks in rank order on rank 0, none elsewhere."""
     parts = comm.gather(rows)
     return rows[:0] if parts is None else np.concatenate([p for p in parts if len(p)] or parts)

@@ -17,10 +17,9 @@ from typing import Any, TypeGuard, TypeVar
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.types import FloatArray, OfTime
+from dolfinx_nts.types import Array, FloatArray, OfTime
 
 T = TypeVar("T")
 StrPath = str | os.PathLike[str]
@@ -123,29 +122,29 @@ def known_options(target: T) -> T:
     return target
 
 
-def is_finite(value: Any) -> TypeGuard[float]:
+def is_finite(value: object) -> TypeGuard[float]:
     """Return whether the value is a finite real number; text and truth values are none."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def is_whole(value: Any) -> TypeGuard[int]:
+def is_whole(value: object) -> TypeGuard[int]:
     """Return whether the value is a whole number; a truth value is none."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
-def require_positive(name: str, value: Any, unit: str) -> None:
+def require_positive(name: str, value: object, unit: str) -> None:
     """Raise ValueError unless the value is a positive, finite number."""
     if not (is_finite(value) and value > 0):
         raise ValueError(f"{name}={value!r}: must be positive and finite [{unit}]")
 
 
-def require_bool(name: str, value: Any) -> None:
+def require_bool(name: str, value: object) -> None:
     """Raise TypeError unless the value is True or False."""
     if not isinstance(value, bool):
         raise TypeError(f"{name}={value!r}: pass True or False")
 
 
-def require_name(argument: str, value: Any) -> None:
+def require_name(argument: str, value: object) -> None:
     """Raise TypeError or ValueError unless the value is text with something to read."""
     if not isinstance(value, str):
         raise TypeError(f"{argument}={value!r}: pass text, e.g. {argument}='block'")
@@ -153,7 +152,7 @@ def require_name(argument: str, value: Any) -> None:
         raise ValueError(f"{argument}={value!r}: is empty; pass e.g. {argument}='block'")
 
 
-def floats(value: Any) -> FloatArray:
+def floats(value: object) -> FloatArray:
     """The value as floats; an empty array where it is no array of real numbers, text included."""
     if hasattr(value, "ufl_shape"):  # UFL would take being asked for an array for Einstein's sum
         return np.empty(0)
@@ -166,7 +165,7 @@ def floats(value: Any) -> FloatArray:
     return np.empty(0)
 
 
-def vector(name: str, value: Any, unit: str, *, or_else: str = "") -> FloatArray:
+def vector(name: str, value: object, unit: str, *, or_else: str = "") -> FloatArray:
     """The value as three finite components, shape (3,)."""
     array = floats(value)
     if array.shape != (3,) or not np.isfinite(array).all():
@@ -175,7 +174,7 @@ def vector(name: str, value: Any, unit: str, *, or_else: str = "") -> FloatArray
     return array
 
 
-def vectors(name: str, value: Any, what: str) -> FloatArray:
+def vectors(name: str, value: object, what: str) -> FloatArray:
     """The value as rows of three finite components, shape (n, 3); a single one may be (3,)."""
     array = np.atleast_2d(floats(value))
     if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
@@ -204,7 +203,7 @@ def require_same(comm: MPI.Comm, **given: Any) -> None:
     raise_together(comm, problem)
 
 
-def as_text(value: Any) -> str:
+def as_text(value: object) -> str:
     """What a value is made of, numbers and texts, in words that do not depend on the rank."""
     array = floats(value)
     if array.size:
@@ -221,7 +220,7 @@ def as_text(value: Any) -> str:
     return "a function" if callable(value) else type(value).__name__
 
 
-def items(name: str, value: Any, fits: Callable[[Any], bool], wanted: str) -> tuple[Any, ...]:
+def items(name: str, value: object, fits: Callable[[Any], bool], wanted: str) -> tuple[Any, ...]:
     """The items of a sequence argument, all of the wanted kind."""
     if not isinstance(value, Iterable):
         raise TypeError(f"{name}={value!r}: pass a sequence of {wanted}")
@@ -361,7 +360,7 @@ def at_points(
     rows: tuple[int, ...],
     kinds: str = "iuf",
     error: type[Exception] = ValueError,
-) -> npt.NDArray[Any]:
+) -> Array:
     """The user's function at this rank's points; what fails on one rank raises on all.
 
     Args:
@@ -395,7 +394,7 @@ def at_points(
     return values
 
 
-def as_path(name: str, value: Any) -> Path:
+def as_path(name: str, value: object) -> Path:
     """The path that an argument is.
 
     Raises:

@@ -20,7 +20,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import range_of
-from dolfinx_nts.types import BoolArray, FloatArray, IntArray, Settings
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray, Places, Settings
 
 
 class Body:
@@ -284,7 +284,7 @@ class Body:
         return np.arange(self.comm.allreduce(self.num_owned // 3))
 
     # ---- points
-    def points(self, x: Any) -> Points:
+    def points(self, x: Places) -> Points:
         """Material points, for joints and springs. Collective.
 
         Args:
@@ -295,7 +295,7 @@ class Body:
         """
         raise TypeError(f"body {self.name!r} has no points(): joints and springs need it, see Body")
 
-    def directions_at(self, direction: FloatArray, x: Any) -> Points:
+    def directions_at(self, direction: FloatArray, x: Places) -> Points:
         """A direction that turns with a point of an oriented body, for joints. Collective.
 
         Args:
@@ -304,7 +304,7 @@ class Body:
         """
         raise TypeError(f"body {self.name!r} is oriented but has no directions_at(), see Body")
 
-    def directions(self, x: Any) -> Points:
+    def directions(self, x: Places) -> Points:
         """Directions that turn with a rigid body as a whole, for joints and springs. Collective.
 
         Args:

@@ -24,7 +24,7 @@ from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import facets as facet_math
 from dolfinx_nts.kernels import patches, triangle_patches
 from dolfinx_nts.parallel import gather_rows
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import Array, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
@@ -225,17 +225,17 @@ class Surface:
         """Shares of all ranks one after another. Collective."""
         return gather_rows(self.body.comm, self.share)
 
-    def at_all(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def at_all(self, values: Array) -> Array:
         """Values at all points from those at the points of `share`. Collective."""
         table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
         table[self._dealt] = gather_rows(self.body.comm, values)
         return table
 
-    def at_own(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def at_own(self, values: Array) -> Array:
         """Values at the points of `rows` from those at the points of `share`. Collective."""
         return self.owned(self.at_all(values))
 
-    def owned(self, table: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def owned(self, table: Array) -> Array:
         """Values at the points of `rows` from those at all points. Collective."""
         start = self.body.comm.exscan(len(self.rows)) or 0
         return table[start : start + len(self.rows)]

@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.interaction.points import of_nodes
-from dolfinx_nts.types import IntArray
+from dolfinx_nts.types import Array, IntArray
 
 #: Nodes at a time.
 _CHUNK = 500
@@ -78,7 +78,7 @@ def _chunks(start: IntArray) -> list[slice]:
     return [slice(k, min(k + _CHUNK, stop)) for k in range(0, stop, _CHUNK)]
 
 
-def _blocks(start: IntArray, entries: npt.NDArray[Any], chunk: slice) -> npt.NDArray[Any]:
+def _blocks(start: IntArray, entries: Array, chunk: slice) -> Array:
     """Entries of an AIJ matrix, which come row by row, block by block.
 
     Args:
@@ -94,7 +94,7 @@ def _blocks(start: IntArray, entries: npt.NDArray[Any], chunk: slice) -> npt.NDA
     # Of the first axis; a node's other rows follow after as many triples as it has blocks.
     triple = np.arange(start[0], start[-1]) + np.repeat(2 * start[:-1], count)
     rows = triple[:, None] + np.repeat(count, count)[:, None] * np.arange(3)
-    blocks: npt.NDArray[Any] = np.take(entries.reshape(-1, 3), rows, axis=0)
+    blocks: Array = np.take(entries.reshape(-1, 3), rows, axis=0)
     return blocks
 
 

@@ -8,12 +8,11 @@ from typing import Any
 
 import basix
 import numpy as np
-import numpy.typing as npt
 from dolfinx.mesh import Mesh
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.parallel import gather_rows, raise_together
-from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+from dolfinx_nts.types import Array, BoolArray, FloatArray, IntArray
 
 #: Part of a cell by which a point may lie beside it, and of coordinates that their rounding is.
 _ON_CELL, _ROUNDING = 1e-9, 4 * np.finfo(np.float64).eps
@@ -84,7 +83,7 @@ class Points:
         own = used[(used >= first) & (used < first + count)]
         return own - first, index
 
-    def nodal(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def nodal(self, values: Array) -> Array:
         """Values at the nodes of all points, (n, k, 3), from this rank's coordinates. Collective.
 
         Args:
@@ -92,7 +91,7 @@ class Points:
         """
         rows, index = self._table
         table = gather_rows(self.body.comm, values.reshape(-1, 3)[rows])
-        found: npt.NDArray[Any] = table[index]
+        found: Array = table[index]
         return found
 
     def gathered(self, values: FloatArray) -> FloatArray:

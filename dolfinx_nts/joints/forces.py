@@ -20,7 +20,7 @@ from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import rank_of
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import FloatArray, Vector, Vectors
 from dolfinx_nts.validation import StepFailedError, require_same, vector
 
 #: Part of their distance from the origin within which two points are one.
@@ -140,7 +140,7 @@ class BetweenPoints(Between):
         ValueError: An argument is out of range, or a point lies outside of a flexible body.
     """
 
-    def __init__(self, a: Any, b: Any, points: Any, *, name: str | None = None) -> None:
+    def __init__(self, a: Any, b: Any, points: Vectors, *, name: str | None = None) -> None:
         ends = (a, b)
         super().__init__(ends, name)
         require_same(self.comm, points=points)
@@ -180,7 +180,7 @@ class AboutAxis(Between):
         ValueError: An argument is out of range, or a body is flexible.
     """
 
-    def __init__(self, a: Any, b: Any, *, axis: Any, name: str | None = None) -> None:
+    def __init__(self, a: Any, b: Any, *, axis: Vector, name: str | None = None) -> None:
         ends = (a, b)
         super().__init__(ends, name)
         require_same(self.comm, axis=axis)

@@ -24,6 +24,7 @@ from dolfinx_nts.joints.between import (
     triad,
 )
 from dolfinx_nts.joints.laws import JointFriction, Motor, laws_on
+from dolfinx_nts.types import Places
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -58,7 +59,7 @@ class Spherical(Between):
         a: Body | None,
         b: Body | None,
         *,
-        point: Any,
+        point: Places,
         displacement: Callable[[float], Any] | None = None,
         name: str | None = None,
     ) -> None:
@@ -88,7 +89,8 @@ class _WithAxis(Between):
     """
 
     def __init__(
-        self, a: Body | None, b: Body | None, *, point: Any, axis: Any, name: str | None = None
+        self, a: Body | None, b: Body | None, *, point: Places, axis: Places,
+        name: str | None = None,
     ) -> None:
         super().__init__(a, b, ("point", point, point), name)
         self.axis = direction(f"axis of {self.name!r}", axis)
@@ -142,8 +144,8 @@ class Revolute(_WithAxis):
         a: Body | None,
         b: Body | None,
         *,
-        point: Any,
-        axis: Any,
+        point: Places,
+        axis: Places,
         angle: Number | None = None,
         friction: JointFriction | None = None,
         limits: Any = None,
@@ -221,8 +223,8 @@ class Prismatic(_WithAxis):
         a: Body | None,
         b: Body | None,
         *,
-        point: Any,
-        axis: Any,
+        point: Places,
+        axis: Places,
         displacement: Number | None = None,
         friction: JointFriction | None = None,
         limits: Any = None,
@@ -276,7 +278,8 @@ class Universal(Between):
     """
 
     def __init__(
-        self, a: Body | None, b: Body | None, *, point: Any, axes: Any, name: str | None = None
+        self, a: Body | None, b: Body | None, *, point: Places, axes: Places,
+        name: str | None = None,
     ) -> None:
         super().__init__(a, b, ("point", point, point), name)
         if floats(axes).shape != (2, 3):
@@ -316,7 +319,7 @@ class Fixed(Between):
     """
 
     def __init__(
-        self, a: Body | None, b: Body | None, *, point: Any, name: str | None = None
+        self, a: Body | None, b: Body | None, *, point: Places, name: str | None = None
     ) -> None:
         super().__init__(a, b, ("point", point, point), name)
         self.m_a, self.m_b = self.directions(np.eye(3))
@@ -356,7 +359,7 @@ class Distance(Between):
         a: Body | None,
         b: Body | None,
         *,
-        points: Any,
+        points: Places,
         length: float | Number | None = None,
         name: str | None = None,
     ) -> None:

@@ -11,6 +11,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.joints.forces import AboutAxis, Between, BetweenPoints, Stiff, Viscous
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.types import Vector, Vectors
 from dolfinx_nts.validation import (
     call_together,
     is_finite,
@@ -110,7 +111,7 @@ class Spring(_Stores, BetweenPoints):
         self,
         a: Body | None,
         b: Body | None,
-        points: Any,
+        points: Vectors,
         *,
         stiffness: float | None = None,
         length: float | None = None,
@@ -156,7 +157,7 @@ class Damper(BetweenPoints):
     entry = ("damping_dissipation", 1.0)
 
     def __init__(
-        self, a: Body | None, b: Body | None, points: Any, *, damping: float,
+        self, a: Body | None, b: Body | None, points: Vectors, *, damping: float,
         name: str | None = None,
     ) -> None:
         require_positive("damping", damping, "N s/m")
@@ -195,7 +196,7 @@ class TorsionSpring(_Stores, AboutAxis):
         a: Body | None,
         b: Body | None,
         *,
-        axis: Any,
+        axis: Vector,
         stiffness: float | None = None,
         angle: float | None = None,
         energy: Function | None = None,
@@ -234,7 +235,8 @@ class TorsionDamper(AboutAxis):
     entry = ("damping_dissipation", 1.0)
 
     def __init__(
-        self, a: Body | None, b: Body | None, *, axis: Any, damping: float, name: str | None = None
+        self, a: Body | None, b: Body | None, *, axis: Vector, damping: float,
+        name: str | None = None,
     ) -> None:
         require_positive("damping", damping, "N m s")
         super().__init__(a, b, axis=axis, name=name)

@@ -12,10 +12,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts.kernels.discrete_gradient import resolved_mean
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import Array, FloatArray
 
 #: Length [m] that keeps 0/0 away where a length is 0; far below any other.
 _NO_LENGTH = 1e-100
@@ -200,7 +199,7 @@ class Stored:
     def _size(self, x: FloatArray) -> FloatArray:
         return np.maximum(np.abs(x), self.unit)
 
-    def value(self, x: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def value(self, x: Array) -> Array:
         """V [J]."""
         return _called(self._energy, x)
 
@@ -230,6 +229,6 @@ class Stored:
         return np.where(resolved, mean, plain), np.where(resolved, change, steep)
 
 
-def _called(function: Callable[[Any], Any], x: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _called(function: Callable[[Any], Any], x: Array) -> Array:
     """The user's function, which need not stand empty arrays."""
     return np.broadcast_to(function(x), x.shape) if x.size else np.zeros(0)

@@ -39,16 +39,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.system import System
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import Array, FloatArray, IntArray, Rows
 
 #: Arrays of a file by their place in it, on rank 0; empty elsewhere.
-Tables = dict[str, npt.NDArray[Any]]
+Tables = dict[str, Array]
 
 #: Kinds of files, and the sentence for one that is none.
 CHECKPOINT, SOLUTION = "checkpoint", "solution"
@@ -95,7 +94,7 @@ def describe(system: System) -> dict[str, Any]:
     }
 
 
-def loads(system: System) -> list[dict[str, Any]]:
+def loads(system: System) -> Rows:
     """Constant loads and supports of the bodies by their options, for JSON; functions are None."""
     settings = [_settings(body) for body in system.bodies]
     return [
@@ -201,7 +200,7 @@ class Numbering:
         self,
         state: State,
         fields: Mapping[str, Sequence[FloatArray]],
-        nodal: Mapping[str, Sequence[npt.NDArray[Any]]],
+        nodal: Mapping[str, Sequence[Array]],
     ) -> Tables:
         """Arrays of a state. Collective.
 
@@ -236,7 +235,7 @@ class Numbering:
                 tables |= found
         return tables if self.comm.rank == 0 else {}
 
-    def _rows(self, place: str, rows: Mapping[str, npt.NDArray[Any]]) -> Tables:
+    def _rows(self, place: str, rows: Mapping[str, Array]) -> Tables:
         found = {name: gather_on_root(self.comm, values) for name, values in rows.items()}
         order = np.argsort(found["number"])
         return {f"{place}/{name}": values[order] for name, values in found.items()}
@@ -259,7 +258,7 @@ class Numbering:
             joints=tuple(joints),
         )
 
-    def nodal(self, tables: Tables, name: str) -> list[npt.NDArray[Any]]:
+    def nodal(self, tables: Tables, name: str) -> list[Array]:
         """Return an array of each contact at this rank's slave nodes. Collective."""
         found = []
         for k, pair in enumerate(self.system.contacts):
@@ -269,8 +268,8 @@ class Numbering:
         return found
 
     def _at(
-        self, rows: Mapping[str, npt.NDArray[Any]], name: str, numbers: IntArray, whose: str
-    ) -> npt.NDArray[Any]:
+        self, rows: Mapping[str, Array], name: str, numbers: IntArray, whose: str
+    ) -> Array:
         """Rows of this rank's elements by their numbers; each has one. Collective.
 
         Raises:
@@ -288,7 +287,7 @@ class Numbering:
             problem = f"{problem}; {remedy}"
         if problem is not None:
             raise ValueError(problem)
-        found: npt.NDArray[Any] = rows[name][np.searchsorted(known, numbers)]
+        found: Array = rows[name][np.searchsorted(known, numbers)]
         return found
 
     def _share(self, tables: Tables, place: str, names: Sequence[str]) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from dolfinx_nts.run.start import kind_of, of_file
 from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.system import System
-from dolfinx_nts.types import FloatArray, Options
+from dolfinx_nts.types import BeforeStep, FloatArray, Options
 from dolfinx_nts.validation import (
     floats,
     is_whole,
@@ -88,7 +88,7 @@ def equilibrium(
     output: Sequence[Writer] = (),
     progress: bool = False,
     watch_overlap: bool = True,
-    before_step: Callable[[float, float], Any] | None = None,
+    before_step: BeforeStep | None = None,
     start: Equilibrium | Saved | None = None,
 ) -> Equilibrium:
     """Equilibrium of a system under its loads, reached in load steps of a pseudo time from 0.

@@ -10,12 +10,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, overload
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts.ledger import resultants
 from dolfinx_nts.ledger.balance import CHANGES, COLUMNS, Switch, Switches
 from dolfinx_nts.run.run_warnings import RunWarning, RunWarnings
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import Array, FloatArray
 
 Row = dict[str, Any]
 
@@ -95,7 +94,7 @@ class Table(Sequence[Row]):
 
 
 #: Arrays by their place in a file.
-Tables = dict[str, npt.NDArray[Any]]
+Tables = dict[str, Array]
 
 _COUNTS = ("retries", "rejected", "exceeded")
 _OF_SWITCHES = ("time", "contact", "node", "facets", "defect")
@@ -251,7 +250,7 @@ class Record:
         }
 
 
-def unpacked(tables: Mapping[str, npt.NDArray[Any]], notes: Mapping[str, Any]) -> dict[str, Any]:
+def unpacked(tables: Mapping[str, Array], notes: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a record from what `Record.packed` has made, by name."""
     table, shapes = tables["balance/table"], notes["columns"]
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])

@@ -18,6 +18,7 @@ from dolfinx_nts.parallel import write_on_root
 from dolfinx_nts.run.record import Record, unpacked
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
+from dolfinx_nts.types import Array, Rows
 from dolfinx_nts.validation import StrPath, as_path
 
 
@@ -38,13 +39,13 @@ class Saved(Record):
     """
 
     time: float
-    bodies: Mapping[str, Mapping[str, npt.NDArray[Any]]]
-    contacts: tuple[Mapping[str, npt.NDArray[Any]], ...]
-    joints: Mapping[str, Mapping[str, npt.NDArray[Any]]]
+    bodies: Mapping[str, Mapping[str, Array]]
+    contacts: tuple[Mapping[str, Array], ...]
+    joints: Mapping[str, Mapping[str, Array]]
     scene: Mapping[str, Any]
     versions: Mapping[str, str]
 
-    def tables(self) -> dict[str, npt.NDArray[Any]]:
+    def tables(self) -> dict[str, Array]:
         """Arrays of the last state by their places in the file."""
         names = [joint["name"] for joint in self.scene["joints"]]
         joints = {names.index(name): found for name, found in self.joints.items()}
@@ -126,7 +127,7 @@ def load(path: StrPath) -> Saved:
     except (OSError, KeyError, RuntimeError) as error:
         raise OSError(f"path={str(path)!r}: cannot be read, it may be damaged ({error})") from error
     scene = notes["scene"]
-    groups: dict[str, list[dict[str, Any]]] = {
+    groups: dict[str, Rows] = {
         kind: [{} for _ in scene[kind]] for kind in ("bodies", "contacts", "joints")
     }
     for place, values in tables.items():

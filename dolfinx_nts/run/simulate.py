@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from dolfinx_nts.parallel import first_problem
@@ -20,7 +20,7 @@ from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.writer import Writer
 from dolfinx_nts.solve.accuracy import ACCURACY, Newton
 from dolfinx_nts.system import System
-from dolfinx_nts.types import Options
+from dolfinx_nts.types import BeforeStep, Options
 from dolfinx_nts.validation import (
     OutputError,
     StepFailedError,
@@ -58,7 +58,7 @@ def simulate(
     sleep: bool = False,
     adapt: Adapt | None = None,
     watch_overlap: bool = True,
-    before_step: Callable[[float, float], Any] | None = None,
+    before_step: BeforeStep | None = None,
     project_start: bool = False,
     ledger: bool = True,
     impact: str = "published",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
 from typing import Any, ClassVar
@@ -41,7 +41,7 @@ from dolfinx_nts.start import consistent
 from dolfinx_nts.start.unresolved import DamperWatch
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
-from dolfinx_nts.types import FloatArray, Options
+from dolfinx_nts.types import BeforeStep, FloatArray, Options
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
@@ -102,7 +102,7 @@ class Stepper:
         start_time: float | None = None,
         sleep: bool = False,
         watch_overlap: bool = True,
-        before_step: Callable[[float, float], Any] | None = None,
+        before_step: BeforeStep | None = None,
         project_start: bool = False,
         ledger: bool = True,
         impact: str = "published",

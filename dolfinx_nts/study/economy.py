@@ -34,7 +34,7 @@ from dolfinx_nts import output, petsc_compat
 from dolfinx_nts.forms import CellForm, assemble_vector
 from dolfinx_nts.kernels.strain_energy import strain_energy
 from dolfinx_nts.solve.linear_solver import SolverOptions
-from dolfinx_nts.types import BalanceRow, FloatArray
+from dolfinx_nts.types import BalanceRow, FloatArray, Rows
 from dolfinx_nts.validation import known_options, require_positive
 
 #: Of a residual, relative to the forces of the step.
@@ -360,7 +360,7 @@ def _spinning(speed: float) -> Any:
 @known_options
 def table(
     comm: MPI.Comm, *, cells: int = 8, steps: int = 10, rounds: int = 9
-) -> list[dict[str, Any]]:
+) -> Rows:
     """Rows of the cost table, the same on all ranks.
 
     All rows are run once in each round, step by step in turn, and compared within it, as the

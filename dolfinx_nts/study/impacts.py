@@ -30,7 +30,7 @@ from dolfinx.mesh import CellType, GhostMode, create_box
 
 import dolfinx_nts as nts
 from dolfinx_nts.study.scene_runs import load
-from dolfinx_nts.types import BalanceRow, FloatArray
+from dolfinx_nts.types import BalanceRow, FloatArray, Rows
 
 #: Way to treat impacts -> mass of slave nodes and options of `simulate`.
 WAYS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
@@ -315,7 +315,7 @@ COLUMNS = (
 
 
 def table(only: Sequence[str] = (), ways: Sequence[str] = (), comm: MPI.Comm = MPI.COMM_WORLD) -> (
-    list[dict[str, Any]]
+    Rows
 ):  # fmt: skip
     """Rows of all runs.
 
@@ -346,7 +346,7 @@ def line(row: BalanceRow) -> str:
     return f"| {row['problem']} | {row['way']} | {' | '.join(cells)} | {row['status'][:200]} |"
 
 
-def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
+def main(arguments: Sequence[str] | None = None) -> Rows:
     """Run the program; returns the rows of its table."""
     parser = argparse.ArgumentParser(
         prog="python -m dolfinx_nts.study.impacts", description=__doc__,

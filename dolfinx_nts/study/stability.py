@@ -36,7 +36,7 @@ import numpy as np
 import dolfinx_nts as nts
 from dolfinx_nts.solve.accuracy import ACCURACY
 from dolfinx_nts.study.extreme_scenes import MATERIALS, Case, Scene, closing, long_run, strips
-from dolfinx_nts.types import BalanceRow
+from dolfinx_nts.types import BalanceRow, Rows
 
 INTEGRATORS: Mapping[str, Any] = {
     "energy-momentum": nts.EnergyMomentum(),
@@ -152,8 +152,8 @@ def chart(
     integrators: Sequence[str] = (),
     accuracy: Sequence[str] = (),
     comm: MPI.Comm = MPI.COMM_WORLD,
-    told: Callable[[list[dict[str, Any]]], None] = lambda _: None,
-) -> list[dict[str, Any]]:
+    told: Callable[[Rows], None] = lambda _: None,
+) -> Rows:
     """Rows of all runs of some axes.
 
     Args:
@@ -259,7 +259,7 @@ def picture(rows: Sequence[BalanceRow], path: Path) -> None:
     plt.close(figure)
 
 
-def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
+def main(arguments: Sequence[str] | None = None) -> Rows:
     """Run the program; returns the rows of its table."""
     parser = argparse.ArgumentParser(
         prog="python -m dolfinx_nts.study.stability",
@@ -276,7 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
     comm = MPI.COMM_WORLD
     folder = Path(options.output)
 
-    def told(rows: list[dict[str, Any]]) -> None:
+    def told(rows: Rows) -> None:
         # A map takes half an hour: what is known of it stays if a later run ends the program.
         if comm.rank > 0:
             return

@@ -33,7 +33,7 @@ import numpy as np
 from dolfinx_nts.run.run_file import versions
 from dolfinx_nts.study import economy
 from dolfinx_nts.study.scene_runs import check, check_value, measure
-from dolfinx_nts.types import BalanceRow
+from dolfinx_nts.types import BalanceRow, Rows
 
 #: Choices a run is made with if none are given.
 DEFAULT: Mapping[str, list[Any]] = {
@@ -44,7 +44,7 @@ DEFAULT: Mapping[str, list[Any]] = {
 TARGETS = (0.1, 0.01, 1e-3)
 
 
-def grid(vary: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+def grid(vary: Mapping[str, Sequence[Any]]) -> Rows:
     """All combinations of the choices."""
     return [dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())]
 
@@ -55,7 +55,7 @@ def compare(
     fixed: BalanceRow,
     reference: BalanceRow,
     comm: MPI.Comm,
-) -> list[dict[str, Any]]:
+) -> Rows:
     """Rows of all runs, the reference first.
 
     Args:
@@ -181,7 +181,7 @@ def _literal(text: str) -> Any:
         return text
 
 
-def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
+def main(arguments: Sequence[str] | None = None) -> Rows:
     """Run the program; returns the rows of its table."""
     parser = argparse.ArgumentParser(
         prog="python -m dolfinx_nts.study.tradeoff",

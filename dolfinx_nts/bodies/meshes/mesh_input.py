@@ -20,7 +20,6 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from dolfinx import mesh as dolfinx_mesh
 from dolfinx.mesh import Mesh
@@ -31,7 +30,7 @@ from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.bodies.solid.continuum import Continuum
 from dolfinx_nts.bodies.solid.parameters import Parameter
 from dolfinx_nts.parallel import on_root
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import Array, FloatArray, IntArray
 from dolfinx_nts.validation import is_whole
 
 _CORNERS = {"tetrahedron": 4, "hexahedron": 8}
@@ -379,7 +378,7 @@ def _merge(
     return Input(nodes, x.reshape(-1, 3)[first], volumes, surfaces)
 
 
-def _joined(tables: Iterable[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+def _joined(tables: Iterable[Array]) -> Array:
     """Rows of all ranks; ranks without rows may not know how wide they are."""
     tables = list(tables)
     return np.concatenate([t for t in tables if len(t)] or tables[:1])

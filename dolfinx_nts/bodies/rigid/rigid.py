@@ -34,7 +34,7 @@ from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross, range_of
 from dolfinx_nts.parallel import gather_rows, raise_together, rank_of
-from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values, Vector
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Places, Settings, Values, Vector
 from dolfinx_nts.validation import (
     UserFunctionError,
     known_options,
@@ -281,7 +281,7 @@ class RigidBody(Body):
         places = np.tile([True, False, False, False], (n, 1))
         return Points(self, nodes, weights, np.tile(y, (n, 1, 1)), fixed, places)
 
-    def points(self, x: Any) -> Points:
+    def points(self, x: Places) -> Points:
         """Material points, inside the body or not, for joints and springs.
 
         Args:
@@ -292,7 +292,7 @@ class RigidBody(Body):
         """
         return self._points(self._weights(vectors("x", x, "points [m]")))
 
-    def directions(self, x: Any) -> Points:
+    def directions(self, x: Places) -> Points:
         """Directions that turn with the body, for joints.
 
         Args:
@@ -304,7 +304,7 @@ class RigidBody(Body):
         local = vectors("x", x, "vectors") @ self._inertia.axes / self.length
         return self._points(np.column_stack([np.zeros(len(local)), local]))
 
-    def directions_at(self, direction: FloatArray, x: Any) -> Points:
+    def directions_at(self, direction: FloatArray, x: Places) -> Points:
         """A direction, which turns alike at all points.
 
         Args:

@@ -18,7 +18,7 @@ from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import beam as kernel
 from dolfinx_nts.kernels.quadratic import Elements
-from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Places, Settings, Values
 from dolfinx_nts.validation import known_options, require_bool, require_name, vector
 
 Vector = Sequence[float] | FloatArray
@@ -166,7 +166,7 @@ class Beam(DirectorBody):
         strain = kernel.strains(self._elements, y)
         return kernel.resultants(strain * self.section.stiffness, y, self._rest, self.length)
 
-    def directions_at(self, direction: FloatArray, x: Any) -> Points:
+    def directions_at(self, direction: FloatArray, x: Places) -> Points:
         """A direction that turns with a node, for joints. Collective.
 
         Args:

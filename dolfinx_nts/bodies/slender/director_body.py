@@ -34,7 +34,7 @@ from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.parallel import gather_rows
-from dolfinx_nts.types import FloatArray, IntArray, Settings, Values
+from dolfinx_nts.types import FloatArray, IntArray, Places, Settings, Values
 from dolfinx_nts.validation import at_points, vector, vectors
 
 #: Part of a body's size within which a point is a node.
@@ -230,7 +230,7 @@ class DirectorBody(Body):
         raise NotImplementedError
 
     # ---- points
-    def points(self, x: Any) -> Points:
+    def points(self, x: Places) -> Points:
         """Nodes as material points, for joints and springs. Collective.
 
         Args:

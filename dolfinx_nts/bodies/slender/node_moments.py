@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import Array, FloatArray, IntArray
 
 
 class NodeMoments:
@@ -33,7 +30,7 @@ class NodeMoments:
         rows = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1)
         self._turning = rows.reshape(-1, 3, 3)
 
-    def at(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def at(self, values: Array) -> Array:
         """Values at the directors of these nodes, (m, directors, 3), from those of this rank."""
         rows = values.reshape(-1, self._width)[self.turned, 3:]
         return rows.reshape(len(self.turned), self._width // 3 - 1, 3)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh
 from dolfinx_nts.kernels import pressure as kernel
-from dolfinx_nts.types import FloatArray, Marker
+from dolfinx_nts.types import Array, FloatArray, Marker
 from dolfinx_nts.validation import (
     at_points,
     is_finite,
@@ -74,7 +72,7 @@ class Pressures:
     """
 
     def __init__(
-        self, comm: MPI.Comm, skeleton: DirectorMesh, cells: npt.NDArray[Any],
+        self, comm: MPI.Comm, skeleton: DirectorMesh, cells: Array,
         loads: dict[int, Pressure], name: str,
     ) -> None:  # fmt: skip
         self._comm = comm

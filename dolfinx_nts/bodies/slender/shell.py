@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from dolfinx.mesh import Mesh
@@ -19,7 +18,7 @@ from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import shell as kernel
 from dolfinx_nts.kernels.quadratic import Elements
-from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values
+from dolfinx_nts.types import FloatArray, IntArray, Marker, Places, Settings, Values
 from dolfinx_nts.validation import (
     is_finite,
     known_options,
@@ -182,7 +181,7 @@ class Shell(DirectorBody):
         force, moment = np.einsum("npi,knpq,nqj->knij", axes, local, axes)
         return force, moment
 
-    def directions_at(self, direction: FloatArray, x: Any) -> Points:
+    def directions_at(self, direction: FloatArray, x: Places) -> Points:
         """The director of a node, for joints. Collective.
 
         Args:

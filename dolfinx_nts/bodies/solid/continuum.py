@@ -22,7 +22,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.types import FloatArray, Settings, Values
+from dolfinx_nts.types import ExtraForm, FloatArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
     items,
@@ -99,7 +99,7 @@ class Continuum(UflBody):
         body_force: VectorInTime = (0.0, 0.0, 0.0),
         traction: Sequence[Traction] = (),
         quadrature_degree: int | None = None,
-        extra_form: Callable[[Any, Any, Any, Any], Any] | None = None,
+        extra_form: ExtraForm | None = None,
         allow_inversion: bool = False,
     ) -> None:
         if not callable(material):

@@ -18,7 +18,7 @@ from dolfinx_nts.bodies.solid.ufl_body import UflBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.types import Values
+from dolfinx_nts.types import ExtraForm, MassForm, Values
 from dolfinx_nts.validation import is_whole, known_options
 
 #: Part of the mass that rounding may add where two directions, or two orders of nodes, differ.
@@ -88,13 +88,13 @@ class FormBody(UflBody):
         *,
         strain: Callable[[Any], Any] | None = None,
         density: Parameter | None = None,
-        mass: Callable[[Any, Any], Any] | None = None,
+        mass: MassForm | None = None,
         velocity: Values = (0.0, 0.0, 0.0),
         displacement: Values = (0.0, 0.0, 0.0),
         bcs: Sequence[Dirichlet] = (),
         name: str = "body",
         quadrature_degree: int | None = None,
-        extra_form: Callable[[Any, Any, Any, Any], Any] | None = None,
+        extra_form: ExtraForm | None = None,
         allow_inversion: bool = False,
     ) -> None:
         _check_callables(energy, strain, mass)

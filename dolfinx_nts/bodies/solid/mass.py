@@ -22,13 +22,12 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.interaction.points import of_nodes
 from dolfinx_nts.parallel import global_sum
-from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+from dolfinx_nts.types import Array, BoolArray, FloatArray, IntArray
 
 
 class MassMatrix:
@@ -232,7 +231,7 @@ def _parents(mass: Any, level: IntArray, x: FloatArray) -> Any:
     return petsc_compat.with_entries(mass, start, columns, 1.0 / np.repeat(counts, counts))
 
 
-def _at_nodes(mass: Any, nodes: npt.NDArray[Any], values: FloatArray) -> FloatArray:
+def _at_nodes(mass: Any, nodes: Array, values: FloatArray) -> FloatArray:
     """Values (n, k) of this rank's nodes at any nodes, by global numbers. Collective."""
     vector = mass.createVecRight()
     target = PETSc.Vec().createSeq(len(nodes), comm=PETSc.COMM_SELF)

@@ -18,7 +18,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.integrators.static import EQUILIBRIUM
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.parallel import raise_together
-from dolfinx_nts.types import FloatArray
+from dolfinx_nts.types import ExtraForm, FloatArray, MassForm
 
 
 def checked_form(
@@ -58,9 +58,6 @@ def checked_form(
     return form
 
 
-ExtraForm = Callable[[Any, Any, Any, Any], Any]
-
-
 class StepForms:
     """What a body's energy does in a step, compiled once for each integrator.
 
@@ -79,7 +76,7 @@ class StepForms:
         self,
         space: fem.FunctionSpace,
         virtual_work: Callable[[Integrator, Any, Any, Any], Any],
-        mass: Callable[[Any, Any], Any],
+        mass: MassForm,
         extra: ExtraForm | None,
         check_alive: Callable[[], None],
     ) -> None:

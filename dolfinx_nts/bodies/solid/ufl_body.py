@@ -30,7 +30,7 @@ from dolfinx_nts.bodies.solid.parameters import (
     require_positive_parameter,
     values_of,
 )
-from dolfinx_nts.bodies.solid.step_forms import ExtraForm, StepForms, checked_form, fill
+from dolfinx_nts.bodies.solid.step_forms import StepForms, checked_form, fill
 from dolfinx_nts.contact.facet_choice import choose_facets
 from dolfinx_nts.contact.skins import skin_of_mesh
 from dolfinx_nts.contact.surfaces import Surface
@@ -40,7 +40,16 @@ from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points, in_mesh
 from dolfinx_nts.parallel import gather_on_root, raise_together
-from dolfinx_nts.types import FloatArray, IntArray, Marker, Settings, Values, Vector
+from dolfinx_nts.types import (
+    ExtraForm,
+    FloatArray,
+    IntArray,
+    Marker,
+    Places,
+    Settings,
+    Values,
+    Vector,
+)
 from dolfinx_nts.validation import (
     UserFunctionError,
     require_bool,
@@ -226,7 +235,7 @@ class UflBody(Body):
             self._mass.nodal_before[::3], self.massless[::3], self.comm,
         )  # fmt: skip
 
-    def points(self, x: Any) -> Points:
+    def points(self, x: Places) -> Points:
         """Material points, for joints and springs. Collective.
 
         Args:
