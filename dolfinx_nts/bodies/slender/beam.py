@@ -11,7 +11,7 @@ from dolfinx.mesh import Mesh
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.slender.axis import axis_of, check_line
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
-from dolfinx_nts.bodies.slender.director_mesh import Hull, of_beam
+from dolfinx_nts.bodies.slender.director_mesh import WholeSkin, of_beam
 from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load
 from dolfinx_nts.bodies.slender.section import Section
 from dolfinx_nts.contact.surfaces import Surface
@@ -101,7 +101,7 @@ class Beam(DirectorBody):
 
     def _finer(self, times: float) -> str:
         """Which elements are needed, see `DirectorBody`."""
-        here = len(self._skeleton.cells)
+        here = len(self._director_mesh.cells)
         needed = int(np.ceil(times * here * (1.0 - 1e-9)))
         or_less = f", or {-(-needed // 2)} with degree=2" if self.degree == 1 else ""
         return f"about {needed} elements are needed for 3 %{or_less}, where it has {here}"
@@ -127,10 +127,10 @@ class Beam(DirectorBody):
         """
         return self._in_order()
 
-    def _make_hull(self) -> Hull:
+    def _make_skin(self) -> WholeSkin:
         """Its whole skin, see `DirectorBody`; without an outline none but the axis."""
         outline = np.array(self.section.outline, dtype=np.float64).reshape(-1, 2)
-        return of_beam(self._skeleton, outline / self.length)
+        return of_beam(self._director_mesh, outline / self.length)
 
     def surface(self, marker: Marker = None, *, smoothing: bool = False) -> Surface:
         """A part of the skin for contact: the section's outline along the axis, and its ends.
@@ -153,9 +153,9 @@ class Beam(DirectorBody):
                 f"section of {self.name!r}: has no outline, so no surface; pass Section(..., "
                 "outline=[(x_1, x_2), ...]), or take one of a shape, Rectangle(b, h).section(...)"
             )
-        hull = self._skin.hull
-        x = np.einsum("pk,pki->pi", hull.weights, self._vectors_at(hull.node))
-        every = np.ones(len(hull.facets), dtype=bool)
+        skin = self._skin.whole_skin
+        x = np.einsum("pk,pki->pi", skin.weights, self._vectors_at(skin.node))
+        every = np.ones(len(skin.facets), dtype=bool)
         return self._skin.surface(self._skin.marked(marker, every, x), smoothing)
 
     def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -174,5 +174,5 @@ class Beam(DirectorBody):
             x: Reference position of the node [m], as of `points`.
         """
         nodes = self.points(x).nodes[:, 0] // 4
-        local = self._skeleton.directors[nodes] @ direction / self.length
+        local = self._director_mesh.directors[nodes] @ direction / self.length
         return self.points_of(nodes, np.column_stack([np.zeros(len(local)), local]))

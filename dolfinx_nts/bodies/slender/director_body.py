@@ -22,7 +22,7 @@ from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.bodies.nodal_values import cell_function
 from dolfinx_nts.bodies.slender import turns
 from dolfinx_nts.bodies.slender.director_matrix import DirectorMatrix
-from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, Hull
+from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, WholeSkin
 from dolfinx_nts.bodies.slender.director_skin import DirectorSkin
 from dolfinx_nts.bodies.slender.element_values import ElementValues
 from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load, NodeConditions
@@ -67,7 +67,7 @@ class DirectorBody(Body):
         """
         raise NotImplementedError
 
-    def _make_hull(self) -> Hull:
+    def _make_skin(self) -> WholeSkin:
         """Its whole skin."""
         raise NotImplementedError
 
@@ -102,7 +102,7 @@ class DirectorBody(Body):
 
     def _set_up(
         self,
-        skeleton: DirectorMesh,
+        director_mesh: DirectorMesh,
         length: float,
         masses: FloatArray,
         bcs: Sequence[Clamp | Dirichlet],
@@ -113,7 +113,7 @@ class DirectorBody(Body):
         """Set up all but the mesh.
 
         Args:
-            skeleton: Nodes and cells.
+            director_mesh: Nodes and cells.
             length: Of the directors [m].
             masses: Per length or area, of the place and of the directors, shape (vectors,).
             bcs: As of the subclass, and so are the next ones.
@@ -121,23 +121,23 @@ class DirectorBody(Body):
             velocity: [m/s].
             spin: [rad/s].
         """
-        self._skeleton, self.length, self._masses = skeleton, length, masses
+        self._director_mesh, self.length, self._masses = director_mesh, length, masses
         self._width = 3 * len(masses)
         self._set_up_nodes()
         self._set_up_elements()
         self._conditions = NodeConditions(
-            self.comm, skeleton, self._here, bcs, forces, self.kind, self.name
+            self.comm, director_mesh, self._here, bcs, forces, self.kind, self.name
         )
         self.fixed, self.driven = self._conditions.fixed, self._conditions.driven
         self.loads_in_time = self._conditions.loads_in_time
         self._moments = NodeMoments(self._conditions.turned, self._width, length)
         self._pressures = Pressures(
-            self.comm, skeleton, self._cells, self._conditions.pressures, self.name
+            self.comm, director_mesh, self._cells, self._conditions.pressures, self.name
         )
         self._set_up_velocity(velocity, spin)
         held = self._here.start + self._conditions.free_directors
-        along = np.empty_like(skeleton.order)
-        along[skeleton.order] = np.arange(len(along))
+        along = np.empty_like(director_mesh.order)
+        along[director_mesh.order] = np.arange(len(along))
         self.joints = (Directors(self, self.points_of(held, self._place), length, along[held]),)
         self._matrix: Any = None
         self.accept(np.zeros(self.num_owned), self.initial_velocity)
@@ -147,7 +147,7 @@ class DirectorBody(Body):
         topology, index_map = self.mesh.topology, self.space.dofmap.index_map
         owned = topology.index_map(topology.dim).size_local
         start = self.comm.exscan(owned) or 0
-        self._cells = self._skeleton.cells[start : start + owned]
+        self._cells = self._director_mesh.cells[start : start + owned]
         self._values = ElementValues(self.comm, index_map, self._cells, self._width)
         self._here, self.num_owned = self._values.here, self._values.num_owned
         here = np.arange(self._here.start, self._here.stop)
@@ -157,7 +157,7 @@ class DirectorBody(Body):
 
     def _vectors_at(self, nodes: IntArray) -> FloatArray:
         """Nodal vectors of nodes in the reference [m], shape (n, vectors, 3)."""
-        x, directors = self._skeleton.x[nodes], self._skeleton.directors[nodes]
+        x, directors = self._director_mesh.x[nodes], self._director_mesh.directors[nodes]
         found: FloatArray = np.concatenate([x[:, None], self.length * directors], axis=1)
         return found
 
@@ -172,7 +172,7 @@ class DirectorBody(Body):
         self.nodal_mass: FloatArray = self._values.sums(of_nodes)
 
     def _set_up_velocity(self, velocity: Values, spin: FloatArray) -> None:
-        x, d = self._skeleton.x[self._here], self._skeleton.directors[self._here]
+        x, d = self._director_mesh.x[self._here], self._director_mesh.directors[self._here]
         if callable(velocity):
             speed = at_points(self.comm, f"velocity of {self.name!r}", velocity, x.T, (3,)).T
         else:
@@ -188,7 +188,7 @@ class DirectorBody(Body):
     def file_order(self) -> IntArray:
         """Nodal vectors of all ranks in an order that does not depend on the ranks, see `Body`."""
         k = self._width // 3
-        order: IntArray = (k * self._skeleton.order[:, None] + np.arange(k)).ravel()
+        order: IntArray = (k * self._director_mesh.order[:, None] + np.arange(k)).ravel()
         return order
 
     # ---- values of this rank's elements
@@ -205,8 +205,8 @@ class DirectorBody(Body):
         """Places in the reference and now [m], shape (n, 3) each, in file order. Collective."""
         u = self.last_accepted()[0].reshape(-1, self._width)[:, :3]
         moved = gather_rows(self.comm, u)
-        order = self._skeleton.order
-        return self._skeleton.x[order], self._skeleton.x[order] + moved[order]
+        order = self._director_mesh.order
+        return self._director_mesh.x[order], self._director_mesh.x[order] + moved[order]
 
     def resultants(self) -> dict[str, Any]:
         """Force and moment in the middles of the cells, at the last accepted state. Collective.
@@ -239,7 +239,7 @@ class DirectorBody(Body):
         Raises:
             ValueError: x is no array of points, or one of them is no node.
         """
-        given, of = vectors("x", x, "points [m]"), self._skeleton.x
+        given, of = vectors("x", x, "points [m]"), self._director_mesh.x
         distance, nodes = cKDTree(of).query(given)
         off = distance > _AT_NODE * np.ptp(of, axis=0).max()
         if off.any():
@@ -277,12 +277,12 @@ class DirectorBody(Body):
     @cached_property
     def _skin(self) -> DirectorSkin:
         """Its whole skin and surfaces of it."""
-        return DirectorSkin(self, self._make_hull(), self._here)
+        return DirectorSkin(self, self._make_skin(), self._here)
 
     @property
     def has_skin(self) -> bool:
         """Whether it has one; a beam whose section has no outline has none."""
-        return bool(len(self._skin.hull.facets))
+        return bool(len(self._skin.whole_skin.facets))
 
     def boundary(self) -> Surface:
         """The whole skin. Collective."""

@@ -59,7 +59,7 @@ def nodes_and_cells(space: fem.FunctionSpace) -> tuple[FloatArray, IntArray, Int
 SIDES = ("bottom", "top", "edge")
 
 
-class Hull(NamedTuple):
+class WholeSkin(NamedTuple):
     """A closed skin, the same on all ranks; the points of a node follow each other.
 
     Attributes:
@@ -77,36 +77,36 @@ class Hull(NamedTuple):
     part: IntArray
 
 
-def _ranked(skeleton: DirectorMesh) -> IntArray:
+def _ranked(director_mesh: DirectorMesh) -> IntArray:
     """Number of each node in the order of files."""
-    rank = np.empty_like(skeleton.order)
-    rank[skeleton.order] = np.arange(len(rank))
+    rank = np.empty_like(director_mesh.order)
+    rank[director_mesh.order] = np.arange(len(rank))
     return rank
 
 
-def of_shell(skeleton: DirectorMesh) -> Hull:
+def of_shell(director_mesh: DirectorMesh) -> WholeSkin:
     """Skin of a shell: phi - D, then phi + D of each node."""
-    cells, edges, n = skeleton.cells, skeleton.edges, len(skeleton.x)
+    cells, edges, n = director_mesh.cells, director_mesh.edges, len(director_mesh.x)
     a, b = edges.T
     facets = [
         2 * cells[:, ::-1], 2 * cells + 1, np.stack([2 * a, 2 * b, 2 * b + 1, 2 * a + 1], axis=1)
     ]  # fmt: skip
     point = np.arange(2 * n)
     weights = np.column_stack([np.ones(2 * n), 2.0 * (point % 2) - 1.0])
-    original = (2 * _ranked(skeleton)[:, None] + np.arange(2)).ravel()
+    original = (2 * _ranked(director_mesh)[:, None] + np.arange(2)).ravel()
     part = np.repeat(np.arange(3), [len(f) for f in facets])
-    return Hull(point // 2, weights, original, np.concatenate(facets), part)
+    return WholeSkin(point // 2, weights, original, np.concatenate(facets), part)
 
 
-def of_beam(skeleton: DirectorMesh, outline: FloatArray) -> Hull:
+def of_beam(director_mesh: DirectorMesh, outline: FloatArray) -> WholeSkin:
     """Skin of a beam: polygons at its nodes, and at its ends fans about their centres.
 
     Args:
-        skeleton: Nodes.
+        director_mesh: Nodes.
         outline: Corners of the polygon over the directors' length, counter-clockwise, an even
             number, shape (k, 2).
     """
-    k, n, cells = len(outline), len(skeleton.x), skeleton.cells
+    k, n, cells = len(outline), len(director_mesh.x), director_mesh.cells
     corner, following = np.arange(k), np.roll(np.arange(k), -1)
     starts, stops = cells[:, :-1].ravel(), cells[:, 1:].ravel()
     a, b = ((k + 1) * ends[:, None] for ends in (starts, stops))
@@ -120,7 +120,7 @@ def of_beam(skeleton: DirectorMesh, outline: FloatArray) -> Hull:
         facets.append(caps[:, :, [0, 1, 2, 3][::way]])
     weights = np.zeros((k + 1, 4))
     weights[:, 0], weights[:k, 1:3] = 1.0, outline
-    original = ((k + 1) * _ranked(skeleton)[:, None] + np.arange(k + 1)).ravel()
+    original = ((k + 1) * _ranked(director_mesh)[:, None] + np.arange(k + 1)).ravel()
     whole = np.concatenate([f.reshape(-1, 4) for f in facets])
     part = np.zeros(len(whole), dtype=np.int64)
-    return Hull(np.repeat(every, k + 1), np.tile(weights, (n, 1)), original, whole, part)
+    return WholeSkin(np.repeat(every, k + 1), np.tile(weights, (n, 1)), original, whole, part)

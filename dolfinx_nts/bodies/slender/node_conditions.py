@@ -25,7 +25,7 @@ class NodeConditions:
 
     Args:
         comm: MPI communicator.
-        skeleton: Its nodes.
+        director_mesh: Its nodes.
         here: Those of this rank.
         bcs: `Clamp` and `Dirichlet` conditions.
         forces: Loads.
@@ -45,15 +45,15 @@ class NodeConditions:
     def __init__(
         self,
         comm: MPI.Comm,
-        skeleton: DirectorMesh,
+        director_mesh: DirectorMesh,
         here: slice,
         bcs: Sequence[Clamp | Dirichlet],
         forces: Sequence[Load | Pressure],
         kind: str,
         name: str,
     ) -> None:
-        self._comm, self._skeleton, self._here, self._name = comm, skeleton, here, name
-        self._width = 3 * (1 + skeleton.directors.shape[1])
+        self._comm, self._director_mesh, self._here, self._name = comm, director_mesh, here, name
+        self._width = 3 * (1 + director_mesh.directors.shape[1])
         bcs = items("bcs", bcs, lambda b: isinstance(b, Clamp | Dirichlet), "Clamp or Dirichlet")
         shell = kind == "shell"
         forces = items(
@@ -69,7 +69,7 @@ class NodeConditions:
         self.loads_in_time = any(callable(load.value) for load in forces)
         turning = [weights != 0.0 for load, weights, _ in self._loads if load.turns]
         self.turned: IntArray = np.flatnonzero(np.any(turning, axis=0) if turning else [])
-        x = skeleton.x[here]
+        x = director_mesh.x[here]
         self._meetings = Meetings(comm, name, self._values, self._dofs, x, self._width)
         self._meetings.check(self._at_dofs(0.0), 0.0, anew=False)
         self.loads(0.0, 1.0)
@@ -114,11 +114,11 @@ class NodeConditions:
         """Nodes of all ranks where a condition holds; it must hold somewhere. Collective."""
         if not callable(where):
             raise TypeError(f"{what}={where!r}: pass a function x (3, n) -> bool (n,)")
-        x = self._skeleton.x
+        x = self._director_mesh.x
         chosen: BoolArray = at_points(self._comm, what, where, x.T, (), "b")
         if not chosen.any():
             low, high = x.min(axis=0).tolist(), x.max(axis=0).tolist()
-            here = ", ".join(str(place.tolist()) for place in x[self._skeleton.order[:_SHOWN]])
+            here = ", ".join(str(place.tolist()) for place in x[self._director_mesh.order[:_SHOWN]])
             raise ValueError(
                 f"{what}: selects no node between {low} and {high}; the nodes are {here}"
                 + (", ...; " if len(x) > _SHOWN else "; ")
@@ -130,7 +130,7 @@ class NodeConditions:
         """A load, what of it acts on this rank's nodes, and its name. Collective."""
         kind = type(load).__name__
         what = f"{kind}.where of forces[{k}] of {self._name!r}"
-        x, edges = self._skeleton.x, self._skeleton.edges
+        x, edges = self._director_mesh.x, self._director_mesh.edges
         chosen = np.ones(len(x), dtype=bool)
         if load.where is not None or not load.per_length:
             chosen = self._chosen(what, load.where)
@@ -142,7 +142,7 @@ class NodeConditions:
                     f"{what}={load.where!r}: selects no two neighbours; select both ends of the "
                     "elements it acts on"
                 )
-            borne = self._skeleton.lengths[along].ravel()
+            borne = self._director_mesh.lengths[along].ravel()
             weights = np.bincount(edges[along].ravel(), borne, len(x))
         elif chosen.sum() != 1:
             raise ValueError(f"{what}: selects {chosen.sum()} nodes; select one")

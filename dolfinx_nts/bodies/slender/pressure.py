@@ -61,7 +61,7 @@ class Pressures:
 
     Args:
         comm: MPI communicator.
-        skeleton: The shell's nodes.
+        director_mesh: The shell's nodes.
         cells: Nodes of this rank's cells, cyclic, shape (n, corners).
         loads: Loads by their position among all of the body's.
         name: Of the body, for messages.
@@ -72,23 +72,23 @@ class Pressures:
     """
 
     def __init__(
-        self, comm: MPI.Comm, skeleton: DirectorMesh, cells: Array,
+        self, comm: MPI.Comm, director_mesh: DirectorMesh, cells: Array,
         loads: dict[int, Pressure], name: str,
     ) -> None:  # fmt: skip
         self._comm = comm
         self._loads: list[tuple[Pressure, FloatArray, str]] = []
-        rest = skeleton.x[cells]
+        rest = director_mesh.x[cells]
         self._unit = kernel.force(rest, rest, 1.0) if loads else np.zeros((len(cells), 0, 3))
         for k, load in loads.items():
-            chosen = np.ones(len(skeleton.x), dtype=bool)
+            chosen = np.ones(len(director_mesh.x), dtype=bool)
             if load.where is not None:
                 what = f"Pressure.where of forces[{k}] of {name!r}"
                 if not callable(load.where):
                     raise TypeError(
                         f"{what}={load.where!r}: pass a function x (3, n) -> bool (n,)"
                     )
-                chosen = at_points(comm, what, load.where, skeleton.x.T, (), "b")
-                if not chosen[skeleton.cells].all(axis=1).any():
+                chosen = at_points(comm, what, load.where, director_mesh.x.T, (), "b")
+                if not chosen[director_mesh.cells].all(axis=1).any():
                     raise ValueError(
                         f"{what}={load.where!r}: selects no cell; select all corners of the cells "
                         "it acts on"

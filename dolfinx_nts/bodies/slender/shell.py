@@ -9,7 +9,7 @@ from dolfinx.mesh import Mesh
 
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
-from dolfinx_nts.bodies.slender.director_mesh import SIDES, Hull, of_shell
+from dolfinx_nts.bodies.slender.director_mesh import SIDES, WholeSkin, of_shell
 from dolfinx_nts.bodies.slender.midsurface import check_midsurface, midsurface_of
 from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load
 from dolfinx_nts.bodies.slender.pressure import Pressure
@@ -138,9 +138,9 @@ class Shell(DirectorBody):
         """
         return self._in_order()
 
-    def _make_hull(self) -> Hull:
+    def _make_skin(self) -> WholeSkin:
         """Its whole skin, see `DirectorBody`."""
-        return of_shell(self._skeleton)
+        return of_shell(self._director_mesh)
 
     def surface(
         self, marker: Marker = None, *, side: str = "top", smoothing: bool = False
@@ -160,8 +160,8 @@ class Shell(DirectorBody):
         """
         require_bool("smoothing", smoothing)
         choose("side", side, SIDES)
-        x = self._skeleton.x[self._skin.hull.node]
-        chosen = self._skin.marked(marker, self._skin.hull.part == SIDES.index(side), x)
+        x = self._director_mesh.x[self._skin.whole_skin.node]
+        chosen = self._skin.marked(marker, self._skin.whole_skin.part == SIDES.index(side), x)
         return self._skin.surface(chosen, smoothing)
 
     def force_and_moment(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -192,7 +192,7 @@ class Shell(DirectorBody):
             ValueError: The direction is not along the director.
         """
         nodes = self.points(x).nodes[:, 0] // 2
-        director = self._skeleton.directors[nodes[0], 0]
+        director = self._director_mesh.directors[nodes[0], 0]
         along = float(director @ direction)
         if np.linalg.norm(direction - along * director) > _PARALLEL * np.linalg.norm(direction):
             raise ValueError(
