@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from dolfinx_nts.contact.contact_law import ContactLaw, Contribution, Together
 from dolfinx_nts.contact.contact_measure import Attachment, Batch, ContactMeasure, Slip
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
+from dolfinx_nts.interaction.combination import Combination, of_multipliers
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.elements import Step, over
 from dolfinx_nts.kernels import compiled_law
@@ -45,7 +46,7 @@ class ContactElements(Batch):
     attachment: Attachment
     measure: ContactMeasure
     law: ContactLaw
-    combination = None
+    combination: ClassVar[Combination | None] = None
 
     def select(self, chosen: BoolArray) -> ContactElements:
         """The pairs chosen by a mask of shape (n,), itself if that chooses all."""
@@ -136,6 +137,20 @@ class ContactElements(Batch):
         x: FloatArray = (y if weights is None else np.matmul(weights, y)) - self.attachment.path[1]
         return x
 
+    def gap(self, x: FloatArray) -> FloatArray:
+        """Gaps beyond the overlap that is left [m], shape (n,), of nodes as of `evaluate`."""
+        gap: FloatArray = self.measure.gap(self._measured(x)) + self.law.overlap
+        return gap
+
+    def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
+        """Gaps [m], shape (n,), by positions of all points.
+
+        Args:
+            positions: As of `ContactPair.positions`.
+            path: Displacement of a master that is no body then [m], shape (3,).
+        """
+        return self.measure.gap(self.pair.points(positions, self.candidates) - path)
+
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Augmented unknowns that fit predicted nodes (n, k, 3), as of `reference`."""
         return self.measure.augmented(self._measured(x))
@@ -144,6 +159,21 @@ class ContactElements(Batch):
         """Number of a pair's slave node in the user's mesh."""
         return int(self.pair.slave.original[self.pair.slave.share[self.candidates.node[i]]])
 
+    def place(self, i: int) -> str:
+        """Where a slave is, for messages."""
+        return self.attachment.place(i)
+
+    @cached_property
+    def tangents(self) -> FloatArray:
+        """Directions of the slip's components, as of `ContactMeasure`."""
+        return self.measure.tangents
+
+    @cached_property
+    def _held(self) -> BoolArray:
+        """Which slaves move as prescribed, shape (n,)."""
+        held: BoolArray = _fixed(self.attachment)[:, : self._own].all(axis=(1, 2))
+        return held
+
     def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
         """Multipliers of given contact forces on the slaves [N], shape (n, constraints).
 
@@ -151,10 +181,10 @@ class ContactElements(Batch):
             normal: p_N, shape (n,).
             tangential: Friction, shape (n, 3).
         """
-        out = np.zeros((self.num_elements, self.law.num_constraints))
+        out = np.zeros((len(normal), self.law.num_constraints))
         out[:, 0] = -normal
         if self.law.num_tangential:
-            out[:, -2:] = -np.einsum("nai,ni->na", self.measure.tangents, tangential)
+            out[:, -2:] = -np.einsum("nai,ni->na", self.tangents, tangential)
         return out
 
     def rows(self, k: Contribution, name: str) -> FloatArray:
@@ -162,6 +192,10 @@ class ContactElements(Batch):
         start = self.num_coordinates
         middle = start + self.measure.num_augmented
         return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
+
+    def _law_rows(self, k: Contribution) -> FloatArray:
+        """What is left of the constraints of each slave [kg m], shape (n, constraints)."""
+        return of_multipliers(self, self.rows(k, "constraints")).reshape(k.multiplier.shape)
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
         """Residual and tangent of the pairs. Collective, and reached by all if an obstacle raises.
@@ -211,7 +245,7 @@ class ContactElements(Batch):
     # ---- what a step asks of elements once it is solved, or is not
     def largest(self, part: Contribution) -> list[float]:
         """Sizes that `ratios` compares: augmented rows, gaps, multipliers and scale."""
-        gaps = self.rows(part, "constraints") / self.law.scale[:, None]
+        gaps = self._law_rows(part) / self.law.scale[:, None]
         arrays = (self.rows(part, "augmented"), gaps, part.multiplier, self.law.scale)
         found = [float(np.abs(a).max(initial=0.0)) for a in arrays]
         # Rows of gaps that repeat each other miss what no motion closes, see `shared_weight`.
@@ -299,17 +333,17 @@ class ContactElements(Batch):
             part: Last iterate.
             flips: How often `Contribution.status` changed, shape (2, n).
         """
-        rows = np.abs(part.residual[:, self.num_coordinates :]).max(axis=1)
+        rows = np.abs(self._law_rows(part)).max(axis=1)
         weight = np.where(np.isnan(rows), np.inf, rows) * (1 + flips.sum(axis=0))
         i = int(np.argmax(weight))
         touch, slide = (int(n) for n in flips[:, i])
-        text = f"contact {self.name!r}: {self.attachment.place(i)}, {touch} active-set flips"
+        text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
         if slide:
             text += f" and {slide} between stick and slip"
         if touch + slide >= _CYCLE:
             states = "stick and slip" if slide > touch else "contact and none"
             remedy = "try steps of another length"
-            if _fixed(self.attachment)[i, : self._own].all():
+            if self._held[i]:
                 # Several such nodes on one facet share the little that its nodes can give way.
                 remedy = "its motion is prescribed, so make its surface the master"
             elif np.isinf(self.pair.friction):
