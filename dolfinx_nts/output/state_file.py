@@ -112,7 +112,9 @@ def _settings(item: Any) -> dict[str, Any]:
 
 
 def _describe_contact(pair: Any) -> dict[str, Any]:
-    found = {"name": pair.name, "friction": float(pair.friction)}
+    found = {
+        "name": pair.name, "friction": float(pair.friction), "integration": pair.integration,
+    }  # fmt: skip
     for role in ("slave", "master"):
         surface = getattr(pair, role)
         facets = getattr(surface, "facets", None)

@@ -104,6 +104,7 @@ def _scene(system: System) -> dict[str, Any]:
     for number, pair in enumerate(system.contacts):
         found[f"friction of contacts[{number}]"] = pair.friction
         found[f"interference of contacts[{number}]"] = pair.interference
+        found[f"integration of contacts[{number}]"] = pair.integration
         surfaces: Mapping[str, Any] = {"slave": pair.slave, "master": pair.master}
         for role, surface in surfaces.items():
             for name, value in surface.settings.items():
