@@ -287,7 +287,7 @@ class ContactElements(Batch):
         """
         start = self.measure.start[:, 0] + self.attachment.path[0]
         x = self.pair.origin + start + theta * (part.place - start)
-        total: FloatArray = cross(x, part.force).sum(axis=0)
+        total: FloatArray = resultant(x, part.force)[1]
         return total
 
     def nodal_forces(self, part: Contribution) -> list[FloatArray]:
@@ -308,6 +308,24 @@ class ContactElements(Batch):
             found.append(total)
             start = stop
         return found
+
+    def impulse(self, part: Contribution, push: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What impulses along the normals at t_{n+1} do, of slaves that are active.
+
+        Args:
+            part: Solution of the step.
+            push: On the slaves [N s], shape (n,).
+
+        Returns:
+            Impulses on the elements' coordinates [N s], shape (n, coordinates); the sum of those on
+            slaves, and of their moments about the origin [N m s], on this rank, shape (2, 3).
+        """
+        # Where a gap is closed, a change of the foot or of the normal does not change it.
+        rows = part.tangent[:, self.gap_row, : self.num_coordinates] / self.law.scale[:, None]
+        slave = self.attachment.sides[0]
+        own = rows[:, : 3 * slave.nodes.shape[1]].reshape(*slave.nodes.shape, 3)
+        pulls = push[:, None] * (own * slave.places[:, :, None]).sum(axis=1)
+        return push[:, None] * rows, resultant(self.pair.origin + part.place, pulls)
 
     def gains(self, part: Contribution, factor: float) -> FloatArray:
         """Energy that each pair brings in by starting behind its facet [J], shape (n,)."""
@@ -350,6 +368,11 @@ class ContactElements(Batch):
                 remedy = "infinite friction may let it neither stick nor leave: try friction=1e4"
             text += f": it flips between {states} and {UNSETTLED}{remedy}"
         return float(weight[i]), text
+
+
+def resultant(x: FloatArray, force: FloatArray) -> FloatArray:
+    """Sum of forces (n, 3) at points (n, 3), and of their moments about the origin, (2, 3)."""
+    return np.array([force.sum(axis=0), cross(x, force).sum(axis=0)])
 
 
 def _fixed(attachment: Attachment) -> BoolArray:

@@ -99,6 +99,10 @@ class FacetGap(Batch):
         value: FloatArray = np.einsum("ni,ni->n", x[:, 0] - foot, normal)
         return value
 
+    def normal_at(self, x: FloatArray) -> FloatArray:
+        """Unit normals at the feet of points at t_{n+1}, shape (n, 3)."""
+        return facets.frame(x[:, 1:], self._projection(x))[2]
+
     def augmented(self, x: FloatArray) -> FloatArray:
         """Facet size times the d and f that fit points at t_{n+1} [m]."""
         return self._fitting(x) if self.num_augmented else np.empty((len(x), 0))
@@ -121,8 +125,7 @@ class FacetGap(Batch):
         if found.slip is None:
             return found
         middle = self.start + self.theta * (x - self.start)
-        normal = facets.frame(middle[:, 1:], self._projection(middle))[2]
-        return found._replace(normal=normal)
+        return found._replace(normal=self.normal_at(middle))
 
     def middle_tangents(self, x: FloatArray) -> MiddleTangents:
         """Tangents halfway between the foot of t_n and that of points at t_{n+1}."""

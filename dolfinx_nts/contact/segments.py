@@ -196,21 +196,26 @@ def _points(
     xi, _ = compiled.project(place.reshape(-1, 3), corners[of], np.zeros((len(of), 2)))
     xi = xi.reshape(n, most, 2)
     found: list[tuple[Any, ...]] = []
-    for first in range(1, most - 1, 2):
-        # Quadrilaterals with the first corner in common, the last one perhaps a triangle.
-        for number in (3, 4):
-            last = count - first + 1
-            some = np.flatnonzero(last >= 4 if number == 4 else last == 3)
-            if not some.size and found:
-                continue
-            piece = xi[some][:, [0, *range(first, first + number - 1)]]
-            at, weight = _rule(piece)
-            some = np.repeat(some, at.shape[1])
-            found.append((some, at.reshape(-1, 2), weight.ravel()))
+    for number in range(3, most + 1):
+        some = np.flatnonzero(count == number)
+        at, weight = (_rule if number < 5 else _fan)(xi[some, :number])
+        found.append((np.repeat(some, at.shape[1]), at.reshape(-1, 2), weight.ravel()))
     which, at, weight = (np.concatenate(x) for x in zip(*found, strict=True))
     order = np.argsort(which, kind="stable")
     which = which[order]
     return SurfacePoints(one[which], two[which], at[order], weight[order])
+
+
+def _fan(piece: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same of polygons (n, k, 2), wherever their corners are counted from.
+
+    Middles of the sides of the triangles around the mean of the corners are exact for degree 2.
+    """
+    spokes = piece - piece.mean(axis=1, keepdims=True)
+    after = np.roll(spokes, -1, axis=1)
+    area = (spokes[..., 0] * after[..., 1] - spokes[..., 1] * after[..., 0]) / 6.0
+    at = np.concatenate([piece + 0.5 * (after - spokes), piece - 0.5 * spokes], axis=1)
+    return at, np.concatenate([area, area + np.roll(area, 1, axis=1)], axis=1)
 
 
 def _rule(piece: FloatArray) -> tuple[FloatArray, FloatArray]:

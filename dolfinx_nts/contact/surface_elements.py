@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse
 
-from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.contact.contact_elements import ContactElements, resultant
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution
 from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
 from dolfinx_nts.contact.facet_gap import FacetGap
@@ -130,8 +130,8 @@ class Sums(Batch):
 class SurfaceElements(ContactElements):
     """Elements of a pair that is integrated over the slave's surface; see `Elements`.
 
-    Arrays of `Contribution` but residual and tangent have slaves as axis 0, and coupling and place
-    have points.
+    Arrays of `Contribution` but residual and tangent have slaves as axis 0; coupling and place, the
+    measure's points at t_{n+1}, have points of the surface.
 
     Attributes:
         attachment: Facets of the elements.
@@ -283,7 +283,7 @@ class SurfaceElements(ContactElements):
             gap=found.gap,
             slip=found.slip.value if found.slip else np.empty((len(multiplier), 0)),
             coupling=points.residual[:, : 3 * y.shape[1]].reshape(y.shape),
-            place=y[:, 0],
+            place=y,
         )
 
     def _motion(self, y: FloatArray) -> FloatArray:
@@ -301,7 +301,7 @@ class SurfaceElements(ContactElements):
         """
         sums, (n, corners), width = self.sums, self.sums.slot.shape, multiplier.shape[1]
         at_corners, size = sums.at_corners(multiplier), 3 * y.shape[1]
-        own, none = np.einsum("nc,nck->nk", sums.share, at_corners), np.empty((n, 0))
+        own, none = sums.to_points(multiplier), np.empty((n, 0))
         directions, slips = np.empty((n, corners, 0, 3)), None
         if width > 1:
             middle = self.measure.middle_tangents(y)
@@ -380,9 +380,17 @@ class SurfaceElements(ContactElements):
     def moment(self, part: Contribution, theta: float) -> FloatArray:
         """As of `ContactElements`."""
         start, force = self.measure.start[:, 0], -part.coupling[:, 0]
-        x = self.pair.origin + start + theta * (part.place - start)
-        total: FloatArray = cross(x, force).sum(axis=0)
+        x = self.pair.origin + start + theta * (part.place[:, 0] - start)
+        total: FloatArray = resultant(x, force)[1]
         return total
+
+    def impulse(self, part: Contribution, push: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of `ContactElements`."""
+        size, width, y = self.num_coordinates, self.law.num_constraints, part.place
+        gaps = part.tangent[:, size::width, :size]
+        each = np.append(push / self.law.scale, 0.0)[self._slot]
+        pulls = self.sums.to_points(push)[:, None] * self.measure.normal_at(y)
+        return np.einsum("ec,ecz->ez", each, gaps), resultant(self.pair.origin + y[:, 0], pulls)
 
     def nodal_forces(self, part: Contribution) -> list[FloatArray]:
         """As of `ContactElements`."""

@@ -94,6 +94,11 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
 
     def _set_up(self) -> None:
         super()._set_up()
+        if not len(self.slave.facets):
+            raise ValueError(
+                f'integration="surface": the slave, of {self.slave.body.name!r}, has points alone; '
+                'use integration="nodes"'
+            )
         if self.slave.body.rigid and self.master.body.rigid:
             raise ValueError(
                 f'integration="surface": both {self.slave.body.name!r} and '

@@ -129,6 +129,30 @@ def test_the_same_on_any_ranks():
         assert np.abs(one - two).max() < 1e-7 * np.abs(runs[1].contact_forces).max()
 
 
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_an_impact_gives_its_energy_back():
+    system = rubbing_blocks(0.0, integration="surface")
+    rule = CONTACT_RULES["energy-momentum"]
+    run = nts.simulate(system, rule, dt=2e-3, t_end=0.1, newton=TIGHT, impact="restored")
+    table, energy = run.balance, run.balance["energy"]
+    assert run.status == "completed" and table["contact_defect"][-1] > 0.05 * energy[0]
+    # What nodes that stay lose or gain as their points change is no impact.
+    assert np.abs(energy / energy[0] - 1).max() < 1e-4
+    assert np.abs(table["ledger_residual"]).max() < 1e-12 * energy[0]
+    for name in ("linear_momentum", "angular_momentum"):
+        assert drift(table, name) < 1e-12
+    # What the contact's forces and their moments have done is the change of the slave's momenta.
+    body, momenta = system.bodies[0], []
+    for state in (system.initial_state(), run.state):
+        p = body.inertia(state.v[0])
+        own = np.stack([body.linear_momentum(p), body.angular_momentum(state.u[0], p)])
+        momenta.append(COMM.allreduce(own))
+    h = np.diff(table["time"])
+    done = [(h[:, None] * a[1:, 0]).sum(axis=0) for a in (run.contact_forces, run.contact_moments)]
+    assert np.abs(momenta[1] - momenta[0] - done).max() < 1e-12 * np.abs(momenta[0]).max()
+
+
 # ---- what is refused
 def test_what_it_does_not_know():
     def pair(master=None, slave=None, **options):
