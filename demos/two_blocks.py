@@ -47,6 +47,7 @@ def scene(
     speed: float | None = None,
     mass: str = "consistent",
     friction: float = 0.0,
+    integration: str = "nodes",
 ) -> nts.System:
     """Two cubes, the first about to hit the second.
 
@@ -60,6 +61,7 @@ def scene(
         speed: Speed of the first cube, 2 m/s if not given; the spin scales with it.
         mass: Of the first cube's nodes that touch, "consistent" or "redistributed".
         friction: Coefficient of friction.
+        integration: As of `ContactPair`.
     """
 
     def box(corner: list[float], size: float, shift: float, n: int) -> Any:
@@ -85,6 +87,7 @@ def scene(
         slave=left.surface(lambda x: x[0] > metre - tolerance, mass=mass),
         master=right.surface(lambda x: x[0] < 1.05 * metre + tolerance),
         friction=friction,
+        integration=integration,
     )
     return nts.System([left, right], contacts=[pair])
 

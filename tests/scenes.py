@@ -102,7 +102,9 @@ def quarter_cube(bcs, traction=(), n=2, material=RUBBER, density=1e3):
 
 
 # ---- two blocks
-def rubbing_blocks(friction, metre=1.0, turn=None, cell=CellType.hexahedron, cells=(3, 2)):
+def rubbing_blocks(
+    friction, metre=1.0, turn=None, cell=CellType.hexahedron, cells=(3, 2), comm=COMM, **options
+):
     """A block thrown at a larger one with half its speed along the contact, turned as a whole."""
     turn = np.eye(3) if turn is None else turn
     rubber = nts.NeoHookean(young=1e6 / metre, poisson=0.3)
@@ -110,7 +112,7 @@ def rubbing_blocks(friction, metre=1.0, turn=None, cell=CellType.hexahedron, cel
     bodies = []
     for corners, n, name in zip(boxes, cells, ("left", "right"), strict=True):
         low, high = metre * np.array(corners)
-        mesh = box(low, high, n, cell)
+        mesh = box(low, high, n, cell, comm)
         mesh.geometry.x[:] = mesh.geometry.x @ turn.T
         bodies.append((mesh, name))
 
@@ -127,6 +129,7 @@ def rubbing_blocks(friction, metre=1.0, turn=None, cell=CellType.hexahedron, cel
         slave=left.surface(lambda x: (turn.T @ x)[0] > metre * (1 - 1e-9)),
         master=right.surface(lambda x: (turn.T @ x)[0] < metre * (1.05 + 1e-9)),
         friction=friction,
+        **options,
     )
     return nts.System([left, right], contacts=[pair])
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from dolfinx_nts.contact.contact_law import ContactLaw, Contribution, Together
 from dolfinx_nts.contact.contact_measure import Attachment, Batch, ContactMeasure, Slip
 from dolfinx_nts.contact.pair import Candidates, ContactPair
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
+from dolfinx_nts.interaction.combination import Combination, of_multipliers
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.elements import Step, over
 from dolfinx_nts.kernels import compiled_law
@@ -47,7 +48,7 @@ class ContactElements(Batch):
     measure: ContactMeasure
     law: ContactLaw
     offset: FloatArray | float = 0.0
-    combination = None
+    combination: ClassVar[Combination | None] = None
 
     def select(self, chosen: BoolArray) -> ContactElements:
         """The pairs chosen by a mask of shape (n,), itself if that chooses all."""
@@ -138,6 +139,20 @@ class ContactElements(Batch):
         x: FloatArray = (y if weights is None else np.matmul(weights, y)) - self.attachment.path[1]
         return x
 
+    def gap(self, x: FloatArray) -> FloatArray:
+        """Gaps beyond the overlap that is left [m], shape (n,), of nodes as of `evaluate`."""
+        gap: FloatArray = self.measure.gap(self._measured(x)) - self.offset + self.law.overlap
+        return gap
+
+    def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
+        """Gaps [m], shape (n,), by positions of all points.
+
+        Args:
+            positions: As of `ContactPair.positions`.
+            path: Displacement of a master that is no body then [m], shape (3,).
+        """
+        return self.measure.gap(self.pair.points(positions, self.candidates) - path) - self.offset
+
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Augmented unknowns that fit predicted nodes (n, k, 3), as of `reference`."""
         return self.measure.augmented(self._measured(x))
@@ -146,6 +161,21 @@ class ContactElements(Batch):
         """Number of a pair's slave node in the user's mesh."""
         return int(self.pair.slave.original[self.pair.slave.share[self.candidates.node[i]]])
 
+    def place(self, i: int) -> str:
+        """Where a slave is, for messages."""
+        return self.attachment.place(i)
+
+    @cached_property
+    def tangents(self) -> FloatArray:
+        """Directions of the slip's components, as of `ContactMeasure`."""
+        return self.measure.tangents
+
+    @cached_property
+    def _held(self) -> BoolArray:
+        """Which slaves move as prescribed, shape (n,)."""
+        held: BoolArray = _fixed(self.attachment)[:, : self._own].all(axis=(1, 2))
+        return held
+
     def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
         """Multipliers of given contact forces on the slaves [N], shape (n, constraints).
 
@@ -153,10 +183,10 @@ class ContactElements(Batch):
             normal: p_N, shape (n,).
             tangential: Friction, shape (n, 3).
         """
-        out = np.zeros((self.num_elements, self.law.num_constraints))
+        out = np.zeros((len(normal), self.law.num_constraints))
         out[:, 0] = -normal
         if self.law.num_tangential:
-            out[:, -2:] = -np.einsum("nai,ni->na", self.measure.tangents, tangential)
+            out[:, -2:] = -np.einsum("nai,ni->na", self.tangents, tangential)
         return out
 
     def rows(self, k: Contribution, name: str) -> FloatArray:
@@ -164,6 +194,10 @@ class ContactElements(Batch):
         start = self.num_coordinates
         middle = start + self.measure.num_augmented
         return k.residual[:, start:middle] if name == "augmented" else k.residual[:, middle:]
+
+    def _law_rows(self, k: Contribution) -> FloatArray:
+        """What is left of the constraints of each slave [kg m], shape (n, constraints)."""
+        return of_multipliers(self, self.rows(k, "constraints")).reshape(k.multiplier.shape)
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
         """Residual and tangent of the pairs. Collective, and reached by all if an obstacle raises.
@@ -213,7 +247,7 @@ class ContactElements(Batch):
     # ---- what a step asks of elements once it is solved, or is not
     def largest(self, part: Contribution) -> list[float]:
         """Sizes that `ratios` compares: augmented rows, gaps, multipliers and scale."""
-        gaps = self.rows(part, "constraints") / self.law.scale[:, None]
+        gaps = self._law_rows(part) / self.law.scale[:, None]
         arrays = (self.rows(part, "augmented"), gaps, part.multiplier, self.law.scale)
         found = [float(np.abs(a).max(initial=0.0)) for a in arrays]
         # Rows of gaps that repeat each other miss what no motion closes, see `shared_weight`.
@@ -255,7 +289,7 @@ class ContactElements(Batch):
         """
         start = self.measure.start[:, 0] + self.attachment.path[0]
         x = self.pair.origin + start + theta * (part.place - start)
-        total: FloatArray = cross(x, part.force).sum(axis=0)
+        total: FloatArray = resultant(x, part.force)[1]
         return total
 
     def nodal_forces(self, part: Contribution) -> list[FloatArray]:
@@ -276,6 +310,24 @@ class ContactElements(Batch):
             found.append(total)
             start = stop
         return found
+
+    def impulse(self, part: Contribution, push: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What impulses along the normals at t_{n+1} do, of slaves that are active.
+
+        Args:
+            part: Solution of the step.
+            push: On the slaves [N s], shape (n,).
+
+        Returns:
+            Impulses on the elements' coordinates [N s], shape (n, coordinates); the sum of those on
+            slaves, and of their moments about the origin [N m s], on this rank, shape (2, 3).
+        """
+        # Where a gap is closed, a change of the foot or of the normal does not change it.
+        rows = part.tangent[:, self.gap_row, : self.num_coordinates] / self.law.scale[:, None]
+        slave = self.attachment.sides[0]
+        own = rows[:, : 3 * slave.nodes.shape[1]].reshape(*slave.nodes.shape, 3)
+        pulls = push[:, None] * (own * slave.places[:, :, None]).sum(axis=1)
+        return push[:, None] * rows, resultant(self.pair.origin + part.place, pulls)
 
     def gains(self, part: Contribution, factor: float) -> FloatArray:
         """Energy that each pair brings in by starting behind its facet [J], shape (n,)."""
@@ -301,23 +353,28 @@ class ContactElements(Batch):
             part: Last iterate.
             flips: How often `Contribution.status` changed, shape (2, n).
         """
-        rows = np.abs(part.residual[:, self.num_coordinates :]).max(axis=1)
+        rows = np.abs(self._law_rows(part)).max(axis=1)
         weight = np.where(np.isnan(rows), np.inf, rows) * (1 + flips.sum(axis=0))
         i = int(np.argmax(weight))
         touch, slide = (int(n) for n in flips[:, i])
-        text = f"contact {self.name!r}: {self.attachment.place(i)}, {touch} active-set flips"
+        text = f"contact {self.name!r}: {self.place(i)}, {touch} active-set flips"
         if slide:
             text += f" and {slide} between stick and slip"
         if touch + slide >= _CYCLE:
             states = "stick and slip" if slide > touch else "contact and none"
             remedy = "try steps of another length"
-            if _fixed(self.attachment)[i, : self._own].all():
+            if self._held[i]:
                 # Several such nodes on one facet share the little that its nodes can give way.
                 remedy = "its motion is prescribed, so make its surface the master"
             elif np.isinf(self.pair.friction):
                 remedy = "infinite friction may let it neither stick nor leave: try friction=1e4"
             text += f": it flips between {states} and {UNSETTLED}{remedy}"
         return float(weight[i]), text
+
+
+def resultant(x: FloatArray, force: FloatArray) -> FloatArray:
+    """Sum of forces (n, 3) at points (n, 3), and of their moments about the origin, (2, 3)."""
+    return np.array([force.sum(axis=0), cross(x, force).sum(axis=0)])
 
 
 def _fixed(attachment: Attachment) -> BoolArray:

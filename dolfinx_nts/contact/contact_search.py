@@ -118,7 +118,7 @@ class ContactSearch:
         both = list(zip(self._found, self._with_unknowns, strict=True))
         self.elements, self.idle = [c.select(a) for c, a in both], [c.select(~a) for c, a in both]
         self.idle_gaps = [np.empty(0) for _ in self.idle]
-        watching = any(c.num_elements for c in self.idle)
+        watching = any(len(c.candidates.node) for c in self.idle)
         self._watching = anywhere(self._comm, watching)
 
     def dives(self) -> bool:
@@ -206,7 +206,8 @@ class ContactSearch:
                 before[:, 1:] = step.factor * carried[:, -2:]
             before[~massless] = np.nan
             law = replace(law, before=before)
-        return replace(elements, law=law, offset=pair.offset[found.node])
+        offset = pair.offset[found.node] if pair.adjust else 0.0
+        return replace(elements, law=law, offset=offset)
 
     def _drop_doubles(self) -> None:
         """Keep one of two pairs that keep a node out of the same fixed surface.
@@ -227,7 +228,7 @@ class ContactSearch:
             stay = self._old[i].force[ca.node] >= self._old[j].force[cb.node]
             for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
                 if len(there):
-                    self._found[k] = c.select(~np.isin(np.arange(c.num_elements), there))
+                    self._found[k] = c.select(~np.isin(np.arange(len(c.candidates.node)), there))
 
     def _may_touch(self, k: int, c: ContactElements, had: BoolArray) -> BoolArray:
         """Return which need unknowns: all within reach, and those that had them in the last step.
@@ -237,7 +238,7 @@ class ContactSearch:
         only what carries, or what flight presses in, begins with unknowns.
         """
         if not self._step.integrator.inertia:
-            return np.ones(c.num_elements, dtype=bool)
+            return np.ones(len(c.candidates.node), dtype=bool)
         node, reach = c.candidates.node, self._reach(k, self._step.motion)
         force = self._old[k].force[node]
         if c.law.strong:
@@ -376,9 +377,7 @@ class ContactSearch:
         if not self._step.integrator.inertia and self._carried is self._old:
             near = _TOUCHING * c.candidates.length
             touching = (self._old[k].force[c.candidates.node] > 0.0) | (c.candidates.gap <= near)
-            augmented = np.empty((c.num_elements, 0))
-            nothing = {"augmented": augmented, "constraints": np.zeros_like(multipliers)}
-            gap = c.evaluate(x, nothing).gap
+            gap = c.gap(x)
             multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
         return multipliers
 
@@ -428,5 +427,4 @@ class ContactSearch:
     def _gap(self, k: int, c: ContactElements, u: Sequence[FloatArray]) -> FloatArray:
         """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
         moved = c.pair.positions([u[b] for b in self.bodies[k]])
-        points = c.pair.points(moved, c.candidates) - self._paths[k][1]
-        return c.measure.gap(points) - c.offset
+        return c.gap_at(moved, self._paths[k][1])

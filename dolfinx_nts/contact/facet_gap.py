@@ -8,12 +8,39 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
 from dolfinx_nts.kernels import compiled, facets, nts_element
 from dolfinx_nts.types import FloatArray
+
+
+class MiddleTangents(NamedTuple):
+    """Tangents a_a over the facet's size, where between t_n and t_{n+1} forces act.
+
+    Attributes:
+        value: [-], shape (n, 2, 3).
+        by_control: Their derivatives by the control points at t_{n+1} [1/m], (n, nc, 2).
+        by_slip: By the slip that `Measured` has [1/m], shape (n, 2, 2, 3), the last axis theirs.
+    """
+
+    value: FloatArray
+    by_control: FloatArray
+    by_slip: FloatArray
+
+    def turns(self, slip: Slip, size: int) -> FloatArray:
+        """Derivatives by the points [1/m], shape (n, 2, size, 3), the last axis the tangents'.
+
+        Args:
+            slip: What `Measured` has.
+            size: Coordinates of the points.
+        """
+        turns = np.einsum("nabi,nbz->nazi", self.by_slip, slip.gradient[..., :size])
+        for i in range(3):
+            turns[:, :, 3 + i :: 3, i] += self.by_control.transpose(0, 2, 1)
+        return turns
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,6 +99,10 @@ class FacetGap(Batch):
         value: FloatArray = np.einsum("ni,ni->n", x[:, 0] - foot, normal)
         return value
 
+    def normal_at(self, x: FloatArray) -> FloatArray:
+        """Unit normals at the feet of points at t_{n+1}, shape (n, 3)."""
+        return facets.frame(x[:, 1:], self._projection(x))[2]
+
     def augmented(self, x: FloatArray) -> FloatArray:
         """Facet size times the d and f that fit points at t_{n+1} [m]."""
         return self._fitting(x) if self.num_augmented else np.empty((len(x), 0))
@@ -94,8 +125,19 @@ class FacetGap(Batch):
         if found.slip is None:
             return found
         middle = self.start + self.theta * (x - self.start)
-        normal = facets.frame(middle[:, 1:], self._projection(middle))[2]
-        return found._replace(normal=normal)
+        return found._replace(normal=self.normal_at(middle))
+
+    def middle_tangents(self, x: FloatArray) -> MiddleTangents:
+        """Tangents halfway between the foot of t_n and that of points at t_{n+1}."""
+        theta = self.theta
+        control = (self.start + theta * (x - self.start))[:, 1:]
+        xi = self.xi + theta * (self._projection(x) - self.xi)
+        _, first, second = facets.shape(xi, control.shape[1])
+        length = self.length[:, None, None]
+        tangents = np.einsum("nia,nij->naj", first, control)
+        bends = np.einsum("niab,nij->nabj", second, control)
+        return MiddleTangents(tangents / length, theta * first / length,
+                              theta * bends / length[..., None] ** 2)  # fmt: skip
 
     def _has_friction(self, multiplier: FloatArray) -> bool:
         return multiplier.shape[1] > self.num_normal

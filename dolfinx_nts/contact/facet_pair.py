@@ -31,7 +31,7 @@ from dolfinx_nts.validation import StepFailedError
 
 #: A node may project this far (in convective coordinates) beyond an edge that the master surface
 #: ends at ...
-_OVERHANG = 0.05
+OVERHANG = 0.05
 #: ... and this far beyond an edge shared with another facet, between the normal cones of a convex
 #: edge, and further by what the node may be away.
 _WEDGE = 0.5
@@ -551,7 +551,7 @@ class FacetPair(ContactPair, master=Surface):
         """
         excess, free = facets.edge_excess(xi, self.master.facets.shape[1]), self._free_edges[facet]
         wedge = _WEDGE + 2.0 * (reach + MARGIN)
-        beyond: BoolArray = (free & (excess > _OVERHANG)).any(axis=1)
+        beyond: BoolArray = (free & (excess > OVERHANG)).any(axis=1)
         inside: BoolArray = (free | (excess <= wedge[:, None])).all(axis=1) & ~beyond
         return inside, beyond
 

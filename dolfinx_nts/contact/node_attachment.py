@@ -51,7 +51,7 @@ class NodeAttachment(Batch):
         """Weights of these points in slave and control points, if they differ."""
         if self.master is None or self.master.weights is None:
             return None
-        return _beside(np.ones((len(self.node), 1)), self.master.weights[self.patch])
+        return beside(np.ones((len(self.node), 1)), self.master.weights[self.patch])
 
     @cached_property
     def sides(self) -> tuple[Points, ...]:
@@ -69,10 +69,10 @@ class NodeAttachment(Batch):
         if slave.are_nodes and control is None:
             return None
         if control is not None:
-            return _beside(slave.weights, control[self.patch])
+            return beside(slave.weights, control[self.patch])
         number = sum(side.nodes.shape[1] for side in others)
         same = np.broadcast_to(np.eye(number), (len(self.node), number, number))
-        return _beside(slave.weights, same)
+        return beside(slave.weights, same)
 
     def place(self, i: int) -> str:
         """The node's number in the user's mesh, and its facet."""
@@ -80,7 +80,7 @@ class NodeAttachment(Batch):
         return node if self.facet is None else f"{node} on facet {int(self.facet[i])}"
 
 
-def _beside(slave: FloatArray, control: FloatArray) -> FloatArray:
+def beside(slave: FloatArray, control: FloatArray) -> FloatArray:
     """Weights in slaves (n, a) and in control points (n, c, b) as one, (n, c + 1, a + b)."""
     n, own = slave.shape
     both = np.zeros((n, control.shape[1] + 1, own + control.shape[2]))

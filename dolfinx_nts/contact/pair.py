@@ -26,6 +26,8 @@ MARGIN = 0.5
 INITIAL_PENETRATION = 0.01
 #: The same of an equilibrium, by what is asked for at overlap; deeper nodes are no candidates.
 INTERFERENCE = {"refuse": INITIAL_PENETRATION, "resolve": MARGIN}
+#: What `ContactPair(integration=...)` may be.
+INTEGRATIONS = ("nodes", "surface")
 
 
 class Candidates(NamedTuple):
@@ -118,6 +120,9 @@ class ContactPair:
             miss each other by. The gap that they start with goes on being none; bodies are drawn
             where their meshes are, and may be that deep inside each other without a warning. At
             most half a facet of the master inwards [m].
+        edges: Keep sharp edges of both bodies out of each other, too.
+        integration: What of the slave is kept out: its "nodes", or the "surface" between them in
+            the mean around each node, by points of all facets (theory section 17).
 
     Attributes:
         origin: Point of space that positions are relative to [m], shape (3,).
@@ -127,36 +132,53 @@ class ContactPair:
 
     Raises:
         TypeError: `slave` is no Surface, or `master` of no known kind.
-        ValueError: friction or `adjust` is negative or no number, `interference` is unknown, the
-            surfaces share nodes, or `edges` of an obstacle, which has none.
+        ValueError: friction or `adjust` is negative or no number, `interference` or `integration`
+            is unknown, the surfaces share nodes, `edges` or "surface" of an obstacle, which has
+            none, or "surface" between rigid bodies, of a smoothed master, of nodes without mass or
+            with `adjust`.
     """
 
     #: Class of pairs for each class of masters.
-    _kinds: ClassVar[dict[type, type[ContactPair]]] = {}
+    _kinds: ClassVar[dict[tuple[type, str], type[ContactPair]]] = {}
 
-    def __init_subclass__(cls, master: type) -> None:
-        ContactPair._kinds[master] = cls
+    def __init_subclass__(cls, master: type, integration: str = "nodes") -> None:
+        ContactPair._kinds[master, integration] = cls
 
-    def __new__(cls, slave: Any = None, master: Any = None, *_: Any, **__: Any) -> ContactPair:
-        """Make a pair of the kind that the master asks for."""
-        kinds = (pair for kind, pair in cls._kinds.items() if isinstance(master, kind))
+    def __new__(
+        cls, slave: Any = None, master: Any = None, *_: Any, integration: Any = "nodes", **__: Any
+    ) -> ContactPair:
+        """Make a pair of the kind that the master and the integration ask for."""
+        kinds = (
+            pair for (kind, how), pair in cls._kinds.items()
+            if isinstance(master, kind) and how == integration
+        )  # fmt: skip
         return super().__new__(next(kinds, cls))
 
     def __init__(
         self, slave: Surface, master: Any, *, friction: float = 0.0, interference: str = "refuse",
-        adjust: float = 0.0, edges: bool = False,
+        adjust: float = 0.0, edges: bool = False, integration: str = "nodes",
     ) -> None:  # fmt: skip
         _check_friction(friction)
         require_bool("edges", edges)
-        if not isinstance(interference, str) or interference not in INTERFERENCE:
-            known = ", ".join(map(repr, INTERFERENCE))
-            raise ValueError(f"interference={interference!r}: choose one of {known}")
         if not (is_finite(adjust) and adjust >= 0.0):
             raise ValueError(f"adjust={adjust!r}: pass a distance >= 0 [m]")
+        for name, given, known in (
+            ("interference", interference, tuple(INTERFERENCE)),
+            ("integration", integration, INTEGRATIONS),
+        ):
+            if not isinstance(given, str) or given not in known:
+                choices = ", ".join(map(repr, known))
+                raise ValueError(f"{name}={given!r}: choose one of {choices}")
+        masters = tuple(kind for kind, _ in self._kinds)
         if not isinstance(slave, Surface):
-            other = isinstance(slave, tuple(self._kinds))
+            other = isinstance(slave, masters)
             hint = "; an obstacle is a master" if other else ""
             raise TypeError(f"slave={slave!r}: pass a Surface, e.g. body.surface(marker){hint}")
+        if type(self) is ContactPair and isinstance(master, masters):
+            raise ValueError(
+                f"integration={integration!r}: {master!r} has no facets to integrate over; use "
+                "integration='nodes'"
+            )
         if type(self) is ContactPair:
             raise TypeError(
                 f"master={master!r}: pass a Surface, e.g. body.surface(marker), or a Plane, Sphere "
@@ -164,7 +186,7 @@ class ContactPair:
             )
         self.slave, self.friction, self.interference = slave, float(friction), interference
         self.master: Any = master
-        self.edges, self.adjust = edges, float(adjust)
+        self.edges, self.adjust, self.integration = edges, float(adjust), integration
         # Searches reach farther by the largest gap that counts as none.
         self.offset, self._lift = np.zeros(len(slave.share)), 0.0
         # What is near is small: gaps keep their digits wherever in space the bodies meet.

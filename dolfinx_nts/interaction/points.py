@@ -68,6 +68,15 @@ class Points:
         arrays = (self.nodes, self.weights, self.reference, self.fixed, self.places)
         return Points(self.body, *(a[chosen] for a in arrays))
 
+    def joined(self, numbers: IntArray) -> Points:
+        """Several points each, by numbers (n, p), as one of all their nodes, one after another."""
+        n, p = numbers.shape
+        arrays: tuple[Any, ...] = (
+            self.nodes, self.weights, self.reference, self.fixed, self.places
+        )  # fmt: skip
+        each = (a[numbers].reshape(n, p * a.shape[1], *a.shape[2:]) for a in arrays)
+        return Points(self.body, *each)
+
     def columns(self, chosen: IntArray) -> Points:
         """Return the points by some of the nodes each depends on; the others have no weight."""
         return self.select((slice(None), chosen))

@@ -262,7 +262,7 @@ def expelled(problem: StepProblem, step: Evaluation) -> str:
         gain = contact.gains(part, problem.factor)
         if len(gain) and gain.max() > best[0]:
             i = int(gain.argmax())
-            where = f"{contact.attachment.place(i)} of {contact.name!r}"
+            where = f"{contact.place(i)} of {contact.name!r}"
             text = f"{gain[i]:.3g} by {where}, deep by {-contact.candidates.gap[i]:.3g}"
             best = float(gain[i]), text
     return max(problem.system.comm.allgather(best))[1]

@@ -27,7 +27,6 @@ from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.state import State
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import StepFailedError
@@ -69,7 +68,7 @@ def restored(
     """
     contacts = _new(problem, step)
     system, comm = problem.system, problem.system.comm
-    local = np.array([[float(new.push.sum()), new.lost] for new in contacts]).reshape(-1, 2)
+    local = np.array([[new.push, new.lost] for new in contacts]).reshape(-1, 2)
     pushes, lost = comm.allreduce(local).T
     if not pushes.sum() > 0.0:
         return None
@@ -99,8 +98,7 @@ def restored(
     for k, (new, bodies) in enumerate(zip(contacts, system.contact_bodies, strict=True)):
         of = _group(groups, bodies)
         share = float(shares[groups == of].max()) if of >= 0 else 0.0
-        push = share * new.push[:, None] * new.normal
-        impulses[:, k] = push.sum(axis=0), cross(new.place, push).sum(axis=0)
+        impulses[:, k] = share * new.impulse
     comm.Allreduce(MPI.IN_PLACE, impulses, op=MPI.SUM)
     return Impact(replace(state, v=v), energy, impulses)
 
@@ -139,22 +137,20 @@ def _group(groups: npt.NDArray[np.int_], bodies: Sequence[int]) -> int:
 
 
 class _New(NamedTuple):
-    """Nodes of a contact that came to touch in a step, and zeros for the others.
+    """What nodes of a contact do that came to touch in a step.
 
     Attributes:
         batch: Elements of the contact.
-        gradient: Of the gaps at t_{n+1} by the nodes' coordinates, shape (n, coordinates).
-        push: Impulse of the step on the slaves along the normal [N s], shape (n,).
-        place: Of the slaves [m], shape (n, 3).
-        normal: Of the surface there, shape (n, 3).
+        push: Impulse of the step along the normals [N s], their sum on this rank.
+        rows: Of the elements' coordinates [N s], shape (elements, coordinates).
+        impulse: On the slave's body, and its moment about the origin [N m s], shape (2, 3).
         lost: Energy that they have lost on this rank [J].
     """
 
     batch: Any
-    gradient: FloatArray
-    push: FloatArray
-    place: FloatArray
-    normal: FloatArray
+    push: float
+    rows: FloatArray
+    impulse: FloatArray
     lost: float
 
 
@@ -165,19 +161,13 @@ def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
         new = part.active & ~(old.force[batch.candidates.node] > 0.0)
         force = np.where(new, -part.multiplier[:, 0], 0.0)
         lost = float(force @ batch.candidates.gap) / problem.factor
-        # Where a gap is closed, a change of the foot or of the normal does not change it.
-        rows = part.tangent[:, batch.gap_row, : batch.num_coordinates]
-        gradient, slave = rows / batch.law.scale[:, None], batch.attachment.sides[0]
-        own = gradient[:, : 3 * slave.nodes.shape[1]].reshape(*slave.nodes.shape, 3)
-        normal = (own * slave.places[:, :, None]).sum(axis=1)
-        place = batch.pair.origin + part.place
-        found.append(_New(batch, gradient, rate * force, place, normal, lost))
+        found.append(_New(batch, rate * force.sum(), *batch.impulse(part, rate * force), lost))
     return found
 
 
 def _forces(problem: StepProblem, contacts: Sequence[_New]) -> list[FloatArray]:
     """Impulses of all contacts on the owned coordinates of each batch of bodies [N s]."""
-    pushed = {id(new.batch): new.push[:, None] * new.gradient for new in contacts}
+    pushed = {id(new.batch): new.rows for new in contacts}
     parts = []
     for batch in problem.elements:
         nothing = np.zeros((batch.num_elements, batch.num_coordinates))

@@ -111,7 +111,10 @@ def _settings(item: Any) -> dict[str, Any]:
 
 
 def _describe_contact(pair: Any) -> dict[str, Any]:
-    found = {"name": pair.name, "friction": float(pair.friction), "adjust": pair.adjust}
+    found = {
+        "name": pair.name, "friction": float(pair.friction), "adjust": pair.adjust,
+        "integration": pair.integration,
+    }  # fmt: skip
     for role in ("slave", "master"):
         surface = getattr(pair, role)
         facets = getattr(surface, "facets", None)

@@ -105,6 +105,7 @@ def _scene(system: System) -> dict[str, Any]:
         found[f"friction of contacts[{number}]"] = pair.friction
         found[f"interference of contacts[{number}]"] = pair.interference
         found[f"adjust of contacts[{number}]"] = pair.adjust
+        found[f"integration of contacts[{number}]"] = pair.integration
         surfaces: Mapping[str, Any] = {"slave": pair.slave, "master": pair.master}
         for role, surface in surfaces.items():
             for name, value in surface.settings.items():

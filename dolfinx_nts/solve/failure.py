@@ -123,13 +123,13 @@ def contact_on(problem: StepProblem, e: Evaluation, flips: Sequence[Any], body: 
     found = []
     both = zip(problem.couplings.touching(e), problem.couplings.bodies, flips, strict=False)
     for (contact, part, _), bodies, changes in both:
-        if body not in bodies or not contact.num_elements:
+        if body not in bodies or not len(part.active):
             continue
         # What flips most, else what carries.
         times = changes.sum(axis=0) + part.active
         i = int(times.argmax())
         how = f"flips {changes[:, i].sum()} times" if changes[:, i].any() else "carries"
-        where = contact.attachment.place(i)
+        where = contact.place(i)
         found.append((int(times[i]), f"contact {contact.name!r} {how} at {where}"))
     most, text = max(f for part in problem.system.comm.allgather([(0, ""), *found]) for f in part)
     if not most:

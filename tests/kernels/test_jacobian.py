@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from dolfinx.mesh import CellType
 from integrators import GRADIENTS, MID_STEP
-from measures import STENCIL, block_errors, dense
+from measures import STENCIL, block_errors, dense, relative
 from scenes import box, rotated_state, smooth_motion
 
 import dolfinx_nts as nts
@@ -33,7 +33,7 @@ SCENES = [
 ]  # fmt: skip
 
 
-def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
+def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0, integration="nodes"):
     """A small block above a larger one; its lower face is the slave, the other may be smooth."""
     rubber = nts.NeoHookean(1e3, 0.3)
     upper = nts.Continuum(
@@ -50,6 +50,7 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0):
         slave=upper.surface(lambda x: x[2] < 1 + gap + 1e-9),
         master=lower.surface(lambda x: x[2] > 1 - 1e-9, smoothing=cell in SMOOTH),
         friction=friction,
+        integration=integration,
     )
     return nts.System([upper, lower], contacts=[pair])
 
@@ -134,6 +135,29 @@ def test_jacobian_is_the_derivative_of_the_residual(rule, cell, friction, active
     errors = block_errors(dense(at.solver.matrix.operator), expected, at.blocks())
     at.close()
     assert max(errors.values()) < 1e-8, errors
+
+
+@pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")
+@pytest.mark.parametrize(("rule", "cell", "friction"), [
+    ("condensed", "hex", "mixed"), ("midpoint", "hex", "slip"), ("gonzalez contact", "tet", "slip"),
+    ("condensed", "tet", "mixed"), ("energy-momentum", "hex", "none"), ("static", "hex", "mixed"),
+])  # fmt: skip
+@pytest.mark.fast("condensed-hex-mixed", "midpoint-hex-slip")
+def test_jacobian_of_a_law_after_sums(rule, cell, friction):
+    """Contact over the slave's surface: directions of the whole Jacobian."""
+    system = two_blocks(cell, friction=FRICTION[friction], integration="surface")
+    at = Linearised(system, rule, "mixed", rotated_state(system))
+    assert at.candidates == 9 and 0 < at.active.sum() < 9
+    x, step = at.problem.x.array_r.copy(), 1e-4
+    ways = np.random.default_rng(3).uniform(-0.3, 0.3, (6, len(x)))
+    expected = np.zeros((len(x), len(ways)))
+    for j, way in enumerate(ways):
+        for k, weight in STENCIL:
+            expected[:, j] += weight / step * at.residual(x + k * step * way)
+    found = dense(at.solver.matrix.operator) @ ways.T
+    errors = [relative(found[rows], expected[rows]) for rows in at.blocks()]
+    at.close()
+    assert max(errors) < 1e-8, errors
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="reads the whole matrix")

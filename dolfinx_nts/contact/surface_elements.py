@@ -1,0 +1,493 @@
+"""Contact whose law holds for sums of the gaps of points: one multiplier, several elements.
+
+The points of a slave's facets have the elements of `FacetGap`; what the law is about, and has a
+multiplier, is g_A = sum_q C_qA g_q of a node, with constant C (theory section 17). Forces go back
+by the same C, so that energy and momenta are those of the points. The elements that bodies see are
+pairs of facets of slave and master: the sums of all points there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse
+
+from dolfinx_nts.contact.contact_elements import ContactElements, resultant
+from dolfinx_nts.contact.contact_law import ContactLaw, Contribution
+from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
+from dolfinx_nts.contact.facet_gap import FacetGap
+from dolfinx_nts.contact.pair import Candidates
+from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
+from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.interaction.combination import Combination
+from dolfinx_nts.interaction.elements import Step
+from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.kernels import compiled_law
+from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+
+_STILL = np.zeros(3), np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FacetAttachment(Batch):
+    """Facets of a slave over facets of a master, see `Attachment`; axis 0 = pair of these."""
+
+    slave: Surface
+    master: Surface
+    own: IntArray
+    other: IntArray
+    path = _STILL
+    shares = None
+    weights = None
+
+    @property
+    def surfaces(self) -> tuple[Surface, Surface]:
+        """Those of the slave and of the master."""
+        return self.slave, self.master
+
+    @property
+    def numbers(self) -> tuple[IntArray, IntArray]:
+        """Their corners."""
+        return self.slave.facets[self.own], self.master.facets[self.other]
+
+    @cached_property
+    def sides(self) -> tuple[Points, Points]:
+        """Nodes that these depend on."""
+        corners = self.slave.material.joined(self.slave.facets[self.own])
+        return corners, self.master.facet_nodes.select(self.other)
+
+    def place(self, i: int) -> str:
+        """The facets' numbers."""
+        return f"facets {int(self.own[i])} and {int(self.other[i])}"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sums(Batch):
+    """What points contribute to; axis 0 = point.
+
+    Attributes:
+        slaves: How many there are.
+        element: Element that has the point, in ascending order, shape (n,).
+        slot: Slaves whose gaps it is a part of, one at each corner of its facet; -1: none.
+        share: Its parts C_qA in their gaps [-], 0 where there is none, shape (n, corners).
+        shape: Weights of the facet's corners in it, shape (n, corners).
+        weights: Those of the element's nodes in the measure's points, shape (n, points, nodes).
+    """
+
+    slaves: int
+    element: IntArray
+    slot: IntArray
+    share: FloatArray
+    shape: FloatArray
+    weights: FloatArray
+
+    @cached_property
+    def _incidence(self) -> Any:
+        """Which slave is at which corner of which point."""
+        n, corners = self.slot.shape
+        row, column = self.slot.ravel(), np.arange(n * corners)
+        on = row >= 0
+        entries = np.ones(on.sum()), (row[on], column[on])
+        return scipy.sparse.csr_array(entries, shape=(self.slaves, n * corners))
+
+    def by_slave(self, values: FloatArray) -> FloatArray:
+        """Sums of what points have at each corner of theirs (n, corners, k), shape (slaves, k)."""
+        found: FloatArray = self._incidence @ values.reshape(self.slot.size, values.shape[2])
+        return found
+
+    def to_slaves(self, values: FloatArray) -> FloatArray:
+        """C times values of points, (n,) or (n, k)."""
+        columns = values if values.ndim > 1 else values[:, None]
+        found = self.by_slave(self.share[:, :, None] * columns[:, None])
+        return found.reshape(self.slaves, *values.shape[1:])
+
+    def at_corners(self, values: FloatArray) -> FloatArray:
+        """Values of slaves (slaves, ..) at each point's corners, 0 at others, (n, corners, ..)."""
+        padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
+        found: FloatArray = padded[self.slot]
+        return found
+
+    def to_points(self, values: FloatArray) -> FloatArray:
+        """C^T times values of slaves (slaves, ..), shape (n, ..)."""
+        found: FloatArray = np.einsum("nc,nc...->n...", self.share, self.at_corners(values))
+        return found
+
+    def to_elements(self, values: FloatArray) -> FloatArray:
+        """Sums of values of points (n, ..) by element."""
+        if not len(values):
+            return values
+        start = np.flatnonzero(np.diff(self.element, prepend=-1))
+        found: FloatArray = np.add.reduceat(values, start, axis=0)
+        return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SurfaceElements(ContactElements):
+    """Elements of a pair that is integrated over the slave's surface; see `Elements`.
+
+    Arrays of `Contribution` but residual and tangent have slaves as axis 0; coupling and place, the
+    measure's points at t_{n+1}, have points of the surface.
+
+    Attributes:
+        attachment: Facets of the elements.
+        measure: Gap and slip of the points.
+        sums: What they contribute to.
+        frame: Directions of the slaves' slips at t_n, shape (slaves, 2, 3).
+    """
+
+    attachment: FacetAttachment
+    measure: FacetGap
+    sums: Sums
+    frame: FloatArray
+
+    def select(self, chosen: BoolArray) -> SurfaceElements:
+        """What serves some of the slaves, chosen by a mask."""
+        if chosen.all():
+            return self
+        sums, number = self.sums, np.where(chosen, np.cumsum(chosen) - 1, -1)
+        slot = np.append(number, -1)[sums.slot]
+        serves = (slot >= 0).any(axis=1)
+        share = np.where(slot >= 0, sums.share, 0.0)
+        there, element = np.unique(sums.element[serves], return_inverse=True)
+        chosen_sums = replace(sums, slaves=int(chosen.sum()), slot=slot, share=share).select(serves)
+        return replace(
+            self, candidates=self.candidates.select(chosen), law=self.law.select(chosen),
+            frame=self.frame[chosen], measure=self.measure.select(serves),
+            attachment=self.attachment.select(np.isin(np.arange(self.num_elements), there)),
+            sums=replace(chosen_sums, element=element),
+        )  # fmt: skip
+
+    # ---- sizes
+    @property
+    def num_elements(self) -> int:
+        """Pairs of facets on this rank."""
+        return len(self.attachment.own)
+
+    @cached_property
+    def _corners(self) -> int:
+        return self.sums.slot.shape[1]
+
+    @cached_property
+    def widths(self) -> dict[str, int]:
+        """Multipliers of the slaves at a facet's corners."""
+        return {"augmented": 0, "constraints": self._corners * self.law.num_constraints}
+
+    @property
+    def pattern(self) -> BoolArray:
+        """Which constraints stand in the rows of which: those of one slave."""
+        return np.kron(np.eye(self._corners, dtype=bool), self.law.pattern)
+
+    @cached_property
+    def _slot(self) -> IntArray:
+        """Slaves at the corners of each element, shape (elements, corners); -1: none."""
+        first = np.flatnonzero(np.diff(self.sums.element, prepend=-1))
+        return self.sums.slot[first]
+
+    @cached_property
+    def combination(self) -> Combination:  # type: ignore[override]
+        """Multipliers are those of the slaves, each in several elements."""
+        slot, width = self._slot, self.law.num_constraints
+        shape = self.num_elements, self.widths["constraints"]
+        number = (np.maximum(slot, 0)[:, :, None] * width + np.arange(width)).reshape(*shape, 1)
+        weight = np.repeat(slot >= 0, width, axis=1).astype(float).reshape(*shape, 1)
+        return Combination(number, weight, len(self.frame) * width)
+
+    @cached_property
+    def _first(self) -> tuple[IntArray, IntArray]:
+        """Of each slave the element that has its equation, and its corner there."""
+        where = np.flatnonzero(self._slot.ravel() >= 0)
+        slot, at = np.unique(self._slot.ravel()[where], return_index=True)
+        assert len(slot) == len(self.frame)
+        element, corner = np.unravel_index(where[at], self._slot.shape)
+        return element, corner
+
+    @property
+    def immovable(self) -> BoolArray:
+        """None is dropped beside another contact's."""
+        return np.zeros(len(self.frame), dtype=bool)
+
+    @property
+    def tangents(self) -> FloatArray:  # type: ignore[override]
+        """The slaves' directions."""
+        return self.frame
+
+    @property
+    def _held(self) -> BoolArray:  # type: ignore[override]
+        fixed: BoolArray = self.pair.slave.fixed[self._numbers].all(axis=1)
+        return fixed
+
+    @property
+    def _numbers(self) -> IntArray:
+        """Positions of the slaves in their surface."""
+        found: IntArray = self.pair.slave.share[self.candidates.node]
+        return found
+
+    def place(self, i: int) -> str:
+        """The slave's number in the user's mesh."""
+        return f"node {self.input_node(i)}"
+
+    # ---- places
+    def _measured(self, y: FloatArray) -> FloatArray:
+        """The measure's points (n, points, 3) from the nodes of elements [m]."""
+        x: FloatArray = np.matmul(self.sums.weights, y[self.sums.element])
+        return x
+
+    def gap(self, x: FloatArray) -> FloatArray:
+        """Gaps of the slaves beyond the overlap that is left [m]."""
+        gap: FloatArray = self._gaps(self._measured(x)) + self.law.overlap
+        return gap
+
+    def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
+        """Gaps of the slaves [m] by positions of all points."""
+        own, master = (
+            side[number[self.sums.element]]
+            for side, number in zip(positions, self.attachment.numbers, strict=True)
+        )
+        slave = np.einsum("nc,nci->ni", self.sums.shape, own)
+        return self._gaps(np.concatenate([slave[:, None], master], axis=1))
+
+    def _gaps(self, x: FloatArray) -> FloatArray:
+        return self.sums.to_slaves(self.measure.gap(x))
+
+    def initial_guess(self, x: FloatArray) -> FloatArray:
+        """No augmented unknowns: those of points follow from their places."""
+        return np.empty((self.num_elements, 0))
+
+    # ---- an iterate
+    def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
+        """Residual and tangent, the law after the sums. Collective.
+
+        Args:
+            x: As of `ContactElements.evaluate`.
+            own: "constraints": h^2/2 lambda of the slaves at the corners over `ContactLaw.scale`.
+        """
+        width = self.law.num_constraints
+        of_corners = own["constraints"].reshape(self.num_elements, self._corners, width)
+        multiplier = self.law.scale[:, None] * of_corners[self._first]
+        y = self._measured(x)
+        points = self._at_points(y, multiplier)
+        found = self._of_slaves(points, multiplier)
+        together = self._together(found.gap, found.slip, multiplier)
+        obeyed = self.law.obey(self._motion(y), found, multiplier, together)
+        of_nodes = compiled_law.to_nodes(self.sums.weights, points.residual, points.tangent)
+        residual, tangent = map(self.sums.to_elements, of_nodes)
+        self._write_law(residual, tangent, obeyed.residual[:, 3:], obeyed.tangent[:, 3:])
+        return Contribution(
+            **obeyed._replace(residual=residual, tangent=tangent)._asdict(),
+            multiplier=multiplier,
+            gap=found.gap,
+            slip=found.slip.value if found.slip else np.empty((len(multiplier), 0)),
+            coupling=points.residual[:, : 3 * y.shape[1]].reshape(y.shape),
+            place=y,
+        )
+
+    def _motion(self, y: FloatArray) -> FloatArray:
+        """How slaves move against their feet in the mean [m], shape (slaves, 1, 3)."""
+        motion = y - self.measure.start
+        foot = np.einsum("nk,nki->ni", self.measure.foot, motion[:, 1:])
+        return self.sums.to_slaves(motion[:, 0] - foot)[:, None]
+
+    def _at_points(self, y: FloatArray, multiplier: FloatArray) -> _AtPoints:
+        """Rows and columns of points, with C in those of the slaves' multipliers.
+
+        Args:
+            y: Points of the measure at t_{n+1} [m].
+            multiplier: Of the slaves [kg m], shape (slaves, constraints).
+        """
+        sums, (n, corners), width = self.sums, self.sums.slot.shape, multiplier.shape[1]
+        at_corners, size = sums.at_corners(multiplier), 3 * y.shape[1]
+        own, none = sums.to_points(multiplier), np.empty((n, 0))
+        directions, slips = np.empty((n, corners, 0, 3)), None
+        if width > 1:
+            middle = self.measure.middle_tangents(y)
+            directions = sums.at_corners(self.frame)
+            force = np.einsum("nc,nck,ncki->ni", sums.share, at_corners[..., 1:], directions)
+            own[:, 1:] = np.einsum("nai,ni->na", middle.value, force)
+        found = self.measure.evaluate(y, none, own)
+        residual = np.zeros((n, size + corners * width))
+        tangent = np.zeros((*residual.shape, residual.shape[1]))
+        residual[:, :size] = found.residual[:, :size]
+        tangent[:, :size, :size] = found.tangent[:, :size, :size]
+        columns, rows = np.empty((2, n, corners, width, size))
+        columns[:, :, 0] = found.tangent[:, None, :size, size]
+        rows[:, :, 0] = found.tangent[:, None, size, :size]
+        if found.slip is not None:
+            slips = np.einsum("nai,na->ni", middle.value, found.slip.value)
+            by_friction, turns = found.tangent[:, :size, size + 1 :], middle.turns(found.slip, size)
+            tangent[:, :size, :size] += by_friction @ np.einsum("nazi,ni->naz", turns, force)
+            along = np.einsum("nai,ncki->ncka", middle.value, directions)
+            columns[:, :, 1:] = np.einsum("nza,ncka->nckz", by_friction, along)
+            rows[:, :, 1:] = np.einsum("ncka,naz->nckz", along, found.slip.gradient[..., :size])
+            by_turns = np.einsum("na,nazi->nzi", found.slip.value, turns)
+            rows[:, :, 1:] += np.einsum("ncki,nzi->nckz", directions, by_turns)
+        flat = (n, corners * width, size)
+        tangent[:, size:, :size] = (sums.share[:, :, None, None] * rows).reshape(flat)
+        columns *= sums.share[:, :, None, None]
+        tangent[:, :size, size:] = columns.reshape(flat).transpose(0, 2, 1)
+        pulls = np.einsum("nckz,nck->ncz", columns[..., :3], at_corners)
+        return _AtPoints(residual, tangent, found.gap, slips, found.normal, pulls)
+
+    def _of_slaves(self, points: _AtPoints, multiplier: FloatArray) -> Measured:
+        """What the law takes for elements, whose coordinates are gap and slip of the slaves.
+
+        Their rows of coordinates are minus the forces on the slaves.
+        """
+        sums, (n, width) = self.sums, multiplier.shape
+        residual, tangent = np.zeros((n, 3 + width)), np.zeros((n, 3 + width, 3 + width))
+        gap = sums.to_slaves(points.gap) + self.law.overlap
+        residual[:, :3] = sums.by_slave(points.pulls)
+        residual[:, 3], tangent[:, 3, 0] = gap, 1.0
+        if points.slip is None or points.normal is None:
+            return Measured(residual, tangent, gap)
+        gradient = np.zeros((n, 2, 3 + width))
+        gradient[:, [0, 1], [1, 2]] = 1.0
+        metric = np.tile(np.eye(2), (n, 1, 1))
+        value = np.einsum("nki,ni->nk", self.frame, sums.to_slaves(points.slip))
+        slip = Slip(value, gradient, metric, np.zeros((n, 2, 2, 3 + width)))
+        normal = sums.to_slaves(points.normal)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return Measured(residual, tangent, gap, slip, normal)
+
+    def _write_law(
+        self, residual: FloatArray, tangent: FloatArray, rows: FloatArray, slopes: FloatArray
+    ) -> None:
+        """Write the equations of slaves into the elements'.
+
+        Args:
+            residual: Of elements, shape (n, r).
+            tangent: Shape (n, r, r).
+            rows: Of the slaves [kg m], shape (slaves, constraints).
+            slopes: Derivatives of these by gap, slips, nothing if there are none, and multipliers.
+        """
+        width, size, slot = rows.shape[1], self.num_coordinates, self._slot
+        padded = np.concatenate([slopes, np.zeros((1, *slopes.shape[1:]))])[slot]
+        scale = np.append(self.law.scale, 0.0)[slot].repeat(width, axis=1)
+        shape, widths = (*slot.shape, width, size), slot.shape[1] * width
+        of_sums = padded[..., :width] @ tangent[:, size:, :size].reshape(shape)
+        tangent[:, size:, :size] = of_sums.reshape(len(slot), widths, size)
+        tangent[:, :size, size:] *= scale[:, None]
+        element, corner = self._first
+        at = size + corner[:, None] * width + np.arange(width)
+        residual[element[:, None], at] = rows
+        tangent[element[:, None, None], at[:, :, None], at[:, None]] = slopes[:, :, 3:]
+
+    # ---- a solution
+    def moment(self, part: Contribution, theta: float) -> FloatArray:
+        """As of `ContactElements`."""
+        start, force = self.measure.start[:, 0], -part.coupling[:, 0]
+        x = self.pair.origin + start + theta * (part.place[:, 0] - start)
+        total: FloatArray = resultant(x, force)[1]
+        return total
+
+    def impulse(self, part: Contribution, push: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of `ContactElements`."""
+        size, width, y = self.num_coordinates, self.law.num_constraints, part.place
+        gaps = part.tangent[:, size::width, :size]
+        each = np.append(push / self.law.scale, 0.0)[self._slot]
+        pulls = self.sums.to_points(push)[:, None] * self.measure.normal_at(y)
+        return np.einsum("ec,ecz->ez", each, gaps), resultant(self.pair.origin + y[:, 0], pulls)
+
+    def nodal_forces(self, part: Contribution) -> list[FloatArray]:
+        """As of `ContactElements`."""
+        force = -part.coupling
+        own, master = (number[self.sums.element] for number in self.attachment.numbers)
+        of_slave = np.einsum("nc,ni->nci", self.sums.shape, force[:, 0])
+        found = []
+        both = zip(self.attachment.surfaces, (own, master), (of_slave, force[:, 1:]), strict=True)
+        for surface, number, values in both:
+            total = np.zeros((len(surface.points), 3))
+            np.add.at(total, number, values)
+            found.append(total)
+        return found
+
+
+class _AtPoints(NamedTuple):
+    """What points contribute at an iterate, before the law; axis 0 = point.
+
+    Attributes:
+        residual: Rows of the measure's points [kg m], and zeros of the multipliers at its corners.
+        tangent: Its derivative; rows of multipliers are C times those of the slaves' gap and slips.
+        gap: [m], shape (n,).
+        slip: As vectors [m], shape (n, 3); None without friction.
+        normal: As of `Measured`.
+        pulls: Minus the forces on the slave of each corner's multipliers, shape (n, corners, 3).
+    """
+
+    residual: FloatArray
+    tangent: FloatArray
+    gap: FloatArray
+    slip: FloatArray | None
+    normal: FloatArray | None
+    pulls: FloatArray
+
+
+def surface_elements(
+    pair: Any,
+    found: Candidates,
+    attachment: FacetAttachment,
+    measure: FacetGap,
+    sums: Sums,
+    step: Step,
+) -> SurfaceElements:
+    """Elements of a step, with the law of a pair for their slaves. Collective.
+
+    Args:
+        pair: The pair.
+        found: The slaves, with sums of what their points have.
+        attachment: Facets of the elements.
+        measure: Gap and slip of the points.
+        sums: What these contribute to.
+        step: The step.
+    """
+    ease, square, free = np.zeros((2, sums.slaves)), 0.0, 0.0
+    each = _moves(attachment, measure, sums)
+    for side, (surface, moves) in enumerate(zip(attachment.surfaces, each, strict=True)):
+        squares, scale = moves.power(2), step.scale(surface, pair.bodies)
+        ease[side] = squares @ ((1.0 if side == 0 else ~surface.fixed.all(axis=1)) / scale)
+        square = square + squares.sum(axis=1)
+        free = free + squares @ (~surface.fixed).astype(float)
+    scale, frame = 1.0 / ease[0], _frame(found.normal)
+    prescribed = None
+    if pair.friction:
+        prescribed = PrescribedSlip(
+            start=np.zeros((sums.slaves, 1, 3)), foot=np.empty((sums.slaves, 0)),
+            normal=found.normal, tangents=frame, free=free / np.reshape(square, (-1, 1)),
+        )  # fmt: skip
+    law = ContactLaw(
+        friction=pair.friction, yields=pair.yields, redundant=pair.redundant, row=3, num_normal=1,
+        scale=scale, yielding=scale / (1.0 + scale * ease[1]), size=found.length,
+        prescribed=prescribed,
+    )  # fmt: skip
+    return SurfaceElements(
+        pair=pair, candidates=found, attachment=attachment, measure=measure, law=law, sums=sums,
+        frame=frame,
+    )  # fmt: skip
+
+
+def _moves(attachment: FacetAttachment, measure: FacetGap, sums: Sums) -> list[Any]:
+    """Weights of each surface's points in the motion of slaves against their feet, sparse."""
+    found = []
+    both = zip(attachment.surfaces, attachment.numbers, (sums.shape, -measure.foot), strict=True)
+    for surface, numbers, weights in both:
+        on = sums.slot >= 0
+        values = sums.share[:, :, None] * weights[:, None]
+        row, column = np.broadcast_arrays(
+            sums.slot[:, :, None], numbers[sums.element][:, None]
+        )
+        entries = values[on].ravel(), (row[on].ravel(), column[on].ravel())
+        shape = sums.slaves, len(surface.points)
+        found.append(scipy.sparse.coo_array(entries, shape=shape).tocsr())
+    return found
+
+
+def _frame(normal: FloatArray) -> FloatArray:
+    """Two directions across each normal (n, 3), orthonormal, shape (n, 2, 3)."""
+    first = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    first = first - np.einsum("ni,ni->n", first, normal)[:, None] * normal
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, cross(normal, first)], axis=1)

@@ -1,0 +1,260 @@
+"""Contact that is integrated over the slave's surface: which parts of it lie over the master."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dolfinx_nts.contact.facet_gap import FacetGap
+from dolfinx_nts.contact.facet_pair import OVERHANG, FacetPair
+from dolfinx_nts.contact.node_attachment import beside
+from dolfinx_nts.contact.pair import MARGIN, Found, Motion
+from dolfinx_nts.contact.segments import near, segments
+from dolfinx_nts.contact.surface_elements import (
+    FacetAttachment,
+    Sums,
+    SurfaceElements,
+    surface_elements,
+)
+from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.interaction.elements import Step
+from dolfinx_nts.kernels import compiled, facets
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+
+#: Part of a node's area that has to lie over the master for it to be a candidate: rows of less
+#: would be nearly those of its neighbours.
+_COVERED = 1e-3
+#: A point's foot may lie so far, in convective coordinates, beyond an edge of two facets.
+_BEYOND = 0.5
+
+
+class SurfaceCandidates(NamedTuple):
+    """Slave nodes that may touch in a step, and the points whose gaps theirs are the means of.
+
+    Attributes:
+        node: As of `Candidates`, and so are normal, gap and length, means of the points'.
+        facet: -1.
+        patch: -1.
+        xi: Zeros.
+        normal: Unit normals, shape (n, 3).
+        gap: g_A0 [m], shape (n,).
+        length: Size of the facets [m], shape (n,).
+        points: Those of the rank's facets.
+    """
+
+    node: IntArray
+    facet: IntArray
+    patch: IntArray
+    xi: FloatArray
+    normal: FloatArray
+    gap: FloatArray
+    length: FloatArray
+    points: OverMaster
+
+    def select(self, chosen: IntArray | BoolArray) -> SurfaceCandidates:
+        """Some of the nodes, by number or by a mask; points stay."""
+        nodal: Any = [*(a[chosen] for a in self[:-1]), self.points]
+        return SurfaceCandidates(*nodal)
+
+
+class OverMaster(NamedTuple):
+    """Points of a slave's facets over a master; axis 0 = point.
+
+    Attributes:
+        own: Facets of the slave, shape (n,).
+        other: Facets of the master, shape (n,).
+        shape: Weights of the facets' corners, shape (n, corners).
+        xi: Their feet on the master's facets at t_n, shape (n, 2).
+        normal: Outward normals of the master there, shape (n, 3).
+        gap: g_q [m], shape (n,).
+        length: Size of the master's facet [m], shape (n,).
+        slot: Positions in the slave's `share` of the nodes at the corners, or -1, (n, corners).
+        part: w_q Phi_A, the reference area that these have there [m^2], shape (n, corners).
+    """
+
+    own: IntArray
+    other: IntArray
+    shape: FloatArray
+    xi: FloatArray
+    normal: FloatArray
+    gap: FloatArray
+    length: FloatArray
+    slot: IntArray
+    part: FloatArray
+
+    def select(self, chosen: IntArray | BoolArray) -> OverMaster:
+        """Some of the points, by number or by a mask."""
+        return OverMaster._make(a[chosen] for a in self)
+
+
+class SurfacePair(FacetPair, master=Surface, integration="surface"):
+    """A `FacetPair` that keeps the slave's surface out in the mean around each node."""
+
+    def _set_up(self) -> None:
+        super()._set_up()
+        if not len(self.slave.facets):
+            raise ValueError(
+                f'integration="surface": the slave, of {self.slave.body.name!r}, has points alone; '
+                'use integration="nodes"'
+            )
+        if self.slave.body.rigid and self.master.body.rigid:
+            raise ValueError(
+                f'integration="surface": both {self.slave.body.name!r} and '
+                f"{self.master.body.name!r} are rigid, and nothing yields to a pressure; use "
+                'integration="nodes"'
+            )
+        if self.adjust:
+            raise ValueError(
+                f'adjust={self.adjust!r}: what nodes miss their facets by is nothing that '
+                'integration="surface" takes its gaps at; leave one of them out'
+            )
+        if self.master.weights is not None:
+            raise ValueError(
+                f'integration="surface": the master, {self.master.body.name!r}, is smoothed, and '
+                "forces on smooth patches are those of no uniform pressure; leave smoothing out"
+            )
+        for surface in self.surfaces:
+            if surface.massless.any():
+                raise ValueError(
+                    f'integration="surface": nodes of {surface.body.name!r} have no mass; use '
+                    'mass="consistent" for its surface, or integration="nodes"'
+                )
+        slave = self.slave
+        self._position = np.full(len(slave.points), -1)
+        self._position[slave.share] = np.arange(len(slave.share))
+        self._facets = np.flatnonzero((self._position[slave.facets] >= 0).any(axis=1))
+
+    def find(
+        self,
+        positions: Sequence[FloatArray],
+        current: IntArray,
+        path: FloatArray,
+        motion: Motion | None = None,
+        followed: BoolArray | None = None,
+    ) -> Found:
+        """Nodes of this rank with facets over the master, as of `ContactPair`."""
+        reach = 0.0 if motion is None else motion.reach
+        slaves, master = positions
+        own, other = slaves[self.slave.facets[self._facets]], master[self.master.facets]
+        radius, cover = (
+            reach + MARGIN * float(s) for s in (facets.size(other).max(), facets.size(other).min())
+        )
+        points = self._over(own, other, near(own, other, radius), slaves, reach)
+        found: Any = self._nodes(points)
+        return Found(found, np.ones(len(self.slave.share), dtype=bool), cover)
+
+    def _over(
+        self,
+        own: FloatArray,
+        other: FloatArray,
+        pairs: tuple[IntArray, IntArray],
+        slaves: FloatArray,
+        reach: float,
+    ) -> OverMaster:
+        """Points that have a partner within reach.
+
+        Args:
+            own: This rank's facets at t_n [m], shape (m, nc, 3).
+            other: The master's.
+            pairs: Numbers of those near each other.
+            slaves: All points of the slave [m].
+            reach: Bound on the motion of slaves relative to the master [m].
+        """
+        found = segments(own, other, pairs)
+        facet, over = self._facets[found.own], found.other
+        corners = self.slave.facets[facet]
+        shape, slopes, _ = facets.shape(found.xi, corners.shape[1])
+        x = np.einsum("nc,nci->ni", shape, slaves[corners])
+        start, _ = compiled.closest_point(x, other[over])
+        xi, converged = compiled.project(x, other[over], start)
+        foot, _, normal = facets.frame(other[over], xi)
+        gap, length = np.einsum("ni,ni->n", normal, x - foot), facets.size(other[over])
+        excess = facets.edge_excess(xi, other.shape[1])
+        rim = self._free_edges[over]
+        legal = converged & (excess <= np.where(rim, OVERHANG, _BEYOND)).all(axis=1)
+        legal &= (gap > -MARGIN * length) & (gap < reach + MARGIN * length)
+        sides = np.einsum("nca,nci->nai", slopes, self.slave.reference[corners])
+        area = found.weight * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        slot, part = self._position[corners], area[:, None] * shape
+        return OverMaster(facet, over, shape, xi, normal, gap, length, slot, part).select(legal)
+
+    def _nodes(self, points: OverMaster) -> SurfaceCandidates:
+        """The nodes of the rank that points make candidates of."""
+        number, on = len(self.slave.share), points.slot >= 0
+        slot, part = points.slot[on], points.part[on]
+
+        def sums(values: FloatArray) -> FloatArray:
+            """Sums over the points of a node, shape (share,)."""
+            each = np.broadcast_to(values[:, None], on.shape)[on]
+            return np.asarray(np.bincount(slot, part * each, number), dtype=float)
+
+        covered = np.bincount(slot, part, number)
+        node = np.flatnonzero(covered > _COVERED * self.slave.area[self.slave.share])
+        means = [points.gap, points.length, *points.normal.T]
+        gap, length, *normal = (sums(values)[node] / covered[node] for values in means)
+        directions = np.stack(normal, axis=1)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        share = points.part / np.append(covered, 1.0)[points.slot]
+        chosen = np.append(np.isin(np.arange(number), node), False)[points.slot]
+        points = points._replace(part=np.where(chosen, share, 0.0))
+        none = np.full(len(node), -1)
+        return SurfaceCandidates(
+            node, none, none, np.zeros((len(node), 2)), directions, gap, length, points
+        )
+
+    def elements(
+        self, found: Any, positions: Sequence[FloatArray], path: FloatArray, step: Step
+    ) -> SurfaceElements:
+        """Equations of candidates in a step. Collective."""
+        number = np.full(len(self.slave.share) + 1, -1)
+        number[found.node] = np.arange(len(found.node))
+        points = found.points
+        slot = number[points.slot]
+        points = points._replace(slot=slot).select((slot >= 0).any(axis=1))
+        points = points.select(np.lexsort((points.other, points.own)))
+        both = np.column_stack([points.own, points.other])
+        new = np.diff(both, axis=0, prepend=-1).any(axis=1)
+        attachment = FacetAttachment(
+            slave=self.slave, master=self.master, own=points.own[new], other=points.other[new]
+        )
+        slaves, master = positions
+        x = np.einsum("nc,nci->ni", points.shape, slaves[self.slave.facets[points.own]])
+        corners = master[self.master.facets[points.other]]
+        measure = FacetGap(
+            start=np.concatenate([x[:, None], corners], axis=1), xi=points.xi,
+            normal=points.normal, length=points.length, rule=step.integrator.contact_gradient,
+            theta=step.integrator.theta, condense=True,
+        )  # fmt: skip
+        sums = Sums(
+            slaves=len(found.node), element=np.cumsum(new) - 1, slot=points.slot,
+            share=np.where(points.slot >= 0, points.part, 0.0), shape=points.shape,
+            weights=self._weights(points),
+        )  # fmt: skip
+        return surface_elements(self, found, attachment, measure, sums, step)
+
+    def _weights(self, points: OverMaster) -> FloatArray:
+        """Weights of the nodes of elements in points and control points."""
+        material = self.slave.material
+        of_corners = material.weights[self.slave.facets[points.own]]
+        own = np.einsum("nc,nck->nck", points.shape, of_corners).reshape(len(points.own), -1)
+        control = self.master.facet_weights
+        if control is None:
+            width = self.master.facet_nodes.nodes.shape[1]
+            of_master = np.broadcast_to(np.eye(width), (len(own), width, width))
+        else:
+            of_master = control[points.other]
+        return beside(own, of_master)
+
+    def missed(
+        self,
+        positions: Sequence[FloatArray],
+        motions: Sequence[FloatArray],
+        path: FloatArray,
+        reach: float,
+        held: IntArray,
+        aimed: IntArray,
+    ) -> IntArray | None:
+        """No facet that should hold a node is another one: none holds it alone."""
+        return None
