@@ -196,9 +196,9 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         gap, length, *normal = (sums(values)[node] / covered[node] for values in means)
         directions = np.stack(normal, axis=1)
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        share = points.part / np.append(covered, 1.0)[points.slot]
         chosen = np.append(np.isin(np.arange(number), node), False)[points.slot]
-        points = points._replace(part=np.where(chosen, share, 0.0))
+        area = np.where(chosen, np.append(covered, 1.0)[points.slot], 1.0)
+        points = points._replace(part=np.where(chosen, points.part, 0.0) / area)
         none = np.full(len(node), -1)
         return SurfaceCandidates(
             node, none, none, np.zeros((len(node), 2)), directions, gap, length, points
