@@ -153,6 +153,15 @@ class ContactElements(Batch):
         """
         return self.measure.gap(self.pair.points(positions, self.candidates) - path) - self.offset
 
+    def is_stale(self, positions: Sequence[FloatArray], part: Contribution) -> bool:
+        """Whether an equilibrium is none of the elements that its places have. Collective.
+
+        Args:
+            positions: Of all points in it, as of `ContactPair.positions`.
+            part: Solution.
+        """
+        return False
+
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """Augmented unknowns that fit predicted nodes (n, k, 3), as of `reference`."""
         return self.measure.augmented(self._measured(x))

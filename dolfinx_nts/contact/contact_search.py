@@ -66,7 +66,7 @@ class ContactSearch:
         self.idle: list[ContactElements] = []
         self.idle_gaps: list[FloatArray] = []
         self.beside = [(0.0, -1)] * len(contacts)
-        self._cover = [0.0] * len(contacts)
+        self._cover, self._stale = [0.0] * len(contacts), False
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
@@ -101,6 +101,7 @@ class ContactSearch:
         touching = slice(len(self.elements))
         self._carried = history if again is None else self.history(again.parts[touching])
         self._step, self._old, self._placed = step, history, {}
+        self._stale &= again is not None
         time = step.state.time
         self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
         if again is None:
@@ -178,7 +179,7 @@ class ContactSearch:
             positions,
             self._old[k].facet,
             path,
-            Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k]),
+            Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k], self._stale),
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia else None,
         )
@@ -281,7 +282,17 @@ class ContactSearch:
             reach = self._reach(k, motion)
             missed |= reach > self._cover[k]
             missed |= self._passed(k, e, parts[k], reach)
-        return missed
+        self._stale = not missed and self._are_stale(e, parts)
+        return missed or self._stale
+
+    def _are_stale(self, e: Evaluation, parts: Sequence[Contribution]) -> bool:
+        """Return whether an equilibrium's elements are those of other places. Collective."""
+        if self._step.integrator.inertia:
+            return False
+        stale = False
+        for pair, of, c, part in zip(self._pairs, self.bodies, self.elements, parts, strict=True):
+            stale |= c.is_stale(pair.positions([e.bodies[b].u1 for b in of]), part)
+        return stale
 
     def _passed(self, k: int, e: Evaluation, part: Contribution, reach: float) -> bool:
         """Return whether nodes have come through facets unseen, which are noted. Collective."""

@@ -95,20 +95,26 @@ class FacetGap(Batch):
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of points at t_{n+1}, shape (n,)."""
-        foot, _, normal = facets.frame(x[:, 1:], self._projection(x))
+        foot, _, normal = facets.frame(x[:, 1:], self.projection(x))
         value: FloatArray = np.einsum("ni,ni->n", x[:, 0] - foot, normal)
         return value
 
+    def projection(self, x: FloatArray) -> FloatArray:
+        """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
+        xi, converged = compiled.project(x[:, 0], x[:, 1:], self.xi)
+        xi[~converged] = np.nan
+        return xi
+
     def normal_at(self, x: FloatArray) -> FloatArray:
         """Unit normals at the feet of points at t_{n+1}, shape (n, 3)."""
-        return facets.frame(x[:, 1:], self._projection(x))[2]
+        return facets.frame(x[:, 1:], self.projection(x))[2]
 
     def augmented(self, x: FloatArray) -> FloatArray:
         """Facet size times the d and f that fit points at t_{n+1} [m]."""
         return self._fitting(x) if self.num_augmented else np.empty((len(x), 0))
 
     def _fitting(self, x: FloatArray) -> FloatArray:
-        xi = self._projection(x)
+        xi = self.projection(x)
         _, _, normal = facets.frame(x[:, 1:], xi)
         return np.column_stack([normal, xi]) * self.length[:, None]
 
@@ -131,7 +137,7 @@ class FacetGap(Batch):
         """Tangents halfway between the foot of t_n and that of points at t_{n+1}."""
         theta = self.theta
         control = (self.start + theta * (x - self.start))[:, 1:]
-        xi = self.xi + theta * (self._projection(x) - self.xi)
+        xi = self.xi + theta * (self.projection(x) - self.xi)
         _, first, second = facets.shape(xi, control.shape[1])
         length = self.length[:, None, None]
         tangents = np.einsum("nia,nij->naj", first, control)
@@ -146,7 +152,7 @@ class FacetGap(Batch):
         """`evaluate` of (x, multipliers)."""
         n, size, theta = len(x), 3 * x.shape[1], self.theta
         middle = self.start + theta * (x - self.start)
-        xi_middle, xi_end = self._projection(middle), self._projection(x)
+        xi_middle, xi_end = self.projection(middle), self.projection(x)
         force, end = nts_element.gap(middle, xi_middle), nts_element.gap(x, xi_end)
         gradient = force.gradient.reshape(n, size)
         residual = np.zeros((n, size + multiplier.shape[1]))
@@ -180,12 +186,6 @@ class FacetGap(Batch):
         """Slip [m] and its gradient as given, the metric per square of the facet size."""
         area = self.length[:, None, None] ** 2
         return Slip(value, gradient, metric / area, by_unknowns / area[..., None])
-
-    def _projection(self, x: FloatArray) -> FloatArray:
-        """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
-        xi, converged = compiled.project(x[:, 0], x[:, 1:], self.xi)
-        xi[~converged] = np.nan
-        return xi
 
     def _invariants(
         self, x: FloatArray, augmented: FloatArray, multiplier: FloatArray
@@ -245,7 +245,7 @@ class FacetGap(Batch):
 
     def _compiled(self, x: FloatArray, multiplier: FloatArray) -> Measured:
         """`_condensed` of the mean value."""
-        xi = self._projection(x)
+        xi = self.projection(x)
         k = compiled.condensed(
             self.start, x, self.normal, self.xi, xi, self.length, multiplier
         )

@@ -70,11 +70,13 @@ class Motion(NamedTuple):
         paths: Displacement of each of a pair's bodies over the step [m], owned coordinates.
         aimed: Facet that a path of an earlier attempt at the step met, or -1, of each of the rank's
             slave nodes.
+        solved: Whether the paths are those of a solution, whose end is to be in equilibrium.
     """
 
     reach: float
     paths: Sequence[FloatArray]
     aimed: IntArray
+    solved: bool = False
 
 
 class Found(NamedTuple):

@@ -28,9 +28,12 @@ from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 _STILL = np.zeros(3), np.zeros(3)
+#: Convective coordinates by which points of an equilibrium may lie beside where they were cut.
+_STALE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,6 +80,7 @@ class Sums(Batch):
         share: Its parts C_qA in their gaps [-], 0 where there is none, shape (n, corners).
         shape: Weights of the facet's corners in it, shape (n, corners).
         weights: Those of the element's nodes in the measure's points, shape (n, points, nodes).
+        cut: Where on the master's facets they were when they were chosen, shape (n, 2).
     """
 
     slaves: int
@@ -85,6 +89,7 @@ class Sums(Batch):
     share: FloatArray
     shape: FloatArray
     weights: FloatArray
+    cut: FloatArray
 
     @cached_property
     def _incidence(self) -> Any:
@@ -244,15 +249,26 @@ class SurfaceElements(ContactElements):
 
     def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
         """Gaps of the slaves [m] by positions of all points."""
+        return self._gaps(self._placed(positions))
+
+    def _placed(self, positions: Sequence[FloatArray]) -> FloatArray:
+        """The measure's points (n, points, 3) from positions of all points [m]."""
         own, master = (
             side[number[self.sums.element]]
             for side, number in zip(positions, self.attachment.numbers, strict=True)
         )
         slave = np.einsum("nc,nci->ni", self.sums.shape, own)
-        return self._gaps(np.concatenate([slave[:, None], master], axis=1))
+        return np.concatenate([slave[:, None], master], axis=1)
 
     def _gaps(self, x: FloatArray) -> FloatArray:
         return self.sums.to_slaves(self.measure.gap(x))
+
+    def is_stale(self, positions: Sequence[FloatArray], part: Contribution) -> bool:
+        """Whether points lie elsewhere over the master than where pieces were cut. Collective."""
+        xi = self.measure.projection(self._placed(positions))
+        carries = np.append(part.active, False)[self.sums.slot].any(axis=1)
+        moved = np.abs(xi - self.sums.cut).max(axis=1)[carries]
+        return anywhere(self.pair.slave.body.comm, bool((moved > _STALE).any()))
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """No augmented unknowns: those of points follow from their places."""

@@ -21,7 +21,9 @@ from dolfinx_nts.contact.surface_elements import (
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets
+from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+from dolfinx_nts.validation import StepFailedError
 
 #: Part of a node's area that has to lie over the master for it to be a candidate: rows of less
 #: would be nearly those of its neighbours.
@@ -35,8 +37,8 @@ class SurfaceCandidates(NamedTuple):
 
     Attributes:
         node: As of `Candidates`, and so are normal, gap and length, means of the points'.
-        facet: -1.
-        patch: -1.
+        facet: Zeros, of no meaning.
+        patch: Zeros.
         xi: Zeros.
         normal: Unit normals, shape (n, 3).
         gap: g_A0 [m], shape (n,).
@@ -70,6 +72,7 @@ class OverMaster(NamedTuple):
         normal: Outward normals of the master there, shape (n, 3).
         gap: g_q [m], shape (n,).
         length: Size of the master's facet [m], shape (n,).
+        cut: As of `Sums`, shape (n, 2).
         slot: Positions in the slave's `share` of the nodes at the corners, or -1, (n, corners).
         part: w_q Phi_A, the reference area that these have there [m^2], shape (n, corners).
     """
@@ -81,6 +84,7 @@ class OverMaster(NamedTuple):
     normal: FloatArray
     gap: FloatArray
     length: FloatArray
+    cut: FloatArray
     slot: IntArray
     part: FloatArray
 
@@ -135,42 +139,37 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         followed: BoolArray | None = None,
     ) -> Found:
         """Nodes of this rank with facets over the master, as of `ContactPair`."""
-        reach = 0.0 if motion is None else motion.reach
-        slaves, master = positions
-        own, other = slaves[self.slave.facets[self._facets]], master[self.master.facets]
-        radius, cover = (
-            reach + MARGIN * float(s) for s in (facets.size(other).max(), facets.size(other).min())
-        )
-        points = self._over(own, other, near(own, other, radius), slaves, reach)
+        reach, at = 0.0 if motion is None else motion.reach, tuple(positions)
+        if motion is not None and motion.solved:
+            # An equilibrium is one of the pieces that it has itself.
+            reach, ways = 0.0, zip(self.surfaces, motion.paths, strict=True)
+            at = tuple(x + s.gather(way) for x, (s, way) in zip(positions, ways, strict=True))
+        sizes = facets.size(at[1][self.master.facets])
+        points = self._over(at, reach, reach + MARGIN * float(sizes.max()))
+        if at[0] is not positions[0]:
+            points = self._seen_from(points, positions)
+        cover = (0.0 if motion is None else motion.reach) + MARGIN * float(sizes.min())
         found: Any = self._nodes(points)
         return Found(found, np.ones(len(self.slave.share), dtype=bool), cover)
 
     def _over(
-        self,
-        own: FloatArray,
-        other: FloatArray,
-        pairs: tuple[IntArray, IntArray],
-        slaves: FloatArray,
-        reach: float,
+        self, positions: Sequence[FloatArray], reach: float, radius: float
     ) -> OverMaster:
-        """Points that have a partner within reach.
+        """Points of this rank's facets that have a partner within reach.
 
         Args:
-            own: This rank's facets at t_n [m], shape (m, nc, 3).
-            other: The master's.
-            pairs: Numbers of those near each other.
-            slaves: All points of the slave [m].
+            positions: Of all points [m].
             reach: Bound on the motion of slaves relative to the master [m].
+            radius: Distance up to which facets are near each other [m].
         """
-        found = segments(own, other, pairs)
+        slaves, master = positions
+        own, other = slaves[self.slave.facets[self._facets]], master[self.master.facets]
+        found = segments(own, other, near(own, other, radius))
         facet, over = self._facets[found.own], found.other
         corners = self.slave.facets[facet]
         shape, slopes, _ = facets.shape(found.xi, corners.shape[1])
         x = np.einsum("nc,nci->ni", shape, slaves[corners])
-        start, _ = compiled.closest_point(x, other[over])
-        xi, converged = compiled.project(x, other[over], start)
-        foot, _, normal = facets.frame(other[over], xi)
-        gap, length = np.einsum("ni,ni->n", normal, x - foot), facets.size(other[over])
+        xi, converged, normal, gap, length = _measured(x, other[over])
         excess = facets.edge_excess(xi, other.shape[1])
         rim = self._free_edges[over]
         legal = converged & (excess <= np.where(rim, OVERHANG, _BEYOND)).all(axis=1)
@@ -178,7 +177,16 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         sides = np.einsum("nca,nci->nai", slopes, self.slave.reference[corners])
         area = found.weight * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
         slot, part = self._position[corners], area[:, None] * shape
-        return OverMaster(facet, over, shape, xi, normal, gap, length, slot, part).select(legal)
+        points = OverMaster(facet, over, shape, xi, normal, gap, length, xi, slot, part)
+        return points.select(legal)
+
+    def _seen_from(self, points: OverMaster, positions: Sequence[FloatArray]) -> OverMaster:
+        """The same points and facets where they were at other positions."""
+        slaves, master = positions
+        x = np.einsum("nc,nci->ni", points.shape, slaves[self.slave.facets[points.own]])
+        xi, converged, normal, gap, length = _measured(x, master[self.master.facets[points.other]])
+        found = points._replace(xi=xi, normal=normal, gap=gap, length=length)
+        return found.select(converged)
 
     def _nodes(self, points: OverMaster) -> SurfaceCandidates:
         """The nodes of the rank that points make candidates of."""
@@ -199,7 +207,7 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         chosen = np.append(np.isin(np.arange(number), node), False)[points.slot]
         area = np.where(chosen, np.append(covered, 1.0)[points.slot], 1.0)
         points = points._replace(part=np.where(chosen, points.part, 0.0) / area)
-        none = np.full(len(node), -1)
+        none = np.zeros(len(node), dtype=np.int64)
         return SurfaceCandidates(
             node, none, none, np.zeros((len(node), 2)), directions, gap, length, points
         )
@@ -230,7 +238,7 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         sums = Sums(
             slaves=len(found.node), element=np.cumsum(new) - 1, slot=points.slot,
             share=np.where(points.slot >= 0, points.part, 0.0), shape=points.shape,
-            weights=self._weights(points),
+            weights=self._weights(points), cut=points.cut,
         )  # fmt: skip
         return surface_elements(self, found, attachment, measure, sums, step)
 
@@ -238,7 +246,8 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         """Weights of the nodes of elements in points and control points."""
         material = self.slave.material
         of_corners = material.weights[self.slave.facets[points.own]]
-        own = np.einsum("nc,nck->nck", points.shape, of_corners).reshape(len(points.own), -1)
+        n, corners, nodes = of_corners.shape
+        own = (points.shape[:, :, None] * of_corners).reshape(n, corners * nodes)
         control = self.master.facet_weights
         if control is None:
             width = self.master.facet_nodes.nodes.shape[1]
@@ -256,5 +265,32 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         held: IntArray,
         aimed: IntArray,
     ) -> IntArray | None:
-        """No facet that should hold a node is another one: none holds it alone."""
+        """Raise where nodes without contact have come through a facet, as of `ContactPair`.
+
+        No other facet is to hold a node: none does alone.
+        """
+        if not self.is_long(reach):
+            return None
+        x, paths = positions[0][self.slave.share], self._gather_paths(motions)
+        through = np.flatnonzero(self._came_through(x, positions[1], *paths, held) >= 0)
+        text = None
+        if through.size:
+            text = (
+                f"contact {self.name!r}: node {self.slave.original[self.slave.share[through[0]]]} "
+                f"has come through {self.master_name!r} beside the points that were looked at; use "
+                "a smaller dt"
+            )
+        comm = self.slave.body.comm
+        raise_together(comm, text, lambda told: StepFailedError(told, advises=True))
         return None
+
+
+def _measured(
+    x: FloatArray, corners: FloatArray
+) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray, FloatArray]:
+    """Feet of points (n, 3) on facets (n, nc, 3), which were found, normals, gaps and sizes [m]."""
+    start, _ = compiled.closest_point(x, corners)
+    xi, converged = compiled.project(x, corners, start)
+    foot, _, normal = facets.frame(corners, xi)
+    gap: FloatArray = np.einsum("ni,ni->n", normal, x - foot)
+    return xi, converged, normal, gap, facets.size(corners)

@@ -158,6 +158,14 @@ static int rub(const Law *law, const Together *together, const Slip *slip, const
     if (stick) {
         memcpy(value, s, 2 * sizeof(double));
         memcpy(rows, slip->gradient, 2 * size * sizeof(double));
+        for (int a = 0; a < 2; a++)
+            for (int b = 0; b < 2; b++) {
+                /* What is prescribed is no sticking, and not zero where it is that of a sum. */
+                double part = unmoved[2 * b + a];
+                value[a] -= part * s[b];
+                for (int z = 0; part != 0.0 && z < size; z++)
+                    rows[a * size + z] -= part * slip->gradient[b * size + z];
+            }
     } else {
         double by_multiplier[2][2], by_bound[2];
         slide(size, slip, less, trial, size_of_trial, bound, c, value, by_multiplier, by_bound, rows);

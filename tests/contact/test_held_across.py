@@ -17,7 +17,7 @@ COMM = MPI.COMM_WORLD
 SHAPES = [(0.0, 0.0, False), (0.2, 0.0, False), (0.0, 0.5, False), (0.2, 0.5, True)]
 
 
-def held_across(friction, twist, skew, smoothing, drag):
+def held_across(friction, twist, skew, smoothing, drag, integration="nodes"):
     """A block pressed on a plate and dragged along it; no node moves across, along z.
 
     Args:
@@ -26,6 +26,7 @@ def held_across(friction, twist, skew, smoothing, drag):
         skew: Shear of the plate in its plane, which makes its facets parallelograms.
         smoothing: Of the plate.
         drag: Path of the block [m] from pseudo time 1 to 2.
+        integration: As of `ContactPair`.
     """
 
     def box(low, high, n):
@@ -50,13 +51,14 @@ def held_across(friction, twist, skew, smoothing, drag):
         slave=block.surface(lambda x: x[1] < 0.1),
         master=plate.surface(lambda x: x[1] > -0.1, smoothing=smoothing),
         friction=friction,
+        integration=integration,
     )
     return nts.System([plate, block], contacts=[pair])
 
 
-def dragged(friction, shape, drag, steps):
+def dragged(friction, shape, drag, steps, integration="nodes"):
     times = [*np.arange(1, 5) / 4, *(1 + np.arange(1, steps + 1) / steps)]
-    run = nts.equilibrium(held_across(friction, *shape, drag), load_steps=times)
+    run = nts.equilibrium(held_across(friction, *shape, drag, integration), load_steps=times)
     assert run.status == "completed" and run.retries == 0
     return run
 
@@ -94,12 +96,13 @@ def test_sticking_nodes_feel_nothing_across(shape):
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", MID_STEP.values(), ids=MID_STEP)
 @pytest.mark.parametrize("friction", [0.3, np.inf])
-@pytest.mark.fast("0.3-energy-momentum")
+@pytest.mark.parametrize("integration", ["nodes", "surface"])
+@pytest.mark.fast("nodes-0.3-energy-momentum")
 @pytest.mark.fast_on_ranks()
-def test_dynamics_on_a_twisted_plate(integrator, friction):
+def test_dynamics_on_a_twisted_plate(integration, integrator, friction):
     """Dragged on from equilibrium the block slides or sticks; the ledger closes."""
     shape, drag = (0.2, 0.5, False), 0.3 if np.isfinite(friction) else 0.02
-    start = dragged(friction, shape, drag, 8)
+    start = dragged(friction, shape, drag, 8, integration)
     run = nts.simulate(start.system, integrator, dt=2e-3, t_end=2.02, start=start)
     assert run.status == "completed" and run.retries == 0
     table = run.balance

@@ -441,7 +441,8 @@ def test_failure_keeps_history(tmp_path, mpi_tmp_path):
 
 @pytest.mark.mpi
 @pytest.mark.fast_on_ranks()
-def test_passing_by_a_facet_is_noticed():
+@pytest.mark.parametrize("integration", ["nodes", "surface"])
+def test_passing_by_a_facet_is_noticed(integration):
     """A block is pushed through more than a facet in one step: no contact may be missed."""
     soft = nts.Continuum(
         box([0, 0, 0.7], [1, 1, 1.2], [3, 3, 2]),
@@ -458,7 +459,9 @@ def test_passing_by_a_facet_is_noticed():
         bcs=[nts.Dirichlet(at(2, 0.0))],
         name="hard",
     )
-    pair = nts.ContactPair(slave=soft.surface(at(2, 0.7)), master=hard.surface(at(2, 0.5)))
+    pair = nts.ContactPair(
+        slave=soft.surface(at(2, 0.7)), master=hard.surface(at(2, 0.5)), integration=integration
+    )
     system = nts.System([soft, hard], contacts=[pair])
     run = nts.equilibrium(system, stabilization=1e-3)
     assert run.status == "completed"

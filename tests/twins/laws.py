@@ -117,6 +117,8 @@ def rub(law, x, residual, tangent, slip, multiplier, active, together):
     by_gap = found.d_bound[new, :, None] * tangent[new, normal][:, None]
     rows[new] -= mu * yielding[new, None, None] * by_gap
     value, slipping = found.residual, ~stick
+    said = np.eye(2) - np.where(stick[:, None, None], prescribed.unmoved, 0.0).transpose(0, 2, 1)
+    value, rows = np.einsum("nab,nb->na", said, value), np.matmul(said, rows)
     value[slipping] /= scale[slipping, 0]
     rows[slipping] /= scale[slipping]
     unsaid = np.where(stick[:, None, None], prescribed.unmoved, held) / scale
