@@ -122,14 +122,6 @@ class Sums(Batch):
         found: FloatArray = np.einsum("nc,nc...->n...", self.share, self.at_corners(values))
         return found
 
-    def to_elements(self, values: FloatArray) -> FloatArray:
-        """Sums of values of points (n, ..) by element."""
-        if not len(values):
-            return values
-        start = np.flatnonzero(np.diff(self.element, prepend=-1))
-        found: FloatArray = np.add.reduceat(values, start, axis=0)
-        return found
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurfaceElements(ContactElements):
@@ -290,8 +282,9 @@ class SurfaceElements(ContactElements):
         found = self._of_slaves(points, multiplier)
         together = self._together(found.gap, found.slip, multiplier)
         obeyed = self.law.obey(self._motion(y), found, multiplier, together)
-        of_nodes = compiled_law.to_nodes(self.sums.weights, points.residual, points.tangent)
-        residual, tangent = map(self.sums.to_elements, of_nodes)
+        residual, tangent = compiled_law.to_elements(
+            self.num_elements, self.sums.element, self.sums.weights, points.residual, points.tangent
+        )
         self._write_law(residual, tangent, obeyed.residual[:, 3:], obeyed.tangent[:, 3:])
         return Contribution(
             **obeyed._replace(residual=residual, tangent=tangent)._asdict(),
@@ -316,15 +309,13 @@ class SurfaceElements(ContactElements):
             multiplier: Of the slaves [kg m], shape (slaves, constraints).
         """
         sums, (n, corners), width = self.sums, self.sums.slot.shape, multiplier.shape[1]
-        at_corners, size = sums.at_corners(multiplier), 3 * y.shape[1]
-        own, none = sums.to_points(multiplier), np.empty((n, 0))
-        directions, slips = np.empty((n, corners, 0, 3)), None
+        size, at_corners = 3 * y.shape[1], sums.at_corners(multiplier)
+        own, slips = sums.to_points(multiplier), None
         if width > 1:
-            middle = self.measure.middle_tangents(y)
-            directions = sums.at_corners(self.frame)
+            middle, directions = self.measure.middle_tangents(y), sums.at_corners(self.frame)
             force = np.einsum("nc,nck,ncki->ni", sums.share, at_corners[..., 1:], directions)
-            own[:, 1:] = np.einsum("nai,ni->na", middle.value, force)
-        found = self.measure.evaluate(y, none, own)
+            own[:, 1:] = np.matmul(middle.value, force[:, :, None])[:, :, 0]
+        found = self.measure.evaluate(y, np.empty((n, 0)), own)
         residual = np.zeros((n, size + corners * width))
         tangent = np.zeros((*residual.shape, residual.shape[1]))
         residual[:, :size] = found.residual[:, :size]
@@ -333,18 +324,23 @@ class SurfaceElements(ContactElements):
         columns[:, :, 0] = found.tangent[:, None, :size, size]
         rows[:, :, 0] = found.tangent[:, None, size, :size]
         if found.slip is not None:
+            slope, turns = found.slip.gradient[..., :size], middle.turns(found.slip, size)
             slips = np.einsum("nai,na->ni", middle.value, found.slip.value)
-            by_friction, turns = found.tangent[:, :size, size + 1 :], middle.turns(found.slip, size)
-            tangent[:, :size, :size] += by_friction @ np.einsum("nazi,ni->naz", turns, force)
-            along = np.einsum("nai,ncki->ncka", middle.value, directions)
-            columns[:, :, 1:] = np.einsum("nza,ncka->nckz", by_friction, along)
-            rows[:, :, 1:] = np.einsum("ncka,naz->nckz", along, found.slip.gradient[..., :size])
-            by_turns = np.einsum("na,nazi->nzi", found.slip.value, turns)
-            rows[:, :, 1:] += np.einsum("ncki,nzi->nckz", directions, by_turns)
-        flat = (n, corners * width, size)
-        tangent[:, size:, :size] = (sums.share[:, :, None, None] * rows).reshape(flat)
-        columns *= sums.share[:, :, None, None]
-        tangent[:, :size, size:] = columns.reshape(flat).transpose(0, 2, 1)
+            by_friction = found.tangent[:, :size, size + 1 :]
+            # By the slip as a vector in space, and of it, shape (n, size, 3).
+            by_force = np.matmul(by_friction, middle.value)
+            by_points = np.matmul(slope.transpose(0, 2, 1), middle.value)
+            by_points += np.einsum("na,nazi->nzi", found.slip.value, turns)
+            of_force = np.matmul(turns, force[:, None, :, None])[..., 0]
+            tangent[:, :size, :size] += np.matmul(by_friction, of_force)
+            flat = directions.reshape(n, 2 * corners, 3)
+            for out, by in ((columns, by_force), (rows, by_points)):
+                along = np.matmul(flat, by.transpose(0, 2, 1))
+                out[:, :, 1:] = along.reshape(n, corners, 2, size)
+        shape, share = (n, corners * width, size), sums.share[:, :, None, None]
+        columns, rows = share * columns, share * rows
+        tangent[:, size:, :size] = rows.reshape(shape)
+        tangent[:, :size, size:] = columns.reshape(shape).transpose(0, 2, 1)
         pulls = np.einsum("nckz,nck->ncz", columns[..., :3], at_corners)
         return _AtPoints(residual, tangent, found.gap, slips, found.normal, pulls)
 
