@@ -37,7 +37,8 @@ class MiddleTangents(NamedTuple):
             slip: What `Measured` has.
             size: Coordinates of the points.
         """
-        turns = np.einsum("nabi,nbz->nazi", self.by_slip, slip.gradient[..., :size])
+        slope = slip.gradient[:, None, :, :size].swapaxes(2, 3)
+        turns: FloatArray = np.matmul(slope, self.by_slip)
         for i in range(3):
             turns[:, :, 3 + i :: 3, i] += self.by_control.transpose(0, 2, 1)
         return turns

@@ -14,121 +14,23 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse
 
 from dolfinx_nts.contact.contact_elements import ContactElements, resultant
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution
-from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
+from dolfinx_nts.contact.contact_measure import Measured, Slip
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
-from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.contact.surface_sums import FacetAttachment, Sums
 from dolfinx_nts.interaction.combination import Combination
 from dolfinx_nts.interaction.elements import Step
-from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import compiled_law
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
-_STILL = np.zeros(3), np.zeros(3)
 #: Convective coordinates by which points of an equilibrium may lie beside where they were cut.
 _STALE = 1e-6
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FacetAttachment(Batch):
-    """Facets of a slave over facets of a master, see `Attachment`; axis 0 = pair of these."""
-
-    slave: Surface
-    master: Surface
-    own: IntArray
-    other: IntArray
-    path = _STILL
-    shares = None
-    weights = None
-
-    @property
-    def surfaces(self) -> tuple[Surface, Surface]:
-        """Those of the slave and of the master."""
-        return self.slave, self.master
-
-    @property
-    def numbers(self) -> tuple[IntArray, IntArray]:
-        """Their corners."""
-        return self.slave.facets[self.own], self.master.facets[self.other]
-
-    @cached_property
-    def sides(self) -> tuple[Points, Points]:
-        """Nodes that these depend on."""
-        corners = self.slave.material.joined(self.slave.facets[self.own])
-        return corners, self.master.facet_nodes.select(self.other)
-
-    def place(self, i: int) -> str:
-        """The facets' numbers."""
-        return f"facets {int(self.own[i])} and {int(self.other[i])}"
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Sums(Batch):
-    """What points contribute to; axis 0 = point.
-
-    Attributes:
-        slaves: How many there are.
-        element: Element that has the point, in ascending order, shape (n,).
-        slot: Slaves whose gaps it is a part of, one at each corner of its facet; -1: none.
-        share: Its parts C_qA in their gaps [-], 0 where there is none, shape (n, corners).
-        shape: Weights of the facet's corners in it, shape (n, corners).
-        weights: Those of the element's nodes in the measure's points, shape (n, points, nodes).
-        cut: Where on the master's facets they were when they were chosen, shape (n, 2).
-    """
-
-    slaves: int
-    element: IntArray
-    slot: IntArray
-    share: FloatArray
-    shape: FloatArray
-    weights: FloatArray
-    cut: FloatArray
-
-    @cached_property
-    def _incidence(self) -> Any:
-        """Which slave is at which corner of which point."""
-        n, corners = self.slot.shape
-        row, column = self.slot.ravel(), np.arange(n * corners)
-        on = row >= 0
-        entries = np.ones(on.sum()), (row[on], column[on])
-        return scipy.sparse.csr_array(entries, shape=(self.slaves, n * corners))
-
-    def by_slave(self, values: FloatArray) -> FloatArray:
-        """Sums of what points have at each corner of theirs (n, corners, k), shape (slaves, k)."""
-        found: FloatArray = self._incidence @ values.reshape(self.slot.size, values.shape[2])
-        return found
-
-    def to_slaves(self, values: FloatArray) -> FloatArray:
-        """C times values of points, (n,) or (n, k)."""
-        columns = values if values.ndim > 1 else values[:, None]
-        found = self.by_slave(self.share[:, :, None] * columns[:, None])
-        return found.reshape(self.slaves, *values.shape[1:])
-
-    def at_corners(self, values: FloatArray) -> FloatArray:
-        """Values of slaves (slaves, ..) at each point's corners, 0 at others, (n, corners, ..)."""
-        padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
-        found: FloatArray = padded[self.slot]
-        return found
-
-    def to_points(self, values: FloatArray) -> FloatArray:
-        """C^T times values of slaves (slaves, ..), shape (n, ..)."""
-        found: FloatArray = np.einsum("nc,nc...->n...", self.share, self.at_corners(values))
-        return found
-
-    def to_elements(self, values: FloatArray) -> FloatArray:
-        """Sums of values of points (n, ..) by element."""
-        if not len(values):
-            return values
-        start = np.flatnonzero(np.diff(self.element, prepend=-1))
-        found: FloatArray = np.add.reduceat(values, start, axis=0)
-        return found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -290,8 +192,9 @@ class SurfaceElements(ContactElements):
         found = self._of_slaves(points, multiplier)
         together = self._together(found.gap, found.slip, multiplier)
         obeyed = self.law.obey(self._motion(y), found, multiplier, together)
-        of_nodes = compiled_law.to_nodes(self.sums.weights, points.residual, points.tangent)
-        residual, tangent = map(self.sums.to_elements, of_nodes)
+        residual, tangent = compiled_law.to_elements(
+            self.num_elements, self.sums.element, self.sums.weights, points.residual, points.tangent
+        )
         self._write_law(residual, tangent, obeyed.residual[:, 3:], obeyed.tangent[:, 3:])
         return Contribution(
             **obeyed._replace(residual=residual, tangent=tangent)._asdict(),
@@ -316,15 +219,13 @@ class SurfaceElements(ContactElements):
             multiplier: Of the slaves [kg m], shape (slaves, constraints).
         """
         sums, (n, corners), width = self.sums, self.sums.slot.shape, multiplier.shape[1]
-        at_corners, size = sums.at_corners(multiplier), 3 * y.shape[1]
-        own, none = sums.to_points(multiplier), np.empty((n, 0))
-        directions, slips = np.empty((n, corners, 0, 3)), None
+        size, at_corners = 3 * y.shape[1], sums.at_corners(multiplier)
+        own, slips = sums.to_points(multiplier), None
         if width > 1:
-            middle = self.measure.middle_tangents(y)
-            directions = sums.at_corners(self.frame)
+            middle, directions = self.measure.middle_tangents(y), sums.at_corners(self.frame)
             force = np.einsum("nc,nck,ncki->ni", sums.share, at_corners[..., 1:], directions)
-            own[:, 1:] = np.einsum("nai,ni->na", middle.value, force)
-        found = self.measure.evaluate(y, none, own)
+            own[:, 1:] = np.matmul(middle.value, force[:, :, None])[:, :, 0]
+        found = self.measure.evaluate(y, np.empty((n, 0)), own)
         residual = np.zeros((n, size + corners * width))
         tangent = np.zeros((*residual.shape, residual.shape[1]))
         residual[:, :size] = found.residual[:, :size]
@@ -333,18 +234,23 @@ class SurfaceElements(ContactElements):
         columns[:, :, 0] = found.tangent[:, None, :size, size]
         rows[:, :, 0] = found.tangent[:, None, size, :size]
         if found.slip is not None:
+            slope, turns = found.slip.gradient[..., :size], middle.turns(found.slip, size)
             slips = np.einsum("nai,na->ni", middle.value, found.slip.value)
-            by_friction, turns = found.tangent[:, :size, size + 1 :], middle.turns(found.slip, size)
-            tangent[:, :size, :size] += by_friction @ np.einsum("nazi,ni->naz", turns, force)
-            along = np.einsum("nai,ncki->ncka", middle.value, directions)
-            columns[:, :, 1:] = np.einsum("nza,ncka->nckz", by_friction, along)
-            rows[:, :, 1:] = np.einsum("ncka,naz->nckz", along, found.slip.gradient[..., :size])
-            by_turns = np.einsum("na,nazi->nzi", found.slip.value, turns)
-            rows[:, :, 1:] += np.einsum("ncki,nzi->nckz", directions, by_turns)
-        flat = (n, corners * width, size)
-        tangent[:, size:, :size] = (sums.share[:, :, None, None] * rows).reshape(flat)
-        columns *= sums.share[:, :, None, None]
-        tangent[:, :size, size:] = columns.reshape(flat).transpose(0, 2, 1)
+            by_friction = found.tangent[:, :size, size + 1 :]
+            # By the slip as a vector in space, and of it, shape (n, size, 3).
+            by_force = np.matmul(by_friction, middle.value)
+            by_points = np.matmul(slope.transpose(0, 2, 1), middle.value)
+            by_points += np.einsum("na,nazi->nzi", found.slip.value, turns)
+            of_force = np.matmul(turns, force[:, None, :, None])[..., 0]
+            tangent[:, :size, :size] += np.matmul(by_friction, of_force)
+            flat = directions.reshape(n, 2 * corners, 3)
+            for out, by in ((columns, by_force), (rows, by_points)):
+                along = np.matmul(flat, by.transpose(0, 2, 1))
+                out[:, :, 1:] = along.reshape(n, corners, 2, size)
+        shape, share = (n, corners * width, size), sums.share[:, :, None, None]
+        columns, rows = share * columns, share * rows
+        tangent[:, size:, :size] = rows.reshape(shape)
+        tangent[:, :size, size:] = columns.reshape(shape).transpose(0, 2, 1)
         pulls = np.einsum("nckz,nck->ncz", columns[..., :3], at_corners)
         return _AtPoints(residual, tangent, found.gap, slips, found.normal, pulls)
 
@@ -461,7 +367,7 @@ def surface_elements(
         step: The step.
     """
     ease, square, free = np.zeros((2, sums.slaves)), 0.0, 0.0
-    each = _moves(attachment, measure, sums)
+    each = sums.moves(attachment, measure.foot)
     for side, (surface, moves) in enumerate(zip(attachment.surfaces, each, strict=True)):
         squares, scale = moves.power(2), step.scale(surface, pair.bodies)
         ease[side] = squares @ ((1.0 if side == 0 else ~surface.fixed.all(axis=1)) / scale)
@@ -483,22 +389,6 @@ def surface_elements(
         pair=pair, candidates=found, attachment=attachment, measure=measure, law=law, sums=sums,
         frame=frame,
     )  # fmt: skip
-
-
-def _moves(attachment: FacetAttachment, measure: FacetGap, sums: Sums) -> list[Any]:
-    """Weights of each surface's points in the motion of slaves against their feet, sparse."""
-    found = []
-    both = zip(attachment.surfaces, attachment.numbers, (sums.shape, -measure.foot), strict=True)
-    for surface, numbers, weights in both:
-        on = sums.slot >= 0
-        values = sums.share[:, :, None] * weights[:, None]
-        row, column = np.broadcast_arrays(
-            sums.slot[:, :, None], numbers[sums.element][:, None]
-        )
-        entries = values[on].ravel(), (row[on].ravel(), column[on].ravel())
-        shape = sums.slaves, len(surface.points)
-        found.append(scipy.sparse.coo_array(entries, shape=shape).tocsr())
-    return found
 
 
 def _frame(normal: FloatArray) -> FloatArray:

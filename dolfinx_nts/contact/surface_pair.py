@@ -12,12 +12,8 @@ from dolfinx_nts.contact.facet_pair import OVERHANG, FacetPair
 from dolfinx_nts.contact.node_attachment import beside
 from dolfinx_nts.contact.pair import MARGIN, Found, Motion
 from dolfinx_nts.contact.segments import near, segments
-from dolfinx_nts.contact.surface_elements import (
-    FacetAttachment,
-    Sums,
-    SurfaceElements,
-    surface_elements,
-)
+from dolfinx_nts.contact.surface_elements import SurfaceElements, surface_elements
+from dolfinx_nts.contact.surface_sums import FacetAttachment, Sums
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets

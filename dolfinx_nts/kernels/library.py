@@ -90,6 +90,7 @@ _KERNELS = {
     "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 16),
     "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
+    "to_elements": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 9),
     "wrenches": (_INT, _LONG, *(_ARRAY,) * 5),
 }
 

@@ -177,9 +177,15 @@ def test_forces_of_points_are_those_of_nodes(number):
     weights[rng.uniform(size=weights.shape) < 0.3] = 0.0
     residual = rng.normal(size=(N, 3 * number + rest))
     tangent = rng.normal(size=(N, *residual.shape[1:] * 2))
+    element, count = rng.integers(0, 4, N), 5
     here = compiled_law.to_nodes(weights, residual, tangent)
-    for found, expected in zip(here, points.to_nodes(weights, residual, tangent), strict=True):
+    sums = compiled_law.to_elements(count, element, weights, residual, tangent)
+    there = points.to_nodes(weights, residual, tangent)
+    for found, summed, expected in zip(here, sums, there, strict=True):
         assert np.abs(found - expected).max() < 1e-13
+        total = np.zeros((count, *expected.shape[1:]))
+        np.add.at(total, element, expected)
+        assert np.abs(summed - total).max() < 1e-12
 
 
 def test_wrenches_are_those_of_numpy():

@@ -1,0 +1,123 @@
+"""Facets of a slave over those of a master, and what their points contribute to its nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from dolfinx_nts.contact.contact_measure import Batch
+from dolfinx_nts.contact.surfaces import Surface
+from dolfinx_nts.interaction.points import Points
+from dolfinx_nts.types import FloatArray, IntArray
+
+_STILL = np.zeros(3), np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FacetAttachment(Batch):
+    """Facets of a slave over facets of a master, see `Attachment`; axis 0 = pair of these."""
+
+    slave: Surface
+    master: Surface
+    own: IntArray
+    other: IntArray
+    path = _STILL
+    shares = None
+    weights = None
+
+    @property
+    def surfaces(self) -> tuple[Surface, Surface]:
+        """Those of the slave and of the master."""
+        return self.slave, self.master
+
+    @property
+    def numbers(self) -> tuple[IntArray, IntArray]:
+        """Their corners."""
+        return self.slave.facets[self.own], self.master.facets[self.other]
+
+    @cached_property
+    def sides(self) -> tuple[Points, Points]:
+        """Nodes that these depend on."""
+        corners = self.slave.material.joined(self.slave.facets[self.own])
+        return corners, self.master.facet_nodes.select(self.other)
+
+    def place(self, i: int) -> str:
+        """The facets' numbers."""
+        return f"facets {int(self.own[i])} and {int(self.other[i])}"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sums(Batch):
+    """What points contribute to; axis 0 = point.
+
+    Attributes:
+        slaves: How many there are.
+        element: Element that has the point, in ascending order, shape (n,).
+        slot: Slaves whose gaps it is a part of, one at each corner of its facet; -1: none.
+        share: Its parts C_qA in their gaps [-], 0 where there is none, shape (n, corners).
+        shape: Weights of the facet's corners in it, shape (n, corners).
+        weights: Those of the element's nodes in the measure's points, shape (n, points, nodes).
+        cut: Where on the master's facets they were when they were chosen, shape (n, 2).
+    """
+
+    slaves: int
+    element: IntArray
+    slot: IntArray
+    share: FloatArray
+    shape: FloatArray
+    weights: FloatArray
+    cut: FloatArray
+
+    @cached_property
+    def _incidence(self) -> Any:
+        """Which slave is at which corner of which point."""
+        n, corners = self.slot.shape
+        row, column = self.slot.ravel(), np.arange(n * corners)
+        on = row >= 0
+        entries = np.ones(on.sum()), (row[on], column[on])
+        return scipy.sparse.csr_array(entries, shape=(self.slaves, n * corners))
+
+    def by_slave(self, values: FloatArray) -> FloatArray:
+        """Sums of what points have at each corner of theirs (n, corners, k), shape (slaves, k)."""
+        found: FloatArray = self._incidence @ values.reshape(self.slot.size, values.shape[2])
+        return found
+
+    def to_slaves(self, values: FloatArray) -> FloatArray:
+        """C times values of points, (n,) or (n, k)."""
+        columns = values if values.ndim > 1 else values[:, None]
+        found = self.by_slave(self.share[:, :, None] * columns[:, None])
+        return found.reshape(self.slaves, *values.shape[1:])
+
+    def at_corners(self, values: FloatArray) -> FloatArray:
+        """Values of slaves (slaves, ..) at each point's corners, 0 at others, (n, corners, ..)."""
+        padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
+        found: FloatArray = padded[self.slot]
+        return found
+
+    def to_points(self, values: FloatArray) -> FloatArray:
+        """C^T times values of slaves (slaves, ..), shape (n, ..)."""
+        found: FloatArray = np.einsum("nc,nc...->n...", self.share, self.at_corners(values))
+        return found
+
+    def moves(self, attachment: FacetAttachment, foot: FloatArray) -> list[Any]:
+        """Weights of each surface's points in the motion of slaves against their feet, sparse.
+
+        Args:
+            attachment: Facets of the elements.
+            foot: Weights of the corners of the master's facets in the points' feet.
+        """
+        found, on = [], self.slot >= 0
+        both = zip(attachment.surfaces, attachment.numbers, (self.shape, -foot), strict=True)
+        for surface, numbers, weights in both:
+            values = self.share[:, :, None] * weights[:, None]
+            row, column = np.broadcast_arrays(
+                self.slot[:, :, None], numbers[self.element][:, None]
+            )
+            entries = values[on].ravel(), (row[on].ravel(), column[on].ravel())
+            shape = self.slaves, len(surface.points)
+            found.append(scipy.sparse.coo_array(entries, shape=shape).tocsr())
+        return found
