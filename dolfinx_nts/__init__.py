@@ -28,6 +28,7 @@ from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.contact.self_contact import SelfContact
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.equations.contact_terms import ContactTerms
 from dolfinx_nts.integrators import (
@@ -139,6 +140,7 @@ __all__ = [
     "Row",
     "Saved",
     "Seam",
+    "SelfContact",
     "Section",
     "Shell",
     "Slopes",

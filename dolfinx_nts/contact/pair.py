@@ -134,8 +134,9 @@ class ContactPair:
     #: Class of pairs for each class of masters.
     _kinds: ClassVar[dict[type, type[ContactPair]]] = {}
 
-    def __init_subclass__(cls, master: type) -> None:
-        ContactPair._kinds[master] = cls
+    def __init_subclass__(cls, master: type | None = None) -> None:
+        if master is not None:
+            ContactPair._kinds[master] = cls
 
     def __new__(cls, slave: Any = None, master: Any = None, *_: Any, **__: Any) -> ContactPair:
         """Make a pair of the kind that the master asks for."""
