@@ -25,6 +25,9 @@ _FINER = 1.1
 #: Least cosine between one normal and the opposite of the other of what faces each other; sides of
 #: a right angle do not.
 _FACING = 0.1
+#: A node of the master's part is kept out of a facet of which less than this part is carried by
+#: slaves, and is so until they carry that part.
+_ENTERS, _STAYS = 0.9, 0.95
 
 
 @known_options
@@ -38,7 +41,8 @@ class SelfContact(FacetPair):
 
     Where two parts of the surface face each other, nodes of one of them are kept out of facets of
     the other, not the other way round as well, or flat parts would be held twice: those of the
-    finer part, of equal ones those with the lowest input number among them, as long as they touch.
+    finer part, of equal ones those with the lowest input number among them, as long as they touch,
+    and at a rim those of the other part that lie between nodes that nothing else holds.
     So what `ContactPair` says of slave and master holds, and so do its energy, momenta and ledger.
     Forces of the contact are those on these nodes.
 
@@ -104,6 +108,41 @@ class SelfContact(FacetPair):
 
         return stops
 
+    def sunk(self, x: FloatArray, least: float) -> tuple[IntArray, IntArray, FloatArray]:
+        """Nodes that may lie inside another part of the body.
+
+        They are behind facets that face them, and were not, or not as deep, in the reference, as
+        the other side of a plate is.
+
+        Args:
+            x: Positions of all points [m].
+            least: Depth of interest in facet sizes.
+
+        Returns:
+            Positions of nodes in the surface, the facets, and the depths [m], shape (n,) each.
+        """
+        at, reference = self.slave.facets, self.slave.reference
+        corners, (nodal, normal) = x[at], self._normals(x)
+        middle, size = corners.mean(axis=1), facets.size(corners)
+        was, before = reference[at].mean(axis=1), self._normals(reference)[1]
+
+        def faces(point: IntArray, facet: IntArray) -> BoolArray:
+            facing = _opposite(nodal[point], normal[facet])
+            some = np.flatnonzero(facing)
+            point, facet = point[some], facet[some]
+            rise = np.einsum("ni,ni->n", x[point] - middle[facet], normal[facet])
+            rose = np.einsum("ni,ni->n", reference[point] - was[facet], before[facet])
+            facing[some] = (rise < -least * size[facet]) & (rose > 0.5 * rise)
+            return facing
+
+        def apart(point: IntArray, facet: IntArray, distance: FloatArray) -> BoolArray:
+            return ~self._own.beside(point, facet, np.zeros(len(point)))
+
+        reach = float(size.max(initial=0.0))
+        found = search.closest_facets(x, corners, reach=reach, admits=search.Admits(faces, apart))
+        node = np.flatnonzero(found.facet >= 0)
+        return node, found.facet[node], found.distance[node]
+
     def _normals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Outward unit normals at points (p, 3), means of their facets', and of facets (m, 3)."""
         at = self.slave.facets
@@ -128,7 +167,7 @@ class SelfContact(FacetPair):
         c = found.candidates
         if not anywhere(self.slave.body.comm, len(c.node) > 0):
             return found
-        return found._replace(candidates=c.select(self._one_sided(c, current)))
+        return found._replace(candidates=c.select(self._one_sided(c, current, positions[0])))
 
     def _measure(
         self, x: FloatArray, master: FloatArray, node: IntArray, facet: IntArray, start: FloatArray,
@@ -174,28 +213,37 @@ class SelfContact(FacetPair):
         carries: BoolArray = (self.slave.at_all(at) >= 0)[self.slave.facets].any(axis=1)
         return carries
 
-    def _one_sided(self, c: Candidates, current: IntArray) -> BoolArray:
+    def _one_sided(self, c: Candidates, current: IntArray, x: FloatArray) -> BoolArray:
         """Which candidates are slaves where two parts face each other, shape (n,). Collective.
 
-        Each is joined with the candidates among the corners of its facet: what is joined are the
-        nodes of two parts, in turn of one and of the other.
+        Each is joined with the candidates among the corners of its facet whose facets face that:
+        what is joined are the nodes of two parts, in turn of one and of the other.
 
         Args:
             c: All that are within reach, of this rank.
             current: As of `find`.
+            x: Positions of all points [m].
         """
-        surface = self.slave
-        facet = np.full(len(surface.share), -1)
-        facet[c.node] = c.facet
-        everywhere = surface.at_all(np.column_stack([facet, current]))
-        node = np.flatnonzero(everywhere[:, 0] >= 0)
-        facet, was = everywhere[node].T
-        number = np.full(len(surface.points), -1)
-        number[node] = np.arange(len(node))
-        other = number[surface.facets[facet]]
-        one, corner = np.nonzero(other >= 0)
-        slave = _one_of_two(one, other[one, corner], was >= 0, surface.original[node])
-        chosen: BoolArray = slave[number[surface.share[c.node]]]
+        surface, normal = self.slave, self._normals(x)[1]
+        at = surface.facets
+        mine = np.full(len(surface.share), -1)
+        mine[c.node] = c.facet
+        facet, was = surface.at_all(np.column_stack([mine, current])).T
+        one, corner = np.nonzero(facet[at[facet]] >= 0)
+        other = at[facet[one], corner]
+        joined = (facet[one] >= 0) & _opposite(normal[facet[one]], normal[facet[other]])
+        near = facet >= 0
+        slave = near & _one_of_two(one[joined], other[joined], was >= 0, surface.original)
+        # Over the rim of the other part nodes of the slave end, and what holds them there is this.
+        foot, _, _ = facets.shape(c.xi, at.shape[1])
+        corners = at[c.facet]
+        held = facet[corners]
+        faces = _opposite(
+            np.repeat(normal[c.facet], at.shape[1], axis=0), normal[held.ravel()]
+        ).reshape(held.shape)
+        carried = (foot * (slave[corners] & faces)).sum(axis=1)
+        rim = carried < np.where(current[c.node] >= 0, _STAYS, _ENTERS)
+        chosen: BoolArray = slave[surface.share[c.node]] | rim
         return chosen
 
 
