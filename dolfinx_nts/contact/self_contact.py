@@ -22,6 +22,8 @@ from dolfinx_nts.validation import known_options
 
 #: Of two sides one is finer if it has so many times the nodes of the other.
 _FINER = 1.1
+#: Mean distances of two parts from the middle are alike up to this part of the surface's extent.
+_ALIKE = 1e-9
 #: Least cosine between one normal and the opposite of the other of what faces each other; sides of
 #: a right angle do not.
 _FACING = 0.1
@@ -41,10 +43,10 @@ class SelfContact(FacetPair):
 
     Where two parts of the surface face each other, nodes of one of them are kept out of facets of
     the other, not the other way round as well, or flat parts would be held twice: those of the
-    finer part, of equal ones those with the lowest input number among them, as long as they touch,
-    and at a rim those of the other part that lie between nodes that nothing else holds.
-    So what `ContactPair` says of slave and master holds, and so do its energy, momenta and ledger.
-    Forces of the contact are those on these nodes.
+    finer part, of equal ones of that nearer to the middle of the surface in the reference, or with
+    the lowest input number, as long as they touch; at a rim also nodes of the other part that lie
+    between nodes that nothing else holds. So what `ContactPair` says of slave and master holds, and
+    so do its energy, momenta and ledger. Forces of the contact are those on these nodes.
 
     A part may not be thinner than a hundredth of its facets, and parts that start inside each other
     by more than that are not seen.
@@ -233,7 +235,8 @@ class SelfContact(FacetPair):
         other = at[facet[one], corner]
         joined = (facet[one] >= 0) & _opposite(normal[facet[one]], normal[facet[other]])
         near = facet >= 0
-        slave = near & _one_of_two(one[joined], other[joined], was >= 0, surface.original)
+        off = np.linalg.norm(surface.reference - surface.reference.mean(axis=0), axis=1)
+        slave = near & _one_of_two(one[joined], other[joined], was >= 0, off, surface.original)
         # Over the rim of the other part nodes of the slave end, and what holds them there is this.
         foot, _, _ = facets.shape(c.xi, at.shape[1])
         corners = at[c.facet]
@@ -253,13 +256,16 @@ def _opposite(one: FloatArray, two: FloatArray) -> BoolArray:
     return facing
 
 
-def _one_of_two(one: IntArray, two: IntArray, was: BoolArray, number: IntArray) -> BoolArray:
+def _one_of_two(
+    one: IntArray, two: IntArray, was: BoolArray, off: FloatArray, number: IntArray
+) -> BoolArray:
     """Which nodes are the slaves of joined ones, shape (n,).
 
     Args:
         one: Nodes, shape (k,).
         two: Nodes of the other part that they are joined with, shape (k,).
         was: Which nodes were slaves in the last step, shape (n,).
+        off: Distances from the middle in the reference, on which no frame has a say [m], (n,).
         number: Numbers of nodes, the same on any ranks, shape (n,).
     """
     n = len(number)
@@ -268,13 +274,18 @@ def _one_of_two(one: IntArray, two: IntArray, was: BoolArray, number: IntArray) 
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * n, 2 * n))
     size, label = connected_components(graph, directed=False)
     mine, theirs = label[:n], label[n:]
-    count, had = (np.bincount(mine, w, size) for w in (np.ones(n), was.astype(float)))
+    count, had, far = (
+        np.bincount(mine, w, size) for w in (np.ones(n), was.astype(float), off)
+    )
+    far = far / np.maximum(count, 1.0)
     first = np.full(size, np.iinfo(np.int64).max)
     np.minimum.at(first, mine, number)
     finer = np.where(count[mine] > _FINER * count[theirs], 1, 0)
     finer -= np.where(count[theirs] > _FINER * count[mine], 1, 0)
     before = np.sign(had[mine] - had[theirs]).astype(int)
-    rank: Any = np.where(before != 0, before, finer)
+    apart = far[theirs] - far[mine]
+    inner = np.where(np.abs(apart) > _ALIKE * off.max(initial=0.0), np.sign(apart), 0).astype(int)
+    rank: Any = np.where(before != 0, before, np.where(finer != 0, finer, inner))
     slave: BoolArray = np.where(rank != 0, rank > 0, first[mine] < first[theirs])
     # What is joined in an odd circle has no two parts: the lower number is the slave.
     odd = np.flatnonzero(mine == theirs)
