@@ -28,6 +28,7 @@ from dolfinx_nts.contact.facet_pair import FacetPair
 from dolfinx_nts.contact.obstacle_pair import ObstaclePair
 from dolfinx_nts.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.contact.self_contact import SelfContact
 from dolfinx_nts.contact.surface_pair import SurfacePair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.equations.contact_terms import ContactTerms
@@ -140,6 +141,7 @@ __all__ = [
     "Row",
     "Saved",
     "Seam",
+    "SelfContact",
     "Section",
     "Shell",
     "Slopes",

@@ -99,8 +99,9 @@ class ConvexEdges:
         return np.where(out, other, -1)
 
     def cut_corners(
-        self, x: FloatArray, way: FloatArray, master: FloatArray, master_path: FloatArray
-    ) -> BoolArray:
+        self, x: FloatArray, way: FloatArray, master: FloatArray, master_path: FloatArray,
+        stops: passages.Stops | None = None,
+    ) -> BoolArray:  # fmt: skip
         """Which nodes without contact come through a facet and out beyond its edge, shape (n,).
 
         They hit it and slide over its edge in one step. What is at the facet already only slides.
@@ -110,9 +111,10 @@ class ConvexEdges:
             way: Their motion in the solved step [m], shape (n, 3).
             master: Points of the master at t_n [m].
             master_path: Their motion [m].
+            stops: As of `passages.first_hits`.
         """
         at, cut = self._at, np.zeros(len(x), dtype=bool)
-        hit, part = passages.first_hits(x, way, master[at], master_path[at])
+        hit, part = passages.first_hits(x, way, master[at], master_path[at], stops)
         some = np.flatnonzero(hit >= 0)
         if not some.size:
             return cut

@@ -277,7 +277,7 @@ class BodyPair:
         return [u[k] for k in self._bodies]
 
     @cached_property
-    def _parts(self) -> list[Watched]:
+    def _parts(self) -> Sequence[Any]:
         """What to look at, gathered at the first look. Collective."""
         one, two = (self._boundary(k) for k in self._bodies)
         if one is two:

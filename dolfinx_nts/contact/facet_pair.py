@@ -46,16 +46,21 @@ class FacetPair(ContactPair, master=Surface):
     """A `ContactPair` whose master is a surface of a body."""
 
     def _set_up(self) -> None:
+        master = self.master
+        self._check_surfaces()
+        self.extent = max(self.extent, master.material.extent(self.origin))
+        self._free_edges = master.boundary_edges
+        self._edges = ConvexEdges(master.facets, master.reference[master.facets])
+
+    def _check_surfaces(self) -> None:
+        """Raise a ValueError unless slave and master are apart."""
         slave, master = self.slave, self.master
         nodes = slave.material.nodes, master.material.nodes
         if slave.body is master.body and np.intersect1d(*nodes).size:
             raise ValueError(
                 f"slave, master: both surfaces of {slave.body.name!r} share nodes; "
-                "choose disjoint markers"
+                "choose disjoint markers, or pass one surface to SelfContact"
             )
-        self.extent = max(self.extent, master.material.extent(self.origin))
-        self._free_edges = master.boundary_edges
-        self._edges = ConvexEdges(master.facets, master.reference[master.facets])
 
     def parts(self, name: str) -> tuple[EdgeContact, ...]:
         """The contact of edges with edges, where both surfaces have any."""
@@ -151,7 +156,7 @@ class FacetPair(ContactPair, master=Surface):
         if search.apart(slaves, corners, radius):
             return Found(NO_CANDIDATES, ~every, radius - self._lift)
         x = slaves[self.slave.share]
-        closest = search.closest_facets(x, corners, reach=radius, current=current)
+        closest = self._closest(slaves, corners, radius, current)
         node = np.flatnonzero(closest.facet >= 0)
         found, lost = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
         if motion is not None:
@@ -160,7 +165,7 @@ class FacetPair(ContactPair, master=Surface):
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
         stays[node], stays[lost] = known[node], False
-        hidden, deepest = found.select(beside), (0.0, -1)
+        hidden, deepest = self._told(found.select(beside), current), (0.0, -1)
         if len(hidden.node):
             depth = -hidden.gap / hidden.length
             node = self.slave.share[hidden.node[depth.argmax()]]
@@ -169,6 +174,33 @@ class FacetPair(ContactPair, master=Surface):
         stays[found.node] = True
         found = found._replace(gap=found.gap - self.offset[found.node])
         return Found(found, stays, cover, deepest)
+
+    def _closest(
+        self, slaves: FloatArray, corners: FloatArray, reach: float, current: IntArray
+    ) -> search.Closest:
+        """The closest facets of this rank's slaves. Collective.
+
+        Args:
+            slaves: Points of the slave at t_n [m].
+            corners: Of the master's facets [m].
+            reach: Largest distance of interest [m].
+            current: As of `find`.
+        """
+        x = slaves[self.slave.share]
+        return search.closest_facets(x, corners, reach=reach, current=current)
+
+    def _told(self, hidden: Candidates, current: IntArray) -> Candidates:
+        """Those of nodes behind the surface that nothing else keeps from sinking in. Collective."""
+        return hidden
+
+    def _stops(self, node: IntArray, master: FloatArray) -> passages.Stops | None:
+        """Which facets may stop these of the rank's slaves on their paths; None: all.
+
+        Args:
+            node: The slaves, shape (n,).
+            master: Points of the master at t_n [m].
+        """
+        return None
 
     def elements(
         self, found: Candidates, positions: Sequence[FloatArray], path: FloatArray, step: Step
@@ -221,8 +253,9 @@ class FacetPair(ContactPair, master=Surface):
             found = _replace(found, other)
         aimed = motion.aimed
         if self.is_long(motion.reach):
+            stops = self._stops(np.arange(len(x)), master)
             hit, _ = passages.first_hits(
-                x, slave_path, corners, master_path[self.master.facets]
+                x, slave_path, corners, master_path[self.master.facets], stops
             )
             aimed = np.where(hit >= 0, hit, aimed)
         node = np.flatnonzero(aimed >= 0)
@@ -432,7 +465,9 @@ class FacetPair(ContactPair, master=Surface):
 
         Arguments as of `_round_edges`, of the solved step, and numbers of these slaves.
         """
-        cut = self._edges.cut_corners(x[some], slave_path[some], master, master_path)
+        cut = self._edges.cut_corners(
+            x[some], slave_path[some], master, master_path, self._stops(some, master)
+        )
         node = self.slave.original[self.slave.share[some[cut]]]
         text = None
         if node.size:
@@ -453,7 +488,8 @@ class FacetPair(ContactPair, master=Surface):
     ) -> IntArray:
         """`missed` of nodes that have passed a facet, with arguments as of `_round_edges`."""
         at = self.master.facets
-        hit, _ = passages.first_hits(x, slave_path, master[at], master_path[at])
+        stops = self._stops(np.arange(len(x)), master)
+        hit, _ = passages.first_hits(x, slave_path, master[at], master_path[at], stops)
         node = np.flatnonzero((hit >= 0) & (hit != held))
         end, moved = (x + slave_path)[node], master + master_path
         start = np.zeros((len(node), 2))

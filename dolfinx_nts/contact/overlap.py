@@ -20,6 +20,7 @@ from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
 from dolfinx_nts.contact.inner_edge import InnerEdges, in_inner_edge
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.overhang import inside_rim
+from dolfinx_nts.contact.self_crossings import SelfPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels.vectors import range_of
 from dolfinx_nts.types import BoolArray, FloatArray
@@ -62,7 +63,7 @@ class OverlapWatch:
             at_start: tuple[FloatArray, ...] = system.initial_state().u
             return at_start
 
-        between: dict[tuple[int, ...], list[Any]] = {}
+        between: dict[tuple[tuple[int, ...], bool], list[Any]] = {}
         obstacles: list[ObstacleContact] = []
         self._contacts = list(zip(system.contacts, system.contact_bodies, strict=True))
         for contact, bodies in self._contacts:
@@ -73,12 +74,16 @@ class OverlapWatch:
                     ObstacleContact(contact, bodies[0], slaves, self._boundary, start)
                 )
             elif len(contact.bodies) == 2 and all(b.mesh is not None for b in contact.bodies):
-                between.setdefault(tuple(sorted(bodies)), []).append(contact)
-        pairs = [BodyPair(k, c, self._boundary) for k, c in between.items()]
+                itself = contact.slave is contact.master
+                between.setdefault((tuple(sorted(bodies)), itself), []).append(contact)
+        pairs = [
+            (SelfPair if itself else BodyPair)(k, c, self._boundary)
+            for (k, itself), c in between.items()
+        ]
         self._pairs: list[BodyPair | ObstacleContact] = [*obstacles, *pairs]
         self._movers: list[list[Any]] = [
             *([o.contact.slave.body, None] for o in obstacles),
-            *([self._bodies[k] for k in bodies] for bodies in between),
+            *([self._bodies[k] for k in bodies] for bodies, _ in between),
         ]
         # What the nodes of meshes miss each other by is no overlap.
         self._allowed = [

@@ -143,8 +143,9 @@ class ContactPair:
     #: Class of pairs for each class of masters.
     _kinds: ClassVar[dict[tuple[type, str], type[ContactPair]]] = {}
 
-    def __init_subclass__(cls, master: type, integration: str = "nodes") -> None:
-        ContactPair._kinds[master, integration] = cls
+    def __init_subclass__(cls, master: type | None = None, integration: str = "nodes") -> None:
+        if master is not None:
+            ContactPair._kinds[master, integration] = cls
 
     def __new__(
         cls, slave: Any = None, master: Any = None, *_: Any, integration: Any = "nodes", **__: Any

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import chain
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from dolfinx_nts.contact.search import ROUNDING, TRIANGLES
 from dolfinx_nts.kernels import facets as fc
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+
+#: Points (n,) and facets (n,) -> which facets may stop which points (n,).
+Stops: TypeAlias = Callable[[IntArray, IntArray], BoolArray]
 
 # Paths that start on a facet, up to rounding, come through it at the start: this part of the motion
 # before it.
@@ -26,8 +30,9 @@ _PORTION = 4096
 
 
 def first_hits(
-    points: FloatArray, motion: FloatArray, corners: FloatArray, corner_motion: FloatArray
-) -> tuple[IntArray, FloatArray]:
+    points: FloatArray, motion: FloatArray, corners: FloatArray, corner_motion: FloatArray,
+    stops: Stops | None = None,
+) -> tuple[IntArray, FloatArray]:  # fmt: skip
     """The facet whose front each point's path meets first, and where.
 
     Points and corners move evenly, so that facets may turn and stretch. A path meets a facet, a
@@ -39,6 +44,7 @@ def first_hits(
         motion: Their motion [m], shape (n, 3).
         corners: Facet corners at the start [m], shape (m, nc, 3).
         corner_motion: Their motion [m], shape (m, nc, 3).
+        stops: Which facets may stop which points; None: all.
 
     Returns:
         Facet of each point or -1, shape (n,), and the part of the motion after which it is met [-],
@@ -52,6 +58,9 @@ def first_hits(
     motion, corner_motion = motion - common, corner_motion - common
     parts = TRIANGLES[corners.shape[1]]
     for point, facet in _near_paths(points, motion, corners, corner_motion):
+        if stops is not None:
+            meets = stops(point, facet)
+            point, facet = point[meets], facet[meets]
         # Seen from the point, which stays where it is.
         start = corners[facet] - points[point, None]
         moved = corner_motion[facet] - motion[point, None]

@@ -5,7 +5,7 @@ Pure geometry on the facets this process holds; their exchange between processes
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import chain
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from dolfinx_nts.kernels import compiled
 from dolfinx_nts.kernels import facets as fc
 from dolfinx_nts.kernels.vectors import range_of
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 # Two distances that differ by less than this part of the lengths they come from are a tie: a
 # point over a shared edge must not choose its facet by rounding noise.
@@ -46,6 +46,18 @@ class Closest(NamedTuple):
     facet: IntArray
     xi: FloatArray
     distance: FloatArray
+
+
+class Admits(NamedTuple):
+    """Which facets may count as the closest of which points.
+
+    Attributes:
+        faces: By points (n,) and facets (n,), wherever these are, shape (n,).
+        apart: By these and their distances [m], shape (n,); asked of what `faces` lets through.
+    """
+
+    faces: Callable[[IntArray, IntArray], BoolArray]
+    apart: Callable[[IntArray, IntArray, FloatArray], BoolArray]
 
 
 class _SizeClass(NamedTuple):
@@ -80,6 +92,7 @@ def closest_facets(
     reach: float | FloatArray,
     current: IntArray | None = None,
     preference: float = PREFERENCE,
+    admits: Admits | None = None,
 ) -> Closest:
     """Closest facet of each point: exactly what a search through all facets would give.
 
@@ -93,6 +106,7 @@ def closest_facets(
         reach: Largest distance of interest [m], one value or shape (n,); may be inf.
         current: Facet of each point so far, shape (n,), negative for none.
         preference: Advantage of the current facet in facet sizes [-].
+        admits: Which facets may count for which points; None: all.
 
     Returns:
         The closest facets, closest points and distances.
@@ -107,7 +121,11 @@ def closest_facets(
         return result
     scene = _Scene(points, corners, fc.size(corners))
     kept = _current(scene, limit, current)
-    if not compiled.closest_facets(points, corners, scene.sizes, limit, ROUNDING, result):
+    if admits is not None:
+        near, classes = _near_box(scene, limit), _size_classes(scene.corners)
+        for point, facet in _candidates(scene, near, classes, limit[near], admits):
+            _choose(scene, limit, point, facet, result, admits)
+    elif not compiled.closest_facets(points, corners, scene.sizes, limit, ROUNDING, result):
         _by_trees(scene, limit, kept, result)
     _prefer(scene, kept, preference, result)
     return result
@@ -242,8 +260,9 @@ def _slack(scene: _Scene, point: IntArray, radius: float, bound: FloatArray) -> 
 
 
 def _candidates(
-    scene: _Scene, near: IntArray, classes: list[_SizeClass], bound: FloatArray
-) -> Iterator[tuple[IntArray, IntArray]]:
+    scene: _Scene, near: IntArray, classes: list[_SizeClass], bound: FloatArray,
+    admits: Admits | None = None,
+) -> Iterator[tuple[IntArray, IntArray]]:  # fmt: skip
     """Pairs (point, facet) that may be closest, in portions with all pairs of their points."""
     alive = bound >= 0.0
     near, bound = near[alive], bound[alive]
@@ -266,6 +285,9 @@ def _candidates(
         point = np.concatenate([pair[0] for pair in pairs])
         facet = np.concatenate([pair[1] for pair in pairs])
         limit = np.concatenate([pair[2] for pair in pairs])
+        if admits is not None:
+            faces = admits.faces(point, facet)
+            point, facet, limit = point[faces], facet[faces], limit[faces]
         keep = _box_distance(scene, point, facet) <= limit
         yield point[keep], facet[keep]
 
@@ -289,12 +311,15 @@ def _box_distance(scene: _Scene, point: IntArray, facet: IntArray) -> FloatArray
 
 
 def _choose(
-    scene: _Scene, limit: FloatArray, point: IntArray, facet: IntArray, result: Closest
-) -> None:
+    scene: _Scene, limit: FloatArray, point: IntArray, facet: IntArray, result: Closest,
+    admits: Admits | None = None,
+) -> None:  # fmt: skip
     """Enter the best of all pairs of each point into the result."""
     xi, distance = scene.closest(point, facet)
     order = np.lexsort((facet, point))
     order = order[distance[order] <= limit[point[order]]]
+    if admits is not None:
+        order = order[admits.apart(point[order], facet[order], distance[order])]
     if not order.size:
         return
     point, facet, xi, distance = point[order], facet[order], xi[order], distance[order]

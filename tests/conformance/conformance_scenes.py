@@ -219,8 +219,30 @@ def in_a_bore(frame):
     return nts.System([block, own], contacts=pairs)
 
 
+def fold(frame):
+    """A strip bent to a U, whose legs close and rub."""
+    mesh = frame.grid("hexahedron", (0, 0, 0), (8, 0.3, 0.4), (8, 1, 2))
+    s, across, z = frame.back(mesh.geometry.x).T
+    radius, angle = 0.02 + across, np.pi * np.clip(0.5 * (s - 3.0), 0.0, 1.0)
+    # The lower leg is longer and wider, and its nodes lie elsewhere.
+    along = np.where(s < 4.0, 0.4 * np.maximum(3.0 - s, 0.0), 0.47 * np.maximum(s - 5.0, 0.0))
+    x = np.where((s > 3.0) & (s < 5.0), -radius * np.sin(angle), along)
+    z = (z - 0.2) * np.where(s < 3.5, 0.8, 1.0)
+    mesh.geometry.x[:] = frame.place(np.column_stack([x, radius * np.cos(angle), z]))
+
+    def closing(x):
+        x, y, _ = frame.back(x.T).T
+        speed = -1.5 * np.sign(y) * np.maximum(x, 0.0)
+        return frame.place(np.column_stack([-0.3 * speed, speed, 0.2 * speed])).T
+
+    law = nts.NeoHookean(young=frame.size(RUBBER["young"], 2), poisson=RUBBER["poisson"])
+    strip = nts.Continuum(mesh, law, density=DENSITY, velocity=closing, name="strip")
+    sides = strip.surface(frame.where(lambda x: np.abs(np.abs(x[:, 1]) - 0.02) < 1e-6))
+    return nts.System([strip], contacts=[nts.SelfContact(sides, friction=0.3)])
+
+
 #: Step [s] of each scene.
 SCENES = {
     two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
-    beam: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
+    beam: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3, fold: 2e-3,
 }  # fmt: skip
