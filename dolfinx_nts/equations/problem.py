@@ -11,6 +11,7 @@ pure: nothing here changes a State, and history changes only when a step is acce
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -293,25 +294,12 @@ class StepProblem:
             again: Solution of this step with fewer elements: its motion and contact forces are
                 taken in place of these.
         """
-        laid, elements = self.laid, self.elements
         places = self.first if flight else self._u0
         if again is not None:
             places = [terms.u1 for terms in again.terms]
-        with self.x as x:
-            laid.write(self.first, x)
-            held = x[laid.held].copy()
-            x[:] = 0.0
-            laid.write(places, x)
-            x[laid.held] = held
-        if "constraints" in laid.own and (forces or not self.integrator.inertia):
-            found = self.couplings.guess(laid.positions(self.x, elements), carried=carried)
-            with self.x as x:
-                x[laid.of_elements("constraints")] = found
-        if "augmented" in laid.own:
-            positions = laid.positions(self.x, elements)
-            guess = [c.initial_guess(p).ravel() for c, p in zip(elements, positions, strict=True)]
-            with self.x as x:
-                x[laid.of_elements("augmented")] = np.concatenate(guess)
+        wanted = forces or not self.integrator.inertia
+        multipliers = partial(self.couplings.guess, carried=carried) if wanted else None
+        self.laid.guess(places, self.first, self.elements, multipliers)
 
     # ---- iterates
     def evaluate(self, x: PETSc.Vec) -> Evaluation:

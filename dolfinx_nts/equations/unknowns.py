@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -186,6 +186,37 @@ class Unknowns:
     def of_elements(self, name: str) -> slice:
         """Where a field of the elements' own unknowns stands among this rank's unknowns."""
         return self.layout.owned(self.own[name])
+
+    def guess(
+        self,
+        places: Sequence[FloatArray],
+        prescribed: Sequence[FloatArray],
+        elements: Sequence[Any],
+        multipliers: Callable[[list[FloatArray]], FloatArray] | None,
+    ) -> None:
+        """Write a first guess into `x`, d and f that fit its positions among it. Collective.
+
+        Args:
+            places: Displacements of each batch of bodies [m], as of `write`.
+            prescribed: The same where coordinates are prescribed [m].
+            elements: Batches of elements.
+            multipliers: From positions as of `positions`; None: they are none.
+        """
+        with self.x as x:
+            self.write(prescribed, x)
+            held = x[self.held].copy()
+            x[:] = 0.0
+            self.write(places, x)
+            x[self.held] = held
+        if "constraints" in self.own and multipliers is not None:
+            found = multipliers(self.positions(self.x, elements))
+            with self.x as x:
+                x[self.of_elements("constraints")] = found
+        if "augmented" in self.own:
+            both = zip(elements, self.positions(self.x, elements), strict=True)
+            guess = [c.initial_guess(positions).ravel() for c, positions in both]
+            with self.x as x:
+                x[self.of_elements("augmented")] = np.concatenate(guess)
 
     def positions(self, x: PETSc.Vec, elements: Sequence[Any]) -> list[FloatArray]:
         """Positions that each batch depends on [m], see `Elements.evaluate`. Collective."""

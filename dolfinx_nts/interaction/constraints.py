@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from dolfinx_nts.interaction.constraint_elements import (
     extents_of,
     largest_of_joints,
 )
+from dolfinx_nts.interaction.constraint_rows import Arm, ConstraintRows, Upright
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -27,66 +28,8 @@ from dolfinx_nts.interaction.prescribed import times, told
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.state import State
-from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray
 from dolfinx_nts.validation import StepFailedError
-
-#: From nodal vectors at the end of a step (n, k, 3) and the times of both its ends [s].
-Upright = Callable[[FloatArray, tuple[float, ...]], FloatArray]
-
-
-class Arm(NamedTuple):
-    """Vectors w_a y_a + constant, of each element.
-
-    Attributes:
-        weights: w_a, shape (n, k).
-        constant: Shape (n, 3).
-    """
-
-    weights: FloatArray
-    constant: FloatArray
-
-    def at(self, y: FloatArray) -> FloatArray:
-        """Their values from nodal vectors (n, k, 3), shape (n, 3)."""
-        found: FloatArray = np.einsum("nk,nki->ni", self.weights, y) + self.constant
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The elements of this rank; axis 0 = element.
-
-    Attributes:
-        sides: Of each body, or of a batch of bodies, the nodes of the elements.
-        equations: Their coefficients.
-        upright: See `Constraints`; of equations, their values are what is positive.
-        arm: See `Constraints`.
-        lent: As of `ConstraintElements`, (n,).
-        joint: Number of each element's joint, (n,).
-        bodies: Numbers of the bodies of each element in the system, shape (n, sides).
-        force: Multipliers of the last step, shape (n, m).
-        scale: As of `ConstraintElements`, shape (n,), once it is known.
-    """
-
-    sides: tuple[Points, ...]
-    equations: Equations
-    upright: Upright | Equations | None
-    arm: Arm | None
-    lent: FloatArray
-    joint: IntArray
-    bodies: IntArray
-    force: FloatArray
-    scale: FloatArray
-
-    def select(self, chosen: BoolArray) -> _Rows:
-        """Return some of them. Collective."""
-        def some(given: Any) -> Any:
-            if isinstance(given, tuple):
-                return type(given)(*(a[chosen] for a in given))
-            return given[chosen] if isinstance(given, np.ndarray) else given
-
-        sides = tuple(side.select(chosen) for side in self.sides)
-        others = {f.name: some(getattr(self, f.name)) for f in fields(self) if f.name != "sides"}
-        return _Rows(sides, **others)
 
 
 class Constraints(EveryStep):
@@ -118,7 +61,7 @@ class Constraints(EveryStep):
         arm: Arm | None = None,
     ) -> None:
         n = len(equations.value)
-        rows = _Rows(
+        rows = ConstraintRows(
             tuple(sides), equations, upright, arm, np.full(n, SHIFT if redundant else 0.0),
             np.zeros(n, dtype=int), np.tile(bodies, (n, 1)), np.zeros_like(equations.value),
             np.ones(n),
@@ -126,7 +69,8 @@ class Constraints(EveryStep):
         self._set_up((name,), bodies, rows, driven)
 
     def _set_up(
-        self, names: Sequence[str], bodies: tuple[int, ...], rows: _Rows, driven: Any = None
+        self, names: Sequence[str], bodies: tuple[int, ...], rows: ConstraintRows,
+        driven: Any = None,
     ) -> None:
         super().__init__(bodies, self._elements)
         self._of, self._names, self._driven = bodies, tuple(names), driven
@@ -140,7 +84,7 @@ class Constraints(EveryStep):
         # What is prescribed may move its bodies in any step.
         self.rests = driven is None
 
-    def _take(self, rows: _Rows) -> None:
+    def _take(self, rows: ConstraintRows) -> None:
         """Let these be the elements of the step."""
         self._rows = rows
         self._rest = np.concatenate([side.reference for side in rows.sides], axis=1)
@@ -187,7 +131,7 @@ class Constraints(EveryStep):
                 return type(found[0])(*map(np.concatenate, zip(*found, strict=True)))
             return np.concatenate(found) if isinstance(found[0], np.ndarray) else found[0]
 
-        rows = _Rows(
+        rows = ConstraintRows(
             tuple(sides), joined("equations"), joined("upright"), joined("arm"), joined("lent"),
             np.repeat(np.arange(len(joints)), counts), joined("bodies"), joined("force"),
             joined("scale"),

@@ -14,7 +14,8 @@ import numpy as np
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.interaction.constraint_elements import Equations
-from dolfinx_nts.interaction.constraints import Arm, Constraints, Upright
+from dolfinx_nts.interaction.constraint_rows import Arm, Upright
+from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.kernels import quadratic
 from dolfinx_nts.parallel import rank_of
