@@ -121,7 +121,7 @@ class ContactPair:
             without strain or force, as if they stood on the master: what the nodes of two meshes
             miss each other by. The gap that they start with goes on being none; bodies are drawn
             where their meshes are, and may be that deep inside each other without a warning. At
-            most half a facet of the master inwards [m].
+            most half a facet of the master inwards; edges of `edges=True` stay as meshed [m].
         edges: Keep sharp edges of both bodies out of each other, too.
         integration: What of the slave is kept out: its "nodes", or the "surface" between them in
             the mean around each node, by points of all facets (theory section 17).

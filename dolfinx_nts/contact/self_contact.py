@@ -110,7 +110,9 @@ class SelfContact(FacetPair):
 
         return stops
 
-    def sunk(self, x: FloatArray, least: float) -> tuple[IntArray, IntArray, FloatArray]:
+    def sunk(
+        self, x: FloatArray, least: float
+    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
         """Nodes that may lie inside another part of the body.
 
         They are behind facets that face them, and were not, or not as deep, in the reference, as
@@ -121,7 +123,8 @@ class SelfContact(FacetPair):
             least: Depth of interest in facet sizes.
 
         Returns:
-            Positions of nodes in the surface, the facets, and the depths [m], shape (n,) each.
+            Positions of nodes in the surface, the facets, and the depths [m], shape (n,) each, and
+            the nodes' inward unit normals, shape (n, 3).
         """
         at, reference = self.slave.facets, self.slave.reference
         corners, (nodal, normal) = x[at], self._normals(x)
@@ -143,7 +146,7 @@ class SelfContact(FacetPair):
         reach = float(size.max(initial=0.0))
         found = search.closest_facets(x, corners, reach=reach, admits=search.Admits(faces, apart))
         node = np.flatnonzero(found.facet >= 0)
-        return node, found.facet[node], found.distance[node]
+        return node, found.facet[node], found.distance[node], -nodal[node]
 
     def _normals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Outward unit normals at points (p, 3), means of their facets', and of facets (m, 3)."""

@@ -16,6 +16,8 @@ from dolfinx_nts.types import FloatArray
 
 #: Of so many nodes, the deepest ones, it is asked whether the body encloses them.
 _MOST = 32
+#: They are looked at this part of their depth inside their own part.
+_INSIDE = 0.05
 
 
 class SelfWatched:
@@ -44,15 +46,13 @@ class SelfWatched:
     def look(self, positions: dict[int, FloatArray]) -> tuple[list[Finding], Pause]:
         """Return what is inside, and how long nothing else may be, as of `Watched`."""
         surface, whole = self._contact.slave, self._whole
-        x, boundary = positions[id(surface)], positions[id(whole)]
+        x, corners = positions[id(surface)], positions[id(whole)][whole.facets]
         smallest = float(facets.size(x[surface.facets]).min())
-        node, facet, depth = self._contact.sunk(x, LEAST)
+        node, facet, depth, inward = self._contact.sunk(x, LEAST)
         order = np.argsort(-depth)[:_MOST]
         for i in order.tolist():
-            # Without its own facets a node of the boundary sees some half of a turn, or less.
-            own = np.searchsorted(whole.points, surface.points[node[i]])
-            others = whole.facets[(whole.facets != own).all(axis=1)]
-            if winding(x[node[i]], boundary[others]) > 1.0:
+            # A little inside its own part the body encloses it once, and twice where it is in two.
+            if winding(x[node[i]] + _INSIDE * depth[i] * inward[i], corners) > 1.5:
                 return [self._told(x, node[i], facet[i], depth[i])], Pause(0.0, smallest)
         return [], Pause(0.0, smallest)
 

@@ -8,6 +8,7 @@ from measures import difference
 from scenes import UNITS, box, everywhere
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from shells import grid, surface_mesh
 from solids import Solid
 
 import dolfinx_nts as nts
@@ -305,6 +306,90 @@ def test_a_coil_spring_is_squeezed_until_it_closes():
     body = run.system.bodies[0]
     x = (body.reference + run.state.u[0]).reshape(-1, 3)
     assert deepest(x, compat.geometry_dofmap(body.mesh)) < 0.01 * WIRE / ACROSS
+# ---- other bodies
+@pytest.mark.mpi
+def test_a_shell_that_folds_keeps_momenta_and_the_ledger():
+    """On its inner side, half a thickness from the middle surface."""
+    leg, bend, gap, thickness = 8, 6, 0.2, 0.03
+    s, z = np.arange(2.0 * leg + bend + 1), np.array([-0.1, 0.0, 0.1])
+    angle = np.pi * np.clip((s - leg) / bend, 0.0, 1.0)
+    along = np.where(s <= leg, leg - s, np.maximum(LONG * (s - leg - bend), 0.0)) / leg
+    x = np.where((s > leg) & (s < leg + bend), -0.5 * gap * np.sin(angle), along)
+    wide = np.outer(np.where(s < leg + bend / 2, NARROW, 1.0), z)
+    y = np.repeat(0.5 * gap * np.cos(angle), 3)
+    mesh = surface_mesh(np.column_stack([np.repeat(x, 3), y, wide.ravel()]), grid(len(s) - 1, 2))
+
+    def velocity(x):
+        speed = np.sign(x[1]) * np.clip(x[0], 0.0, None)
+        return np.array([0.1 + 0.0 * speed, -3.0 * speed, 0.3 * speed])
+
+    sheet = nts.Shell(
+        mesh, young=1e7, poisson=0.3, thickness=thickness, density=1e3, velocity=velocity,
+        name="sheet",
+    )  # fmt: skip
+    contact = nts.SelfContact(sheet.surface(side="bottom"), friction=0.3)
+    system = nts.System([sheet], contacts=[contact])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.05)
+    assert run.status == "completed"
+    table, energy = run.balance, run.balance["energy"][0]
+    assert table["active"].max() >= 2 and table["min_gap"].min() > -1e-10
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * energy
+    for name in ("linear_momentum", "angular_momentum"):
+        off = np.abs(table[name] - table[name][0]).max()
+        assert off < 1e-12 * np.abs(table[name][0]).max(), name
+
+
+@pytest.mark.slow
+def test_the_ends_of_a_clip_of_tetrahedra_do_not_enter_each_other():
+    """Its whole boundary with its edges, meshed by Gmsh, by a test of all nodes in all cells."""
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize()
+    gmsh.option.setNumber("General.Verbosity", 0)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.25)
+    occ = gmsh.model.occ
+    ring = [(3, occ.addCylinder(0, 0, 0, 0, 0, 0.5, 1.0))]
+    for tool in (occ.addCylinder(0, 0, -1, 0, 0, 3, 0.7), occ.addBox(0, -0.1, -1, 2, 0.2, 3)):
+        ring, _ = occ.cut(ring, [(3, tool)])
+    occ.synchronize()
+    gmsh.model.addPhysicalGroup(3, [ring[0][1]])
+    gmsh.model.mesh.generate(3)
+    (part,) = nts.bodies_from_gmsh(gmsh.model, MPI.COMM_SELF).values()
+    gmsh.finalize()
+
+    def velocity(x):
+        speed = np.sign(x[1]) * np.clip(x[0], 0.0, None)
+        return np.array([1.0 + 0.0 * speed, -4.0 * speed * np.abs(x[0]), 0.5 * speed])
+
+    clip = nts.Continuum(
+        part.mesh, nts.NeoHookean(**RUBBER), density=1e3, velocity=velocity, name="clip"
+    )
+    contact = nts.SelfContact(clip.surface(everywhere), friction=0.3)
+    depths, cells = [], compat.geometry_dofmap(clip.mesh)
+
+    class Judge(nts.Writer):
+        def write(self, stepper, *, last=False):
+            x = (clip.reference + stepper.state.u[0]).reshape(-1, 3)
+            depths.append(deepest(x, cells))
+
+        def start(self, stepper):
+            pass
+
+        def close(self, stepper):
+            pass
+
+    run = nts.simulate(
+        nts.System([clip], contacts=[contact]), nts.EnergyMomentum(), dt=4e-3, t_end=0.12,
+        output=[Judge()],
+    )  # fmt: skip
+    assert run.status == "completed" and not run.warnings
+    table, energy = run.balance, run.balance["energy"][0]
+    assert table["active"].max() >= 4 and max(depths) < 0.01 * 0.25
+    assert np.abs(table["ledger_residual"]).max() < 1e-11 * energy
+    for name in ("linear_momentum", "angular_momentum"):
+        off = np.abs(table[name] - table[name][0]).max()
+        assert off < 1e-12 * np.abs(table[name][0]).max(), name
+
+
 # ---- what may touch
 def candidates(mesh):
     """Slave nodes that may touch at rest."""
