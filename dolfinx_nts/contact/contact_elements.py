@@ -109,6 +109,11 @@ class ContactElements(Batch):
         return fixed
 
     @property
+    def sag(self) -> FloatArray | float:
+        """Gap that slaves of curved bodies may have which just touch [m], shape (n,)."""
+        return 0.0
+
+    @property
     def _own(self) -> int:
         """Points of the slave's surface that an element depends on."""
         return self.attachment.numbers[0].shape[1]
@@ -337,6 +342,13 @@ class ContactElements(Batch):
         own = rows[:, : 3 * slave.nodes.shape[1]].reshape(*slave.nodes.shape, 3)
         pulls = push[:, None] * (own * slave.places[:, :, None]).sum(axis=1)
         return push[:, None] * rows, resultant(self.pair.origin + part.place, pulls)
+
+    def pressing(self, part: Contribution) -> FloatArray | None:
+        """This rank's part of the contact forces at all points of the slave [kg m], shape (p,).
+
+        None: they are those of the law.
+        """
+        return None
 
     def gains(self, part: Contribution, factor: float) -> FloatArray:
         """Energy that each pair brings in by starting behind its facet [J], shape (n,)."""

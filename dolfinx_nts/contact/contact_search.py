@@ -387,7 +387,8 @@ class ContactSearch:
             multipliers[:, 1:] = 0.0
         if not self._step.integrator.inertia and self._carried is self._old:
             near = _TOUCHING * c.candidates.length
-            touching = (self._old[k].force[c.candidates.node] > 0.0) | (c.candidates.gap <= near)
+            touching = c.candidates.gap <= np.maximum(near, c.sag)
+            touching |= self._old[k].force[c.candidates.node] > 0.0
             gap = c.gap(x)
             multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
         return multipliers

@@ -31,6 +31,8 @@ from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Convective coordinates by which points of an equilibrium may lie beside where they were cut.
 _STALE = 1e-6
+#: Mean gap over the size of the facets around a node where curved bodies may touch.
+_SAG = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -117,6 +119,12 @@ class SurfaceElements(ContactElements):
     def immovable(self) -> BoolArray:
         """None is dropped beside another contact's."""
         return np.zeros(len(self.frame), dtype=bool)
+
+    @property
+    def sag(self) -> FloatArray:
+        """A part of the facets: where curved bodies touch at a point, means are off."""
+        sag: FloatArray = _SAG * self.candidates.length
+        return sag
 
     @property
     def tangents(self) -> FloatArray:  # type: ignore[override]
@@ -304,6 +312,17 @@ class SurfaceElements(ContactElements):
         start, force = self.measure.start[:, 0], -part.coupling[:, 0]
         x = self.pair.origin + start + theta * (part.place[:, 0] - start)
         total: FloatArray = resultant(x, force)[1]
+        return total
+
+    def pressing(self, part: Contribution) -> FloatArray:
+        """As of `ContactElements`, of the pressure between the nodes, sum of C_qA lambda_A.
+
+        Multipliers alternate from node to node where it does not (theory 17).
+        """
+        total = np.zeros(len(self.pair.slave.points))
+        corners = self.attachment.numbers[0][self.sums.element]
+        force = -self.sums.to_points(part.multiplier[:, 0])
+        np.add.at(total, corners, self.sums.shape * force[:, None])
         return total
 
     def impulse(self, part: Contribution, push: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.pair import ContactPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.state import State
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
 
@@ -53,6 +53,23 @@ class ContactLoads(NamedTuple):
         return found
 
 
+    def pressing(self, k: int, force: FloatArray) -> FloatArray:
+        """Contact forces p_N of this rank's slave nodes as their body feels them [N]. Collective.
+
+        Args:
+            k: Number of the contact.
+            force: Those of its law, shape (share,).
+        """
+        contact = self.elements[k]
+        found = contact.pressing(self.parts[k])
+        if found is None:
+            return force
+        slave = contact.pair.slave
+        slave.body.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.SUM)
+        own: FloatArray = found[slave.share] / self.factor
+        return own
+
+
 def labels(system: System) -> list[str]:
     """Names of the contacts for fields: those of the same name are numbered."""
     names = [re.sub(r"^\.+|[^\w.-]+", "_", pair.name) for pair in system.contacts]
@@ -86,7 +103,8 @@ def at_nodes(
             own = state.contacts[k]
             first = np.where(own.force > 0.0, own.force, -own.gap)
             area = system.slave_areas[k][pair.slave.share]
-            for name, (elsewhere, values) in _of_slave(pair, state, k, area).items():
+            press = own.force if loads is None else loads.pressing(k, own.force)
+            for name, (elsewhere, values) in _of_slave(pair, own, press, area).items():
                 fields[f"{name}_{label}"] = spread(pair.slave, elsewhere, values, first)
     return fields
 
@@ -115,17 +133,22 @@ def spread(
 
 
 def _of_slave(
-    pair: ContactPair, state: State, k: int, area: FloatArray
+    pair: ContactPair, own: ContactHistory, press: FloatArray, area: FloatArray
 ) -> dict[str, tuple[float, FloatArray]]:
-    """Name -> value elsewhere and values at this rank's slave nodes of these areas [m^2]."""
-    own = state.contacts[k]
-    force, gap = own.force, own.gap
-    near = np.isfinite(gap)
+    """Name -> value elsewhere and values at this rank's slave nodes.
+
+    Args:
+        pair: The contact.
+        own: What it remembers.
+        press: Contact forces [N].
+        area: Of the nodes [m^2].
+    """
+    gap, near = own.gap, np.isfinite(own.gap)
     fields = {
-        "contact_force": (0.0, force),
-        "contact_pressure": (0.0, force / area),
+        "contact_force": (0.0, press),
+        "contact_pressure": (0.0, press / area),
         "contact_gap": (np.nan, np.where(near, gap, np.nan)),
-        "contact_status": (-1.0, np.where(force > 0, 2.0, near.astype(float)) + own.stick),
+        "contact_status": (-1.0, np.where(own.force > 0, 2.0, near.astype(float)) + own.stick),
     }
     if pair.friction:
         fields["contact_friction"] = (0.0, own.tangential)

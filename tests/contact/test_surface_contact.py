@@ -41,6 +41,8 @@ def patch(cells, cell="hexahedron", metre=1.0, friction=0.0):
     assert run.status == "completed"
     local = run.state.contacts[0].force / slave.area[slave.share]
     pressure = np.concatenate(COMM.allgather(local)) * metre / strain
+    field = run.contact_fields(bodies[0])["contact_pressure_at_0.5-at_0.0"].x.array
+    assert np.abs(field[field != 0.0] * metre / strain - 1).max() < 1e-8
     # Displacements are linear in z if the stress is uniform.
     off = [linear_part(b, metre) / (metre * strain) for b in bodies]
     return pressure, max(off)
