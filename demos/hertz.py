@@ -136,10 +136,12 @@ def plane(problem, axis, value):
     return lambda x: np.abs(x[axis] - value) < 1e-9 * problem.radius
 
 
-def scene(comm, problem, *, held=(), loads=(), whole=False, friction=0.0):
+def scene(
+    comm, problem, *, held=(), loads=(), whole=False, friction=0.0, integration="nodes"
+):
     """Both bodies; `held` and `loads` are conditions and tractions of the upper one.
 
-    `whole` cylinders instead of the half x >= 0.
+    `whole` cylinders instead of the half x >= 0; `integration` as of `ContactPair`.
     """
     r, block = problem.radius, problem.block
     sides = [] if whole else [nts.Dirichlet(plane(problem, 0, 0.0), components=(0,))]
@@ -170,17 +172,18 @@ def scene(comm, problem, *, held=(), loads=(), whole=False, friction=0.0):
         slave=upper.surface(under_the_block(r)),
         master=lower.surface(under_the_block(-r)),
         friction=friction,
+        integration=integration,
     )
     return nts.System([upper, lower], contacts=[pair])
 
 
-def pressed(comm, problem):
+def pressed(comm, problem, **options):
     """Return both bodies under an even pressure on the flat face."""
     r, n = problem.radius, problem.cells
     rim = np.sin(np.diff(np.arctan(np.arange(n + 1) / n)))  # the face of a sphere is a polygon
     area = 4 * r**2 * rim.sum() if problem.spheres else 2 * r
     load = nts.Traction(plane(problem, 2, r), (0.0, 0.0, -problem.force / area))
-    return scene(comm, problem, loads=[load])
+    return scene(comm, problem, loads=[load], **options)
 
 
 def press(comm, problem, **options):

@@ -158,12 +158,15 @@ class ContactElements(Batch):
         """
         return self.measure.gap(self.pair.points(positions, self.candidates) - path) - self.offset
 
-    def is_stale(self, positions: Sequence[FloatArray], part: Contribution) -> bool:
+    def is_stale(
+        self, positions: Sequence[FloatArray], part: Contribution, repeats: int
+    ) -> bool:
         """Whether an equilibrium is none of the elements that its places have. Collective.
 
         Args:
             positions: Of all points in it, as of `ContactPair.positions`.
             part: Solution.
+            repeats: How often it has been sought again for that.
         """
         return False
 

@@ -66,7 +66,7 @@ class ContactSearch:
         self.idle: list[ContactElements] = []
         self.idle_gaps: list[FloatArray] = []
         self.beside = [(0.0, -1)] * len(contacts)
-        self._cover, self._stale = [0.0] * len(contacts), False
+        self._cover, self._repeats = [0.0] * len(contacts), 0
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
@@ -101,7 +101,7 @@ class ContactSearch:
         touching = slice(len(self.elements))
         self._carried = history if again is None else self.history(again.parts[touching])
         self._step, self._old, self._placed = step, history, {}
-        self._stale &= again is not None
+        self._repeats = 0 if again is None else self._repeats
         time = step.state.time
         self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
         if again is None:
@@ -179,7 +179,7 @@ class ContactSearch:
             positions,
             self._old[k].facet,
             path,
-            Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k], self._stale),
+            Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k], self._repeats > 0),
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia else None,
         )
@@ -282,8 +282,9 @@ class ContactSearch:
             reach = self._reach(k, motion)
             missed |= reach > self._cover[k]
             missed |= self._passed(k, e, parts[k], reach)
-        self._stale = not missed and self._are_stale(e, parts)
-        return missed or self._stale
+        stale = not missed and self._are_stale(e, parts)
+        self._repeats = self._repeats + 1 if stale else 0
+        return missed or stale
 
     def _are_stale(self, e: Evaluation, parts: Sequence[Contribution]) -> bool:
         """Return whether an equilibrium's elements are those of other places. Collective."""
@@ -291,7 +292,8 @@ class ContactSearch:
             return False
         stale = False
         for pair, of, c, part in zip(self._pairs, self.bodies, self.elements, parts, strict=True):
-            stale |= c.is_stale(pair.positions([e.bodies[b].u1 for b in of]), part)
+            end = pair.positions([e.bodies[b].u1 for b in of])
+            stale |= c.is_stale(end, part, self._repeats)
         return stale
 
     def _passed(self, k: int, e: Evaluation, part: Contribution, reach: float) -> bool:

@@ -29,8 +29,10 @@ from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
-#: Convective coordinates by which points of an equilibrium may lie beside where they were cut.
-_STALE = 1e-6
+#: Convective coordinates by which points of an equilibrium may lie beside where they were cut, by
+#: how often it was sought again. Mostly one time leaves a hundredth; where points come and go at
+#: the limit of what is looked at, it ends in turns between two states that differ by little.
+_STALE = (1e-5, 1e-4, 1e-3)
 #: Mean gap over the size of the facets around a node where curved bodies may touch.
 _SAG = 0.05
 
@@ -173,12 +175,15 @@ class SurfaceElements(ContactElements):
     def _gaps(self, x: FloatArray) -> FloatArray:
         return self.sums.to_slaves(self.measure.gap(x))
 
-    def is_stale(self, positions: Sequence[FloatArray], part: Contribution) -> bool:
+    def is_stale(
+        self, positions: Sequence[FloatArray], part: Contribution, repeats: int
+    ) -> bool:
         """Whether points lie elsewhere over the master than where pieces were cut. Collective."""
         xi = self.measure.projection(self._placed(positions))
         carries = np.append(part.active, False)[self.sums.slot].any(axis=1)
         moved = np.abs(xi - self.sums.cut).max(axis=1)[carries]
-        return anywhere(self.pair.slave.body.comm, bool((moved > _STALE).any()))
+        limit = _STALE[min(repeats, len(_STALE) - 1)]
+        return anywhere(self.pair.slave.body.comm, bool((moved > limit).any()))
 
     def initial_guess(self, x: FloatArray) -> FloatArray:
         """No augmented unknowns: those of points follow from their places."""
@@ -304,7 +309,11 @@ class SurfaceElements(ContactElements):
         element, corner = self._first
         at = size + corner[:, None] * width + np.arange(width)
         residual[element[:, None], at] = rows
-        tangent[element[:, None, None], at[:, :, None], at[:, None]] = slopes[:, :, 3:]
+        # Each element has a part, without which one would say nothing of a multiplier of its own.
+        number = np.append(np.bincount(slot[slot >= 0]), 1)[slot]
+        for k in range(slot.shape[1]):
+            here = slice(size + k * width, size + (k + 1) * width)
+            tangent[:, here, here] = padded[:, k, :, 3:] / number[:, k, None, None]
 
     # ---- a solution
     def moment(self, part: Contribution, theta: float) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from mpi4py import MPI
 
+import hertz
 import numpy as np
 import pytest
 import two_blocks
@@ -113,6 +114,25 @@ def leaning():
         blocks[1].surface(at(2, 0.5)), blocks[0].surface(at(2, 0.5)), integration="surface"
     )
     return nts.System(blocks, contacts=[pair])
+
+
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_cylinders_that_press_each_other():
+    """Hertz: curved bodies, which touch along a line at the start, where all means are open."""
+    problem = hertz.PROBLEMS["cylinders"]
+    run = nts.equilibrium(hertz.pressed(COMM, problem, integration="surface"), load_steps=2)
+    assert run.status == "completed" and "unstable equilibrium" not in run.warnings
+    upper = run.system.bodies[0]
+    fields = run.contact_fields(upper)
+    pressure, force = (
+        fields[f"contact_{name}_upper-lower"].x.array[:] for name in ("pressure", "force")
+    )
+    x = fields["contact_force_upper-lower"].function_space.tabulate_dof_coordinates()[:, 0]
+    half = hertz.half_width(problem, x, np.nan_to_num(force))
+    assert COMM.allreduce(pressure.max(), op=MPI.MAX) == pytest.approx(problem.peak, rel=0.01)
+    if COMM.size == 1:  # ranks share nodes
+        assert half == pytest.approx(problem.half_width, rel=0.01)
 
 
 # ---- impact
