@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -38,8 +38,13 @@ _WEDGE = 0.5
 #: A foot is followed from piece to piece of the surface over a facet so often; then the last will
 #: do, as neighbours go on alike beyond their border.
 _MOST_PATCHES = 3
+#: Least cosine between one normal and the opposite of the other of what faces each other.
+_FACING = 0.1
 #: Weights of a foot that are rounding.
 _STILL = 1e-9
+
+#: Numbers of slaves and of facets -> which of these pairs face each other.
+Faces = Callable[[IntArray, IntArray], BoolArray]
 
 
 class FacetPair(ContactPair, master=Surface):
@@ -51,6 +56,7 @@ class FacetPair(ContactPair, master=Surface):
         self.extent = max(self.extent, master.material.extent(self.origin))
         self._free_edges = master.boundary_edges
         self._edges = ConvexEdges(master.facets, master.reference[master.facets])
+        self._facing: Faces | None = None
 
     def _check_surfaces(self) -> None:
         """Raise a ValueError unless slave and master are apart."""
@@ -156,6 +162,7 @@ class FacetPair(ContactPair, master=Surface):
         if search.apart(slaves, corners, radius):
             return Found(NO_CANDIDATES, ~every, radius - self._lift)
         x = slaves[self.slave.share]
+        self._facing = self._what_faces(slaves, corners)
         closest = self._closest(slaves, corners, radius, current)
         node = np.flatnonzero(closest.facet >= 0)
         found, lost = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
@@ -186,8 +193,49 @@ class FacetPair(ContactPair, master=Surface):
             reach: Largest distance of interest [m].
             current: As of `find`.
         """
-        x = slaves[self.slave.share]
-        return search.closest_facets(x, corners, reach=reach, current=current)
+        x, faces = slaves[self.slave.share], self._facing
+        admits = None if faces is None else search.Admits(faces, _anywhere)
+        return search.closest_facets(x, corners, reach=reach, current=current, admits=admits)
+
+    def _what_faces(self, slaves: FloatArray, corners: FloatArray) -> Faces | None:
+        """Which facets face which of this rank's slaves, or None if all that is near does.
+
+        Only over sharp edges a node that no facet of its own brings against a side of the master
+        may be near it, as at rims that lie on each other.
+        """
+        at = self.slave.facets
+        if not len(at) or not self._edges.sharp.any():
+            return None
+        own, other = middles(slaves[at])[1], middles(corners)[1]
+        points = at.ravel()
+        order = np.argsort(points, kind="stable")
+        of, first = order // at.shape[1], np.searchsorted(points[order], self.slave.share)
+        count = np.searchsorted(points[order], self.slave.share, side="right") - first
+
+        def faces(node: IntArray, facet: IntArray) -> BoolArray:
+            number = count[node]
+            pair = np.repeat(np.arange(len(node)), number)
+            start = np.cumsum(number) - number
+            mine = of[first[node][pair] + np.arange(len(pair)) - start[pair]]
+            cosine = np.einsum("ni,ni->n", own[mine], other[facet[pair]])
+            found = number == 0
+            found[pair[cosine < -_FACING]] = True
+            return found
+
+        return faces
+
+    def _beside(self, node: IntArray, facet: IntArray) -> BoolArray:
+        """Which sharp edges of facets end the surface for nodes, shape (n, nc).
+
+        The facet beyond does not face the node.
+        """
+        ends = np.zeros((len(node), self.master.facets.shape[1]), dtype=bool)
+        if self._facing is None:
+            return ends
+        beside, joined = self._edges.beside[facet], self._edges.joined[facet]
+        some, edge = np.nonzero((beside >= 0) & (joined < 0))
+        ends[some, edge] = ~self._facing(node[some], beside[some, edge] // ends.shape[1])
+        return ends
 
     def _told(self, hidden: Candidates, current: IntArray) -> Candidates:
         """Those of nodes behind the surface that nothing else keeps from sinking in. Collective."""
@@ -296,6 +344,7 @@ class FacetPair(ContactPair, master=Surface):
         for edge in range(nc):
             other = self._edges.beside[near.facet, edge] // nc
             some = np.flatnonzero((excess[:, edge] > search.PREFERENCE) & (other >= 0))
+            some = some[self._does_face(near.node[some], other[some])]
             if not some.size:
                 continue
             start, _ = compiled.closest_point(end[some], moved[self.master.facets[other[some]]])
@@ -345,7 +394,7 @@ class FacetPair(ContactPair, master=Surface):
             return found
         node = some.node
         facet = self._passed(x[node], slave_path[node], some.facet, master, master_path)
-        change = facet >= 0
+        change = (facet >= 0) & self._does_face(node, facet)
         if not change.any():
             return found
         return self._moved_to(found, node[change], facet[change], x, master)
@@ -450,7 +499,16 @@ class FacetPair(ContactPair, master=Surface):
         excess = facets.edge_excess(xi, self.master.facets.shape[1]).max(axis=1)
         out = np.flatnonzero(converged & (excess > ASIDE))
         node, whole = some[out], np.ones(len(out))
-        found[out] = self._edges.across(end[node], held[node], master, master_path, whole)
+        other = self._edges.across(end[node], held[node], master, master_path, whole)
+        found[out] = np.where(self._does_face(node, other), other, -1)
+        return found
+
+    def _does_face(self, node: IntArray, facet: IntArray) -> BoolArray:
+        """Which facets, -1 none, face the rank's slaves, shape (n,)."""
+        found = np.ones(len(node), dtype=bool)
+        if self._facing is not None:
+            some = np.flatnonzero(facet >= 0)
+            found[some] = self._facing(node[some], facet[some])
         return found
 
     def _refuse_cut_corners(
@@ -522,7 +580,7 @@ class FacetPair(ContactPair, master=Surface):
         legal = converged & self._movable(node, patch, xi, -gap / length)
         beyond = np.zeros_like(legal)
         if reach is not None:
-            over, beyond = self._over_facet(facet, xi, reach / length)
+            over, beyond = self._over_facet(node, facet, xi, reach / length)
             legal &= over & (gap > -MARGIN * length) & (gap < reach + MARGIN * length)
         found = Candidates(node, facet, patch, xi, normal, gap, length).select(legal)
         return found, node[beyond]
@@ -579,13 +637,14 @@ class FacetPair(ContactPair, master=Surface):
         return change, joined[change] // nc
 
     def _over_facet(
-        self, facet: IntArray, xi: FloatArray, reach: FloatArray
+        self, node: IntArray, facet: IntArray, xi: FloatArray, reach: FloatArray
     ) -> tuple[BoolArray, BoolArray]:
         """Return whether pairs within `reach` (facet sizes) may touch there; a facet is 2 xi wide.
 
         And whether they are beyond an edge that the surface ends at.
         """
-        excess, free = facets.edge_excess(xi, self.master.facets.shape[1]), self._free_edges[facet]
+        excess = facets.edge_excess(xi, self.master.facets.shape[1])
+        free = self._free_edges[facet] | self._beside(node, facet)
         wedge = _WEDGE + 2.0 * (reach + MARGIN)
         beyond: BoolArray = (free & (excess > OVERHANG)).any(axis=1)
         inside: BoolArray = (free | (excess <= wedge[:, None])).all(axis=1) & ~beyond
@@ -614,6 +673,10 @@ class FacetPair(ContactPair, master=Surface):
         moves = (np.abs(foot) * free).max(axis=1)
         movable[held] = moves > np.maximum(_STILL, depth[held])
         return movable
+
+
+def _anywhere(point: IntArray, _facet: IntArray, _distance: FloatArray) -> BoolArray:
+    return np.ones(len(point), dtype=bool)
 
 
 def _replace(found: Candidates, other: Candidates) -> Candidates:
