@@ -46,7 +46,9 @@ SHORT: dict[str, str] = {
 }
 #: Modules that users import themselves, by the page they are on.
 MORE = {
-    "output": [f"dolfinx_nts.output.{name}" for name in ("writers", "film", "pictures", "plots")],
+    "output": [
+        f"dolfinx_nts.output.{name}" for name in ("fields", "tables", "film", "pictures", "plots")
+    ],
     "study": [
         f"dolfinx_nts.study.{name}"
         for name in sorted(p.stem for p in (ROOT / "dolfinx_nts/study").glob("[a-z]*.py"))
