@@ -424,8 +424,8 @@ def cut_off(pair: ContactPair, depth: FloatArray) -> str:
     name = pair.master.body.name
     return (
         f"that is no more than the flat facets of {name!r} cut off its curved surface: pass "
-        "smoothing=True to its surface, adjust= to the contact, or take a finer mesh; "
-        'interference="resolve" would press the bodies as if they overlapped by that much'
+        "smoothing=True to its surface, adjust= to the contact, or take a finer mesh; pressed out "
+        "it is a fit by that much, which the curves do not have"
     )
 
 

@@ -38,8 +38,9 @@ _WEDGE = 0.5
 #: A foot is followed from piece to piece of the surface over a facet so often; then the last will
 #: do, as neighbours go on alike beyond their border.
 _MOST_PATCHES = 3
-#: Least cosine between one normal and the opposite of the other of what faces each other.
-_FACING = 0.1
+#: Least cosine between one normal and the opposite of the other of what faces each other; sides of
+#: a right angle do not, also where bodies that are pressed have turned them by 17 degrees.
+_FACING = 0.3
 #: Weights of a foot that are rounding.
 _STILL = 1e-9
 
@@ -194,8 +195,17 @@ class FacetPair(ContactPair, master=Surface):
             current: As of `find`.
         """
         x, faces = slaves[self.slave.share], self._facing
-        admits = None if faces is None else search.Admits(faces, _anywhere)
-        return search.closest_facets(x, corners, reach=reach, current=current, admits=admits)
+        found = search.closest_facets(x, corners, reach=reach, current=current)
+        near = np.flatnonzero(found.facet >= 0)
+        if faces is None or not near.size:
+            return found
+        again = near[~faces(near, found.facet[near])]
+        if again.size:
+            admits = search.Admits(lambda point, facet: faces(again[point], facet))
+            other = search.closest_facets(x[again], corners, reach=reach, admits=admits)
+            for values, better in zip(found, other, strict=True):
+                values[again] = better
+        return found
 
     def _what_faces(self, slaves: FloatArray, corners: FloatArray) -> Faces | None:
         """Which facets face which of this rank's slaves, or None if all that is near does.
@@ -203,26 +213,42 @@ class FacetPair(ContactPair, master=Surface):
         Only over sharp edges a node that no facet of its own brings against a side of the master
         may be near it, as at rims that lie on each other.
         """
-        at = self.slave.facets
-        if not len(at) or not self._edges.sharp.any():
+        if not len(self.slave.facets) or not self._edges.sharp.any():
             return None
-        own, other = middles(slaves[at])[1], middles(corners)[1]
-        points = at.ravel()
-        order = np.argsort(points, kind="stable")
-        of, first = order // at.shape[1], np.searchsorted(points[order], self.slave.share)
-        count = np.searchsorted(points[order], self.slave.share, side="right") - first
+        of, first, count = self._own_facets
+        own, other = middles(slaves[self.slave.facets])[1], middles(corners)[1]
+        # The tip of a needle has facets that face nothing ahead of it, but their mean does.
+        mean = np.zeros_like(slaves)
+        np.add.at(mean, self.slave.facets, own[:, None])
+        mean = mean[self.slave.share]
+        mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
 
         def faces(node: IntArray, facet: IntArray) -> BoolArray:
             number = count[node]
             pair = np.repeat(np.arange(len(node)), number)
             start = np.cumsum(number) - number
             mine = of[first[node][pair] + np.arange(len(pair)) - start[pair]]
-            cosine = np.einsum("ni,ni->n", own[mine], other[facet[pair]])
-            found = number == 0
-            found[pair[cosine < -_FACING]] = True
+            found = (number == 0) | opposite(mean[node], other[facet])
+            found[pair[opposite(own[mine], other[facet[pair]])]] = True
             return found
 
         return faces
+
+    @cached_property
+    def _own_facets(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Facets of the rank's slaves in a row, where those of each begin, and how many they are.
+
+        None of nodes where the declared surface ends, as what is beyond there may face anything.
+        """
+        at = self.slave.facets
+        facet, edge = np.nonzero(self.slave.boundary_edges)
+        ends = [at[facet, edge], at[facet, (edge + 1) % at.shape[1]]]
+        order = np.argsort(at.ravel(), kind="stable")
+        points = at.ravel()[order]
+        first = np.searchsorted(points, self.slave.share)
+        last = np.searchsorted(points, self.slave.share, side="right")
+        count = np.where(np.isin(self.slave.share, np.concatenate(ends)), 0, last - first)
+        return order // at.shape[1], first, count
 
     def _beside(self, node: IntArray, facet: IntArray) -> BoolArray:
         """Which sharp edges of facets end the surface for nodes, shape (n, nc).
@@ -675,8 +701,10 @@ class FacetPair(ContactPair, master=Surface):
         return movable
 
 
-def _anywhere(point: IntArray, _facet: IntArray, _distance: FloatArray) -> BoolArray:
-    return np.ones(len(point), dtype=bool)
+def opposite(one: FloatArray, two: FloatArray) -> BoolArray:
+    """Return which of unit normals (n, 3) face each other, shape (n,)."""
+    facing: BoolArray = np.einsum("ni,ni->n", one, two) < -_FACING
+    return facing
 
 
 def _replace(found: Candidates, other: Candidates) -> Candidates:

@@ -53,11 +53,12 @@ class Admits(NamedTuple):
 
     Attributes:
         faces: By points (n,) and facets (n,), wherever these are, shape (n,).
-        apart: By these and their distances [m], shape (n,); asked of what `faces` lets through.
+        apart: By these and their distances [m], shape (n,); asked of what `faces` lets through;
+            None: all do.
     """
 
     faces: Callable[[IntArray, IntArray], BoolArray]
-    apart: Callable[[IntArray, IntArray, FloatArray], BoolArray]
+    apart: Callable[[IntArray, IntArray, FloatArray], BoolArray] | None = None
 
 
 class _SizeClass(NamedTuple):
@@ -318,7 +319,7 @@ def _choose(
     xi, distance = scene.closest(point, facet)
     order = np.lexsort((facet, point))
     order = order[distance[order] <= limit[point[order]]]
-    if admits is not None:
+    if admits is not None and admits.apart is not None:
         order = order[admits.apart(point[order], facet[order], distance[order])]
     if not order.size:
         return

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.along_surface import Neighbourhoods
-from dolfinx_nts.contact.facet_pair import FacetPair
+from dolfinx_nts.contact.facet_pair import FacetPair, opposite
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, Candidates, Found, Motion
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets
@@ -24,9 +24,6 @@ from dolfinx_nts.validation import known_options
 _FINER = 1.1
 #: Mean distances of two parts from the middle are alike up to this part of the surface's extent.
 _ALIKE = 1e-9
-#: Least cosine between one normal and the opposite of the other of what faces each other; sides of
-#: a right angle do not.
-_FACING = 0.1
 #: A node of the master's part is kept out of a facet of which less than this part is carried by
 #: slaves, and is so until they carry that part.
 _ENTERS, _STAYS = 0.9, 0.95
@@ -82,7 +79,7 @@ class SelfContact(FacetPair):
         middle, depth = corners.mean(axis=1), INITIAL_PENETRATION * facets.size(corners)
 
         def faces(point: IntArray, facet: IntArray) -> BoolArray:
-            facing = _opposite(nodal[share[point]], normal[facet])
+            facing = opposite(nodal[share[point]], normal[facet])
             some = np.flatnonzero(facing)
             point, facet = point[some], facet[some]
             rise = np.einsum("ni,ni->n", slaves[share[point]] - middle[facet], normal[facet])
@@ -106,7 +103,7 @@ class SelfContact(FacetPair):
 
         def stops(point: IntArray, facet: IntArray) -> BoolArray:
             beside = self._own.beside(number[point], facet, np.zeros(len(point)))
-            return ~beside & _opposite(nodal[number[point]], normal[facet])
+            return ~beside & opposite(nodal[number[point]], normal[facet])
 
         return stops
 
@@ -132,7 +129,7 @@ class SelfContact(FacetPair):
         was, before = reference[at].mean(axis=1), self._normals(reference)[1]
 
         def faces(point: IntArray, facet: IntArray) -> BoolArray:
-            facing = _opposite(nodal[point], normal[facet])
+            facing = opposite(nodal[point], normal[facet])
             some = np.flatnonzero(facing)
             point, facet = point[some], facet[some]
             rise = np.einsum("ni,ni->n", x[point] - middle[facet], normal[facet])
@@ -236,7 +233,7 @@ class SelfContact(FacetPair):
         facet, was = surface.at_all(np.column_stack([mine, current])).T
         one, corner = np.nonzero(facet[at[facet]] >= 0)
         other = at[facet[one], corner]
-        joined = (facet[one] >= 0) & _opposite(normal[facet[one]], normal[facet[other]])
+        joined = (facet[one] >= 0) & opposite(normal[facet[one]], normal[facet[other]])
         near = facet >= 0
         off = np.linalg.norm(surface.reference - surface.reference.mean(axis=0), axis=1)
         slave = near & _one_of_two(one[joined], other[joined], was >= 0, off, surface.original)
@@ -244,19 +241,13 @@ class SelfContact(FacetPair):
         foot, _, _ = facets.shape(c.xi, at.shape[1])
         corners = at[c.facet]
         held = facet[corners]
-        faces = _opposite(
+        faces = opposite(
             np.repeat(normal[c.facet], at.shape[1], axis=0), normal[held.ravel()]
         ).reshape(held.shape)
         carried = (foot * (slave[corners] & faces)).sum(axis=1)
         rim = carried < np.where(current[c.node] >= 0, _STAYS, _ENTERS)
         chosen: BoolArray = slave[surface.share[c.node]] | rim
         return chosen
-
-
-def _opposite(one: FloatArray, two: FloatArray) -> BoolArray:
-    """Return which of unit normals (n, 3) face each other, shape (n,)."""
-    facing: BoolArray = np.einsum("ni,ni->n", one, two) < -_FACING
-    return facing
 
 
 def _one_of_two(

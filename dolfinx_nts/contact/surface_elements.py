@@ -117,6 +117,17 @@ class SurfaceElements(ContactElements):
         element, corner = np.unravel_index(where[at], self._slot.shape)
         return element, corner
 
+    @cached_property
+    def _elements_of(self) -> IntArray:
+        """How many elements the slaves at the corners have, shape (n, corners).
+
+        Each has a part of a slave's equations, without which one would say nothing of a multiplier
+        of its own.
+        """
+        slot = self._slot
+        found: IntArray = np.append(np.bincount(slot[slot >= 0]), 1)[slot]
+        return found
+
     @property
     def immovable(self) -> BoolArray:
         """None is dropped beside another contact's."""
@@ -309,11 +320,9 @@ class SurfaceElements(ContactElements):
         element, corner = self._first
         at = size + corner[:, None] * width + np.arange(width)
         residual[element[:, None], at] = rows
-        # Each element has a part, without which one would say nothing of a multiplier of its own.
-        number = np.append(np.bincount(slot[slot >= 0]), 1)[slot]
         for k in range(slot.shape[1]):
             here = slice(size + k * width, size + (k + 1) * width)
-            tangent[:, here, here] = padded[:, k, :, 3:] / number[:, k, None, None]
+            tangent[:, here, here] = padded[:, k, :, 3:] / self._elements_of[:, k, None, None]
 
     # ---- a solution
     def moment(self, part: Contribution, theta: float) -> FloatArray:

@@ -52,6 +52,10 @@ _NEAR = 0.05
 _OPEN = 0.1
 #: Rounding of work over that of forces times the size of the scene.
 _ROUNDING = 16 * float(np.finfo(float).eps)
+#: Part of an overlap from which on what flat facets cut off a curve is told.
+_SAG_TOLD = 0.05
+#: Part of that which an overlap has to be, not to be rounding.
+_SAG_LEAST = 1e-3
 
 
 class _Relaxed:
@@ -154,6 +158,13 @@ class LoadStepper(Stepper):
         worked = float(np.abs(self._worked).sum())
         self._largest = max(self._largest, abs(row["potential"]), worked)
         missing, size = abs(row["ledger_residual"]), self._largest
+        if self._stabilization and terms["friction_dissipation"] > _OPEN * size:
+            self.solution.warn(
+                "stabilized friction", time, terms["friction_dissipation"],
+                "nodes slide with friction in load steps that stabilization holds: what is lent "
+                "and given back lets them slide back, and friction comes out too small in the "
+                "first of these steps; leave stabilization out, or compare with other load steps",
+            )  # fmt: skip
         loads = sum(float(np.abs(t.external).sum()) for t in step.bodies)
         pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
         pressed += self.system.comm.allreduce(loads)
@@ -245,9 +256,10 @@ class LoadStepper(Stepper):
             self.solution.warn(
                 "unstable equilibrium", self.state.time, float(number),
                 f"{number} independent motion{'s' if number > 1 else ''} away from this state "
-                "release energy: it is an equilibrium, but not a stable one, and a small "
-                "disturbance leads elsewhere, as in buckling or tipping; to find where, begin with "
-                "a small displacement= in that direction, or disturb the loads",
+                f"release{'' if number > 1 else 's'} energy: it is an equilibrium, but not a "
+                "stable one, and a small disturbance leads elsewhere, as in buckling or tipping; "
+                "to find where, begin with a small displacement= in that direction, or disturb the "
+                "loads",
             )  # fmt: skip
 
     def _slips(self) -> bool:
@@ -257,13 +269,18 @@ class LoadStepper(Stepper):
         return anywhere(self.system.comm, slip)
 
     def _tell_cut_off(self) -> None:
-        """Warn if an overlap that is to be resolved may be that of flat facets alone."""
-        contacts = self.system.contacts
-        if all(pair.interference != "resolve" for pair in contacts):
-            return
-        for pair, depth in zip(contacts, self.system.penetration(self.state), strict=True):
-            if pair.interference == "resolve" and (text := cut_off(pair, depth)):
-                deep = float(depth.max())
+        """Warn if an overlap that load steps press out may be that of flat facets, or is partly."""
+        for pair, depth in zip(
+            self.system.contacts, self.system.penetration(self.state), strict=True
+        ):
+            deep, text = float(depth.max(initial=0.0)), cut_off(pair, depth)
+            if not text and pair.sag > _SAG_TOLD * deep > 0.0:
+                part = 100.0 * pair.sag / deep
+                text = (
+                    f"flat facets cut {part:.2g} % of that off a curve, by which the pressure may "
+                    "be wrong: take a finer mesh, or smoothing=True for the master"
+                )
+            if text and deep > _SAG_LEAST * pair.sag:
                 self.solution.warn(
                     "flat facets", self.state.time, deep,
                     f"contact {pair.name!r}: nodes start inside by up to {deep:.3g} of a facet; "

@@ -1,5 +1,8 @@
-"""Blocks whose faces end at the same rims: whole boundaries touch as the faces alone do."""
+"""Which side of a master holds a node at a rim: one that the node faces, of whole boundaries."""
 
+from mpi4py import MPI
+
+import gmsh
 import numpy as np
 import pytest
 from scenes import box, everywhere
@@ -37,3 +40,39 @@ def test_nodes_at_the_rims_stay_with_the_face_that_they_face(cells, poisson, fri
     faces = pressed(cells, poisson, lambda x: np.abs(x[2] - 1) < 1e-9, friction)
     assert faces[2] > 1e5
     assert whole == pytest.approx(faces, abs=1e-9 * faces[2])
+
+
+def stepped():
+    """A floor of 4 x 2 x 0.5 with a wall on its last quarter, of tetrahedra."""
+    gmsh.initialize()
+    gmsh.option.setNumber("General.Verbosity", 1)
+    occ = gmsh.model.occ
+    floor, wall = occ.addBox(0, 0, -0.5, 4, 2, 0.5), occ.addBox(3, 0, 0, 1, 2, 1)
+    out, _ = occ.fuse([(3, floor)], [(3, wall)])
+    occ.synchronize()
+    for entities, name in ((out, "step"), (gmsh.model.getBoundary(out, oriented=False), "skin")):
+        dim = entities[0][0]
+        group = gmsh.model.addPhysicalGroup(dim, [tag for _, tag in entities])
+        gmsh.model.setPhysicalName(dim, group, name)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.8)
+    gmsh.model.mesh.generate(3)
+    part = nts.bodies_from_gmsh(gmsh.model, MPI.COMM_WORLD)["step"]
+    gmsh.finalize()
+    return part
+
+
+def test_a_bottom_that_is_declared_alone_does_not_pass_through_a_wall():
+    """What is beyond the rim of a declared face may face anything, and so may the nodes there."""
+    given, rubber = stepped(), nts.NeoHookean(young=1e7, poisson=0.3)
+    step = given.continuum(
+        rubber, density=1e3, bcs=[nts.Dirichlet(lambda x: x[2] < -0.5 + 1e-9)], name="step"
+    )
+    mesh = box((1.5, 0.6, 1e-4), (2.2, 1.3, 0.7), (2, 2, 2))
+    cube = nts.Continuum(mesh, rubber, density=1e3, velocity=(2, 0, 0), name="cube")
+    pair = nts.ContactPair(
+        cube.surface(lambda x: x[2] < 1e-4 + 1e-9), step.surface(*given.where("skin"))
+    )
+    system = nts.System([step, cube], contacts=[pair])
+    nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.5, accuracy="balanced")
+    # It is at the wall after 0.4 s.
+    assert nts.motion_of(cube).velocity[0] < 0.0

@@ -7,7 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
-from scenes import YOUNG, at, quarter_cube, rubber_stress
+from scenes import YOUNG, at, box, quarter_cube, rubber_stress
 
 import dolfinx_nts as nts
 
@@ -166,3 +166,21 @@ def test_a_body_elsewhere_does_not_turn_a_rigid_block(young):
 def test_a_rigid_block_on_a_slope_that_is_too_steep_has_no_equilibrium():
     _, run = on_slope(22, (2, 2, 3), nts.Newton(max_retries=1))
     assert "not solved" in run.status
+
+
+@pytest.mark.parametrize("stabilization", [None, 0.1])
+def test_friction_under_stabilization_is_told(stabilization):
+    """A pad that a floor slides under drags by Coulomb's bound unless stabilization holds it."""
+    top = nts.Dirichlet(lambda x: x[2] > 0.5 - 1e-9, value=lambda t: (0, 0, -0.01 * min(t, 1.0)))
+    mesh = box((0, 0, 0), (1, 1, 0.5), (2, 2, 2))
+    pad = nts.Continuum(mesh, nts.NeoHookean(young=1e7, poisson=0.0), density=1e3, bcs=[top])
+    floor = nts.Plane((0, 0, 0), (0, 0, 1), motion=lambda t: (0.1 * max(0.0, t - 1.0), 0, 0))
+    pair = nts.ContactPair(pad.surface(lambda x: x[2] < 1e-9), floor, friction=0.3)
+    times = [0.5, 1.0, 1.25, 1.5, 1.75, 2.0]
+    run = nts.equilibrium(
+        nts.System([pad], contacts=[pair]), load_steps=times, stabilization=stabilization
+    )
+    drag, _, normal = np.abs(run.contact_forces[3:, 0]).T
+    told = "stabilized friction" in run.warnings
+    assert told == (stabilization is not None)
+    assert told or drag / normal == pytest.approx(0.3, rel=1e-9)
