@@ -206,6 +206,13 @@ class ContactElements(Batch):
             out[:, -2:] = -np.einsum("nai,ni->na", self.tangents, tangential)
         return out
 
+    def components(self, slip: FloatArray) -> FloatArray:
+        """Components as of `Contribution.slip` of slips in space [m], (n, 3) -> (n, 2)."""
+        metric = np.matmul(self.tangents, self.tangents.transpose(0, 2, 1))
+        along = np.einsum("nai,ni->na", self.tangents, slip)
+        found: FloatArray = np.linalg.solve(metric, along[:, :, None])[:, :, 0]
+        return found
+
     def rows(self, k: Contribution, name: str) -> FloatArray:
         """The residual's rows of "augmented" unknowns or "constraints", shape (n, width)."""
         start = self.num_coordinates
@@ -235,6 +242,9 @@ class ContactElements(Batch):
         gap = found.gap - self.offset + law.overlap
         found.residual[:, law.row], found = gap, found._replace(gap=gap)
         slip = found.slip
+        if slip:
+            slip = slip._replace(value=slip.value + law.slid)
+            found = found._replace(slip=slip)
         together = self._together(gap, slip, multiplier)
         obeyed = law.obey(x, found, multiplier, together)
         residual, tangent, weights = obeyed.residual, obeyed.tangent, self.attachment.weights
@@ -368,6 +378,9 @@ class ContactElements(Batch):
         new.tangential[node] = self.law.tangential_at_end(part, old.tangential[node], factor)
         new.slip[:] = old.slip
         new.slip[node] += part.distance
+        if self.law.num_tangential:
+            on = part.active[:, None]
+            new.slid[node] = on * np.einsum("na,nai->ni", part.slip, self.tangents)
         return new._replace(overlap=old.overlap)
 
     def describe(self, part: Contribution, flips: IntArray) -> tuple[float, str]:

@@ -142,6 +142,8 @@ class ContactLaw(Batch):
         force_rounding: Contact force [kg m] that counts as none.
         imposed: Which pairs are active, whatever their forces and gaps say, shape (n,); None: those
             that the law says.
+        slid: What had slipped in the step before the state that the elements start from, components
+            as of `Contribution.slip` [m], shape (n, 2).
         overlap: How deep the slaves may lie behind their facets at t_{n+1} [m], shape (n,).
         rubs: What pairs with friction that touch obey instead of Coulomb's law.
         before: h^2/2 lambda_N and lambda_T at t_n of massless nodes [kg m], NaN of the others,
@@ -160,6 +162,7 @@ class ContactLaw(Batch):
     rounding: float = 0.0
     force_rounding: float = 0.0
     imposed: BoolArray | None = None
+    slid: FloatArray | float = 0.0
     overlap: FloatArray | float = 0.0
     rubs: Rub = Rub.LAW
     before: FloatArray | None = None
@@ -290,7 +293,7 @@ class ContactLaw(Batch):
         """
         held, prescribed = None, self.prescribed
         if prescribed and prescribed.any:
-            held = prescribed.held(x, self.still)
+            held = prescribed.held(x, self.still, self.slid)
         return compiled_law.laws(
             self._kernel, together, found.residual, found.tangent, found.gap, found.slip,
             multiplier, held, found.normal,

@@ -198,6 +198,9 @@ class ContactSearch:
             elements.law, overlap=(1.0 - ramp(end)) * overlap, rounding=_TOUCH * gap,
             force_rounding=_TOUCH * force,
         )  # fmt: skip
+        if pair.friction and not step.dt:
+            # A load step is relaxed in several solutions, and friction knows of all of them.
+            law = replace(law, slid=elements.components(self._old[k].slid[found.node]))
         massless = self._massless[k][found.node]
         if step.integrator.inertia and massless.any():
             old, before = self._old[k], np.zeros((len(massless), 3))

@@ -67,7 +67,9 @@ class PrescribedSlip(Batch):
         )
         return projector
 
-    def held(self, x: FloatArray, still: FloatArray) -> FloatArray:
+    def held(
+        self, x: FloatArray, still: FloatArray, slid: FloatArray | float = 0.0
+    ) -> FloatArray:
         """`unmoved` where the slip prescribed there is zero, else zero, shape (n, 2, 2).
 
         Nodes that slip leave this part of lambda_T out of the trial, too: Coulomb's law says
@@ -76,10 +78,13 @@ class PrescribedSlip(Batch):
         Args:
             x: Points at t_{n+1} [m], shape (n, points, 3).
             still: Slip that counts as none [m], shape (n,).
+            slid: As of `ContactLaw`.
         """
         motion = x - self.start
         motion = motion[:, 0] - np.einsum("nk,nki->ni", self.foot, motion[:, 1:])
         slip = np.einsum("nij,nj->ni", self._blocked, motion * self._prescribed)
+        if np.ndim(slid):
+            slip += np.einsum("nij,nai,na->nj", self._blocked, self.tangents, slid)
         held: FloatArray = self.unmoved.copy()
         held[np.abs(slip).max(axis=1) > still] = 0.0
         return held

@@ -293,7 +293,7 @@ class SurfaceElements(ContactElements):
         gradient = np.zeros((n, 2, 3 + width))
         gradient[:, [0, 1], [1, 2]] = 1.0
         metric = np.tile(np.eye(2), (n, 1, 1))
-        value = np.einsum("nki,ni->nk", self.frame, sums.to_slaves(points.slip))
+        value = np.einsum("nki,ni->nk", self.frame, sums.to_slaves(points.slip)) + self.law.slid
         slip = Slip(value, gradient, metric, np.zeros((n, 2, 2, 3 + width)))
         normal = sums.to_slaves(points.normal)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -73,7 +73,7 @@ class _Relaxed:
 
     def __init__(self, system: System) -> None:
         self.of_joints = {name for joint in system.joints for name in joint.losses}
-        self.lost = dict.fromkeys(("friction_dissipation", *self.of_joints), 0.0)
+        self.lost = dict.fromkeys(self.of_joints, 0.0)
         self.driven = np.zeros(len(system.joints))
 
 
@@ -158,13 +158,6 @@ class LoadStepper(Stepper):
         worked = float(np.abs(self._worked).sum())
         self._largest = max(self._largest, abs(row["potential"]), worked)
         missing, size = abs(row["ledger_residual"]), self._largest
-        if self._stabilization and terms["friction_dissipation"] > _OPEN * size:
-            self.solution.warn(
-                "stabilized friction", time, terms["friction_dissipation"],
-                "nodes slide with friction in load steps that stabilization holds: what is lent "
-                "and given back lets them slide back, and friction comes out too small in the "
-                "first of these steps; leave stabilization out, or compare with other load steps",
-            )  # fmt: skip
         loads = sum(float(np.abs(t.external).sum()) for t in step.bodies)
         pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
         pressed += self.system.comm.allreduce(loads)
@@ -315,10 +308,9 @@ class LoadStepper(Stepper):
         stabilization: a proximal-point iteration, whose limit knows nothing of it.
         """
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
-        search, since, lowest, way, moved = True, 0.0, 0.0, 0.0, 0.0
+        search, lowest, way, moved = True, 0.0, 0.0, 0.0
         size = problem.lengths.radius + problem.lengths.director
         relaxed = _Relaxed(self.system)
-        slipped = [contact.slip for contact in kept.contacts]
         problem.stabilization.share = self._stabilization
         state = replace(kept, v=self.solution.rates)
         try:
@@ -326,13 +318,11 @@ class LoadStepper(Stepper):
                 try:
                     step = self._solve(state, dt, search)
                     reached = state_after(problem, step, time)
-                    if search:  # else slip still counts from the last search
-                        relaxed.lost["friction_dissipation"] += since
-                        slipped = [contact.slip for contact in state.contacts]
+                    # What each slipped is that of the whole load step.
                     contacts = tuple(
-                        new._replace(slip=start + new.slip - old.slip)
+                        new._replace(slip=start.slip + new.slip - old.slip)
                         for start, old, new in zip(
-                            slipped, state.contacts, reached.contacts, strict=True
+                            kept.contacts, state.contacts, reached.contacts, strict=True
                         )
                     )
                     reached = replace(reached, contacts=contacts)
@@ -355,7 +345,6 @@ class LoadStepper(Stepper):
                 if left <= 1.0:
                     return step, state, iterations, relaxed
                 terms = balance.step_terms(problem, step)
-                since = terms["friction_dissipation"]
                 for name in relaxed.of_joints:
                     relaxed.lost[name] += terms[name]
                 moved = float(problem.lengths.motion_of(step).max()) / size

@@ -169,8 +169,8 @@ def test_a_rigid_block_on_a_slope_that_is_too_steep_has_no_equilibrium():
 
 
 @pytest.mark.parametrize("stabilization", [None, 0.1])
-def test_friction_under_stabilization_is_told(stabilization):
-    """A pad that a floor slides under drags by Coulomb's bound unless stabilization holds it."""
+def test_what_slides_under_stabilization_drags_by_coulombs_bound(stabilization):
+    """What nodes slid in the first relaxation of a load step, they have slid in all of them."""
     top = nts.Dirichlet(lambda x: x[2] > 0.5 - 1e-9, value=lambda t: (0, 0, -0.01 * min(t, 1.0)))
     mesh = box((0, 0, 0), (1, 1, 0.5), (2, 2, 2))
     pad = nts.Continuum(mesh, nts.NeoHookean(young=1e7, poisson=0.0), density=1e3, bcs=[top])
@@ -181,6 +181,7 @@ def test_friction_under_stabilization_is_told(stabilization):
         nts.System([pad], contacts=[pair]), load_steps=times, stabilization=stabilization
     )
     drag, _, normal = np.abs(run.contact_forces[3:, 0]).T
-    told = "stabilized friction" in run.warnings
-    assert told == (stabilization is not None)
-    assert told or drag / normal == pytest.approx(0.3, rel=1e-9)
+    assert drag / normal == pytest.approx(0.3, rel=1e-9)
+    # In the first of these steps the pad follows the floor for a part of the way.
+    lost = np.diff(run.balance["friction_dissipation"][3:])
+    assert lost == pytest.approx(0.025 * drag[1:], rel=1e-6)
