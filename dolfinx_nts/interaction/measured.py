@@ -153,7 +153,8 @@ class MeasuredPart(NamedTuple):
         residual: Rows of coordinates and of the multiplier [kg m].
         tangent: Its derivative.
         status: What may flip, shape (1, n); (0, n) without multiplier.
-        memory: The measure at t_{n+1}, and with a multiplier D, shape (n, 1) or (n, 2).
+        memory: The measure at t_{n+1}, and with a multiplier D and where the measure began, shape
+            (n, 1) or (n, 3).
         work: Of the force against the motion of the step [J], shape (n,).
     """
 
@@ -175,6 +176,7 @@ class MeasuredElements(PointElements):
         y0: Nodal vectors at t_n [m], shape (n, k, 3).
         drift: Their velocities where forces are taken without motion [m/s], shape (n, k, 3).
         near: The measure at t_n, shape (n,).
+        since: The measure where the step began, which a load step does in several solutions.
         entry: Column of the ledger for the work that it takes, and its sign; "": none.
         scale: Force per motion in the units of the step; 0 without multiplier.
     """
@@ -185,6 +187,7 @@ class MeasuredElements(PointElements):
     y0: FloatArray
     drift: FloatArray
     near: FloatArray
+    since: FloatArray
     entry: tuple[str, float]
     scale: float = 0.0
 
@@ -238,14 +241,14 @@ class MeasuredElements(PointElements):
             length, unit = measure.length, self.force_scale
             force = own["constraints"][:, 0]
             pull, slope = unit / factor * force, np.zeros_like(gradient.mean)
-            row = self.law.row(length * self.near, length * at_end, force, unit / factor)
+            row = self.law.row(length * self.since, length * at_end, force, unit / factor)
             ends = measure.kind.gradient(end, end, at_end, at_end).end.reshape(end.shape)
             to_end = np.einsum("va,nvi->nai", measure.weights, ends).reshape(n, size)
             residual[:, size] = self.scale * row.value
             tangent[:, :size, size] = unit * along.reshape(n, size)
             tangent[:, size, :size] = unit * row.by_end[:, None] * to_end
             tangent[:, size, size] = self.scale * row.by_force
-            status, memory = row.status[None], np.column_stack([at_end, pull])
+            status, memory = row.status[None], np.column_stack([at_end, pull, self.since])
         residual[:, :size] = factor * (pull[:, None, None] * along).reshape(n, size)
         bend = share * pull[:, None, None] * gradient.change
         inner = (bend + gradient.mean[:, :, None] * slope[:, None]).reshape(n, *a.shape[1:] * 2)
@@ -254,6 +257,8 @@ class MeasuredElements(PointElements):
             "va,nviwj,wb->naibj", weights, inner, weights, optimize=True
         ).reshape(n, size, size)
         work = pull * np.einsum("nai,nai->n", along, du)
+        if width > size and not self.step.integrator.inertia:
+            work = pull * (at_end - self.since)
         return MeasuredPart(residual, tangent, status, memory, work)
 
     def largest(self, part: MeasuredPart) -> list[float]:
@@ -298,13 +303,15 @@ class Measured(EveryStep):
         near = measure.kind.value(measure.vectors(y0), history[:, 0])
         drift = [step.moments[b].drift for b in of]
         velocity = [none if v is None else v for v, none in zip(drift, self._still, strict=True)]
-        scale = 0.0
+        scale, since = 0.0, near
         if holds(joint.law):
+            since = near if step.dt else history[:, 2]
             scale = min(step.mean_scale(side.body) for side in measure.sides)
             self._force = history[:, 1]
         return MeasuredElements(
             name=joint.name, sides=measure.sides, measure=measure, law=joint.law, step=step, y0=y0,
-            drift=measure.nodal(velocity), near=near, entry=joint.entry, scale=scale,
+            drift=measure.nodal(velocity), near=near, since=since, entry=joint.entry,
+            scale=scale,
         )  # fmt: skip
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:

@@ -87,7 +87,7 @@ class Between(Joint):
 
     def start(self) -> FloatArray:
         """The turns of an angle begin with none, multipliers with zero."""
-        return np.zeros((self._here, 1 + holds(self.law)))
+        return np.zeros((self._here, 3 if holds(self.law) else 1))
 
     def check_step(self, step: Step) -> None:
         """Raise where its measure cannot be followed through a step. Collective."""
