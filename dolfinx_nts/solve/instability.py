@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
+from scipy import sparse
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.problem import StepProblem
@@ -39,9 +40,10 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
     """Return how many independent motions away from an equilibrium release energy. Collective.
 
     They are the negative pivots of L D L^T (Sylvester's law of inertia) of the stiffness, in which
-    closed contacts and joints are stiff springs. Nothing is known, and 0 returned, of bodies under
-    loads that have no potential, and of more than 20,000 coordinates. Nodes are not to slip with
-    friction, which has none; those that rest at Coulomb's bound count as sticking.
+    closed contacts and joints are stiff springs; directors turn, and do nothing else. Nothing is
+    known, and 0 returned, of bodies under loads that have no potential, and of more than 20,000
+    coordinates. Nodes are not to slip with friction, which has none; those that rest at Coulomb's
+    bound count as sticking.
 
     Args:
         problem: Equations of a load step.
@@ -65,10 +67,51 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
     transpose = matrix.transpose(PETSc.Mat())
     matrix.axpy(1.0, transpose)
     transpose.destroy()
-    none = _no_stiffness(problem, step, matrix, turning)
-    negative = _negative_pivots(matrix, none)
-    matrix.destroy()
+    turns = _turns(problem, step)
+    none = turns.power(2).T @ _no_stiffness(problem, step, matrix, turning)
+    motions = _distributed(turns, matrix)
+    reduced = matrix.PtAP(motions)
+    negative = _negative_pivots(reduced, none)
+    for each in (reduced, motions, matrix):
+        each.destroy()
     return negative
+
+
+def _turns(problem: StepProblem, step: Evaluation) -> Any:
+    """Motions that keep directors orthonormal, orthonormal columns of this rank's coordinates.
+
+    Springs in place of these constraints would leave less than nothing of the resistance to motions
+    along which the constraints' forces turn, such as the spin of a string.
+    """
+    parts = []
+    for k in problem.awake:
+        body = problem.system.bodies[k]
+        x = (body.reference + step.bodies[k].u1).reshape(-1, 3)
+        nodes = int(body.places.sum())
+        if not nodes or nodes == len(body.places):
+            parts.append(sparse.identity(len(body.places) * 3, format="csr"))
+            continue
+        directors = x.reshape(nodes, -1, 3)[:, 1:]
+        # A turn about an axis moves a director by their cross product.
+        moves = np.cross(np.eye(3), directors[:, :, None]).transpose(0, 1, 3, 2)
+        ways, _, _ = np.linalg.svd(moves.reshape(nodes, -1, 3), full_matrices=False)
+        free = 3 if directors.shape[1] > 1 else 2
+        blocks = np.zeros((nodes, x.size // nodes, 3 + free))
+        blocks[:, :3, :3], blocks[:, 3:, 3:] = np.eye(3), ways[:, :, :free]
+        parts.append(sparse.bsr_array((blocks, np.arange(nodes), np.arange(nodes + 1))))
+    return sparse.csr_matrix(sparse.block_diag(parts, format="csr"))
+
+
+def _distributed(local: Any, matrix: PETSc.Mat) -> PETSc.Mat:
+    """A block diagonal matrix of one block (rows, columns) on each rank. Collective."""
+    comm, (rows, columns) = matrix.comm.tompi4py(), local.shape
+    first = comm.exscan(columns) or 0
+    numbers = (a.astype(PETSc.IntType) for a in (local.indptr, local.indices + first))
+    found = PETSc.Mat().createAIJ(
+        ((rows, None), (columns, None)), csr=(*numbers, local.data), comm=comm
+    )
+    found.assemble()
+    return found
 
 
 def _sticking(problem: StepProblem, step: Evaluation) -> tuple[Any, ...]:

@@ -4,6 +4,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from lines import interval_mesh, straight
 from rotations import rotation
 from scenes import at, box, everywhere
 from shells import plate
@@ -288,3 +289,25 @@ def test_a_cantilever_strip_buckles_sideways(high):
     for part, expected in ((0.98, 0), (1.02, 1)):
         run = beam((thin, high), (0, 0, -part * prandtl), n=32)
         assert told(run) == expected, part
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("wide", [3.3e-4, 1e-3])
+def test_a_string_between_hinges_is_stable_though_it_may_spin(wide):
+    """Its spin costs nothing: springs in place of what holds its directors made it release energy.
+
+    A load F in the middle of a string under a tension T gives it a sag of F L/(4 T).
+    """
+    steel = nts.Circle(wide / 2).section(young=2e11, poisson=0.3, density=7850.0)
+    long, strain, load = 0.65, 4.09e-3, 1.0
+    bcs = [
+        nts.Dirichlet(at(0, 0.0)),
+        nts.Dirichlet(at(0, long), lambda t: (strain * long * min(t, 1.0), 0, 0)),
+    ]
+    pluck = nts.PointForce(at(0, long / 2), lambda t: (0, 0, load * max(0.0, t - 1.0)))
+    string = nts.Beam(interval_mesh(straight(20, long)), steel, bcs=bcs, forces=[pluck])
+    run = nts.equilibrium(nts.System([string]), load_steps=[0.5, 1.0, 1.5, 2.0])
+    assert run.status == "completed" and not run.warnings
+    sag = load * long / (4.0 * strain * steel.EA)
+    # It resists bending a little, too.
+    assert string.centreline()[1][10, 2] == pytest.approx(sag, rel=0.02)
