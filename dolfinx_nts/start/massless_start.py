@@ -96,7 +96,7 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
             text = (
                 f"nodes of {body.name!r} without mass start off balance by a force of "
                 f"{missing:.3g} and will move to and fro about it in every step; start from "
-                "equilibrium(...), or without displacement"
+                "equilibrium(...), which leaves no more than their weight, or without displacement"
             )
     return worst, text
 
