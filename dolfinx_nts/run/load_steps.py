@@ -12,7 +12,7 @@ from dolfinx_nts.integrators import Static
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.ledger.contact_fields import ContactLoads
-from dolfinx_nts.parallel import anywhere
+from dolfinx_nts.parallel import anywhere, global_max
 from dolfinx_nts.run.ledger_check import NOT_FINITE
 from dolfinx_nts.run.solution import Equilibrium
 from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
@@ -160,7 +160,7 @@ class LoadStepper(Stepper):
         missing, size = abs(row["ledger_residual"]), self._largest
         loads = sum(float(np.abs(t.external).sum()) for t in step.bodies)
         pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
-        pressed += self.system.comm.allreduce(loads)
+        pressed += self.system.comm.allreduce(loads) + self._rounded_force(step)
         rounding = _ROUNDING * self.problem.rounded_length * pressed
         if not missing <= _OPEN * size + rounding:
             text = (
@@ -175,6 +175,12 @@ class LoadStepper(Stepper):
         tell_couplings(self.solution, self.problem, step, state)
         self._solved = step
         self.look()
+
+    def _rounded_force(self, step: Evaluation) -> float:
+        """What bodies that only move resist by rounding, over that of lengths [N]. Collective."""
+        stiff = [body.nodal_stiffness().max(initial=0.0) for body in self.system.bodies]
+        motion = self.problem.lengths.motion_of(step)
+        return float((global_max(self.system.comm, np.array(stiff)) * motion).max())
 
     def _remedy_of_ledger(self) -> str:
         """Why the ledger is open, and what closes it."""
