@@ -12,8 +12,8 @@ from solids import distances
 import dolfinx_nts as nts
 
 COMM = MPI.COMM_WORLD
-#: Radius of the hooks' wire [mm].
-THICK = 3.0
+#: Radii of the hooks and of their wire [mm].
+RADIUS, THICK = 10.0, 3.0
 #: Faces of a tetrahedron.
 FACES = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))
 
@@ -68,17 +68,17 @@ def deepest(body, other):
 
 def hook(turned):
     """Three quarters of a ring of 20 mm on a shank along z; or upside down and turned by 90."""
-    radius, long = 10.0, 20.0
+    long = 20.0
 
     def draw(occ):
-        ring = occ.addTorus(0, 0, 0, radius, THICK, angle=1.5 * np.pi)
+        ring = occ.addTorus(0, 0, 0, RADIUS, THICK, angle=1.5 * np.pi)
         occ.rotate([(3, ring)], 0, 0, 0, 1, 0, 0, np.pi / 2)
-        out, _ = occ.fuse([(3, ring)], [(3, occ.addCylinder(radius, 0, 0, 0, 0, -long, THICK))])
+        out, _ = occ.fuse([(3, ring)], [(3, occ.addCylinder(RADIUS, 0, 0, 0, 0, -long, THICK))])
         if turned:
             occ.rotate(out, 0, 0, 0, 1, 0, 0, np.pi)
             occ.rotate(out, 0, 0, 0, 0, 0, 1, np.pi / 2)
             # 0.02 mm are left between the hooks.
-            occ.translate(out, 0, 0, 2.0 * (radius - THICK) - 0.02)
+            occ.translate(out, 0, 0, 2.0 * (RADIUS - THICK) - 0.02)
         return out
 
     return draw
@@ -114,4 +114,4 @@ def test_hooks_hold_each_other(size, friction):
     # Slave nodes are held out, but for one in a valley of the coarse master, which one of the two
     # facets holds; the master's come in by the sag of the slave's flat facets.
     assert deepest(up, low) < (0.05 if size == 3.0 else 1e-6)
-    assert deepest(low, up) < size / (8.0 * THICK)
+    assert deepest(low, up) < size / 8.0 * (1.0 / THICK + 1.0 / (RADIUS - THICK))
