@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import itertools
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +22,9 @@ from dolfinx_nts.types import FloatArray, IntArray
 
 #: One for all meshes of the same ranks in the same order, see `petsc_communicator`.
 _COMMUNICATORS: list[Any] = [MPI.COMM_SELF, MPI.COMM_WORLD]
+#: See `close_at_exit`; in an order that all ranks have.
+_OPEN: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
+_NUMBERS = itertools.count()
 
 
 def petsc_communicator(comm: MPI.Comm) -> MPI.Comm:
@@ -38,6 +44,20 @@ def free_dropped(comm: MPI.Comm) -> None:
     """Free what PETSc made on a communicator and Python has dropped; all ranks call it."""
     if comm.size > 1:
         PETSc.garbage_cleanup(comm)
+
+
+def close_at_exit(owner: Any) -> None:
+    """Close what owns preconditioners of Python's before Python ends, if nobody does."""
+    _OPEN[next(_NUMBERS)] = owner
+
+
+@atexit.register
+def _close() -> None:
+    # What is left, PETSc would free after Python is gone, and ask Python for it.
+    for _, owner in sorted(_OPEN.items()):
+        owner.close()
+    for comm in _COMMUNICATORS:
+        free_dropped(comm)
 
 
 def create_vector(space: fem.FunctionSpace) -> PETSc.Vec:

@@ -15,6 +15,7 @@ from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.ledger.guards import check_momentum
 from dolfinx_nts.ledger.impact import restored
+from dolfinx_nts.petsc_compat import close_at_exit
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme, same_run
 from dolfinx_nts.run.balance_table import Ledger
 from dolfinx_nts.run.ledger_check import LedgerCheck
@@ -132,6 +133,7 @@ class Stepper:
             system, integrator, rtol=self.newton.rtol, condense=self.newton.condense, sleep=sleep
         )
         self.solver, self._given = StepSolver(self.problem, self.newton, preset, given), given
+        close_at_exit(self)
         self.system = system
         self._overlap = OverlapWatch(system) if watch_overlap else None
         self._last_steps, self._dampers = LastSteps(), DamperWatch(self.problem)

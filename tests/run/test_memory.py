@@ -14,6 +14,7 @@ import pytest
 import ufl
 from dolfinx.mesh import CellType, create_box
 from petsc4py import PETSc
+from processes import in_fresh_python, on_ranks
 
 import dolfinx_nts as nts
 
@@ -167,3 +168,29 @@ def test_a_hundred_systems_in_one_process():
     for k in range(100):
         one_run(2e6 + k)
     assert resident() - before < 100 * 10e3
+
+
+LEFT_OPEN = """
+from mpi4py import MPI
+import dolfinx_nts as nts
+from dolfinx.mesh import CellType, create_box
+corners = [[0, 0, 0.01], [1, 1, 1]]
+mesh = create_box(MPI.COMM_WORLD, corners, [2, 2, 2], CellType.hexahedron)
+rubber = nts.NeoHookean(young=1e6, poisson=0.3)
+cube = nts.Continuum(mesh, rubber, density=1e3, velocity=(0, 0, -1.0))
+pair = nts.ContactPair(cube.surface(lambda x: x[2] < 0.01 + 1e-9), nts.Plane((0, 0, 0), (0, 0, 1)))
+stepper = nts.Stepper(nts.System([cube], contacts=[pair]), nts.EnergyMomentum())
+for _ in range(20):
+    stepper.advance(1e-3)
+assert stepper.solution.balance["active"].any()
+"""
+
+
+def test_a_stepper_that_nobody_closes_ends_with_python():
+    """PETSc would free the preconditioners that Python serves after Python has gone."""
+    in_fresh_python(LEFT_OPEN)
+
+
+@pytest.mark.slow
+def test_a_stepper_that_nobody_closes_ends_with_python_on_ranks():
+    on_ranks(2, "-c", LEFT_OPEN)
