@@ -174,12 +174,18 @@ LEFT_OPEN = """
 from mpi4py import MPI
 import dolfinx_nts as nts
 from dolfinx.mesh import CellType, create_box
-corners = [[0, 0, 0.01], [1, 1, 1]]
-mesh = create_box(MPI.COMM_WORLD, corners, [2, 2, 2], CellType.hexahedron)
+from dolfinx_nts.solve.accuracy import ACCURACY
 rubber = nts.NeoHookean(young=1e6, poisson=0.3)
-cube = nts.Continuum(mesh, rubber, density=1e3, velocity=(0, 0, -1.0))
-pair = nts.ContactPair(cube.surface(lambda x: x[2] < 0.01 + 1e-9), nts.Plane((0, 0, 0), (0, 0, 1)))
-stepper = nts.Stepper(nts.System([cube], contacts=[pair]), nts.EnergyMomentum())
+cubes = [
+    nts.Continuum(
+        create_box(MPI.COMM_WORLD, [[0, 0, z], [1, 1, z + 1]], [4, 4, 4], CellType.hexahedron),
+        rubber, density=1e3, velocity=(0, 0, way), name=name,
+    )
+    for z, way, name in ((0.0, 1.0, "lower"), (1.01, -1.0, "upper"))
+]
+faces = [cube.surface(lambda x: abs(x[2] - 1.005) < 0.006) for cube in cubes]
+system = nts.System(cubes, contacts=[nts.ContactPair(*faces)])
+stepper = nts.Stepper(system, nts.EnergyMomentum(), newton=ACCURACY["balanced"])
 for _ in range(20):
     stepper.advance(1e-3)
 assert stepper.solution.balance["active"].any()
