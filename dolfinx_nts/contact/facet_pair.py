@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -13,6 +13,7 @@ from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
 from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE, ConvexEdges, middles
 from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.facet_gap import FacetGap
+from dolfinx_nts.contact.facing import Faces, Facing
 from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.pair import (
     MARGIN,
@@ -38,14 +39,8 @@ _WEDGE = 0.5
 #: A foot is followed from piece to piece of the surface over a facet so often; then the last will
 #: do, as neighbours go on alike beyond their border.
 _MOST_PATCHES = 3
-#: Least cosine between one normal and the opposite of the other of what faces each other; sides of
-#: a right angle do not, also where bodies that are pressed have turned them by 17 degrees.
-_FACING = 0.3
 #: Weights of a foot that are rounding.
 _STILL = 1e-9
-
-#: Numbers of slaves and of facets -> which of these pairs face each other.
-Faces = Callable[[IntArray, IntArray], BoolArray]
 
 
 class FacetPair(ContactPair, master=Surface):
@@ -211,44 +206,15 @@ class FacetPair(ContactPair, master=Surface):
         """Which facets face which of this rank's slaves, or None if all that is near does.
 
         Only over sharp edges a node that no facet of its own brings against a side of the master
-        may be near it, as at rims that lie on each other.
+        may be near it, as at rims that lie on each other. Collective.
         """
         if not len(self.slave.facets) or not self._edges.sharp.any():
             return None
-        of, first, count = self._own_facets
-        own, other = middles(slaves[self.slave.facets])[1], middles(corners)[1]
-        # The tip of a needle has facets that face nothing ahead of it, but their mean does.
-        mean = np.zeros_like(slaves)
-        np.add.at(mean, self.slave.facets, own[:, None])
-        mean = mean[self.slave.share]
-        mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
-
-        def faces(node: IntArray, facet: IntArray) -> BoolArray:
-            number = count[node]
-            pair = np.repeat(np.arange(len(node)), number)
-            start = np.cumsum(number) - number
-            mine = of[first[node][pair] + np.arange(len(pair)) - start[pair]]
-            found = (number == 0) | opposite(mean[node], other[facet])
-            found[pair[opposite(own[mine], other[facet[pair]])]] = True
-            return found
-
-        return faces
+        return self._faces.of(slaves, corners)
 
     @cached_property
-    def _own_facets(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Facets of the rank's slaves in a row, where those of each begin, and how many they are.
-
-        None of nodes where the declared surface ends, as what is beyond there may face anything.
-        """
-        at = self.slave.facets
-        facet, edge = np.nonzero(self.slave.boundary_edges)
-        ends = [at[facet, edge], at[facet, (edge + 1) % at.shape[1]]]
-        order = np.argsort(at.ravel(), kind="stable")
-        points = at.ravel()[order]
-        first = np.searchsorted(points, self.slave.share)
-        last = np.searchsorted(points, self.slave.share, side="right")
-        count = np.where(np.isin(self.slave.share, np.concatenate(ends)), 0, last - first)
-        return order // at.shape[1], first, count
+    def _faces(self) -> Facing:
+        return Facing(self.slave)
 
     def _beside(self, node: IntArray, facet: IntArray) -> BoolArray:
         """Which sharp edges of facets end the surface for nodes, shape (n, nc).
@@ -699,12 +665,6 @@ class FacetPair(ContactPair, master=Surface):
         moves = (np.abs(foot) * free).max(axis=1)
         movable[held] = moves > np.maximum(_STILL, depth[held])
         return movable
-
-
-def opposite(one: FloatArray, two: FloatArray) -> BoolArray:
-    """Return which of unit normals (n, 3) face each other, shape (n,)."""
-    facing: BoolArray = np.einsum("ni,ni->n", one, two) < -_FACING
-    return facing
 
 
 def _replace(found: Candidates, other: Candidates) -> Candidates:
