@@ -20,7 +20,6 @@ class ContactHistory(NamedTuple):
         tangential: Friction force [N], shape (n, 3).
         stick: Whether it sticks.
         slip: Distance that it has slipped since the start [m].
-        slid: How far it has slipped in the last step [m], shape (n, 3).
         followed: Whether it is not known to have passed by the surface's edge.
         overlap: How deep it may lie in the master at pseudo time 0, >= 0 [m]; at 1, not at all.
     """
@@ -31,7 +30,6 @@ class ContactHistory(NamedTuple):
     tangential: FloatArray
     stick: BoolArray
     slip: FloatArray
-    slid: FloatArray
     followed: BoolArray
     overlap: FloatArray
 
@@ -40,8 +38,8 @@ class ContactHistory(NamedTuple):
         """Return the history of n nodes that have not touched yet."""
         off, none = np.zeros(n, dtype=bool), np.zeros(n)
         return cls(
-            np.full(n, -1), none, np.full(n, np.inf), np.zeros((n, 3)), off, none.copy(),
-            np.zeros((n, 3)), ~off, none.copy(),
+            np.full(n, -1), none, np.full(n, np.inf), np.zeros((n, 3)), off, none.copy(), ~off,
+            none.copy(),
         )
 
 

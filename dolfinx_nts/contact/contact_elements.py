@@ -16,7 +16,7 @@ from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.interaction.combination import Combination, of_multipliers
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.elements import Step, over
-from dolfinx_nts.kernels import compiled_law
+from dolfinx_nts.kernels import compiled_law, nts_element
 from dolfinx_nts.kernels.vectors import cross
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.state import ContactHistory
@@ -206,11 +206,21 @@ class ContactElements(Batch):
             out[:, -2:] = -np.einsum("nai,ni->na", self.tangents, tangential)
         return out
 
-    def components(self, slip: FloatArray) -> FloatArray:
-        """Components as of `Contribution.slip` of slips in space [m], (n, 3) -> (n, 2)."""
+    def slid_since(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
+        """Slip from earlier positions to those at t_n, as of `Contribution.slip`, shape (n, 2).
+
+        Args:
+            positions: As of `ContactPair.positions`.
+            path: Displacement of a master that is no body then [m], shape (3,).
+        """
         metric = np.matmul(self.tangents, self.tangents.transpose(0, 2, 1))
-        along = np.einsum("nai,ni->na", self.tangents, slip)
-        found: FloatArray = np.linalg.solve(metric, along[:, :, None])[:, :, 0]
+        along = np.matmul(self.tangents, self._way_from(positions, path)[:, :, None])
+        return nts_element.solve(metric, along)[:, :, 0]
+
+    def _way_from(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
+        """How slaves have moved against their feet of t_n since then [m], shape (n, 3)."""
+        way = self.measure.start - self.pair.points(positions, self.candidates) + path
+        found: FloatArray = way[:, 0] - np.einsum("nk,nki->ni", self.measure.foot, way[:, 1:])
         return found
 
     def rows(self, k: Contribution, name: str) -> FloatArray:
@@ -378,9 +388,6 @@ class ContactElements(Batch):
         new.tangential[node] = self.law.tangential_at_end(part, old.tangential[node], factor)
         new.slip[:] = old.slip
         new.slip[node] += part.distance
-        if self.law.num_tangential:
-            on = part.active[:, None]
-            new.slid[node] = on * np.einsum("na,nai->ni", part.slip, self.tangents)
         return new._replace(overlap=old.overlap)
 
     def describe(self, part: Contribution, flips: IntArray) -> tuple[float, str]:

@@ -101,6 +101,8 @@ class ContactSearch:
         touching = slice(len(self.elements))
         self._carried = history if again is None else self.history(again.parts[touching])
         self._step, self._old, self._placed = step, history, {}
+        if step.dt:
+            self._begun = step.state
         self._repeats = 0 if again is None else self._repeats
         time = step.state.time
         self._paths = [pair.path(time, time + step.dt) for pair in self._pairs]
@@ -200,7 +202,10 @@ class ContactSearch:
         )  # fmt: skip
         if pair.friction and not step.dt:
             # A load step is relaxed in several solutions, and friction knows of all of them.
-            law = replace(law, slid=elements.components(self._old[k].slid[found.node]))
+            begun = self._begun
+            since = pair.positions([begun.u[b] for b in bodies])
+            slid = elements.slid_since(since, pair.path(begun.time, begun.time)[0])
+            law = replace(law, slid=slid)
         massless = self._massless[k][found.node]
         if step.integrator.inertia and massless.any():
             old, before = self._old[k], np.zeros((len(massless), 3))
@@ -298,6 +303,19 @@ class ContactSearch:
             end = pair.positions([e.bodies[b].u1 for b in of])
             stale |= c.is_stale(end, part, self._repeats)
         return stale
+
+    def strayed(self, e: Evaluation) -> float:
+        """How far from the master's real surface carrying nodes ended, in facet sizes. Collective.
+
+        They left their facets in a load step, over edges of a curved surface.
+        """
+        far = [0.0]
+        for k, c in enumerate(self.elements):
+            on = e.parts[k].active
+            end = self._pairs[k].positions([e.bodies[b].u1 for b in self.bodies[k]])
+            due = np.broadcast_to(c.offset - c.law.overlap, on.shape)[on]
+            far.append(self._pairs[k].strayed(end, c.candidates.select(on), due))
+        return float(global_max(self._comm, np.array(far)).max())
 
     def _passed(self, k: int, e: Evaluation, part: Contribution, reach: float) -> bool:
         """Return whether nodes have come through facets unseen, which are noted. Collective."""

@@ -39,6 +39,8 @@ _WEDGE = 0.5
 #: A foot is followed from piece to piece of the surface over a facet so often; then the last will
 #: do, as neighbours go on alike beyond their border.
 _MOST_PATCHES = 3
+#: Patches of a smooth surface part by less than this part of the way beyond their borders.
+_APART = 0.1
 #: Weights of a foot that are rounding.
 _STILL = 1e-9
 
@@ -468,6 +470,22 @@ class FacetPair(ContactPair, master=Surface):
             beyond = self._held_beyond(x + paths[0], positions[1], paths[1], held, by_edges)
             hit[by_edges] = np.where(beyond >= 0, beyond, hit[by_edges])
         return hit
+
+    def strayed(
+        self, positions: Sequence[FloatArray], found: Candidates, due: FloatArray
+    ) -> float:
+        """Do as `ContactPair`, over edges of curved surfaces."""
+        x, master = positions[0][self.slave.share][found.node], positions[1]
+        _, _, xi, converged = self._projected(x, master, found.facet, found.xi)
+        excess = facets.edge_excess(xi, self.master.facets.shape[1])
+        joined = self._edges.joined[found.facet, excess.argmax(axis=1)]
+        out = np.flatnonzero(converged & (excess.max(axis=1) > ASIDE) & (joined >= 0))
+        if self.master.weights is not None:
+            return float((_APART * excess[out].max(axis=1)).max(initial=0.0))
+        other, corners = joined[out] // excess.shape[1], master[self.master.facets]
+        foot, _ = compiled.closest_point(x[out], corners[other])
+        off = self._gap_at(other, foot, x[out], master) - due[out]
+        return float((np.abs(off) / facets.size(corners[other])).max(initial=0.0))
 
     def _held_beyond(
         self,

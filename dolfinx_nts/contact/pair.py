@@ -375,6 +375,18 @@ class ContactPair:
         """
         raise NotImplementedError
 
+    def strayed(
+        self, positions: Sequence[FloatArray], found: Candidates, due: FloatArray
+    ) -> float:
+        """How far from the real surface those end that have left their facets, in facet sizes.
+
+        Args:
+            positions: Of all points at the end of a load step.
+            found: Candidates that carry.
+            due: Gaps that they are to have [m].
+        """
+        return 0.0
+
     def missed(
         self,
         positions: Sequence[FloatArray],

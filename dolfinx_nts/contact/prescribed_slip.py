@@ -83,8 +83,8 @@ class PrescribedSlip(Batch):
         motion = x - self.start
         motion = motion[:, 0] - np.einsum("nk,nki->ni", self.foot, motion[:, 1:])
         slip = np.einsum("nij,nj->ni", self._blocked, motion * self._prescribed)
-        if np.ndim(slid):
-            slip += np.einsum("nij,nai,na->nj", self._blocked, self.tangents, slid)
+        before = np.broadcast_to(slid, self.tangents.shape[:2])
+        slip += np.einsum("nij,nai,na->nj", self._blocked, self.tangents, before)
         held: FloatArray = self.unmoved.copy()
         held[np.abs(slip).max(axis=1) > still] = 0.0
         return held

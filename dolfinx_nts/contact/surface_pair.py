@@ -252,6 +252,10 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
             of_master = control[points.other]
         return beside(own, of_master)
 
+    def strayed(self, positions: Sequence[FloatArray], found: Any, due: FloatArray) -> float:
+        """None: where pieces are cut is looked at elsewhere, see `SurfaceElements.is_stale`."""
+        return 0.0
+
     def missed(
         self,
         positions: Sequence[FloatArray],

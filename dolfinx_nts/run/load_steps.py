@@ -48,6 +48,10 @@ _FAR = 0.3
 #: Contacts are sought anew once bodies have moved by this part of the scene, or while more than
 #: `_NEARLY_AT_REST` is left.
 _NEAR = 0.05
+#: Distance from the master's surface, in facet sizes, that carrying nodes may have which have left
+#: their facets, by how often a load step at rest is sought again; in the valley between two facets
+#: a node comes and goes.
+_STRAYS = 1e-3, 1e-2, 1e-1
 #: Part of the stored energy that the work of load steps may miss without a word.
 _OPEN = 0.1
 #: Rounding of work over that of forces times the size of the scene.
@@ -316,7 +320,7 @@ class LoadStepper(Stepper):
         problem, kept, iterations, last = self.problem, self.state, 0, np.inf
         search, lowest, way, moved = True, 0.0, 0.0, 0.0
         size = problem.lengths.radius + problem.lengths.director
-        relaxed = _Relaxed(self.system)
+        relaxed, strays = _Relaxed(self.system), iter(_STRAYS)
         problem.stabilization.share = self._stabilization
         state = replace(kept, v=self.solution.rates)
         try:
@@ -349,7 +353,12 @@ class LoadStepper(Stepper):
                 state, dt = reached, 0.0
                 left, restless = unrest(problem, step)
                 if left <= 1.0:
-                    return step, state, iterations, relaxed
+                    allowed = next(strays, np.inf)
+                    if problem.couplings.contacts.strayed(step) <= allowed:
+                        return step, state, iterations, relaxed
+                    # On the facets that its nodes have come to, the rest is another one.
+                    search, last = True, np.inf
+                    continue
                 terms = balance.step_terms(problem, step)
                 for name in relaxed.of_joints:
                     relaxed.lost[name] += terms[name]

@@ -84,7 +84,7 @@ def _turns(problem: StepProblem, step: Evaluation) -> Any:
     along which the constraints' forces turn, such as the spin of a string.
     """
     parts = []
-    for k in problem.awake:
+    for k in sorted(problem.awake, key=lambda k: problem.of_body(k).start):
         body = problem.system.bodies[k]
         x = (body.reference + step.bodies[k].u1).reshape(-1, 3)
         nodes = int(body.places.sum())

@@ -7,7 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
-from scenes import YOUNG, at, box, quarter_cube, rubber_stress
+from scenes import YOUNG, at, box, everywhere, quarter_cube, rubber_stress
 
 import dolfinx_nts as nts
 
@@ -185,3 +185,55 @@ def test_what_slides_under_stabilization_drags_by_coulombs_bound(stabilization):
     # In the first of these steps the pad follows the floor for a part of the way.
     lost = np.diff(run.balance["friction_dissipation"][3:])
     assert lost == pytest.approx(0.025 * drag[1:], rel=1e-6)
+
+
+def pad_on(floors, friction, steps, stabilization=None):
+    """Drag and normal force of a pad at the end of load steps over floors that slide under it."""
+    top = nts.Dirichlet(at(2, 0.5), value=lambda t: (0, 0, -0.01 * min(t, 1.0)))
+    rubber = nts.NeoHookean(young=1e7, poisson=0.0)
+    mesh = box((0, 0, 0), (1, 1, 0.5), (6, 3, 2))
+    pad = nts.Continuum(mesh, rubber, density=1e3, bcs=[top], name="pad")
+    moved = nts.Dirichlet(everywhere, value=lambda t: (0.8 * max(0.0, t - 1.0), 0, 0))
+    bodies = [
+        nts.Continuum(mesh, rubber, density=1e3, bcs=[moved], name=f"floor {k}")
+        for k, mesh in enumerate(floors)
+    ]
+    pairs = [
+        nts.ContactPair(
+            pad.surface(at(2, 0.0)), body.surface(lambda x: x[2] > -0.05), friction=friction,
+            interference="resolve",
+        )
+        for body in bodies
+    ]  # fmt: skip
+    system = nts.System([pad, *bodies], contacts=pairs)
+    times = [0.5, 1.0, *np.linspace(1.0, 2.0, steps + 1)[1:]]
+    run = nts.equilibrium(system, load_steps=times, stabilization=stabilization)
+    assert run.status == "completed"
+    force = np.abs(run.contact_forces.sum(axis=1))
+    return force[2 :: steps // 4][1:, [0, 2]].T
+
+
+@pytest.mark.parametrize("stabilization", [None, 0.1])
+def test_nodes_that_slide_over_waves_in_few_load_steps(stabilization):
+    """An equilibrium is that of the facets where its nodes are, however far they came in a step.
+
+    Nodes kept the facets where the step began, and four load steps dragged with 57 kN for 37.
+    """
+    floor = box((-1.03, -0.3, -0.3), (1.97, 1.3, 0), (24, 4, 1))
+    x = floor.geometry.x
+    waves = 0.004 * (1.0 + np.cos(4.0 * np.pi * x[:, 0]))
+    x[:, 2] -= np.where(x[:, 2] > -1e-9, waves, 0.0)
+    few = pad_on([floor], 0.3, 4, stabilization)
+    assert few == pytest.approx(pad_on([floor], 0.3, 16), rel=1e-6)
+
+
+@pytest.mark.parametrize("stabilization", [None, 1.0])
+def test_a_pad_slides_over_the_seam_of_two_floors(stabilization):
+    """What nodes have slid counts for the contact that they come to, too."""
+    ends = (-1.03, 0.47, 1.97)
+    floors = [
+        box((a, -0.3, -0.5), (b, 1.3, 0), (4, 4, 1))
+        for a, b in zip(ends[:-1], ends[1:], strict=True)
+    ]
+    drag, normal = pad_on(floors, 0.3, 4, stabilization)
+    assert drag / normal == pytest.approx(0.3, rel=1e-6)

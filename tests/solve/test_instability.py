@@ -311,3 +311,25 @@ def test_a_string_between_hinges_is_stable_though_it_may_spin(wide):
     sag = load * long / (4.0 * strain * steel.EA)
     # It resists bending a little, too.
     assert string.centreline()[1][10, 2] == pytest.approx(sag, rel=0.02)
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.parametrize(("factor", "motions"), [(0.98, 0), (1.02, 2)])
+def test_a_column_beside_rigid_bodies_in_any_order(place, factor, motions):
+    """Rigid bodies under their weight alone stand first in the matrix, wherever they are listed."""
+    section = nts.Rectangle(0.01, 0.01).section(young=2.1e11, poisson=0.3, density=7800.0)
+    load = factor * np.pi**2 / 4.0 * section.EI[0]
+    column = nts.Beam(
+        interval_mesh(straight(16)), section, bcs=[nts.Clamp(at(0, 0.0))], name="column",
+        forces=[nts.PointForce(at(0, 1.0), (-load, 0, 0))],
+    )  # fmt: skip
+    bodies, joints = [], []
+    for k in range(2):
+        bob = nts.RigidBody.from_inertia(1.0, (0.1, 0.1, 0.1), (-1, 2 + k, 0), name=f"bob {k}")
+        bodies.append(bob)
+        joints.append(nts.Fixed(bob, None, point=(0, 2 + k, 0), name=f"joint {k}"))
+    bodies.insert(place, column)
+    run = nts.equilibrium(nts.System(bodies, joints=joints, gravity=(-9.81, 0, 0)), load_steps=4)
+    told = run.warnings.get("unstable equilibrium")
+    assert (told.worst if told else 0) == motions
