@@ -419,7 +419,7 @@ def _refuse_deep(pair: ContactPair, depth: FloatArray, limit: float, remedy: str
 
 def cut_off(pair: ContactPair, depth: FloatArray) -> str:
     """What to say of slaves (points,) no deeper than flat facets cut off a curve, or nothing."""
-    if not 0.0 < depth.max(initial=0.0) <= _SAGS * pair.sag:
+    if not 0.0 < depth.max(initial=0.0) <= _SAGS * pair.sag(depth > 0.0):
         return ""
     name = pair.master.body.name
     return (

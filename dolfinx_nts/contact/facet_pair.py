@@ -73,17 +73,19 @@ class FacetPair(ContactPair, master=Surface):
         contact = EdgeContact(self, name)
         return (contact,) if all(len(edges.ends) for edges in contact.edges) else ()
 
-    @cached_property
-    def sag(self) -> float:
+    def sag(self, points: BoolArray) -> float:
         """As of `ContactPair`: s^2/(8 r) of facets that turn by s/r from one to the next."""
-        if self.master.weights is not None or not len(self.master.facets):
+        at = self.master.facets
+        if self.master.weights is not None or not len(at) or not points.any():
             return 0.0
-        corners = self.master.reference[self.master.facets]
+        corners = self.master.reference[at]
         (place, normal), (one, two, _) = middles(corners), self._edges.smooth
         cosine = np.einsum("ni,ni->n", normal[one], normal[two])
         way = np.linalg.norm(place[one] - place[two], axis=1) / facets.size(corners)[one]
-        sags: FloatArray = way * np.arccos(np.clip(cosine, -1.0, 1.0)) / 8.0
-        return float(sags.max(initial=0.0))
+        sags = np.zeros(len(at))
+        np.maximum.at(sags, one, way * np.arccos(np.clip(cosine, -1.0, 1.0)) / 8.0)
+        found = search.closest_facets(self.slave.reference[points], corners, reach=np.inf)
+        return float(sags[found.facet].max())
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:

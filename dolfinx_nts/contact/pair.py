@@ -235,9 +235,12 @@ class ContactPair:
         """What comes with it beside its own elements, as joints of a System with this name."""
         return ()
 
-    @property
-    def sag(self) -> float:
-        """How deep the master's flat facets cut into a curved surface, in facet sizes."""
+    def sag(self, points: BoolArray) -> float:
+        """How deep flat facets of the master cut into a curved surface, in facet sizes.
+
+        Args:
+            points: Which of the slave's lie over these, shape (p,).
+        """
         return 0.0
 
     @property

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.run.arguments import same_run
 from dolfinx_nts.run.load_steps import LoadStepper
 from dolfinx_nts.run.run_file import Saved
@@ -26,10 +27,19 @@ from dolfinx_nts.validation import (
     require_positive,
 )
 
-_REMEDY = (
-    "Try more load steps, or inspect the nodes named here; a body that nothing but contact holds "
-    "must touch at the start, or needs stabilization=0.1"
-)
+
+def _remedy(system: System) -> str:
+    """What to do if a load step is not solved. Collective."""
+    text = "Try more load steps, or inspect the nodes named here"
+    joined = {id(body) for joint in system.joints for body in joint.bodies}
+    for body in system.bodies:
+        held = anywhere(system.comm, bool(body.fixed.any()))
+        if not held and id(body) not in joined:
+            return (
+                f"{text}; {body.name!r}, which nothing but contact holds, must touch at the start, "
+                "or needs stabilization=0.1"
+            )
+    return text
 
 
 def _pseudo_times(load_steps: Any, begin: float) -> list[float]:
@@ -171,5 +181,5 @@ def equilibrium(
     stepper.solution.settings |= {"load_steps": times, "stabilization": stabilization}
     lengths = np.diff(times, prepend=begin).tolist()
     steps = list(zip(lengths, times, strict=True))
-    run(stepper, steps, output, progress=progress, remedy=_REMEDY)
+    run(stepper, steps, output, progress=progress, remedy=_remedy(system))
     return stepper.solution

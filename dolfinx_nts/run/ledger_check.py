@@ -181,12 +181,14 @@ class LedgerCheck:
             # What a coefficient of restitution takes is asked for.
             asked, lost = row["impact_restored"] != 0.0, -total - massless
             if not asked and lost > _LOSS * self._largest + self._rounding:
+                nodes = bool(self._solution.system.contacts)
+                who = f"{'nodes' if nodes else 'joints at their limits'} that touch or leave"
                 self._solution.warn(
                     "energy lost to contact", row["time"], lost,
-                    f"nodes that touch or leave in mid step have taken an energy of {lost:.3g}, "
+                    f"{who} in mid step have taken an energy of {lost:.3g}, "
                     f"{self._part(lost):.2g} of the largest energy: how bodies rebound may "
                     "depend on it; compare with a smaller dt (with Adapt a smaller tolerance) "
-                    "and a finer mesh",
+                    "and, where bodies are meshes, a finer one",
                 )  # fmt: skip
             return
         self._solution.warn("energy from behind facets", row["time"], gain, text, grave=True)

@@ -277,13 +277,14 @@ class LoadStepper(Stepper):
             self.system.contacts, self.system.penetration(self.state), strict=True
         ):
             deep, text = float(depth.max(initial=0.0)), cut_off(pair, depth)
-            if not text and pair.sag > _SAG_TOLD * deep > 0.0:
-                part = 100.0 * pair.sag / deep
+            sag = pair.sag(depth > 0.0)
+            if not text and sag > _SAG_TOLD * deep > 0.0:
+                part = 100.0 * sag / deep
                 text = (
                     f"flat facets cut {part:.2g} % of that off a curve, by which the pressure may "
                     "be wrong: take a finer mesh, or smoothing=True for the master"
                 )
-            if text and deep > _SAG_LEAST * pair.sag:
+            if text and deep > _SAG_LEAST * sag:
                 self.solution.warn(
                     "flat facets", self.state.time, deep,
                     f"contact {pair.name!r}: nodes start inside by up to {deep:.3g} of a facet; "

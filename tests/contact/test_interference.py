@@ -195,6 +195,24 @@ def test_a_fit_without_clearance_is_pressed_by_the_sag_of_its_chords():
     assert 0.0 <= pressed(0.0, (24, 16), how="refuse", smoothing=True) < found / 8.0
 
 
+def test_an_overlap_on_a_flat_end_is_none_of_the_mantle():
+    """The hub's whole boundary is curved, but not where a block overlaps its end."""
+    hub = ring(FIT, HUB, (4, 6), "hub", 1.0)
+    low = 0.98 * THICKNESS
+    mesh = create_box(COMM, [(1.5, 1.5, low), (1.9, 1.9, 0.5)], [2] * 3, CellType.hexahedron)
+    held = nts.Dirichlet(lambda x: x[2] > 0.5 - 1e-9)
+    elastic = nts.StVenantKirchhoff(young=YOUNG, poisson=0.0)
+    block = nts.Continuum(mesh, elastic, density=1e3, bcs=[held], name="block")
+    pair = nts.ContactPair(
+        block.surface(lambda x: x[2] < low + 1e-9), hub.surface(lambda x: x[0] > -1.0),
+        interference="resolve",
+    )  # fmt: skip
+    run = nts.equilibrium(nts.System([hub, block], contacts=[pair]))
+    assert run.status == "completed" and not run.warnings
+    strain = (THICKNESS - low) / (0.5 - low)
+    assert run.contact_forces[-1, 0, 2] == pytest.approx(0.16 * YOUNG * strain, rel=0.02)
+
+
 # ---- a pin whose nodes are not those of the hole
 def widened(unit, push, **options):
     """A pin of the hole's radius that is widened from within by `push` of its bore, and its table.
