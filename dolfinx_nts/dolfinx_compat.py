@@ -107,8 +107,7 @@ def model_to_mesh(model: Any, comm: MPI.Comm, rank: int = 0) -> tuple[Any, Any, 
 
 def _table(a: Any, layout: Any) -> IntArray:
     """Rows of a list, which does not know how long they are where there is none."""
-    table: IntArray = np.asarray(a.array).reshape(a.num_nodes, layout.num_dofs)
-    return table
+    return np.asarray(a.array).reshape(a.num_nodes, layout.num_dofs)
 
 
 def geometry_dofmap(msh: Mesh) -> IntArray:
@@ -116,8 +115,7 @@ def geometry_dofmap(msh: Mesh) -> IntArray:
     g = msh.geometry
     if OLD:
         return _table(g.dofmap, g.cmap.create_dof_layout())
-    nodes: IntArray = g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap
-    return nodes
+    return g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap
 
 
 def coordinate_map(msh: Mesh) -> Any:
@@ -130,8 +128,7 @@ def cell_dofs(space: fem.FunctionSpace) -> IntArray:
     """Blocked dofs of the cells, shape (cells, dofs)."""
     if OLD:
         return _table(space.dofmap.list, space.dofmap.dof_layout)
-    dofs: IntArray = space.dofmap.list
-    return dofs
+    return space.dofmap.list
 
 
 def entities_to_geometry(msh: Mesh, dim: int, entities: npt.ArrayLike) -> IntArray:
@@ -336,8 +333,7 @@ def with_ghosts(space: fem.FunctionSpace, chosen: IntArray) -> npt.NDArray[np.bo
     mark = fem.Function(space)
     mark.x.array[chosen] = 1.0
     mark.x.scatter_forward()
-    marked: npt.NDArray[np.bool_] = mark.x.array.reshape(-1, 3) > 0.5
-    return marked
+    return mark.x.array.reshape(-1, 3) > 0.5
 
 
 def subspace_component_bc(space: fem.FunctionSpace, component: int, blocked_dofs: IntArray) -> Any:
@@ -403,8 +399,7 @@ def compile_forms(forms: Iterable[Any]) -> Iterator[tuple[Any, Path]]:
 
 def constants(form: Any) -> FloatArray:
     """Values of a compiled form's Constants, shape (n,)."""
-    values: FloatArray = cpp.fem.pack_constants(getattr(form, "_cpp_object", form))
-    return values
+    return cpp.fem.pack_constants(getattr(form, "_cpp_object", form))
 
 
 def functions(form: Any, compiled: Any) -> list[Any]:

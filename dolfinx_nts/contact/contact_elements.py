@@ -105,8 +105,7 @@ class ContactElements(Batch):
     @property
     def immovable(self) -> BoolArray:
         """Whether all coordinates of the pairs' masters are prescribed, shape (n,)."""
-        fixed: BoolArray = _fixed(self.attachment)[:, self._own :].all(axis=(1, 2))
-        return fixed
+        return _fixed(self.attachment)[:, self._own :].all(axis=(1, 2))
 
     @property
     def sag(self) -> FloatArray | float:
@@ -141,13 +140,11 @@ class ContactElements(Batch):
     def _measured(self, y: FloatArray) -> FloatArray:
         """The measure's points (n, points, 3) from nodes (n, k, 3) [m]."""
         weights = self.attachment.weights
-        x: FloatArray = (y if weights is None else np.matmul(weights, y)) - self.attachment.path[1]
-        return x
+        return (y if weights is None else np.matmul(weights, y)) - self.attachment.path[1]
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gaps beyond the overlap that is left [m], shape (n,), of nodes as of `evaluate`."""
-        gap: FloatArray = self.measure.gap(self._measured(x)) - self.offset + self.law.overlap
-        return gap
+        return self.measure.gap(self._measured(x)) - self.offset + self.law.overlap
 
     def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
         """Gaps [m], shape (n,), by positions of all points.
@@ -190,8 +187,7 @@ class ContactElements(Batch):
     @cached_property
     def _held(self) -> BoolArray:
         """Which slaves move as prescribed, shape (n,)."""
-        held: BoolArray = _fixed(self.attachment)[:, : self._own].all(axis=(1, 2))
-        return held
+        return _fixed(self.attachment)[:, : self._own].all(axis=(1, 2))
 
     def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
         """Multipliers of given contact forces on the slaves [N], shape (n, constraints).
@@ -306,8 +302,7 @@ class ContactElements(Batch):
         """
         start = self.measure.start[:, 0] + self.attachment.path[0]
         x = self.pair.origin + start + theta * (part.place - start)
-        total: FloatArray = resultant(x, part.force)[1]
-        return total
+        return resultant(x, part.force)[1]
 
     def nodal_forces(self, part: Contribution) -> list[FloatArray]:
         """Forces on the points of the slave and of the master's surface, if it has a body [kg m].
@@ -355,8 +350,7 @@ class ContactElements(Batch):
 
     def gains(self, part: Contribution, factor: float) -> FloatArray:
         """Energy that each pair brings in by starting behind its facet [J], shape (n,)."""
-        gain: FloatArray = part.multiplier[:, 0] * self.candidates.gap / factor
-        return gain
+        return part.multiplier[:, 0] * self.candidates.gap / factor
 
     def history(self, part: Contribution, factor: float, old: ContactHistory) -> ContactHistory:
         """Return what the contact remembers of an accepted step."""
@@ -412,8 +406,7 @@ def _moves(attachment: Attachment, foot: FloatArray) -> FloatArray:
     weights = np.concatenate([np.ones((len(foot), 1)), -foot], axis=1)
     if attachment.shares is None:
         return weights
-    moves: FloatArray = np.einsum("nk,nkp->np", weights, attachment.shares)
-    return moves
+    return np.einsum("nk,nkp->np", weights, attachment.shares)
 
 
 def elements_of(

@@ -248,8 +248,7 @@ class ContactSearch:
         # What goes to and fro at the limit would change the layout in every step.
         # All nodes that rest, or none: rounding of their gaps must not decide which carry forces.
         near = reach + c.law.rounding if c.pair.redundant else reach
-        awake: BoolArray = had[node] | (c.candidates.gap < near) | (force > 0.0)
-        return awake
+        return had[node] | (c.candidates.gap < near) | (force > 0.0)
 
     # ---- a solution
     def wake(self, e: Evaluation, parts: Sequence[Contribution]) -> bool:
@@ -400,8 +399,7 @@ class ContactSearch:
         c, old = self.elements[k], self._carried[k]
         node = c.candidates.node
         forces = c.multipliers(old.force[node], old.tangential[node])
-        multipliers: FloatArray = self._step.factor * forces / c.law.scale[:, None]
-        return multipliers
+        return self._step.factor * forces / c.law.scale[:, None]
 
     @property
     def may_slip(self) -> bool:

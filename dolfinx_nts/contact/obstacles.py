@@ -117,8 +117,7 @@ class Obstacle:
             return -self.lowest_gap(x0, x1)
         length = np.linalg.norm(x1 - x0, axis=1)
         between = 0.5 * (length - self.gap(x0).value - self.gap(x1).value)
-        bound: FloatArray = np.maximum(self._sampled(x0, x1, limit), np.minimum(between, limit))
-        return bound
+        return np.maximum(self._sampled(x0, x1, limit), np.minimum(between, limit))
 
     def _sampled(self, x0: FloatArray, x1: FloatArray, limit: FloatArray) -> FloatArray:
         """Largest depth on straight paths [m], (n,), to one part in a hundred above the limit."""
@@ -292,8 +291,7 @@ class _Round(Obstacle):
         square = np.einsum("ni,ni->n", path, path)
         part = -np.einsum("ni,ni->n", y0, path) * inverse(square)
         nearest = y0 + part.clip(0.0, 1.0)[:, None] * path
-        lowest: FloatArray = np.linalg.norm(nearest, axis=1) - self.radius
-        return lowest
+        return np.linalg.norm(nearest, axis=1) - self.radius
 
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(y_0 + y_1) / (r_0 + r_1): the discrete gradient of r, the root of y . y."""
@@ -308,8 +306,7 @@ class _Round(Obstacle):
 
 def inverse(r: FloatArray) -> FloatArray:
     """1/r, and 0 for 0: the centre of a ball has no direction and touches nothing."""
-    result: FloatArray = np.divide(1.0, r, out=np.zeros_like(r), where=r != 0.0)
-    return result
+    return np.divide(1.0, r, out=np.zeros_like(r), where=r != 0.0)
 
 
 @known_options

@@ -123,8 +123,7 @@ def _rises(corner: FloatArray, on: BoolArray, master: FloatArray) -> BoolArray:
     normal[on] = fc.frame(master[at.facet], at.xi)[2]
     edge = corner[:, None] - corner[:, :, None]
     rise: FloatArray = np.einsum("mkli,mki->mkl", edge, normal)
-    steep: BoolArray = rise > _RISES * np.linalg.norm(edge, axis=3)
-    return steep
+    return rise > _RISES * np.linalg.norm(edge, axis=3)
 
 
 def inside_rim(

@@ -60,8 +60,7 @@ class OverlapWatch:
         self._edges: dict[int, InnerEdges] = {}
 
         def start() -> tuple[FloatArray, ...]:
-            at_start: tuple[FloatArray, ...] = system.initial_state().u
-            return at_start
+            return system.initial_state().u
 
         between: dict[tuple[tuple[int, ...], bool], list[Any]] = {}
         obstacles: list[ObstacleContact] = []

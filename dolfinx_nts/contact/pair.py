@@ -263,8 +263,7 @@ class ContactPair:
     @property
     def master_name(self) -> str:
         """Name of the master for messages and files."""
-        name: str = self.master.name
-        return name
+        return self.master.name
 
     def has_master_of(self, other: ContactPair) -> bool:
         """Return whether the masters of both are equal, also of different systems."""
@@ -290,8 +289,7 @@ class ContactPair:
 
     def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
         """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
-        x: FloatArray = positions[0][self.slave.share[found.node]][:, None]
-        return x
+        return positions[0][self.slave.share[found.node]][:, None]
 
     def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
         """Return how deep slaves start inside another body, in facet sizes, wherever. Collective.
@@ -418,8 +416,7 @@ class ContactPair:
         return same_nodes and self.has_master_of(other)
 
     def _moved(self, surface: Surface, u: FloatArray) -> FloatArray:
-        x: FloatArray = surface.reference - self.origin + surface.gather(u)
-        return x
+        return surface.reference - self.origin + surface.gather(u)
 
 
 def _check_friction(friction: Any) -> None:

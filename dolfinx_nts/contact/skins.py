@@ -158,8 +158,7 @@ def boundary_of_mesh(body: Any, u: FloatArray) -> FloatArray:
     moved.x.array[: len(here)] = here
     moved.x.scatter_forward()
     blocks = compat.node_blocks(mesh, body.space)[nodes]
-    corners: FloatArray = mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
-    return corners
+    return mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
 
 
 def oriented_nodes(mesh: Mesh, local_facets: IntArray) -> IntArray:

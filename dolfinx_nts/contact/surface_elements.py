@@ -125,8 +125,7 @@ class SurfaceElements(ContactElements):
         of its own.
         """
         slot = self._slot
-        found: IntArray = np.append(np.bincount(slot[slot >= 0]), 1)[slot]
-        return found
+        return np.append(np.bincount(slot[slot >= 0]), 1)[slot]
 
     @property
     def immovable(self) -> BoolArray:
@@ -136,8 +135,7 @@ class SurfaceElements(ContactElements):
     @property
     def sag(self) -> FloatArray:
         """A part of the facets: where curved bodies touch at a point, means are off."""
-        sag: FloatArray = _SAG * self.candidates.length
-        return sag
+        return _SAG * self.candidates.length
 
     @property
     def tangents(self) -> FloatArray:  # type: ignore[override]
@@ -146,14 +144,12 @@ class SurfaceElements(ContactElements):
 
     @property
     def _held(self) -> BoolArray:  # type: ignore[override]
-        fixed: BoolArray = self.pair.slave.fixed[self._numbers].all(axis=1)
-        return fixed
+        return self.pair.slave.fixed[self._numbers].all(axis=1)
 
     @property
     def _numbers(self) -> IntArray:
         """Positions of the slaves in their surface."""
-        found: IntArray = self.pair.slave.share[self.candidates.node]
-        return found
+        return self.pair.slave.share[self.candidates.node]
 
     def place(self, i: int) -> str:
         """The slave's number in the user's mesh."""
@@ -162,13 +158,11 @@ class SurfaceElements(ContactElements):
     # ---- places
     def _measured(self, y: FloatArray) -> FloatArray:
         """The measure's points (n, points, 3) from the nodes of elements [m]."""
-        x: FloatArray = np.matmul(self.sums.weights, y[self.sums.element])
-        return x
+        return np.matmul(self.sums.weights, y[self.sums.element])
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gaps of the slaves beyond the overlap that is left [m]."""
-        gap: FloatArray = self._gaps(self._measured(x)) + self.law.overlap
-        return gap
+        return self._gaps(self._measured(x)) + self.law.overlap
 
     def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
         """Gaps of the slaves [m] by positions of all points."""
@@ -329,8 +323,7 @@ class SurfaceElements(ContactElements):
         """As of `ContactElements`."""
         start, force = self.measure.start[:, 0], -part.coupling[:, 0]
         x = self.pair.origin + start + theta * (part.place[:, 0] - start)
-        total: FloatArray = resultant(x, force)[1]
-        return total
+        return resultant(x, force)[1]
 
     def pressing(self, part: Contribution) -> FloatArray:
         """As of `ContactElements`, of the pressure between the nodes, sum of C_qA lambda_A.

@@ -33,8 +33,7 @@ class Saddle:
         """Solution of A x = right, owned entries. Collective."""
         self._b.array_w[:] = right
         self._ksp.solve(self._b, self._x)
-        solution: FloatArray = self._x.array_r.copy()
-        return solution
+        return self._x.array_r.copy()
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

@@ -94,8 +94,7 @@ def _blocks(start: IntArray, entries: Array, chunk: slice) -> Array:
     # Of the first axis; a node's other rows follow after as many triples as it has blocks.
     triple = np.arange(start[0], start[-1]) + np.repeat(2 * start[:-1], count)
     rows = triple[:, None] + np.repeat(count, count)[:, None] * np.arange(3)
-    blocks: Array = np.take(entries.reshape(-1, 3), rows, axis=0)
-    return blocks
+    return np.take(entries.reshape(-1, 3), rows, axis=0)
 
 
 class NodeBlocks:

@@ -272,8 +272,7 @@ class StepProblem:
     def _inertial(self, body: Body, du: FloatArray) -> FloatArray:
         """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
         if self.integrator.inertia:
-            force: FloatArray = body.inertia(du)
-            return force
+            return body.inertia(du)
         return self.stabilization.of(body) * du
 
     def guess(

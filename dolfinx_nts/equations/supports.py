@@ -125,8 +125,7 @@ class Supports:
             advance(np.ones(1), none, none, self._dt)[which]
             - advance(none, none, none, self._dt)[which]
         )
-        flown: FloatArray = du + (rates[which] - advance(du, v0, a0, self._dt)[which]) / slope
-        return flown
+        return du + (rates[which] - advance(du, v0, a0, self._dt)[which]) / slope
 
     def ahead(self, k: int, ahead: FloatArray, first: FloatArray) -> FloatArray:
         """Motion of a body without forces [m], so that M (du - ahead) has the right rates.

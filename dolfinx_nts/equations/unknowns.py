@@ -282,8 +282,7 @@ class Unknowns:
         self._forces.set(0.0)
         add, reverse = PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE
         self._scatter.scatter(self._local, self._forces, addv=add, mode=reverse)
-        force: FloatArray = self._forces.array_r.copy()
-        return force
+        return self._forces.array_r.copy()
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

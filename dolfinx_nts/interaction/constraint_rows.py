@@ -29,8 +29,7 @@ class Arm(NamedTuple):
 
     def at(self, y: FloatArray) -> FloatArray:
         """Their values from nodal vectors (n, k, 3), shape (n, 3)."""
-        found: FloatArray = np.einsum("nk,nki->ni", self.weights, y) + self.constant
-        return found
+        return np.einsum("nk,nki->ni", self.weights, y) + self.constant
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,8 +197,7 @@ class Constraints(EveryStep):
 
     def _rest_of_rows(self) -> BoolArray:
         """Which of all elements are not in the step."""
-        resting: BoolArray = np.isin(self._all.bodies, list(self._resting)).any(axis=1)
-        return resting
+        return np.isin(self._all.bodies, list(self._resting)).any(axis=1)
 
     def touched(self) -> set[int]:
         """All bodies."""
@@ -329,8 +328,7 @@ class Constraints(EveryStep):
     def _gap(self, state: State, y: FloatArray) -> FloatArray:
         """G - c at a state with these nodal vectors [m], shape (n, m). Collective."""
         (weights, constants, _), (c, *_) = self._at(state.time, state.time)
-        found: FloatArray = kernel.value(kernel.factors(weights, constants, y)) - c
-        return found
+        return kernel.value(kernel.factors(weights, constants, y)) - c
 
     def _rates(
         self, state: State, y: FloatArray, dt: float
@@ -395,5 +393,4 @@ class Constraints(EveryStep):
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the last step."""
-        guess: FloatArray = self._factor * self._rows.force / self._rows.scale[:, None]
-        return guess
+        return self._factor * self._rows.force / self._rows.scale[:, None]

@@ -58,8 +58,7 @@ class Measure:
 
     def directed(self, y: FloatArray) -> FloatArray:
         """The same without constants, as of velocities."""
-        found: FloatArray = np.einsum("va,nai->nvi", self.weights, y)
-        return found
+        return np.einsum("va,nai->nvi", self.weights, y)
 
     def nodal(self, values: Sequence[FloatArray]) -> FloatArray:
         """Values at the nodes, (n, k, 3), from those of the bodies' coordinates. Collective."""

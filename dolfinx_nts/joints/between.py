@@ -310,8 +310,7 @@ def direction(name: str, value: Any) -> FloatArray:
     if largest == 0.0:
         raise ValueError(f"{name}={value!r}: has no direction; pass a vector that is not zero")
     given = given / largest  # squares of the smallest and largest numbers are none
-    unit: FloatArray = given / np.linalg.norm(given)
-    return unit
+    return given / np.linalg.norm(given)
 
 
 def triad(axis: FloatArray) -> FloatArray:

@@ -215,9 +215,8 @@ def _asking(joint: Any, motor: Motor) -> Callable[..., FloatArray]:
         return found.reshape(at.shape)
 
     def ask(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
-        found: FloatArray = call_together(
+        return call_together(
             joint.comm, f"motor of {joint.name!r}", of, time, at, rate, shown=motor
         )
-        return found
 
     return ask

@@ -231,8 +231,7 @@ def _middles() -> FloatArray:
     at = np.array([[1.0, 1.0], [0.5, 0.5]]) / 3
     across = along(at, np.array([[1.0, -1.0]] * 2))[:, :, 2:4]
     jumps = np.einsum("naj,kag->knjg", across, jump).reshape(-1, 21)
-    weights: FloatArray = -np.linalg.pinv(jumps[:, 18:]) @ jumps[:, :18]
-    return weights
+    return -np.linalg.pinv(jumps[:, 18:]) @ jumps[:, :18]
 
 
 def _own_points(facets: IntArray, planes: Planes) -> tuple[IntArray, FloatArray]:
@@ -317,8 +316,7 @@ def _weights(d: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray
 
     def derivative(k: int, direction: FloatArray) -> FloatArray:
         """Return the derivative by a direction (m, 2) in the plane of corner k, shape (m, q)."""
-        result: FloatArray = np.einsum("ma,maq->mq", direction, d[:, k])
-        return result
+        return np.einsum("ma,maq->mq", direction, d[:, k])
 
     rows, seconds = [], []
     for k in range(3):

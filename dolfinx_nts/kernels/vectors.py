@@ -11,8 +11,7 @@ _ONE, _TWO = [1, 2, 0], [2, 0, 1]
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """A x b of vectors (..., 3)."""
-    product: FloatArray = a[..., _ONE] * b[..., _TWO] - a[..., _TWO] * b[..., _ONE]
-    return product
+    return a[..., _ONE] * b[..., _TWO] - a[..., _TWO] * b[..., _ONE]
 
 
 def range_of(moved: FloatArray, around: FloatArray | float = 0.0) -> FloatArray:

@@ -66,8 +66,7 @@ class ContactLoads(NamedTuple):
             return force
         slave = contact.pair.slave
         slave.body.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.SUM)
-        own: FloatArray = found[slave.share] / self.factor
-        return own
+        return found[slave.share] / self.factor
 
 
 def labels(system: System) -> list[str]:

@@ -225,8 +225,7 @@ def _normals(x: FloatArray) -> FloatArray:
     """Unit normals of quadrilaterals (n, 4, 3), zero where degenerate."""
     normal = np.cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])
     size = np.linalg.norm(normal, axis=1, keepdims=True)
-    unit: FloatArray = normal / np.where(size > 0, size, 1.0)
-    return unit
+    return normal / np.where(size > 0, size, 1.0)
 
 
 def colour_scale(drawn: Sequence[Drawn], colour: str, limits: Any) -> Any:

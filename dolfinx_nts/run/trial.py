@@ -144,8 +144,7 @@ class LastSteps:
         if not self._recent:
             return None
         steps, forces = zip(*self._recent, strict=True)
-        mean: FloatArray = np.average([force[k] for force in forces], axis=0, weights=steps)
-        return mean
+        return np.average([force[k] for force in forces], axis=0, weights=steps)
 
     @property
     def lengths(self) -> list[float]:

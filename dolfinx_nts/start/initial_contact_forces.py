@@ -99,5 +99,4 @@ def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:
 
 def _closed(c: ContactElements) -> BoolArray:
     """Which candidates touch at the start."""
-    closed: BoolArray = np.abs(c.candidates.gap) <= _CLOSED * c.candidates.length
-    return closed
+    return np.abs(c.candidates.gap) <= _CLOSED * c.candidates.length

@@ -146,8 +146,7 @@ def pieces_of(mesh: Mesh) -> int:
 def _joined(one: IntArray, two: IntArray, count: int) -> tuple[int, IntArray]:
     """Number of parts of a graph with these edges and so many nodes, and each node's part."""
     edges = coo_matrix((np.ones(len(one), dtype=bool), (one, two)), (count, count))
-    found: tuple[int, IntArray] = connected_components(edges, directed=False)
-    return found
+    return connected_components(edges, directed=False)
 
 
 def _hashed(a: HashArray) -> HashArray:

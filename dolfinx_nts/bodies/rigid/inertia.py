@@ -45,8 +45,7 @@ class Inertia(NamedTuple):
     @property
     def moments(self) -> FloatArray:
         """Principal moments of inertia [kg m^2], shape (3,)."""
-        found: FloatArray = self.euler.sum() - self.euler
-        return found
+        return self.euler.sum() - self.euler
 
     @property
     def length(self) -> float:

@@ -259,14 +259,12 @@ class RigidBody(Body):
         They are the principal axes of inertia as they stand now, so this is not the identity at the
         start. The rotation from there is `body.rotation @ at_start.T`, with a copy of it made then.
         """
-        turned: FloatArray = self._y[1:].T / self.length
-        return turned
+        return self._y[1:].T / self.length
 
     @property
     def angular_velocity(self) -> FloatArray:
         """1/2 sum d_i x v_i [rad/s], shape (3,), the same on all ranks."""
-        spin: FloatArray = 0.5 * cross(self._y[1:], self._v[1:]).sum(axis=0) / self.length**2
-        return spin
+        return 0.5 * cross(self._y[1:], self._v[1:]).sum(axis=0) / self.length**2
 
     # ---- points
     def _weights(self, x: FloatArray) -> FloatArray:

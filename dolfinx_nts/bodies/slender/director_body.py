@@ -158,8 +158,7 @@ class DirectorBody(Body):
     def _vectors_at(self, nodes: IntArray) -> FloatArray:
         """Nodal vectors of nodes in the reference [m], shape (n, vectors, 3)."""
         x, directors = self._director_mesh.x[nodes], self._director_mesh.directors[nodes]
-        found: FloatArray = np.concatenate([x[:, None], self.length * directors], axis=1)
-        return found
+        return np.concatenate([x[:, None], self.length * directors], axis=1)
 
     def _set_up_elements(self) -> None:
         """This rank's elements, and their mass."""
@@ -188,8 +187,7 @@ class DirectorBody(Body):
     def file_order(self) -> IntArray:
         """Nodal vectors of all ranks in an order that does not depend on the ranks, see `Body`."""
         k = self._width // 3
-        order: IntArray = (k * self._director_mesh.order[:, None] + np.arange(k)).ravel()
-        return order
+        return (k * self._director_mesh.order[:, None] + np.arange(k)).ravel()
 
     # ---- values of this rank's elements
     def _of_elements(self, owned: FloatArray) -> FloatArray:
@@ -430,8 +428,7 @@ class DirectorBody(Body):
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""
         (directors,) = self.joints
-        turned: float = directors.largest_turn(self.reference + u0, self.reference + u1)
-        return turned
+        return directors.largest_turn(self.reference + u0, self.reference + u1)
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""

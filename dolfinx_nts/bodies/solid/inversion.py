@@ -99,8 +99,7 @@ class Determinants:
     @cached_property
     def _inverse(self) -> FloatArray:
         """One over det(dX/dxi) [1/m^3], shape (cells, points)."""
-        found: FloatArray = 1.0 / self._dets(self._reference)
-        return found
+        return 1.0 / self._dets(self._reference)
 
     def _dets(self, x: FloatArray) -> FloatArray:
         """det(dx/dxi) of nodes' positions x [m^3], shape (cells, points)."""
@@ -168,5 +167,4 @@ def describe(body: Body, u: FloatArray) -> tuple[str, str]:
         u: Its displacements [m].
     """
     found = body.comm.allgather(body.smallest_det(u))
-    text: tuple[str, str] = body.describe_det(*min(found, key=lambda one: one[0]))
-    return text
+    return body.describe_det(*min(found, key=lambda one: one[0]))

@@ -71,8 +71,7 @@ class MassMatrix:
         """M v. Collective."""
         self._in.array_w[:] = v
         self.matrix.mult(self._in, self._out)
-        product: FloatArray = self._out.array_r.copy()
-        return product
+        return self._out.array_r.copy()
 
     # ---- nodes without mass
     def redistribute(self, massless: BoolArray, x: FloatArray, fixed: IntArray) -> str:
@@ -186,8 +185,7 @@ class _Products:
         """M times nodal scalars, shape (n,). Collective."""
         self._in.array_w[:] = np.repeat(values, 3)
         self._matrix.mult(self._in, self._out)
-        product: FloatArray = self._out.array_r[::3].copy()
-        return product
+        return self._out.array_r[::3].copy()
 
     def destroy(self) -> None:
         """Free the vectors."""
@@ -254,15 +252,13 @@ def _polynomials(x: FloatArray, comm: MPI.Comm) -> FloatArray:
     size = 0.5 * float((ends[0] + ends[1]).max())
     one = np.column_stack([np.ones(len(x)), (x - 0.5 * (ends[0] - ends[1])) / size])
     pairs = [one[:, i] * one[:, j] for i in range(4) for j in range(i, 4)]
-    columns: FloatArray = np.column_stack(pairs)
-    return columns
+    return np.column_stack(pairs)
 
 
 def _moments(affine: FloatArray, products: list[FloatArray], comm: MPI.Comm) -> FloatArray:
     """Return the moments of mass in the order of `_polynomials`, shape (10,). Collective."""
     local = [float(affine[:, i] @ products[j]) for i in range(4) for j in range(i, 4)]
-    total: FloatArray = comm.allreduce(np.array(local))
-    return total
+    return comm.allreduce(np.array(local))
 
 
 def _factors(
