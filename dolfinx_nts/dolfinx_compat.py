@@ -254,10 +254,7 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
 
 def vector_space(msh: Mesh, degree: int) -> fem.FunctionSpace:
     """Continuous Lagrange space of 3-vectors."""
-    if OLD:
-        with _told_compiler("an element"):
-            return fem.VectorFunctionSpace(msh, ("Lagrange", degree), dim=3)
-    return fem.functionspace(msh, ("Lagrange", degree, (3,)))
+    return function_space(msh, "Lagrange", degree, (3,))
 
 
 def lagrange_degree(space: fem.FunctionSpace) -> int | None:
@@ -286,28 +283,18 @@ def is_nodal(space: fem.FunctionSpace, msh: Mesh) -> bool:
     return same and not broken
 
 
-def scalar_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
-    """Scalar space of the family ("Lagrange" or "DG")."""
+def function_space(
+    msh: Mesh, family: str, degree: int, shape: tuple[int, ...] = ()
+) -> fem.FunctionSpace:
+    """Space of the family ("Lagrange" or "DG") of scalars, 3-vectors or 3 x 3 tensors."""
     if OLD:
         with _told_compiler("an element"):
-            return fem.FunctionSpace(msh, (family, degree))
-    return fem.functionspace(msh, (family, degree))
-
-
-def cell_vector_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
-    """Space of 3-vectors of the family ("DG")."""
-    if OLD:
-        with _told_compiler("an element"):
-            return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
-    return fem.functionspace(msh, (family, degree, (3,)))
-
-
-def tensor_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
-    """Space of 3 x 3 tensors of the family ("Lagrange" or "DG")."""
-    if OLD:
-        with _told_compiler("an element"):
-            return fem.TensorFunctionSpace(msh, (family, degree), shape=(3, 3))
-    return fem.functionspace(msh, (family, degree, (3, 3)))
+            if not shape:
+                return fem.FunctionSpace(msh, (family, degree))
+            if len(shape) == 1:
+                return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
+            return fem.TensorFunctionSpace(msh, (family, degree), shape=shape)
+    return fem.functionspace(msh, (family, degree, *([shape] if shape else [])))
 
 
 def node_blocks(mesh: Mesh, space: fem.FunctionSpace) -> IntArray:

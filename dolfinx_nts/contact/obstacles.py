@@ -19,7 +19,14 @@ import numpy as np
 from dolfinx_nts.kernels.bounded_slope import highest
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.types import FloatArray, Settings
-from dolfinx_nts.validation import at_time, known_options, require_name, require_positive, vector
+from dolfinx_nts.validation import (
+    at_time,
+    direction,
+    known_options,
+    require_name,
+    require_positive,
+    vector,
+)
 
 Vector = Sequence[float] | FloatArray
 Motion = Callable[[float], Vector]
@@ -159,16 +166,6 @@ class Obstacle:
             )
 
 
-def _direction(name: str, value: Vector) -> tuple[float, ...]:
-    direction = vector(name, value, "-")
-    # By the largest component first: squares of tiny or huge numbers leave the range of floats.
-    largest = np.abs(direction).max()
-    if largest == 0.0:
-        raise ValueError(f"{name}={value!r}: has no direction; pass a vector other than zero")
-    direction = direction / largest
-    return tuple((direction / np.linalg.norm(direction)).tolist())
-
-
 def _place(name: str, value: Vector) -> tuple[float, ...]:
     return tuple(vector(name, value, "m").tolist())
 
@@ -199,7 +196,7 @@ class Plane(Obstacle):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", _place("point", self.point))
-        object.__setattr__(self, "normal", _direction("normal", self.normal))
+        object.__setattr__(self, "normal", tuple(direction("normal", self.normal).tolist()))
         self._check()
 
     @property
@@ -375,7 +372,7 @@ class Cylinder(_Round):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", _place("point", self.point))
-        object.__setattr__(self, "axis", _direction("axis", self.axis))
+        object.__setattr__(self, "axis", tuple(direction("axis", self.axis).tolist()))
         self._check()
 
     def about(self, origin: FloatArray) -> Cylinder:

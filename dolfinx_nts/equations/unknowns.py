@@ -132,10 +132,6 @@ class Unknowns:
         return blocks
 
     # ---- bodies
-    def of_batch(self, j: int) -> slice:
-        """Where a batch's coordinates that are in the step stand among this rank's unknowns."""
-        return self._places[j]
-
     def of_body(self, k: int) -> slice:
         """Where a body's coordinates stand among this rank's unknowns."""
         place, rigid = self._places[self._batches.batch_of(k)], self._batches.rigid

@@ -109,7 +109,7 @@ class Part:
                 f"values={dict(values)!r}: body {self.name!r} is made of {wanted}; pass a value "
                 "for each of them and for nothing else"
             )
-        found = fem.Function(compat.scalar_space(self.mesh, "DG", 0))
+        found = fem.Function(compat.function_space(self.mesh, "DG", 0))
         dofs = compat.cell_dofs(found.function_space)[self.cell_tags.indices, 0]
         found.x.array[dofs] = [values[known[tag]] for tag in here.tolist()]
         return found

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-from dolfinx import fem
 from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
-from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
+from dolfinx_nts.bodies.mesh_body import MeshBody
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
+from dolfinx_nts.bodies.nodal_values import motion_on
 from dolfinx_nts.bodies.rigid.inertia import Inertia, inertia_of, principal
 from dolfinx_nts.bodies.rigid.rigid_loads import PrescribedMotion, RigidLoads, VectorInTime
 from dolfinx_nts.bodies.solid.parameters import (
@@ -26,19 +25,15 @@ from dolfinx_nts.bodies.solid.parameters import (
     require_positive_parameter,
     values_of,
 )
-from dolfinx_nts.contact.facet_choice import choose_facets
-from dolfinx_nts.contact.skins import skin_of_mesh
-from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross, range_of
 from dolfinx_nts.parallel import gather_rows, raise_together, rank_of
-from dolfinx_nts.types import FloatArray, IntArray, Marker, Places, Settings, Values, Vector
+from dolfinx_nts.types import FloatArray, IntArray, Places, Settings, Values
 from dolfinx_nts.validation import (
     UserFunctionError,
     known_options,
-    require_bool,
     require_name,
     require_positive,
     require_same,
@@ -52,7 +47,7 @@ _LENT = 1e-8
 
 
 @known_options
-class RigidBody(Body):
+class RigidBody(MeshBody):
     """A rigid body on a DOLFINx mesh, with twelve coordinates and six constraints.
 
     Its coordinates are those of four nodes: the centre of mass phi and D_i = l d_i, l the radius of
@@ -118,8 +113,7 @@ class RigidBody(Body):
         self.mesh, self.density, self.degree = mesh, density, 1
         self.made_on = places_of(mesh)
         self.space = compat.vector_space(mesh, 1)
-        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
-        self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
+        self.u, self.v = motion_on(self.space, name)
         self._densities = [] if is_number(density) else [density]
         self._measured = self.parameters()
         self._set_up(mesh.comm, inertia_of(self.space, density), **given)
@@ -280,86 +274,29 @@ class RigidBody(Body):
         return Points(self, nodes, weights, np.tile(y, (n, 1, 1)), fixed, places)
 
     def points(self, x: Places) -> Points:
-        """Material points, inside the body or not, for joints and springs.
-
-        Args:
-            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
-
-        Raises:
-            ValueError: x is no array of points.
-        """
+        """As of `Body`, inside the body or not."""
         return self._points(self._weights(vectors("x", x, "points [m]")))
 
     def directions(self, x: Places) -> Points:
-        """Directions that turn with the body, for joints.
-
-        Args:
-            x: At the start [-], shape (3,) or (n, 3), the same on all ranks.
-
-        Raises:
-            ValueError: x is no array of vectors.
-        """
+        """As of `Body`."""
         local = vectors("x", x, "vectors") @ self._inertia.axes / self.length
         return self._points(np.column_stack([np.zeros(len(local)), local]))
 
     def directions_at(self, direction: FloatArray, x: Places) -> Points:
-        """A direction, which turns alike at all points.
-
-        Args:
-            direction: At the start [-], shape (3,).
-            x: Reference position of a point [m].
-        """
+        """As of `Body`; it turns alike at all points."""
         return self.directions(direction)
 
     def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
-        """Nodes of the mesh as material points, for surfaces.
-
-        Args:
-            nodes: Global numbers in `space`, shape (n,).
-            x: Their reference positions [m], shape (n, 3).
-        """
+        """As of `Body`."""
         return self._points(self._weights(x))
 
     def at_mesh(self, values: FloatArray) -> FloatArray:
-        """Values at the mesh's nodes on this rank, as of `space`, from the coordinates. Collective.
-
-        Args:
-            values: At the owned coordinates, shape (num_owned,).
-        """
+        """As of `Body`. Collective."""
         owned = self.space.dofmap.index_map.size_local
-        return (self._mesh_weights[:owned] @ self._everywhere(values)).ravel()
+        return (self._mesh_weights[:owned] @ gather_rows(self.comm, values.reshape(-1, 3))).ravel()
 
-    def _everywhere(self, values: FloatArray) -> FloatArray:
-        """Nodal vectors (4, 3) on all ranks. Collective."""
-        return gather_rows(self.comm, values.reshape(-1, 3))
-
-    def surface(
-        self,
-        marker: Marker,
-        tag: int | None = None,
-        *,
-        normal: Vector | None = None,
-        angle: float | None = None,
-        smoothing: bool = False,
-        mass: str = "consistent",
-    ) -> Surface:
-        """A part of the boundary for contact, as of `Continuum.surface`.
-
-        Args:
-            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
-                meshtags.
-            tag: Value in the meshtags.
-            normal: As of `Continuum.surface`.
-            angle: As of `Continuum.surface` [degrees].
-            smoothing: Whether slaves touch a smooth surface when this one is the master.
-            mass: "consistent"; no node of a rigid body can lose its mass.
-
-        Raises:
-            TypeError: smoothing is no bool.
-            ValueError: The body has no mesh; no facet, or interior facets, or none that faces
-                `normal`; normal or angle is none; mass is another one.
-        """
-        require_bool("smoothing", smoothing)
+    def _check_surface(self, mass: str) -> None:
+        """As of `MeshBody`."""
         if mass != "consistent":
             raise ValueError(
                 f"mass={mass!r} of a surface of {self.name!r}: a rigid body has no nodes that "
@@ -369,9 +306,6 @@ class RigidBody(Body):
             raise ValueError(
                 f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
             )
-        what = f"marker of a surface of {self.name!r}"
-        found = choose_facets(self.mesh, marker, tag, normal, angle, what)
-        return Surface(self, skin_of_mesh(self, found), smoothing)
 
     def motion_range(self, du: FloatArray) -> FloatArray:
         """Bounds on the motion of the mesh's points on this rank, see `Body` [m]."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from dolfinx import fem
 from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 from scipy.spatial import cKDTree
@@ -19,7 +17,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
-from dolfinx_nts.bodies.nodal_values import cell_function
+from dolfinx_nts.bodies.nodal_values import cell_function, motion_on
 from dolfinx_nts.bodies.slender import turns
 from dolfinx_nts.bodies.slender.director_matrix import DirectorMatrix
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, WholeSkin
@@ -97,8 +95,7 @@ class DirectorBody(Body):
         told = turns.that_leaves(self._felt, turns.TOLD)
         self.low_dets = float(np.cos(told)), float(np.cos(turns.NAMED))
         self.space = compat.vector_space(mesh, degree)
-        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
-        self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
+        self.u, self.v = motion_on(self.space, name)
 
     def _set_up(
         self,
@@ -229,14 +226,7 @@ class DirectorBody(Body):
 
     # ---- points
     def points(self, x: Places) -> Points:
-        """Nodes as material points, for joints and springs. Collective.
-
-        Args:
-            x: Reference positions of nodes [m], shape (3,) or (n, 3), the same on all ranks.
-
-        Raises:
-            ValueError: x is no array of points, or one of them is no node.
-        """
+        """As of `Body`, of nodes alone: ValueError for a point that is none. Collective."""
         given, of = vectors("x", x, "points [m]"), self._director_mesh.x
         distance, nodes = cKDTree(of).query(given)
         off = distance > _AT_NODE * np.ptp(of, axis=0).max()
@@ -249,12 +239,7 @@ class DirectorBody(Body):
         return self.points_of(nodes, self._place)
 
     def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
-        """Nodes of the mesh as material points. Collective.
-
-        Args:
-            nodes: Global numbers in `space`, shape (n,), the same on all ranks.
-            x: Their reference positions [m], shape (n, 3).
-        """
+        """As of `Body`. Collective."""
         return self.points_of(np.asarray(nodes), self._place)
 
     def points_of(self, nodes: IntArray, weights: FloatArray) -> Points:

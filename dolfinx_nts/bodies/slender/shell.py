@@ -182,15 +182,7 @@ class Shell(DirectorBody):
         return force, moment
 
     def directions_at(self, direction: FloatArray, x: Places) -> Points:
-        """The director of a node, for joints. Collective.
-
-        Args:
-            direction: At the start [-], shape (3,).
-            x: Reference position of the node [m], as of `points`.
-
-        Raises:
-            ValueError: The direction is not along the director.
-        """
+        """As of `Body`, at a node; ValueError unless along its director. Collective."""
         nodes = self.points(x).nodes[:, 0] // 2
         director = self._director_mesh.directors[nodes[0], 0]
         along = float(director @ direction)
