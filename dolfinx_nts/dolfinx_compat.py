@@ -390,12 +390,7 @@ def constants(form: Any) -> FloatArray:
 
 
 def functions(form: Any, compiled: Any) -> list[Any]:
-    """The Functions of a form in the order in which its kernel takes them.
-
-    Args:
-        form: In UFL.
-        compiled: By DOLFINx.
-    """
+    """The Functions of a form in the order in which its kernel takes them."""
     given, made = form.coefficients(), compiled.ufcx_form
     place = made.original_coefficient_position if OLD else made.original_coefficient_positions
     return [given[place[k]] for k in range(made.num_coefficients)]

@@ -307,9 +307,6 @@ class ContactElements(Batch):
     def nodal_forces(self, part: Contribution) -> list[FloatArray]:
         """Forces on the points of the slave and of the master's surface, if it has a body [kg m].
 
-        Args:
-            part: Solution of the step.
-
         Returns:
             Of each surface this rank's part, shape (p, 3).
         """

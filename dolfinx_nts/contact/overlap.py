@@ -164,11 +164,9 @@ class OverlapWatch:
             ))  # fmt: skip
 
     def _held_otherwise(self, k: int, forces: Sequence[FloatArray]) -> BoolArray:
-        """Which points of a contact's slave carry in another contact, shape (p,).
+        """Which points of contact k's slave carry in another contact, shape (p,).
 
-        Args:
-            k: Number of the contact.
-            forces: Normal forces of all points of each contact's slave [N].
+        By the normal forces of all points of each contact's slave [N].
         """
         slave = self._contacts[k][0].slave
         held = np.zeros(len(slave.points), dtype=bool)

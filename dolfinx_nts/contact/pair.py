@@ -300,11 +300,7 @@ class ContactPair:
         return 0.0
 
     def settle(self, u: Sequence[FloatArray]) -> None:
-        """Take the gaps at the start that count as none, see `offset`. Collective.
-
-        Args:
-            u: As of `depth`.
-        """
+        """Take the gaps at the start that count as none, see `offset`. Collective."""
         self.offset, self._lift = np.zeros(len(self.slave.share)), 0.0
         if not self.adjust:
             return
@@ -321,21 +317,11 @@ class ContactPair:
         return self.slave.at_all(self.offset != 0.0)
 
     def _at_start(self, positions: Sequence[FloatArray], path: FloatArray) -> Candidates:
-        """This rank's slaves that may be within `adjust` of the master. Collective.
-
-        Args:
-            positions: Of all points at the start [m].
-            path: As of `find`.
-        """
+        """This rank's slaves within `adjust` of the master; arguments as of `find`. Collective."""
         raise NotImplementedError
 
     def encloses(self, u: Sequence[FloatArray], time: float) -> bool:
-        """Return whether all of the slave's body starts inside an obstacle. Collective.
-
-        Args:
-            u: As of `depth`.
-            time: Of the start [s].
-        """
+        """Return whether all of the slave's body starts inside an obstacle. Collective."""
         return False
 
     def find(

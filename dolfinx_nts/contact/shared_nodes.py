@@ -16,9 +16,6 @@ from dolfinx_nts.types import BoolArray
 def check_shared(contacts: Sequence[ContactPair]) -> None:
     """Raise unless what two contacts hold out of one master is a row of nodes between them.
 
-    Args:
-        contacts: Those of a system.
-
     Raises:
         ValueError: Two slaves share facets, or one's nodes are all the other's, or both share nodes
             and their masters share but a part of their facets.
@@ -43,9 +40,6 @@ def check_shared(contacts: Sequence[ContactPair]) -> None:
 
 def held_before(contacts: Sequence[ContactPair]) -> list[BoolArray]:
     """Which points of each slave belong to a contact declared before, with the same master.
-
-    Args:
-        contacts: Those of a system.
 
     Returns:
         Of each contact, shape (points,).

@@ -146,10 +146,6 @@ def boundary_of_mesh(body: Any, u: FloatArray) -> FloatArray:
     """Corners of the exterior facets of a body's mesh that this rank has [m], (m, nc, 3).
 
     Collective.
-
-    Args:
-        body: The body.
-        u: Its owned displacements [m].
     """
     mesh = body.mesh
     nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))

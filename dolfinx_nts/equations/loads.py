@@ -69,9 +69,6 @@ class Loads:
         methods that carry accelerations, not those where the step takes them. Loads that are
         functions of time differ; of others, and of other methods, it is 0. What loads push at
         prescribed coordinates goes into the supports: their reactions hold it.
-
-        Args:
-            e: Solution of the step.
         """
         rule, state, dt = self._integrator, self._state, self._dt
         work, batches = 0.0, self._system.batches

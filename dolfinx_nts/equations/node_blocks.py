@@ -79,16 +79,7 @@ def _chunks(start: IntArray) -> list[slice]:
 
 
 def _blocks(start: IntArray, entries: Array, chunk: slice) -> Array:
-    """Entries of an AIJ matrix, which come row by row, block by block.
-
-    Args:
-        start: Where its block rows begin, in blocks.
-        entries: Its columns or values.
-        chunk: Range of block rows.
-
-    Returns:
-        Shape (blocks, 3, 3).
-    """
+    """Columns or values of some block rows of an AIJ matrix, block by block, (blocks, 3, 3)."""
     start = start[chunk.start : chunk.stop + 1].astype(np.intp)
     count = np.diff(start)
     # Of the first axis; a node's other rows follow after as many triples as it has blocks.

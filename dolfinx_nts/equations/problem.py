@@ -302,11 +302,7 @@ class StepProblem:
 
     # ---- iterates
     def evaluate(self, x: PETSc.Vec) -> Evaluation:
-        """The step equations at an iterate; no state changes. Every rank must call it.
-
-        Args:
-            x: PETSc vector of the unknowns.
-        """
+        """The step equations at an iterate; no state changes. Every rank must call it."""
         values, laid = x.array_r.copy(), self.laid
         if laid.blocks or self._of_none is None:
             parts = self._parts_of_elements(x, values)
@@ -332,12 +328,7 @@ class StepProblem:
         return Evaluation(values, tuple(terms), self.batches.split, parts)
 
     def _parts_of_elements(self, x: PETSc.Vec, values: FloatArray) -> tuple[Any, ...]:
-        """What each batch of elements contributes at an iterate. Collective.
-
-        Args:
-            x: PETSc vector of the unknowns.
-            values: This rank's part of it.
-        """
+        """What elements contribute at an iterate, whose part here is `values`. Collective."""
         laid, elements = self.laid, self.elements
         positions = laid.positions(x, elements)
         own = laid.own_values(values, elements)
@@ -350,11 +341,7 @@ class StepProblem:
         return parts
 
     def _without_elements(self, j: int, u1: FloatArray) -> tuple[FloatArray, ...]:
-        """`BodyTerms` of a batch at a displacement, but for those of elements. Collective.
-
-        Returns:
-            u1, du, internal and external forces, and the equation without elements.
-        """
+        """A batch's u1, du, internal and external force and equation, no elements. Collective."""
         body, du = self.batches.bodies[j], u1 - self._u0[j]
         internal = self.factor * body.internal(u1)
         external = self.factor * body.external(u1, self.loads.gravity)

@@ -199,10 +199,6 @@ class Supports:
         """Angular momentum from (y_1 - y_0) x M (v_0 + v_1)/2 on this rank [kg m^2/s], (3,).
 
         It is zero where (v_0 + v_1)/2 is the mean velocity. Collective.
-
-        Args:
-            k: Number of the body.
-            du: Its motion in the step [m].
         """
         if k not in self.moving:
             return np.zeros(3)

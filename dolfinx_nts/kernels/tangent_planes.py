@@ -98,14 +98,11 @@ def _rings(fan: IntArray, point: IntArray, node: IntArray) -> tuple[IntArray, Bo
 
 
 def _fit(linear: FloatArray, p: FloatArray) -> FloatArray:
-    """Weights of data at places p in the linear unknowns of a quadratic that fits them best.
+    """Weights (n, u, r) of data at places p (n, r, 2) in the quadratics that fit them best.
 
     Args:
         linear: Linear unknowns in each datum, shape (n, r, u).
-        p: Places [-], shape (n, r, 2).
-
-    Returns:
-        Shape (n, u, r).
+        p: Places [-].
     """
     (n, r, u), (s, t) = linear.shape, p.transpose(2, 0, 1)
     rows = np.zeros((n, r + 3, u + 3))

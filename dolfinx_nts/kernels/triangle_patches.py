@@ -142,7 +142,7 @@ def _elevated(points: FloatArray, degree: int) -> FloatArray:
 def _edge(
     ends: FloatArray, tangents: FloatArray, across: FloatArray, parts: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The first two rows of control points of the piece beside an edge.
+    """The first two rows of control points, (5, ...) and (4, ...), of the piece beside an edge.
 
     Args:
         ends: Both ends of the edge, shape (2, ...).
@@ -150,9 +150,6 @@ def _edge(
         across: Vectors across it there, shape (2, ...).
         parts: What the derivatives towards the third corner have of across and along, at both ends,
             shape (2 ends, 2, ...), to be multiplied with the others.
-
-    Returns:
-        Rows of shape (5, ...) and (4, ...).
     """
     cubic = np.stack([ends[0], ends[0] + tangents[0] / 3, ends[1] - tangents[1] / 3, ends[1]])
     row, slope = _elevated(cubic, _DEGREE), 3.0 * np.diff(cubic, axis=0)

@@ -76,12 +76,7 @@ def diagnosis(
 
 
 def used_up(problem: StepProblem, e: Evaluation) -> str:
-    """Of statics, which body slides as friction alone holds it, or nothing. Collective.
-
-    Args:
-        problem: The step.
-        e: The last iterate.
-    """
+    """Of statics, which body slides as friction alone holds it, or nothing. Collective."""
     system = problem.system
     if problem.integrator.inertia:
         return ""

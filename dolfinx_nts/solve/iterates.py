@@ -68,11 +68,7 @@ class Iterates:
         self._fewest, self._patience = np.inf, _PATIENCE
 
     def at(self, x: PETSc.Vec) -> Evaluation:
-        """Evaluation at an iterate, reused while SNES asks for the same one. Collective.
-
-        Args:
-            x: PETSc vector of the unknowns.
-        """
+        """Evaluation at an iterate, reused while SNES asks for the same one. Collective."""
         last = self.last
         same = last is not None and np.array_equal(last.x, x.array_r)
         if everywhere(self._problem.system.comm, same):

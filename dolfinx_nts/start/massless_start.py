@@ -24,13 +24,7 @@ _SLOW = 0.4
 
 
 def check_massless(system: System, integrator: Integrator, impact: str) -> None:
-    """Raise a ValueError on every rank where massless nodes make no sense. Collective.
-
-    Args:
-        system: The scene.
-        integrator: Of the run.
-        impact: As of `simulate`.
-    """
+    """Raise a ValueError on every rank where massless nodes make no sense. Collective."""
     with_massless = [b.name for b in system.bodies if b.has_massless]
     if not with_massless:
         return
@@ -66,11 +60,6 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
     A step balances the mean of its ends. A force missing at one end returns with the other sign at
     the next.
 
-    Args:
-        problem: Equations of the run.
-        state: At the start.
-        dt: First step [s].
-
     Returns:
         Force [N], and the text: empty where what is missing is small beside the internal forces.
     """
@@ -103,9 +92,6 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
 
 def thick_layer(system: System) -> tuple[float, str]:
     """The massless layer with friction that is too thick by most for an impact. Collective.
-
-    Args:
-        system: The scene.
 
     Returns:
         Time of a shear wave through it over that of a pressure wave through the body, and a

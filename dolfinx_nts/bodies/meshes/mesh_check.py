@@ -41,10 +41,6 @@ def places_of(mesh: Mesh) -> int:
 def check_mesh(mesh: Mesh, name: str) -> None:
     """Raise on every rank unless the mesh is a valid 3D mesh of degree 1.
 
-    Args:
-        mesh: DOLFINx mesh.
-        name: Of its body, for messages.
-
     Raises:
         TypeError: It is no mesh.
         ValueError: Cells of another kind, not finite, inverted or overlapping.

@@ -55,13 +55,9 @@ class DirectorBody(Body):
 
     # ---- what each kind has of its own
     def _elements_of(self, y: FloatArray) -> tuple[kernel.Elements, FloatArray]:
-        """This rank's elements from their reference.
+        """This rank's elements from their reference y [m], shape (n, k, 3).
 
-        Args:
-            y: Nodal vectors [m], shape (n, k, 3).
-
-        Returns:
-            The elements, and int N_a N_b of their nodes [m or m^2], shape (n, nodes, nodes).
+        And int N_a N_b of their nodes [m or m^2], shape (n, nodes, nodes).
         """
         raise NotImplementedError
 
@@ -79,11 +75,7 @@ class DirectorBody(Body):
         raise NotImplementedError
 
     def _felt(self, turn: float) -> tuple[float, float]:
-        """Turn that the strains of an element feel, and its slope.
-
-        Args:
-            turn: Between neighbouring nodes [rad].
-        """
+        """Turn that strains feel where neighbouring nodes turn by so much [rad], and its slope."""
         raise NotImplementedError
 
     # ---- set-up

@@ -160,11 +160,6 @@ def forbidden(system: Any, dets: FloatArray) -> FloatArray:
 
 
 def describe(body: Body, u: FloatArray) -> tuple[str, str]:
-    """Where a body's smallest det F is, and what may prevent it, see `Body`. Collective.
-
-    Args:
-        body: The body.
-        u: Its displacements [m].
-    """
+    """Where a body's smallest det F is, and what may prevent it, see `Body`. Collective."""
     found = body.comm.allgather(body.smallest_det(u))
     return body.describe_det(*min(found, key=lambda one: one[0]))
