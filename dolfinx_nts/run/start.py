@@ -18,8 +18,9 @@ from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.start import consistent
 from dolfinx_nts.start.initial_contact_forces import with_resting_forces
+from dolfinx_nts.start.taken_over import is_like, state_from
 from dolfinx_nts.state import State
-from dolfinx_nts.system import System, is_like
+from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray, Options
 from dolfinx_nts.validation import UserFunctionError, is_finite
 
@@ -199,7 +200,7 @@ def first_state(system: System, start: Any, time: Any) -> State:
             "simulate(...) or of restart(...), or load(...) of a saved equilibrium"
         )
     time = None if time is None else float(time)
-    return system.state_from(start.system, start.state, moving=start.moving, time=time)
+    return state_from(system, start.system, start.state, moving=start.moving, time=time)
 
 
 def incomplete(start: Solution | None) -> str | None:
