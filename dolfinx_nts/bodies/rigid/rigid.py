@@ -19,6 +19,7 @@ from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
 from dolfinx_nts.bodies.nodal_values import motion_on
 from dolfinx_nts.bodies.rigid.inertia import Inertia, inertia_of, principal
 from dolfinx_nts.bodies.rigid.rigid_loads import PrescribedMotion, RigidLoads, VectorInTime
+from dolfinx_nts.bodies.rigid.rigid_matrix import RigidMatrix
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,
     is_number,
@@ -40,10 +41,6 @@ from dolfinx_nts.validation import (
     vector,
     vectors,
 )
-
-#: Part of the mass that the matrix lends to directors without mass where a rotation has no
-#: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
-_LENT = 1e-8
 
 
 @known_options
@@ -206,9 +203,9 @@ class RigidBody(MeshBody):
         held = self.points(self.centre).select(slice(0, int(comm.rank == self.owner)))
         self._directors_held = Directors(self, held, self.length, np.arange(len(held)))
         self.joints = () if self._drive.turns else (self._directors_held,)
-        self._matrix: Any = None
-        # Mass factor that it holds, and PETSc's count of changes since.
-        self._holds: tuple[float, int] | None = None
+        self._matrix = RigidMatrix(
+            self.comm, self.nodal_mass + self.lent, self.fixed, self.mass
+        )
         #: Of each node the largest weight in a point of the mesh, shape (4,).
         self.reach = np.ones(4)
         if self.mesh is not None:
@@ -226,10 +223,8 @@ class RigidBody(MeshBody):
         y, masses = self._inertia.nodes, self._inertia.nodal_mass
         self.reference: FloatArray = y.ravel()[: self.num_owned]
         self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
-        #: Mass that matrices have beside `nodal_mass` [kg], see `_LENT`.
-        self.lent = np.zeros(self.num_owned)
-        if np.count_nonzero(masses[1:]) < 2:
-            self.lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * self.mass
+        #: Mass that matrices have beside `nodal_mass` [kg], see `Inertia.lent`.
+        self.lent: FloatArray = np.repeat(self._inertia.lent, 3)[: self.num_owned]
         speeds = np.vstack([linear, np.cross(turning, y[1:])])
         self.initial_velocity = speeds.ravel()[: self.num_owned]
         self._fixed = np.repeat([self._drive.moves] + 3 * [self._drive.turns], 3)
@@ -365,24 +360,13 @@ class RigidBody(MeshBody):
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """Return mass M less stiffness times the derivative of the torque's forces."""
         self.check_alive()
-        if self._matrix is None:
-            self._matrix = petsc_compat.dense_matrix(self.comm, self.num_owned)
-        constant = not self._loads.turn
-        if constant and self._holds == (mass, self._matrix.stateGet()):
-            return self._matrix
+        if not self._loads.turn:
+            return self._matrix.at(mass, None)
+        turning = np.zeros((9, 9))
         if self.num_owned:
-            whole = np.diag(mass * (self.nodal_mass + self.lent))
-            if not constant:
-                by_directors = self._loads.gradient(self._directors(u1))
-                whole[3:, 3:] -= stiffness * self._theta * by_directors
-            if self.fixed.size:
-                whole[self.fixed] = whole[:, self.fixed] = 0.0
-                whole[self.fixed, self.fixed] = mass * self.mass or 1.0
-            numbers = np.arange(12, dtype=PETSc.IntType)
-            self._matrix.setValues(numbers, numbers, whole.ravel())
-        self._matrix.assemble()
-        self._holds = (mass, self._matrix.stateGet()) if constant else None
-        return self._matrix
+            by_directors = self._loads.gradient(self._directors(u1))
+            turning = stiffness * self._theta * by_directors
+        return self._matrix.at(mass, turning)
 
     def nodal_stiffness(self) -> FloatArray:
         """None [N/m]."""
@@ -459,5 +443,4 @@ class RigidBody(MeshBody):
     def destroy(self) -> None:
         """Free the PETSc objects; the body is of no use then."""
         super().destroy()
-        if self._matrix is not None:
-            self._matrix.destroy()
+        self._matrix.destroy()

@@ -33,9 +33,6 @@ from dolfinx_nts.types import Array, BoolArray, FloatArray, IntArray
 class MassMatrix:
     """Mass matrix of a body.
 
-    Args:
-        form: Compiled mass.
-
     Attributes:
         matrix: PETSc matrix, the same scalar in each of the three directions.
         nodal: Its row sums [kg], shape (num_owned,).
