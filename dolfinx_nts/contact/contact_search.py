@@ -44,11 +44,6 @@ _SURELY = 1e-3
 class ContactSearch:
     """Makes the elements of all contacts of a system, step after step; see `Coupling`.
 
-    Args:
-        contacts: The contacts.
-        bodies: Numbers of the bodies of each.
-        comm: MPI communicator.
-
     Attributes:
         elements: Candidates of each contact that have unknowns in this step.
         idle: The others, which the step's motion does not bring to their masters.

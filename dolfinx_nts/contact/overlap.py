@@ -49,9 +49,6 @@ class OverlapWatch:
     a small obstacle counts as a facet, and so does the thickness of the thicker one of two bodies.
     Where they have moved by more than that thickness between two looks, the straight way is looked
     at, too.
-
-    Args:
-        system: The scene.
     """
 
     def __init__(self, system: Any) -> None:

@@ -17,10 +17,6 @@ from dolfinx_nts.types import FloatArray
 class Loads:
     """Loads on the bodies in a step; `begin` fixes the step and tells the bodies.
 
-    Args:
-        system: The scene.
-        integrator: Rules of the step.
-
     Attributes:
         moments: Where the forces on each body are taken.
         gravity: What acts of it in the step [m/s^2], shape (3,).

@@ -11,11 +11,7 @@ from dolfinx_nts.types import FloatArray
 
 
 class Saddle:
-    """Factors of a matrix by MUMPS, without equations that repeat others. Collective.
-
-    Args:
-        matrix: PETSc AIJ matrix.
-    """
+    """Factors of a matrix by MUMPS, without equations that repeat others. Collective."""
 
     def __init__(self, matrix: PETSc.Mat) -> None:
         self._x, self._b = matrix.createVecs()

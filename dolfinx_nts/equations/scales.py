@@ -22,9 +22,6 @@ _EPS = float(np.finfo(float).eps)
 class Lengths:
     """Lengths of a scene [m], the same on all ranks; `begin` measures a step.
 
-    Args:
-        system: The scene.
-
     Attributes:
         centre: Middle of all bodies in the reference, shape (3,).
         radius: Half the diagonal of the box around them.

@@ -16,10 +16,6 @@ class Sleepers:
     """Finds the bodies at rest whose forces balance, at the price of their loads in each step.
 
     Internal forces are evaluated once for all steps in which a body rests at the same place.
-
-    Args:
-        bodies: Bodies of the system.
-        comm: MPI communicator.
     """
 
     def __init__(self, bodies: Sequence[Body], comm: MPI.Comm) -> None:

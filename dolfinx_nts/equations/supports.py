@@ -63,10 +63,6 @@ class _Ends(NamedTuple):
 class Supports:
     """Prescribed coordinates of a system in a step; `begin` fixes it.
 
-    Args:
-        system: The scene.
-        integrator: Rules of the step.
-
     Attributes:
         moving: Numbers of the bodies whose prescribed coordinates move, before, in or after it.
     """

@@ -164,11 +164,7 @@ def listed(sentences: list[str]) -> str:
 
 # ---- a state in the numberings of the file
 class Numbering:
-    """Between the arrays of the ranks and those of the file. Collective.
-
-    Args:
-        system: The scene.
-    """
+    """Between the arrays of the ranks and those of the file. Collective."""
 
     def __init__(self, system: System) -> None:
         self.system, self.comm = system, system.comm

@@ -22,9 +22,6 @@ _SLIDING = 8
 class Iterates:
     """Evaluates the iterates of a step and counts how often elements change their status.
 
-    Args:
-        problem: Equations of the step.
-
     Attributes:
         last: Evaluation of the last iterate.
         flips: Of each batch of elements how often each has changed its status.

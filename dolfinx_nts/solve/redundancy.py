@@ -13,9 +13,6 @@ from dolfinx_nts.interaction.evaluation import Evaluation
 class Redundancy:
     """Whether the joints of a run repeat each other.
 
-    Args:
-        problem: Equations of its steps.
-
     Attributes:
         independent: Whether they do not; None before a step has shown it.
     """

@@ -16,10 +16,6 @@ from dolfinx_nts.solve.presets import Presets
 class StepJacobian:
     """The matrices of a step, which live as long as the layout of its unknowns.
 
-    Args:
-        problem: Equations of the step.
-        presets: Of the linear solver.
-
     Attributes:
         tangents: Matrices of the bodies.
         matrix: Jacobian as SNES sees it, after `assemble`.

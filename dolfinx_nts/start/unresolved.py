@@ -135,9 +135,6 @@ class DamperWatch:
 
     What they hold back from rest, or only slowly drag along, has the right places and forces
     however stiff they are, so that only what happens tells.
-
-    Args:
-        problem: Equations of the run.
     """
 
     def __init__(self, problem: StepProblem) -> None:
