@@ -152,6 +152,13 @@ def require_name(argument: str, value: object) -> None:
         raise ValueError(f"{argument}={value!r}: is empty; pass e.g. {argument}='block'")
 
 
+def require_one_of(name: str, value: object, known: Iterable[str]) -> None:
+    """Raise ValueError unless the value is one of the known texts."""
+    known = tuple(known)
+    if not (isinstance(value, str) and value in known):
+        raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, known))}")
+
+
 def floats(value: object) -> FloatArray:
     """The value as floats; an empty array where it is no array of real numbers, text included."""
     if hasattr(value, "ufl_shape"):  # UFL would take being asked for an array for Einstein's sum

@@ -6,9 +6,8 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.facet_choice import choose_facets
 from dolfinx_nts.contact.skins import skin_of_mesh
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.types import Marker, Vector
-from dolfinx_nts.validation import require_bool
+from dolfinx_nts.validation import require_bool, require_one_of
 
 
 class MeshBody(Body):
@@ -86,7 +85,7 @@ class MeshBody(Body):
                 to take its mass, or the body has moved already.
         """
         require_bool("smoothing", smoothing)
-        choose("mass", mass, ("consistent", "redistributed"))
+        require_one_of("mass", mass, ("consistent", "redistributed"))
         self._check_surface(mass)
         what = f"marker of a surface of {self.name!r}"
         found = choose_facets(self.mesh, marker, tag, normal, angle, what)

@@ -17,7 +17,7 @@ from dolfinx_nts.interaction.combination import Combination, of_multipliers
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.elements import Step, over
 from dolfinx_nts.kernels import compiled_law
-from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.kernels.vectors import resultant
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
@@ -301,8 +301,12 @@ class ContactElements(Batch):
             theta: Where between t_n and t_{n+1} the forces act.
         """
         start = self.measure.start[:, 0] + self.attachment.path[0]
-        x = self.pair.origin + start + theta * (part.place - start)
-        return resultant(x, part.force)[1]
+        place, force = self._pushed(part)
+        return resultant(self.pair.origin + start + theta * (place - start), force)[1]
+
+    def _pushed(self, part: Contribution) -> tuple[FloatArray, FloatArray]:
+        """The measure's slaves at t_{n+1} [m], and forces on them [kg m], shape (n, 3) each."""
+        return part.place, part.force
 
     def nodal_forces(self, part: Contribution) -> list[FloatArray]:
         """Forces on the points of the slave and of the master's surface, if it has a body [kg m].
@@ -310,15 +314,19 @@ class ContactElements(Batch):
         Returns:
             Of each surface this rank's part, shape (p, 3).
         """
-        force, shares, start, found = -part.coupling, self.attachment.shares, 0, []
+        found = []
+        for surface, each in zip(self.attachment.surfaces, self._pushes(part), strict=True):
+            found.append(np.zeros((len(surface.points), 3)))
+            np.add.at(found[-1], *each)
+        return found
+
+    def _pushes(self, part: Contribution) -> list[tuple[IntArray, FloatArray]]:
+        """Of each surface, numbers of points (n, p) and forces on them [kg m], (n, p, 3)."""
+        force, shares, numbers = -part.coupling, self.attachment.shares, self.attachment.numbers
         if shares is not None:
             force = np.matmul(shares.transpose(0, 2, 1), force)
-        for surface, number in zip(self.attachment.surfaces, self.attachment.numbers, strict=True):
-            total, stop = np.zeros((len(surface.points), 3)), start + number.shape[1]
-            np.add.at(total, number, force[:, start:stop])
-            found.append(total)
-            start = stop
-        return found
+        each = np.split(force, np.cumsum([number.shape[1] for number in numbers]), axis=1)
+        return list(zip(numbers, each, strict=False))
 
     def impulse(self, part: Contribution, push: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What impulses along the normals at t_{n+1} do, of slaves that are active.
@@ -387,11 +395,6 @@ class ContactElements(Batch):
         return float(weight[i]), text
 
 
-def resultant(x: FloatArray, force: FloatArray) -> FloatArray:
-    """Sum of forces (n, 3) at points (n, 3), and of their moments about the origin, (2, 3)."""
-    return np.array([force.sum(axis=0), cross(x, force).sum(axis=0)])
-
-
 def _fixed(attachment: Attachment) -> BoolArray:
     """Which coordinates of the surfaces' points are prescribed, shape (n, sum of p, 3)."""
     both = zip(attachment.surfaces, attachment.numbers, strict=True)
@@ -409,15 +412,7 @@ def _moves(attachment: Attachment, foot: FloatArray) -> FloatArray:
 def elements_of(
     pair: Any, found: Candidates, attachment: Attachment, measure: ContactMeasure, step: Step
 ) -> ContactElements:
-    """Elements of a step by the law of a pair. Collective.
-
-    Args:
-        pair: The pair.
-        found: Its candidates.
-        attachment: Which points of bodies these are.
-        measure: Their gap and slip.
-        step: The step.
-    """
+    """Elements of a pair's candidates in a step, by its law. Collective."""
     moves = _moves(attachment, measure.foot)
     fixed = _fixed(attachment)
     scales = [step.scale(surface, pair.bodies) for surface in attachment.surfaces]

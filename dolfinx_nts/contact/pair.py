@@ -18,7 +18,7 @@ from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
-from dolfinx_nts.validation import is_finite, known_options, require_bool
+from dolfinx_nts.validation import is_finite, known_options, require_bool, require_one_of
 
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 MARGIN = 0.5
@@ -165,13 +165,8 @@ class ContactPair:
         require_bool("edges", edges)
         if not (is_finite(adjust) and adjust >= 0.0):
             raise ValueError(f"adjust={adjust!r}: pass a distance >= 0 [m]")
-        for name, given, known in (
-            ("interference", interference, tuple(INTERFERENCE)),
-            ("integration", integration, INTEGRATIONS),
-        ):
-            if not isinstance(given, str) or given not in known:
-                choices = ", ".join(map(repr, known))
-                raise ValueError(f"{name}={given!r}: choose one of {choices}")
+        require_one_of("interference", interference, INTERFERENCE)
+        require_one_of("integration", integration, INTEGRATIONS)
         masters = tuple(kind for kind, _ in self._kinds)
         if not isinstance(slave, Surface):
             other = isinstance(slave, masters)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.contact.contact_elements import ContactElements, resultant
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution
 from dolfinx_nts.contact.contact_measure import Measured, Slip
 from dolfinx_nts.contact.facet_gap import FacetGap
@@ -25,7 +25,7 @@ from dolfinx_nts.contact.surface_sums import FacetAttachment, Sums
 from dolfinx_nts.interaction.combination import Combination
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled_law
-from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.kernels.vectors import cross, resultant
 from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -319,11 +319,9 @@ class SurfaceElements(ContactElements):
             tangent[:, here, here] = padded[:, k, :, 3:] / self._elements_of[:, k, None, None]
 
     # ---- a solution
-    def moment(self, part: Contribution, theta: float) -> FloatArray:
+    def _pushed(self, part: Contribution) -> tuple[FloatArray, FloatArray]:
         """As of `ContactElements`."""
-        start, force = self.measure.start[:, 0], -part.coupling[:, 0]
-        x = self.pair.origin + start + theta * (part.place[:, 0] - start)
-        return resultant(x, force)[1]
+        return part.place[:, 0], -part.coupling[:, 0]
 
     def pressing(self, part: Contribution) -> FloatArray:
         """As of `ContactElements`, of the pressure between the nodes, sum of C_qA lambda_A.
@@ -344,18 +342,11 @@ class SurfaceElements(ContactElements):
         pulls = self.sums.to_points(push)[:, None] * self.measure.normal_at(y)
         return np.einsum("ec,ecz->ez", each, gaps), resultant(self.pair.origin + y[:, 0], pulls)
 
-    def nodal_forces(self, part: Contribution) -> list[FloatArray]:
+    def _pushes(self, part: Contribution) -> list[tuple[IntArray, FloatArray]]:
         """As of `ContactElements`."""
-        force = -part.coupling
         own, master = (number[self.sums.element] for number in self.attachment.numbers)
-        of_slave = np.einsum("nc,ni->nci", self.sums.shape, force[:, 0])
-        found = []
-        both = zip(self.attachment.surfaces, (own, master), (of_slave, force[:, 1:]), strict=True)
-        for surface, number, values in both:
-            total = np.zeros((len(surface.points), 3))
-            np.add.at(total, number, values)
-            found.append(total)
-        return found
+        of_slave = np.einsum("nc,ni->nci", self.sums.shape, -part.coupling[:, 0])
+        return [(own, of_slave), (master, -part.coupling[:, 1:])]
 
 
 class _AtPoints(NamedTuple):

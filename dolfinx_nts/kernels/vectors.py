@@ -14,6 +14,11 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return a[..., _ONE] * b[..., _TWO] - a[..., _TWO] * b[..., _ONE]
 
 
+def resultant(x: FloatArray, force: FloatArray) -> FloatArray:
+    """Sum of forces (n, 3) at points (n, 3), and of their moments about the origin, (2, 3)."""
+    return np.array([force.sum(axis=0), cross(x, force).sum(axis=0)])
+
+
 def range_of(moved: FloatArray, around: FloatArray | float = 0.0) -> FloatArray:
     """Largest components of vectors along the axes and against them, shape (2, 3).
 
