@@ -119,11 +119,8 @@ class SurfaceElements(ContactElements):
 
     @cached_property
     def _elements_of(self) -> IntArray:
-        """How many elements the slaves at the corners have, shape (n, corners).
-
-        Each has a part of a slave's equations, without which one would say nothing of a multiplier
-        of its own.
-        """
+        """How many elements the slaves at the corners have, shape (n, corners)."""
+        # Each has a part of a slave's equations, or it would say nothing of its own multiplier.
         slot = self._slot
         return np.append(np.bincount(slot[slot >= 0]), 1)[slot]
 
@@ -144,12 +141,8 @@ class SurfaceElements(ContactElements):
 
     @property
     def _held(self) -> BoolArray:  # type: ignore[override]
-        return self.pair.slave.fixed[self._numbers].all(axis=1)
-
-    @property
-    def _numbers(self) -> IntArray:
-        """Positions of the slaves in their surface."""
-        return self.pair.slave.share[self.candidates.node]
+        slave = self.pair.slave
+        return slave.fixed[slave.share[self.candidates.node]].all(axis=1)
 
     def place(self, i: int) -> str:
         """The slave's number in the user's mesh."""
@@ -196,12 +189,7 @@ class SurfaceElements(ContactElements):
 
     # ---- an iterate
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
-        """Residual and tangent, the law after the sums. Collective.
-
-        Args:
-            x: As of `ContactElements.evaluate`.
-            own: "constraints": h^2/2 lambda of the slaves at the corners over `ContactLaw.scale`.
-        """
+        """As of `ContactElements`, by multipliers of the slaves at the corners. Collective."""
         width = self.law.num_constraints
         of_corners = own["constraints"].reshape(self.num_elements, self._corners, width)
         multiplier = self.law.scale[:, None] * of_corners[self._first]

@@ -174,13 +174,8 @@ def add(matrix: PETSc.Mat, numbers: IntArray, values: npt.NDArray[np.float64]) -
 def _most_couplings(comm: MPI.Comm, first: IntArray, elements: Sequence[IntArray]) -> IntArray:
     """Upper bound of the blocks that elements need in each of this rank's rows. Collective.
 
-    Args:
-        comm: MPI communicator.
-        first: First node of each rank, and the number of all.
-        elements: As of `NodeBlocks`.
-
-    Returns:
-        In the rank's own columns and in those of others, shape (nodes, 2).
+    In its own columns and in those of others, shape (nodes, 2). `first` is the first node of each
+    rank, and the number of all; elements as of `NodeBlocks`.
     """
     local = int(first[comm.rank + 1] - first[comm.rank])
     count = PETSc.Vec().createMPI((2 * local, None), comm=comm)

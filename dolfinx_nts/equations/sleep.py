@@ -9,6 +9,7 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.parallel import everywhere
 from dolfinx_nts.types import FloatArray
 
 
@@ -56,6 +57,6 @@ class Sleepers:
 
     def _internal(self, k: int, u: FloatArray) -> FloatArray:
         known = k in self._known and np.array_equal(self._known[k][0], u)
-        if not self._comm.allreduce(known, op=MPI.LAND):
+        if not everywhere(self._comm, known):
             self._known[k] = u, self._bodies[k].internal(u)
         return self._known[k][1]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from mpi4py import MPI
-
 import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import anywhere, global_max
 from dolfinx_nts.start.consistent import accelerating_forces
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
@@ -68,7 +66,7 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
     chosen = [body.has_massless for body in bodies]
     both = zip(bodies, state.u, chosen, strict=True)
     moved = any(some and bool(u.any()) for _, u, some in both)
-    if not problem.system.comm.allreduce(moved, op=MPI.LOR):
+    if not anywhere(problem.system.comm, moved):
         return worst, text
     forces = accelerating_forces(problem, state, dt)
     for body, (force, _), u, some in zip(bodies, forces, state.u, chosen, strict=True):

@@ -309,10 +309,7 @@ def _part(comm: MPI.Comm, name: str, body: Any, surfaces: Mapping[str, int]) -> 
 def _find_facets(mesh: Mesh, facets: IntArray, tags: IntArray) -> tuple[IntArray, IntArray]:
     """This rank's facets with the given nodes, ascending, and their tags.
 
-    Args:
-        mesh: dolfinx mesh with facets.
-        facets: Input node numbers, ascending in each row, shape (k, facet corners).
-        tags: Shape (k,).
+    Of input node numbers, ascending in each row, shape (k, facet corners), and tags (k,).
     """
     facet_map = mesh.topology.index_map(2)
     every = np.arange(facet_map.size_local + facet_map.num_ghosts, dtype=np.int32)

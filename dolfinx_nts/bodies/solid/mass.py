@@ -26,7 +26,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.interaction.points import of_nodes
-from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.parallel import anywhere, global_sum
 from dolfinx_nts.types import Array, BoolArray, FloatArray, IntArray
 
 
@@ -193,9 +193,9 @@ class _Products:
 def _levels(mass: _Products, massless: BoolArray, comm: MPI.Comm) -> IntArray | None:
     """Cells from each node to one with mass, shape (n,); None if some node reaches none."""
     level, layer = np.where(massless, -1, 0), 0
-    while comm.allreduce(bool((level < 0).any()), op=MPI.LOR):
+    while anywhere(comm, bool((level < 0).any())):
         near = (level < 0) & (mass.times((level == layer).astype(float)) != 0.0)
-        if not comm.allreduce(bool(near.any()), op=MPI.LOR):
+        if not anywhere(comm, bool(near.any())):
             return None
         layer += 1
         level[near] = layer

@@ -35,7 +35,7 @@ from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points, in_mesh
-from dolfinx_nts.parallel import gather_on_root, raise_together
+from dolfinx_nts.parallel import anywhere, gather_on_root, raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Places, Settings, Values
 from dolfinx_nts.validation import UserFunctionError, require_bool, require_name, vectors
 
@@ -178,7 +178,7 @@ class UflBody(MeshBody):
         self.v.x.scatter_forward()
         self.initial_velocity = self.v.x.array[: self.num_owned].copy()
         self.u.x.array[:] = self._given("displacement", displacement, "m")
-        self.starts_moved = self.comm.allreduce(bool(self.u.x.array.any()), op=MPI.LOR)
+        self.starts_moved = anywhere(self.comm, bool(self.u.x.array.any()))
         self.u.x.array[self.fixed] = self.prescribed(0.0)
         self.u.x.scatter_forward()
         self.initial_displacement = self.u.x.array[: self.num_owned].copy()
