@@ -215,11 +215,6 @@ class StepProblem:
         return self.laid.of_body(k)
 
     @property
-    def of_constraints(self) -> slice:
-        """Where the elements' multipliers stand among this rank's unknowns."""
-        return self.laid.of_elements("constraints")
-
-    @property
     def laid(self) -> Unknowns:
         """The layout, after `begin`."""
         assert self.unknowns is not None, "begin comes first"

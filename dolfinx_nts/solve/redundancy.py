@@ -40,7 +40,7 @@ class Redundancy:
             self.independent = space.is_empty()
             if self.independent:
                 return solved
-        here = problem.of_constraints
+        here = problem.laid.of_elements("constraints")
         with problem.x as x:
             x[here] = solved.x[here] - space.part(solved.x[here])
         e = problem.evaluate(problem.x)
