@@ -108,6 +108,16 @@ class Determinants:
         batches.add(np.empty(0), out.reshape(-1))
         return out
 
+    def refuse_inverted(self, u: FloatArray, name: str) -> None:
+        """Raise on every rank if a start, as of `smallest`, turns a cell of a body inside out."""
+        det, place = min(self._comm.allgather(self.smallest(u)), key=lambda found: found[0])
+        if det <= 0.0:
+            where = ", ".join(f"{x:.4g}" for x in place)
+            raise ValueError(
+                f"displacement of {name!r}: with its Dirichlet values at t=0 it turns a cell "
+                f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
+            )
+
     @np.errstate(over="ignore", invalid="ignore")  # an iterate may run off
     def smallest(self, u: FloatArray) -> tuple[float, FloatArray]:
         """The smallest det F on this rank and the middle X of its cell [m], shape (3,). Collective.

@@ -24,12 +24,13 @@ from dolfinx_nts.bodies.solid.mass import MassMatrix, waves
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,
+    Taken,
     in_expressions,
     is_number,
     require_positive_parameter,
     values_of,
 )
-from dolfinx_nts.bodies.solid.step_forms import StepForms, checked_form, fill
+from dolfinx_nts.bodies.solid.step_forms import StepForms, check_extra_form, fill
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
@@ -182,47 +183,30 @@ class UflBody(MeshBody):
         self.u.x.array[self.fixed] = self.prescribed(0.0)
         self.u.x.scatter_forward()
         self.initial_displacement = self.u.x.array[: self.num_owned].copy()
-        self._refuse_inversion()
+        if self._determinants is not None and self.starts_moved and not self.allow_inversion:
+            self._determinants.refuse_inverted(self.u.x.array, self.name)
 
     def _given(self, name: str, given: Any, unit: str) -> FloatArray:
         """Values of an argument at all nodes of this rank, shape (coordinates,)."""
         return nodal_values(self.space, name, self.name, given, unit).ravel()
 
-    def _refuse_inversion(self) -> None:
-        """Raise on every rank if the start turns a cell inside out."""
-        if self._determinants is None or not self.starts_moved or self.allow_inversion:
-            return
-        smallest = self._determinants.smallest(self.u.x.array)
-        det, place = min(self.comm.allgather(smallest), key=lambda found: found[0])
-        if det <= 0.0:
-            where = ", ".join(f"{x:.4g}" for x in place)
-            raise ValueError(
-                f"displacement of {self.name!r}: with its Dirichlet values at t=0 it turns a cell "
-                f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
-            )
-
     def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
         """Compile mass and energy in UFL and any loads, which are returned."""
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         mass = self._mass_form(v, w)
-        of_energy, self._mass_parameters = (
+        of_energy, of_mass = (
             in_expressions((part.integrand() for part in form.integrals()), [self.u])
             for form in (energy, mass)
         )
-        self._parameters = [*of_energy, *self._mass_parameters]
-        self._taken = self.parameters()
+        self._parameters = [*of_energy, *of_mass]
+        self._taken = Taken(self._parameters), Taken(of_mass)
         if self._extra_form is not None:
-            self._check_extra_form(self._extra_form, w)
-        self._energy_form, of_mass, *compiled = compile_forms([energy, mass, *loads])
+            check_extra_form(self, self._extra_form, w)
+        self._energy_form, mass_form, *compiled = compile_forms([energy, mass, *loads])
         self._load = np.zeros(self.num_owned)
-        self._mass = MassMatrix(of_mass)
-        self._take_mass()
-        return compiled
-
-    def _take_mass(self) -> None:
-        """Take over the mass matrix as it was assembled."""
+        self._mass = MassMatrix(mass_form)
         self.nodal_mass = self._mass.nodal
-        self._mass_values = values_of(self._mass_parameters)
+        return compiled
 
     def _density(self, density: Any) -> Any:
         """A density as the forms take it: bodies of any number share compiled forms.
@@ -239,15 +223,6 @@ class UflBody(MeshBody):
         if problem:
             raise ValueError(f"density={density!s} of {self.name!r}: {problem}")
         return density
-
-    def _check_extra_form(self, extra_form: ExtraForm, w: Any) -> None:
-        # Sums, as those that it will be given.
-        given = self.u + self.v, self.u - self.v, w, fem.Constant(self.mesh, 0.0)
-        checked_form(
-            self, f"extra_form={extra_form!r}", lambda: extra_form(*given), {w},
-            "is not linear in the test function w alone",
-            "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx",
-        )  # fmt: skip
 
     # ---- as of Body
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
@@ -337,13 +312,13 @@ class UflBody(MeshBody):
         """
         if not self._parameters:
             return
-        known = (self._parameters, self._taken), (self._mass_parameters, self._mass_values)
-        changed = np.array([not np.array_equal(values_of(p), last) for p, last in known])
+        changed = np.array([taken.changed for taken in self._taken])
         self.comm.Allreduce(MPI.IN_PLACE, changed, op=MPI.LOR)
         if not changed.any():
             return
         self._refuse_values()
-        self._taken, self._stiffness = self.parameters(), None
+        self._taken[0].take()
+        self._stiffness = None
         if not changed[1]:
             return
         if self.has_massless:
@@ -352,7 +327,8 @@ class UflBody(MeshBody):
                 "took it from its nodes; keep it, or use mass='consistent'"
             )
         self._mass.assemble()
-        self._take_mass()
+        self._taken[1].take()
+        self.nodal_mass = self._mass.nodal
         total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
         if not total > 0.0:
             raise UserFunctionError(
