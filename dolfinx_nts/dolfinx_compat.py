@@ -107,8 +107,7 @@ def model_to_mesh(model: Any, comm: MPI.Comm, rank: int = 0) -> tuple[Any, Any, 
 
 def _table(a: Any, layout: Any) -> IntArray:
     """Rows of a list, which does not know how long they are where there is none."""
-    table: IntArray = np.asarray(a.array).reshape(a.num_nodes, layout.num_dofs)
-    return table
+    return np.asarray(a.array).reshape(a.num_nodes, layout.num_dofs)
 
 
 def geometry_dofmap(msh: Mesh) -> IntArray:
@@ -116,8 +115,7 @@ def geometry_dofmap(msh: Mesh) -> IntArray:
     g = msh.geometry
     if OLD:
         return _table(g.dofmap, g.cmap.create_dof_layout())
-    nodes: IntArray = g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap
-    return nodes
+    return g.dofmaps[0] if hasattr(g, "dofmaps") else g.dofmap
 
 
 def coordinate_map(msh: Mesh) -> Any:
@@ -130,8 +128,7 @@ def cell_dofs(space: fem.FunctionSpace) -> IntArray:
     """Blocked dofs of the cells, shape (cells, dofs)."""
     if OLD:
         return _table(space.dofmap.list, space.dofmap.dof_layout)
-    dofs: IntArray = space.dofmap.list
-    return dofs
+    return space.dofmap.list
 
 
 def entities_to_geometry(msh: Mesh, dim: int, entities: npt.ArrayLike) -> IntArray:
@@ -257,10 +254,7 @@ def _told_compiler(what: str) -> Iterator[list[Path]]:
 
 def vector_space(msh: Mesh, degree: int) -> fem.FunctionSpace:
     """Continuous Lagrange space of 3-vectors."""
-    if OLD:
-        with _told_compiler("an element"):
-            return fem.VectorFunctionSpace(msh, ("Lagrange", degree), dim=3)
-    return fem.functionspace(msh, ("Lagrange", degree, (3,)))
+    return function_space(msh, "Lagrange", degree, (3,))
 
 
 def lagrange_degree(space: fem.FunctionSpace) -> int | None:
@@ -289,28 +283,18 @@ def is_nodal(space: fem.FunctionSpace, msh: Mesh) -> bool:
     return same and not broken
 
 
-def scalar_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
-    """Scalar space of the family ("Lagrange" or "DG")."""
+def function_space(
+    msh: Mesh, family: str, degree: int, shape: tuple[int, ...] = ()
+) -> fem.FunctionSpace:
+    """Space of the family ("Lagrange" or "DG") of scalars, 3-vectors or 3 x 3 tensors."""
     if OLD:
         with _told_compiler("an element"):
-            return fem.FunctionSpace(msh, (family, degree))
-    return fem.functionspace(msh, (family, degree))
-
-
-def cell_vector_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
-    """Space of 3-vectors of the family ("DG")."""
-    if OLD:
-        with _told_compiler("an element"):
-            return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
-    return fem.functionspace(msh, (family, degree, (3,)))
-
-
-def tensor_space(msh: Mesh, family: str, degree: int) -> fem.FunctionSpace:
-    """Space of 3 x 3 tensors of the family ("Lagrange" or "DG")."""
-    if OLD:
-        with _told_compiler("an element"):
-            return fem.TensorFunctionSpace(msh, (family, degree), shape=(3, 3))
-    return fem.functionspace(msh, (family, degree, (3, 3)))
+            if not shape:
+                return fem.FunctionSpace(msh, (family, degree))
+            if len(shape) == 1:
+                return fem.VectorFunctionSpace(msh, (family, degree), dim=3)
+            return fem.TensorFunctionSpace(msh, (family, degree), shape=shape)
+    return fem.functionspace(msh, (family, degree, *([shape] if shape else [])))
 
 
 def node_blocks(mesh: Mesh, space: fem.FunctionSpace) -> IntArray:
@@ -336,8 +320,7 @@ def with_ghosts(space: fem.FunctionSpace, chosen: IntArray) -> npt.NDArray[np.bo
     mark = fem.Function(space)
     mark.x.array[chosen] = 1.0
     mark.x.scatter_forward()
-    marked: npt.NDArray[np.bool_] = mark.x.array.reshape(-1, 3) > 0.5
-    return marked
+    return mark.x.array.reshape(-1, 3) > 0.5
 
 
 def subspace_component_bc(space: fem.FunctionSpace, component: int, blocked_dofs: IntArray) -> Any:
@@ -403,17 +386,11 @@ def compile_forms(forms: Iterable[Any]) -> Iterator[tuple[Any, Path]]:
 
 def constants(form: Any) -> FloatArray:
     """Values of a compiled form's Constants, shape (n,)."""
-    values: FloatArray = cpp.fem.pack_constants(getattr(form, "_cpp_object", form))
-    return values
+    return cpp.fem.pack_constants(getattr(form, "_cpp_object", form))
 
 
 def functions(form: Any, compiled: Any) -> list[Any]:
-    """The Functions of a form in the order in which its kernel takes them.
-
-    Args:
-        form: In UFL.
-        compiled: By DOLFINx.
-    """
+    """The Functions of a form in the order in which its kernel takes them."""
     given, made = form.coefficients(), compiled.ufcx_form
     place = made.original_coefficient_position if OLD else made.original_coefficient_positions
     return [given[place[k]] for k in range(made.num_coefficients)]

@@ -18,24 +18,13 @@ from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
 from dolfinx_nts.contact.shared_nodes import areas, check_shared
 from dolfinx_nts.interaction.coupling import Joint, is_joint
-from dolfinx_nts.parallel import need_kernels, raise_together
+from dolfinx_nts.parallel import need_kernels
 from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items, known_options, require_same, vector
 
-#: Part of a body's coordinates by which a start may differ from prescribed displacements.
-_ON_SUPPORT = 1e-9
 #: Overlap over the sag of facets up to which these alone may be its cause.
 _SAGS = 1.1
-
-
-def is_like(one: Joint, other: Joint) -> bool:
-    """Return whether two joints are of one kind and name and join bodies of the same names.
-
-    What the one remembers at the end of a run then fits the other.
-    """
-    names = [[body.name for body in joint.bodies] for joint in (one, other)]
-    return type(one) is type(other) and one.name == other.name and names[0] == names[1]
 
 
 @known_options
@@ -214,95 +203,6 @@ class System:
             joints=tuple(joint.start() for joint in self.joints),
         )
 
-    def state_from(
-        self, other: System, state: State, *, moving: bool, time: float | None = None
-    ) -> State:
-        """State at the displacements of another system's state. Collective.
-
-        Bodies and joints correspond by name.
-
-        Args:
-            other: System with bodies of the same names on the same meshes.
-            state: Its state.
-            moving: Whether bodies move on as there; else with their initial velocities.
-            time: Of the result [s], if not that of the state.
-
-        Raises:
-            ValueError: A body has no counterpart, stands off its prescribed displacement, or lies
-                in a master or around an obstacle, or an obstacle would jump.
-        """
-        time = state.time if time is None else time
-        index = {b.name: k for k, b in enumerate(other.bodies)}
-        missing = [b.name for b in self.bodies if b.name not in index]
-        if missing:
-            raise ValueError(
-                f"start: has bodies {list(index)}, not {missing}; give both scenes the same bodies "
-                "by the same names (what comes in later waits in the first, too, e.g. held by bcs)"
-            )
-        u = tuple(state.u[index[b.name]].copy() for b in self.bodies)
-        for body, now in zip(self.bodies, u, strict=True):
-            old = other.bodies[index[body.name]]
-            self._check_start(body, old, now, time)
-        found = self.initial_state()
-        contacts = list(found.contacts)
-        for k, pair in enumerate(self.contacts):
-            for j, known in enumerate(other.contacts):
-                if pair.is_like(known):
-                    contacts[k] = state.contacts[j]
-                    self._check_jump(pair, known, state.time, time)
-        joints = list(found.joints)
-        for k, joint in enumerate(self.joints):
-            for known, history in zip(other.joints, state.joints, strict=True):
-                if is_like(joint, known):
-                    joints[k] = history
-        start = replace(found, time=time, u=u, contacts=tuple(contacts), joints=tuple(joints))
-        if moving:
-            v = tuple(state.v[index[b.name]].copy() for b in self.bodies)
-            a = tuple(state.a[index[b.name]].copy() for b in self.bodies) if state.a else ()
-            start = replace(start, v=v, a=a)
-        if not moving:
-            self._check_penetration(self.penetration(start))
-            self._check_enclosed(start)
-        return start
-
-    @staticmethod
-    def _check_start(body: Body, old: Body, u: FloatArray, time: float) -> None:
-        """Raise on every rank unless u fits the body's mesh and conditions."""
-        problem, there = None, body.prescribed(time)
-        if not np.array_equal(body.reference, old.reference):
-            other = "mesh there; use the same mesh object" if body.mesh is not None else (
-                "reference there; give it the mass, centre, inertia and axes that it has there"
-            )
-            problem = f"start: body {body.name!r} has another {other}"
-        else:
-            off = np.abs(there - u[body.fixed]).max(initial=0.0)
-            if off > _ON_SUPPORT * np.abs(body.reference).max(initial=0.0):
-                problem = (
-                    f"start: the prescribed values of body {body.name!r} at t={time:.6g} are "
-                    f"off its displacement by {off:.3g}; let them go on from there"
-                )
-        raise_together(body.comm, problem)
-
-    @staticmethod
-    def _check_jump(pair: ContactPair, old: ContactPair, end: float, begin: float) -> None:
-        """Raise if what a pair presses on stands elsewhere than where the other run left it.
-
-        Args:
-            pair: Of this system.
-            old: Its counterpart there.
-            end: Time at which the other run ended [s].
-            begin: Time at which this one begins [s].
-        """
-        left, found = old.path(end, end)[0], pair.path(begin, begin)[0]
-        off = np.abs(found - left).max()
-        size = max(np.abs(a).max() for a in (left, found, pair.slave.reference))
-        if off > _ON_SUPPORT * size:
-            raise ValueError(
-                f"start: the motion of obstacle {pair.master.name!r} at t={begin:.6g} is "
-                f"off its displacement at the end of what it starts from by {off:.3g}; let it go "
-                "on from there, e.g. by leaving start_time out"
-            )
-
     @staticmethod
     def _at_start(body: Body) -> FloatArray:
         u = body.initial_displacement.copy()
@@ -383,6 +283,11 @@ class System:
         )
         for pair, depth in zip(self.contacts, depths, strict=True):
             _refuse_deep(pair, depth, INTERFERENCE[pair.interference], remedy)
+
+    def check_apart(self, state: State) -> None:
+        """Raise on every rank if bodies start inside each other, or around obstacles."""
+        self._check_penetration(self.penetration(state))
+        self._check_enclosed(state)
 
     def _check_sides(self, state: State) -> None:
         """Raise on every rank if a body starts on the wrong side of an obstacle."""

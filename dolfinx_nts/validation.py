@@ -152,6 +152,13 @@ def require_name(argument: str, value: object) -> None:
         raise ValueError(f"{argument}={value!r}: is empty; pass e.g. {argument}='block'")
 
 
+def require_one_of(name: str, value: object, known: Iterable[str]) -> None:
+    """Raise ValueError unless the value is one of the known texts."""
+    known = tuple(known)
+    if not (isinstance(value, str) and value in known):
+        raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, known))}")
+
+
 def floats(value: object) -> FloatArray:
     """The value as floats; an empty array where it is no array of real numbers, text included."""
     if hasattr(value, "ufl_shape"):  # UFL would take being asked for an array for Einstein's sum
@@ -172,6 +179,16 @@ def vector(name: str, value: object, unit: str, *, or_else: str = "") -> FloatAr
         other = f", or {or_else}" if or_else else ""
         raise ValueError(f"{name}={value!r}: pass three finite components [{unit}]{other}")
     return array
+
+
+def direction(name: str, value: object) -> FloatArray:
+    """A unit vector (3,) along a given one of any length."""
+    given = vector(name, value, "-")
+    largest = np.abs(given).max()
+    if largest == 0.0:
+        raise ValueError(f"{name}={value!r}: has no direction; pass a vector that is not zero")
+    given = given / largest  # squares of the smallest and largest numbers are none
+    return given / np.linalg.norm(given)
 
 
 def vectors(name: str, value: object, what: str) -> FloatArray:
@@ -280,29 +297,17 @@ def at_time(
             ranks.
     """
     label = f"{name} at t={float(time)!r}"
-    problem, cause, value = None, None, np.zeros(3)
-    try:
-        given = function(time)
-    except Exception as error:  # any: a rank that raises alone would leave the others waiting
-        cause, problem = error, f"{label}: {function!r} raised {error!r}; correct it"
-    else:
-        array = floats(given)
-        if array.shape == (3,) and np.isfinite(array).all():
-            value = array
-        else:
-            shown = given.item() if isinstance(given, np.generic) else given  # NumPy 2 adds a type
-            problem = f"{label}: returned {shown!r}; pass three finite components [{unit}]"
-    agree(comm, label, value, problem, cause)
+    value = floats(given := call_together(comm, label, function, time))
+    problem = None
+    if value.shape != (3,) or not np.isfinite(value).all():
+        shown = given.item() if isinstance(given, np.generic) else given  # NumPy 2 adds a type
+        problem = f"{label}: returned {shown!r}; pass three finite components [{unit}]"
+        value = np.zeros(3)
+    agree(comm, label, value, problem)
     return value
 
 
-def agree(
-    comm: MPI.Comm,
-    label: str,
-    value: FloatArray,
-    problem: str | None,
-    cause: Exception | None = None,
-) -> None:
+def agree(comm: MPI.Comm, label: str, value: FloatArray, problem: str | None) -> None:
     """Raise on all ranks what is wrong with a function's value on one, or if values differ.
 
     Args:
@@ -310,7 +315,6 @@ def agree(
         label: What the function is for, and when it was called.
         value: What it returned here, of the same shape on all ranks.
         problem: What is wrong with it.
-        cause: What it raised.
 
     Raises:
         UserFunctionError: As above; the largest numbers may differ by rounding.
@@ -326,7 +330,7 @@ def agree(
                 "same on all ranks"
             )
     if problem is not None:
-        raise UserFunctionError(problem) from cause
+        raise UserFunctionError(problem)
 
 
 def vector_in_time(comm: MPI.Comm, name: str, value: Any, time: float, unit: str) -> FloatArray:

@@ -168,8 +168,7 @@ class Body:
 
     def linear_momentum(self, momentum: FloatArray) -> FloatArray:
         """This rank's part of the sum of the places' momenta [kg m/s], shape (3,)."""
-        total: FloatArray = self.places @ momentum.reshape(-1, 3)
-        return total
+        return self.places @ momentum.reshape(-1, 3)
 
     def angular_momentum(self, u: FloatArray, momentum: FloatArray) -> FloatArray:
         """This rank's part of sum y_a x p_a about the origin [kg m^2/s], shape (3,)."""

@@ -59,8 +59,7 @@ class Directors(Joint):
 
 def _handedness(y: FloatArray, _: tuple[float, ...]) -> FloatArray:
     """Determinants of triads, which turn over to negative ones, shape (n,)."""
-    found: FloatArray = np.linalg.det(y[:, 1:])
-    return found
+    return np.linalg.det(y[:, 1:])
 
 
 def turns_of(y0: FloatArray, y1: FloatArray, count: int) -> FloatArray:
@@ -76,5 +75,4 @@ def turns_of(y0: FloatArray, y1: FloatArray, count: int) -> FloatArray:
     cosine = np.einsum("nij,nij->n", a, b) / np.einsum("nij,nij->n", a, a)
     if count == 3:
         cosine = 1.5 * cosine - 0.5
-    found: FloatArray = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return found
+    return np.arccos(np.clip(cosine, -1.0, 1.0))

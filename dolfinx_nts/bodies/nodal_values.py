@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,12 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import UserFunctionError, at_points, vector
+
+
+def motion_on(space: fem.FunctionSpace, name: str) -> tuple[fem.Function, fem.Function]:
+    """Functions for the displacement and the velocity of a body of this name."""
+    stem = re.sub(r"\W", "_", name, flags=re.ASCII)  # DOLFINx makes C identifiers of the names
+    return fem.Function(space, name=f"{stem}_u"), fem.Function(space, name=f"{stem}_v")
 
 
 def nodal_values(
@@ -65,8 +72,7 @@ def at_nodes(space: fem.FunctionSpace, what: str, value: Any) -> FloatArray:
 
 def cell_function(mesh: Mesh, name: str, values: FloatArray) -> fem.Function:
     """Function of degree 0 from values in this rank's cells, (n, 3) or (n, 3, 3). Collective."""
-    make = compat.cell_vector_space if values.ndim == 2 else compat.tensor_space
-    function = fem.Function(make(mesh, "DG", 0), name=name)
+    function = fem.Function(compat.function_space(mesh, "DG", 0, values.shape[1:]), name=name)
     of_cells = compat.cell_dofs(function.function_space)[: len(values), 0]
     rows = values.reshape(len(values), 3 ** (values.ndim - 1))
     function.x.array.reshape(-1, rows.shape[1])[of_cells] = rows

@@ -52,8 +52,7 @@ class Neighbourhoods:
         key = point[:, None] * self._number + self._at[facet]
         i = np.searchsorted(self._key, key).clip(max=len(self._key) - 1)
         way = np.where(self._key[i] == key, self._way[i], np.inf).min(axis=1)
-        near: BoolArray = way <= _RATIO * distance
-        return near
+        return way <= _RATIO * distance
 
 
 def _ways(

@@ -17,7 +17,7 @@ from dolfinx_nts.interaction.combination import Combination, of_multipliers
 from dolfinx_nts.interaction.constraint_elements import SHIFT
 from dolfinx_nts.interaction.elements import Step, over
 from dolfinx_nts.kernels import compiled_law, nts_element
-from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.kernels.vectors import resultant
 from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
@@ -105,8 +105,7 @@ class ContactElements(Batch):
     @property
     def immovable(self) -> BoolArray:
         """Whether all coordinates of the pairs' masters are prescribed, shape (n,)."""
-        fixed: BoolArray = _fixed(self.attachment)[:, self._own :].all(axis=(1, 2))
-        return fixed
+        return _fixed(self.attachment)[:, self._own :].all(axis=(1, 2))
 
     @property
     def sag(self) -> FloatArray | float:
@@ -141,13 +140,11 @@ class ContactElements(Batch):
     def _measured(self, y: FloatArray) -> FloatArray:
         """The measure's points (n, points, 3) from nodes (n, k, 3) [m]."""
         weights = self.attachment.weights
-        x: FloatArray = (y if weights is None else np.matmul(weights, y)) - self.attachment.path[1]
-        return x
+        return (y if weights is None else np.matmul(weights, y)) - self.attachment.path[1]
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gaps beyond the overlap that is left [m], shape (n,), of nodes as of `evaluate`."""
-        gap: FloatArray = self.measure.gap(self._measured(x)) - self.offset + self.law.overlap
-        return gap
+        return self.measure.gap(self._measured(x)) - self.offset + self.law.overlap
 
     def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
         """Gaps [m], shape (n,), by positions of all points.
@@ -190,8 +187,7 @@ class ContactElements(Batch):
     @cached_property
     def _held(self) -> BoolArray:
         """Which slaves move as prescribed, shape (n,)."""
-        held: BoolArray = _fixed(self.attachment)[:, : self._own].all(axis=(1, 2))
-        return held
+        return _fixed(self.attachment)[:, : self._own].all(axis=(1, 2))
 
     def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
         """Multipliers of given contact forces on the slaves [N], shape (n, constraints).
@@ -325,28 +321,32 @@ class ContactElements(Batch):
             theta: Where between t_n and t_{n+1} the forces act.
         """
         start = self.measure.start[:, 0] + self.attachment.path[0]
-        x = self.pair.origin + start + theta * (part.place - start)
-        total: FloatArray = resultant(x, part.force)[1]
-        return total
+        place, force = self._pushed(part)
+        return resultant(self.pair.origin + start + theta * (place - start), force)[1]
+
+    def _pushed(self, part: Contribution) -> tuple[FloatArray, FloatArray]:
+        """The measure's slaves at t_{n+1} [m], and forces on them [kg m], shape (n, 3) each."""
+        return part.place, part.force
 
     def nodal_forces(self, part: Contribution) -> list[FloatArray]:
         """Forces on the points of the slave and of the master's surface, if it has a body [kg m].
 
-        Args:
-            part: Solution of the step.
-
         Returns:
             Of each surface this rank's part, shape (p, 3).
         """
-        force, shares, start, found = -part.coupling, self.attachment.shares, 0, []
+        found = []
+        for surface, each in zip(self.attachment.surfaces, self._pushes(part), strict=True):
+            found.append(np.zeros((len(surface.points), 3)))
+            np.add.at(found[-1], *each)
+        return found
+
+    def _pushes(self, part: Contribution) -> list[tuple[IntArray, FloatArray]]:
+        """Of each surface, numbers of points (n, p) and forces on them [kg m], (n, p, 3)."""
+        force, shares, numbers = -part.coupling, self.attachment.shares, self.attachment.numbers
         if shares is not None:
             force = np.matmul(shares.transpose(0, 2, 1), force)
-        for surface, number in zip(self.attachment.surfaces, self.attachment.numbers, strict=True):
-            total, stop = np.zeros((len(surface.points), 3)), start + number.shape[1]
-            np.add.at(total, number, force[:, start:stop])
-            found.append(total)
-            start = stop
-        return found
+        each = np.split(force, np.cumsum([number.shape[1] for number in numbers]), axis=1)
+        return list(zip(numbers, each, strict=False))
 
     def impulse(self, part: Contribution, push: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What impulses along the normals at t_{n+1} do, of slaves that are active.
@@ -375,8 +375,7 @@ class ContactElements(Batch):
 
     def gains(self, part: Contribution, factor: float) -> FloatArray:
         """Energy that each pair brings in by starting behind its facet [J], shape (n,)."""
-        gain: FloatArray = part.multiplier[:, 0] * self.candidates.gap / factor
-        return gain
+        return part.multiplier[:, 0] * self.candidates.gap / factor
 
     def history(self, part: Contribution, factor: float, old: ContactHistory) -> ContactHistory:
         """Return what the contact remembers of an accepted step."""
@@ -416,11 +415,6 @@ class ContactElements(Batch):
         return float(weight[i]), text
 
 
-def resultant(x: FloatArray, force: FloatArray) -> FloatArray:
-    """Sum of forces (n, 3) at points (n, 3), and of their moments about the origin, (2, 3)."""
-    return np.array([force.sum(axis=0), cross(x, force).sum(axis=0)])
-
-
 def _fixed(attachment: Attachment) -> BoolArray:
     """Which coordinates of the surfaces' points are prescribed, shape (n, sum of p, 3)."""
     both = zip(attachment.surfaces, attachment.numbers, strict=True)
@@ -432,22 +426,13 @@ def _moves(attachment: Attachment, foot: FloatArray) -> FloatArray:
     weights = np.concatenate([np.ones((len(foot), 1)), -foot], axis=1)
     if attachment.shares is None:
         return weights
-    moves: FloatArray = np.einsum("nk,nkp->np", weights, attachment.shares)
-    return moves
+    return np.einsum("nk,nkp->np", weights, attachment.shares)
 
 
 def elements_of(
     pair: Any, found: Candidates, attachment: Attachment, measure: ContactMeasure, step: Step
 ) -> ContactElements:
-    """Elements of a step by the law of a pair. Collective.
-
-    Args:
-        pair: The pair.
-        found: Its candidates.
-        attachment: Which points of bodies these are.
-        measure: Their gap and slip.
-        step: The step.
-    """
+    """Elements of a pair's candidates in a step, by its law. Collective."""
     moves = _moves(attachment, measure.foot)
     fixed = _fixed(attachment)
     scales = [step.scale(surface, pair.bodies) for surface in attachment.surfaces]

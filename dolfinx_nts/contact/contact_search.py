@@ -13,8 +13,9 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
+from dolfinx_nts.contact.left_behind import beside, unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
-from dolfinx_nts.contact.shared_nodes import held_before
+from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -29,12 +30,6 @@ _TOUCHING = 1e-6
 #: A gap of at most this many roundings of positions, or of forces, counts as closed; without a
 #: force it is no contact.
 _TOUCH = 4.0
-#: Difference of two normals, or of two gaps over the facet's size, that counts as none.
-_ONE = 1e-6
-#: Depth in facet sizes from which on a node behind a surface that it passed by is told.
-_BESIDE = 1e-3
-#: Depth in facet sizes from which on a node is told that lies behind its facet without a force.
-_UNHELD = 1e-6
 #: Depth from which on flight is a poor first guess, in the size of the facets on either side.
 _DEEP = 0.03
 #: Flight that closes a gap by this part of the step's motion, or more, makes a contact for sure.
@@ -43,11 +38,6 @@ _SURELY = 1e-3
 
 class ContactSearch:
     """Makes the elements of all contacts of a system, step after step; see `Coupling`.
-
-    Args:
-        contacts: The contacts.
-        bodies: Numbers of the bodies of each.
-        comm: MPI communicator.
 
     Attributes:
         elements: Candidates of each contact that have unknowns in this step.
@@ -111,7 +101,7 @@ class ContactSearch:
         if search:
             self._followed = [old.followed for old in self._old]
             self._found = [self._search(k) for k in range(len(self._pairs))]
-            self._drop_doubles()
+            drop_doubles(self._found, [old.force for old in self._old])
             had = self.had_unknowns
             self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in enumerate(self._found)]
         self._choose()
@@ -218,27 +208,6 @@ class ContactSearch:
         offset = pair.offset[found.node] if pair.adjust else 0.0
         return replace(elements, law=law, offset=offset)
 
-    def _drop_doubles(self) -> None:
-        """Keep one of two pairs that keep a node out of the same fixed surface.
-
-        Two constraints on one gap are one too many where no master can yield, as over the seam of
-        two plates. A node stays with the one that carried it.
-        """
-        for i, j in itertools.combinations(range(len(self._found)), 2):
-            a, b = self._found[i], self._found[j]
-            if a.pair.slave.body is not b.pair.slave.body:
-                continue
-            one, two = (c.pair.slave.points[c.pair.slave.share[c.candidates.node]] for c in (a, b))
-            _, ia, ib = np.intersect1d(one, two, return_indices=True)
-            ca, cb = a.candidates.select(ia), b.candidates.select(ib)
-            double = np.einsum("ni,ni->n", ca.normal, cb.normal) > 1.0 - _ONE
-            double &= np.abs(ca.gap - cb.gap) < _ONE * np.minimum(ca.length, cb.length)
-            double &= a.immovable[ia] & b.immovable[ib]
-            stay = self._old[i].force[ca.node] >= self._old[j].force[cb.node]
-            for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
-                if len(there):
-                    self._found[k] = c.select(~np.isin(np.arange(len(c.candidates.node)), there))
-
     def _may_touch(self, k: int, c: ContactElements, had: BoolArray) -> BoolArray:
         """Return which need unknowns: all within reach, and those that had them in the last step.
 
@@ -256,8 +225,7 @@ class ContactSearch:
         # What goes to and fro at the limit would change the layout in every step.
         # All nodes that rest, or none: rounding of their gaps must not decide which carry forces.
         near = reach + c.law.rounding if c.pair.redundant else reach
-        awake: BoolArray = had[node] | (c.candidates.gap < near) | (force > 0.0)
-        return awake
+        return had[node] | (c.candidates.gap < near) | (force > 0.0)
 
     # ---- a solution
     def wake(self, e: Evaluation, parts: Sequence[Contribution]) -> bool:
@@ -359,42 +327,10 @@ class ContactSearch:
 
     def warnings(self, parts: Sequence[Contribution]) -> list[StepWarning]:
         """Nodes that an accepted step leaves beside or behind a surface."""
-        return [*self._beside(), *self._unheld(parts)]
-
-    def _beside(self) -> Iterator[StepWarning]:
-        """Nodes that have passed by a surface's edge and lie behind it. Collective."""
+        found = unheld(self._comm, self.elements, parts)
         if not self._step.integrator.inertia:
-            return  # what a load step passes by is looked for
-        deepest = global_max(self._comm, np.array([depth for depth, _ in self.beside]))
-        if deepest.max(initial=0.0) <= _BESIDE:
-            return
-        found = self._comm.allgather(self.beside)
-        for k in np.flatnonzero(deepest > _BESIDE):
-            depth, node = max(of_rank[k] for of_rank in found)
-            name = self._pairs[k].name
-            text = (
-                f"node {node} of contact {name!r} has passed the master's edge and lies {depth:.3g}"
-                " of a facet behind its surface, where nothing holds it; let the master's surface "
-                "reach farther"
-            )
-            yield StepWarning("node beside a surface", float(depth), text, (name,))
-
-    def _unheld(self, parts: Sequence[Contribution]) -> Iterator[StepWarning]:
-        """Nodes behind their facets whose forces would be rounding of other forces. Collective."""
-        depths = [
-            (-part.gap / c.candidates.length)[~part.active].max(initial=0.0)
-            for c, part in zip(self.elements, parts, strict=True)
-        ]
-        for pair, depth in zip(self._pairs, global_max(self._comm, np.array(depths)), strict=True):
-            # Without friction no force counts as rounding.
-            if pair.friction and depth > _UNHELD:
-                text = (
-                    f"nodes of contact {pair.name!r} lie up to {depth:.3g} of a facet behind their "
-                    "master without contact: a force that holds them is below the rounding of the "
-                    "forces in the bodies, where friction has no direction; pass friction=0, or "
-                    "let the bodies differ less in stiffness and weight"
-                )
-                yield StepWarning("contact below rounding", float(depth), text, (pair.name,), True)
+            return list(found)  # what a load step passes by is looked for
+        return [*beside(self._comm, self._pairs, self.beside), *found]
 
     # ---- first guesses, and what leads to a solution
     def guess(self, k: int, x: FloatArray) -> FloatArray:
@@ -421,8 +357,7 @@ class ContactSearch:
         c, old = self.elements[k], self._carried[k]
         node = c.candidates.node
         forces = c.multipliers(old.force[node], old.tangential[node])
-        multipliers: FloatArray = self._step.factor * forces / c.law.scale[:, None]
-        return multipliers
+        return self._step.factor * forces / c.law.scale[:, None]
 
     @property
     def may_slip(self) -> bool:

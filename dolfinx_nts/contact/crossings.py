@@ -226,9 +226,7 @@ def places(way: float, through: float) -> int:
 def _meeting(one: FloatArray, two: FloatArray) -> tuple[float, float]:
     """First and last part of a motion in which boxes may meet; the first is larger if they do not.
 
-    Args:
-        one: Smallest and largest coordinates at the start and at the end [m], shape (2, 2, 3).
-        two: Those of the other box.
+    Of each box the smallest and largest coordinates at the start and the end [m], (2, 2, 3).
     """
     # Points that move evenly stay within bounds that move evenly. All of these must be negative.
     apart = np.concatenate([one[:, 0] - two[:, 1], two[:, 0] - one[:, 1]], axis=1)
@@ -285,11 +283,7 @@ class BodyPair:
         return [Watched((one, two), self.contacts, None)]
 
     def look(self, where: list[FloatArray]) -> tuple[list[Finding], Pause]:
-        """Return what is inside, and how long nothing else may be. Collective.
-
-        Args:
-            where: Of `where`.
-        """
+        """Return what is inside, and how long nothing else may be. Collective."""
         positions = self._positions(where)
         looks = [part.look(positions) for part in self._parts]
         pause = reduce(Pause.shorter, (pause for _, pause in looks))

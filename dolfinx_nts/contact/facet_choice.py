@@ -91,8 +91,7 @@ def _angles(normals: FloatArray, others: FloatArray) -> FloatArray:
     """Angles between unit vectors (m, 3) and others, (m, 3) or (3,) [degrees], shape (m,)."""
     others = np.broadcast_to(others, normals.shape)
     sine = np.linalg.norm(cross(normals, others), axis=1)
-    found: FloatArray = np.degrees(np.arctan2(sine, np.einsum("ni,ni->n", normals, others)))
-    return found
+    return np.degrees(np.arctan2(sine, np.einsum("ni,ni->n", normals, others)))
 
 
 def _grown(mesh: Mesh, seeds: IntArray, angle: float) -> IntArray:

@@ -91,14 +91,12 @@ class FacetGap(Batch):
     def tangents(self) -> FloatArray:
         """Tangents a_a of the facets at t_n over their size [-], shape (n, 2, 3)."""
         _, tangents, _ = facets.frame(self.start[:, 1:], self.xi)
-        scaled: FloatArray = tangents / self.length[:, None, None]
-        return scaled
+        return tangents / self.length[:, None, None]
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of points at t_{n+1}, shape (n,)."""
         foot, _, normal = facets.frame(x[:, 1:], self.projection(x))
-        value: FloatArray = np.einsum("ni,ni->n", x[:, 0] - foot, normal)
-        return value
+        return np.einsum("ni,ni->n", x[:, 0] - foot, normal)
 
     def projection(self, x: FloatArray) -> FloatArray:
         """Convective coordinates (n, 2); NaN, which no step survives, where there is none."""
@@ -273,8 +271,7 @@ class FacetGap(Batch):
 
         def reduce(a: FloatArray) -> FloatArray:
             """Derivatives by the outer unknowns from those by all."""
-            reduced: FloatArray = a[..., outer] - np.matmul(a[..., inner], inside)
-            return reduced
+            return a[..., outer] - np.matmul(a[..., inner], inside)
 
         tangent = reduce(tangent[:, outer])
         if slip is not None:

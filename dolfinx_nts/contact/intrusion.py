@@ -75,8 +75,7 @@ class Found(NamedTuple):
     @property
     def is_node(self) -> BoolArray:
         """Whether each is a node, shape (n,)."""
-        same: BoolArray = self.nodes[:, 0] == self.nodes[:, 1]
-        return same
+        return self.nodes[:, 0] == self.nodes[:, 1]
 
 
 _NOTHING = Found(
@@ -173,8 +172,7 @@ class Placed:
     @cached_property
     def corners(self) -> FloatArray:
         """Corners of the facets [m], shape (m, nc, 3)."""
-        corners: FloatArray = self.x[self.boundary.facets]
-        return corners
+        return self.x[self.boundary.facets]
 
     @cached_property
     def sizes(self) -> FloatArray:
@@ -186,8 +184,7 @@ class Placed:
 
     def edge_sizes(self, edge: IntArray) -> FloatArray:
         """Size of the larger facet beside each of the edges [m], shape (n,)."""
-        largest: FloatArray = self.sizes[self.boundary.beside[edge]].max(axis=1)
-        return largest
+        return self.sizes[self.boundary.beside[edge]].max(axis=1)
 
     @cached_property
     def facet_boxes(self) -> tuple[FloatArray, FloatArray]:
@@ -246,8 +243,7 @@ class Placed:
         else:
             normal = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
-        unit: FloatArray = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
-        return unit
+        return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
 
     def _around(self, point: IntArray) -> tuple[FloatArray, BoolArray]:
         """Normals at points, weighted by the facets' angles, (n, 3); which are on a rim, (n,)."""
@@ -269,8 +265,7 @@ class Placed:
 
 def _meet(low: FloatArray, high: FloatArray, box: FloatArray) -> BoolArray:
     """Which of the boxes low (n, 3) to high (n, 3) meet a box (2, 3)."""
-    meet: BoolArray = ((low <= box[1]) & (high >= box[0])).all(axis=1)
-    return meet
+    return ((low <= box[1]) & (high >= box[0])).all(axis=1)
 
 
 def box_gap(one: FloatArray, two: FloatArray) -> float:
@@ -355,16 +350,14 @@ def _edges_near(a: Placed, b: Placed, least: float) -> IntArray:
 def _straddles(at: Depth, end: IntArray) -> BoolArray:
     """Whether the ends (n, 2) of edges are over facets that face opposite ways, shape (n,)."""
     one, two = at.normal[end].transpose(1, 0, 2)
-    both: BoolArray = (_cosine(one, two) < _OPPOSITE) & at.over[end].all(axis=1)
-    return both
+    return (_cosine(one, two) < _OPPOSITE) & at.over[end].all(axis=1)
 
 
 def _cosine(one: FloatArray, two: FloatArray) -> FloatArray:
     """Cosine of the angles between vectors (n, 3) each, shape (n,); 0 where one is zero."""
     length = np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
     product = np.einsum("ni,ni->n", one, two)
-    cosine: FloatArray = np.divide(product, length, out=np.zeros_like(length), where=length > 0.0)
-    return cosine
+    return np.divide(product, length, out=np.zeros_like(length), where=length > 0.0)
 
 
 def _deepest(

@@ -40,14 +40,12 @@ class _Near(NamedTuple):
     @property
     def deep(self) -> BoolArray:
         """Which are in the obstacle, shape (n,)."""
-        deep: BoolArray = self.depth > self.limit
-        return deep
+        return self.depth > self.limit
 
     @property
     def between(self) -> BoolArray:
         """Which are as much deeper in it than their nodes, shape (n,)."""
-        between: BoolArray = self.depth - np.maximum(self.corner, 0.0) > self.limit
-        return between
+        return self.depth - np.maximum(self.corner, 0.0) > self.limit
 
     def select(self, chosen: BoolArray) -> _Near:
         """Some of them."""
@@ -350,5 +348,4 @@ def _shared(surface: Surface, declared: Sequence[Surface]) -> BoolArray:
     rows = np.sort(np.concatenate(tables), axis=1)
     number = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
     own = len(surface.facets)
-    shared: BoolArray = np.isin(number[-own:], number[:-own])
-    return shared
+    return np.isin(number[-own:], number[:-own])

@@ -46,8 +46,7 @@ class ObstacleGap(Batch):
     @property
     def extent(self) -> float:
         """Size of the obstacle [m]."""
-        extent: float = self.obstacle.extent
-        return extent
+        return self.obstacle.extent
 
     @property
     def foot(self) -> FloatArray:
@@ -63,8 +62,7 @@ class ObstacleGap(Batch):
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gap [m] of slaves at t_{n+1}, shape (n, 1, 3)."""
-        value: FloatArray = self.obstacle.gap(x[:, 0]).value
-        return value
+        return self.obstacle.gap(x[:, 0]).value
 
     def augmented(self, x: FloatArray) -> FloatArray:
         """None."""

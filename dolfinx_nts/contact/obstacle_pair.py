@@ -43,8 +43,7 @@ class ObstaclePair(ContactPair, master=Obstacle):
     @property
     def driven(self) -> bool:
         """Whether the obstacle moves."""
-        moves: bool = self.master.driven
-        return moves
+        return self.master.driven
 
     def has_master_of(self, other: ContactPair) -> bool:
         """Return whether the obstacles of both are equal."""

@@ -19,7 +19,14 @@ import numpy as np
 from dolfinx_nts.kernels.bounded_slope import highest
 from dolfinx_nts.kernels.nts_element import Gap
 from dolfinx_nts.types import FloatArray, Settings
-from dolfinx_nts.validation import at_time, known_options, require_name, require_positive, vector
+from dolfinx_nts.validation import (
+    at_time,
+    direction,
+    known_options,
+    require_name,
+    require_positive,
+    vector,
+)
 
 Vector = Sequence[float] | FloatArray
 Motion = Callable[[float], Vector]
@@ -117,8 +124,7 @@ class Obstacle:
             return -self.lowest_gap(x0, x1)
         length = np.linalg.norm(x1 - x0, axis=1)
         between = 0.5 * (length - self.gap(x0).value - self.gap(x1).value)
-        bound: FloatArray = np.maximum(self._sampled(x0, x1, limit), np.minimum(between, limit))
-        return bound
+        return np.maximum(self._sampled(x0, x1, limit), np.minimum(between, limit))
 
     def _sampled(self, x0: FloatArray, x1: FloatArray, limit: FloatArray) -> FloatArray:
         """Largest depth on straight paths [m], (n,), to one part in a hundred above the limit."""
@@ -160,16 +166,6 @@ class Obstacle:
             )
 
 
-def _direction(name: str, value: Vector) -> tuple[float, ...]:
-    direction = vector(name, value, "-")
-    # By the largest component first: squares of tiny or huge numbers leave the range of floats.
-    largest = np.abs(direction).max()
-    if largest == 0.0:
-        raise ValueError(f"{name}={value!r}: has no direction; pass a vector other than zero")
-    direction = direction / largest
-    return tuple((direction / np.linalg.norm(direction)).tolist())
-
-
 def _place(name: str, value: Vector) -> tuple[float, ...]:
     return tuple(vector(name, value, "m").tolist())
 
@@ -200,7 +196,7 @@ class Plane(Obstacle):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", _place("point", self.point))
-        object.__setattr__(self, "normal", _direction("normal", self.normal))
+        object.__setattr__(self, "normal", tuple(direction("normal", self.normal).tolist()))
         self._check()
 
     @property
@@ -292,8 +288,7 @@ class _Round(Obstacle):
         square = np.einsum("ni,ni->n", path, path)
         part = -np.einsum("ni,ni->n", y0, path) * inverse(square)
         nearest = y0 + part.clip(0.0, 1.0)[:, None] * path
-        lowest: FloatArray = np.linalg.norm(nearest, axis=1) - self.radius
-        return lowest
+        return np.linalg.norm(nearest, axis=1) - self.radius
 
     def discrete_gradient(self, x0: FloatArray, x1: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(y_0 + y_1) / (r_0 + r_1): the discrete gradient of r, the root of y . y."""
@@ -308,8 +303,7 @@ class _Round(Obstacle):
 
 def inverse(r: FloatArray) -> FloatArray:
     """1/r, and 0 for 0: the centre of a ball has no direction and touches nothing."""
-    result: FloatArray = np.divide(1.0, r, out=np.zeros_like(r), where=r != 0.0)
-    return result
+    return np.divide(1.0, r, out=np.zeros_like(r), where=r != 0.0)
 
 
 @known_options
@@ -378,7 +372,7 @@ class Cylinder(_Round):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", _place("point", self.point))
-        object.__setattr__(self, "axis", _direction("axis", self.axis))
+        object.__setattr__(self, "axis", tuple(direction("axis", self.axis).tolist()))
         self._check()
 
     def about(self, origin: FloatArray) -> Cylinder:

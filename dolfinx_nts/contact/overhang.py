@@ -108,23 +108,16 @@ def overhang(
 
 
 def _rises(corner: FloatArray, on: BoolArray, master: FloatArray) -> BoolArray:
-    """Whether facets rise from the master on the way from each corner that carries to the others.
+    """Whether facets (m, nc, 3) rise from the master's (k, nc, 3) on the way between corners.
 
-    Args:
-        corner: Corners of the facets [m], shape (m, nc, 3).
-        on: Which of them carry, shape (m, nc).
-        master: Corners of the master's facets [m].
-
-    Returns:
-        Shape (m, nc, nc), first the corner that carries.
+    From each corner that carries, `on` (m, nc), to the others: shape (m, nc, nc), that one first.
     """
     at = closest_facets(corner[on], master, reach=np.inf)
     normal = np.zeros_like(corner)
     normal[on] = fc.frame(master[at.facet], at.xi)[2]
     edge = corner[:, None] - corner[:, :, None]
     rise: FloatArray = np.einsum("mkli,mki->mkl", edge, normal)
-    steep: BoolArray = rise > _RISES * np.linalg.norm(edge, axis=3)
-    return steep
+    return rise > _RISES * np.linalg.norm(edge, axis=3)
 
 
 def inside_rim(

@@ -49,9 +49,6 @@ class OverlapWatch:
     a small obstacle counts as a facet, and so does the thickness of the thicker one of two bodies.
     Where they have moved by more than that thickness between two looks, the straight way is looked
     at, too.
-
-    Args:
-        system: The scene.
     """
 
     def __init__(self, system: Any) -> None:
@@ -60,8 +57,7 @@ class OverlapWatch:
         self._edges: dict[int, InnerEdges] = {}
 
         def start() -> tuple[FloatArray, ...]:
-            at_start: tuple[FloatArray, ...] = system.initial_state().u
-            return at_start
+            return system.initial_state().u
 
         between: dict[tuple[tuple[int, ...], bool], list[Any]] = {}
         obstacles: list[ObstacleContact] = []
@@ -165,11 +161,9 @@ class OverlapWatch:
             ))  # fmt: skip
 
     def _held_otherwise(self, k: int, forces: Sequence[FloatArray]) -> BoolArray:
-        """Which points of a contact's slave carry in another contact, shape (p,).
+        """Which points of contact k's slave carry in another contact, shape (p,).
 
-        Args:
-            k: Number of the contact.
-            forces: Normal forces of all points of each contact's slave [N].
+        By the normal forces of all points of each contact's slave [N].
         """
         slave = self._contacts[k][0].slave
         held = np.zeros(len(slave.points), dtype=bool)

@@ -18,7 +18,7 @@ from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import global_max
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
-from dolfinx_nts.validation import is_finite, known_options, require_bool
+from dolfinx_nts.validation import is_finite, known_options, require_bool, require_one_of
 
 #: Candidates are sought this part of a facet beyond the reach of the step's motion.
 MARGIN = 0.5
@@ -165,13 +165,8 @@ class ContactPair:
         require_bool("edges", edges)
         if not (is_finite(adjust) and adjust >= 0.0):
             raise ValueError(f"adjust={adjust!r}: pass a distance >= 0 [m]")
-        for name, given, known in (
-            ("interference", interference, tuple(INTERFERENCE)),
-            ("integration", integration, INTEGRATIONS),
-        ):
-            if not isinstance(given, str) or given not in known:
-                choices = ", ".join(map(repr, known))
-                raise ValueError(f"{name}={given!r}: choose one of {choices}")
+        require_one_of("interference", interference, INTERFERENCE)
+        require_one_of("integration", integration, INTEGRATIONS)
         masters = tuple(kind for kind, _ in self._kinds)
         if not isinstance(slave, Surface):
             other = isinstance(slave, masters)
@@ -266,8 +261,7 @@ class ContactPair:
     @property
     def master_name(self) -> str:
         """Name of the master for messages and files."""
-        name: str = self.master.name
-        return name
+        return self.master.name
 
     def has_master_of(self, other: ContactPair) -> bool:
         """Return whether the masters of both are equal, also of different systems."""
@@ -293,8 +287,7 @@ class ContactPair:
 
     def points(self, positions: Sequence[FloatArray], found: Candidates) -> FloatArray:
         """Slave and control points of pairs [m], shape (n, nc + 1, 3)."""
-        x: FloatArray = positions[0][self.slave.share[found.node]][:, None]
-        return x
+        return positions[0][self.slave.share[found.node]][:, None]
 
     def depth(self, u: Sequence[FloatArray]) -> FloatArray | float:
         """Return how deep slaves start inside another body, in facet sizes, wherever. Collective.
@@ -305,11 +298,7 @@ class ContactPair:
         return 0.0
 
     def settle(self, u: Sequence[FloatArray]) -> None:
-        """Take the gaps at the start that count as none, see `offset`. Collective.
-
-        Args:
-            u: As of `depth`.
-        """
+        """Take the gaps at the start that count as none, see `offset`. Collective."""
         self.offset, self._lift = np.zeros(len(self.slave.share)), 0.0
         if not self.adjust:
             return
@@ -326,21 +315,11 @@ class ContactPair:
         return self.slave.at_all(self.offset != 0.0)
 
     def _at_start(self, positions: Sequence[FloatArray], path: FloatArray) -> Candidates:
-        """This rank's slaves that may be within `adjust` of the master. Collective.
-
-        Args:
-            positions: Of all points at the start [m].
-            path: As of `find`.
-        """
+        """This rank's slaves within `adjust` of the master; arguments as of `find`. Collective."""
         raise NotImplementedError
 
     def encloses(self, u: Sequence[FloatArray], time: float) -> bool:
-        """Return whether all of the slave's body starts inside an obstacle. Collective.
-
-        Args:
-            u: As of `depth`.
-            time: Of the start [s].
-        """
+        """Return whether all of the slave's body starts inside an obstacle. Collective."""
         return False
 
     def find(
@@ -433,8 +412,7 @@ class ContactPair:
         return same_nodes and self.has_master_of(other)
 
     def _moved(self, surface: Surface, u: FloatArray) -> FloatArray:
-        x: FloatArray = surface.reference - self.origin + surface.gather(u)
-        return x
+        return surface.reference - self.origin + surface.gather(u)
 
 
 def _check_friction(friction: Any) -> None:

@@ -75,13 +75,8 @@ def first_hits(
 def _passages(start: FloatArray, moved: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return where triangles pass over the origin with their fronts ahead, and when.
 
-    Args:
-        start: Corners at the start [m], shape (p, 3, 3).
-        moved: Their motion [m], shape (p, 3, 3).
-
-    Returns:
-        Triangles, shape (k,), one of which may occur twice, and the part of the motion after which
-        each meets the origin [-], shape (k,).
+    For corners at the start and their motion [m], (p, 3, 3) each: triangles, (k,), one of which may
+    occur twice, and the part of the motion after which each meets the origin [-], (k,).
     """
     height = _height(start, moved)
     hull = height @ _HULL
@@ -103,13 +98,8 @@ def _passages(start: FloatArray, moved: FloatArray) -> tuple[IntArray, FloatArra
 def _height(start: FloatArray, moved: FloatArray) -> FloatArray:
     """Height of the planes of triangles over the origin times twice their area, a cubic of time.
 
-    Args:
-        start: Corners at the start [m], shape (p, 3, 3).
-        moved: Their motion [m], shape (p, 3, 3).
-
-    Returns:
-        Coefficients of the powers of time, lowest first [m^3], shape (p, 4); negative where the
-        origin is in front of the triangle.
+    For corners at the start and their motion [m], (p, 3, 3) each: coefficients of the powers of
+    time, lowest first [m^3], (p, 4); negative where the origin is in front of the triangle.
     """
     (a, one, two), (b, turn_one, turn_two) = (
         (x[:, 0], x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]) for x in (start, moved)

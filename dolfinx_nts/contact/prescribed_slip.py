@@ -51,8 +51,7 @@ class PrescribedSlip(Batch):
         along = np.eye(3) - self.normal[:, :, None] * self.normal[:, None]
         part, vector = np.linalg.eigh(np.matmul(along * self._prescribed[:, None], along))
         vector *= (part > _IMMOVABLE)[:, None]
-        projector: FloatArray = np.matmul(vector, vector.transpose(0, 2, 1))
-        return projector
+        return np.matmul(vector, vector.transpose(0, 2, 1))
 
     @cached_property
     def unmoved(self) -> FloatArray:
@@ -62,10 +61,9 @@ class PrescribedSlip(Batch):
         """
         metric = np.matmul(self.tangents, self.tangents.transpose(0, 2, 1))
         dual = nts_element.solve(metric, self.tangents)
-        projector: FloatArray = np.matmul(
+        return np.matmul(
             np.matmul(self.tangents, self._blocked), dual.transpose(0, 2, 1)
         )
-        return projector
 
     def held(
         self, x: FloatArray, still: FloatArray, slid: FloatArray | float = 0.0

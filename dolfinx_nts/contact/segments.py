@@ -109,15 +109,13 @@ def _plane(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _in_plane(x: FloatArray, middle: FloatArray, axes: FloatArray) -> FloatArray:
     """Corners (n, k, 3) in the plane of others [m], shape (n, k, 2)."""
-    found: FloatArray = np.matmul(x - middle[:, None], axes[:, :2].transpose(0, 2, 1))
-    return found
+    return np.matmul(x - middle[:, None], axes[:, :2].transpose(0, 2, 1))
 
 
 def _turns(polygon: FloatArray) -> FloatArray:
     """Twice the area of the triangle at each corner of polygons (n, k, 2), > 0 if convex there."""
     before, after = (polygon - np.roll(polygon, k, axis=1) for k in (1, -1))
-    turns: FloatArray = -(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0])
-    return turns
+    return -(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0])
 
 
 def _convex(polygon: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -181,8 +179,7 @@ def _area(polygon: FloatArray, count: IntArray) -> FloatArray:
     one, two = spans[:, 1:-1], spans[:, 2:]
     doubled = one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0]
     doubled[np.arange(2, polygon.shape[1]) >= count[:, None]] = 0.0
-    area: FloatArray = np.where(count < 3, 0.0, 0.5 * doubled.sum(axis=1))
-    return area
+    return np.where(count < 3, 0.0, 0.5 * doubled.sum(axis=1))
 
 
 def _points(

@@ -213,8 +213,7 @@ class SelfContact(FacetPair):
         Args:
             at: Facet of each of the rank's nodes, or -1, shape (share,).
         """
-        carries: BoolArray = (self.slave.at_all(at) >= 0)[self.slave.facets].any(axis=1)
-        return carries
+        return (self.slave.at_all(at) >= 0)[self.slave.facets].any(axis=1)
 
     def _one_sided(self, c: Candidates, current: IntArray, x: FloatArray) -> BoolArray:
         """Which candidates are slaves where two parts face each other, shape (n,). Collective.
@@ -247,8 +246,7 @@ class SelfContact(FacetPair):
         ).reshape(held.shape)
         carried = (foot * (slave[corners] & faces)).sum(axis=1)
         rim = carried < np.where(current[c.node] >= 0, _STAYS, _ENTERS)
-        chosen: BoolArray = slave[surface.share[c.node]] | rim
-        return chosen
+        return slave[surface.share[c.node]] | rim
 
 
 def _one_of_two(

@@ -7,17 +7,17 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.pair import ContactPair
-from dolfinx_nts.types import BoolArray
+from dolfinx_nts.types import BoolArray, FloatArray
+
+#: Difference of two normals, or of two gaps over the facet's size, that counts as none.
+_ONE = 1e-6
 
 
 def check_shared(contacts: Sequence[ContactPair]) -> None:
     """Raise unless what two contacts hold out of one master is a row of nodes between them.
-
-    Args:
-        contacts: Those of a system.
 
     Raises:
         ValueError: Two slaves share facets, or one's nodes are all the other's, or both share nodes
@@ -44,9 +44,6 @@ def check_shared(contacts: Sequence[ContactPair]) -> None:
 def held_before(contacts: Sequence[ContactPair]) -> list[BoolArray]:
     """Which points of each slave belong to a contact declared before, with the same master.
 
-    Args:
-        contacts: Those of a system.
-
     Returns:
         Of each contact, shape (points,).
     """
@@ -56,7 +53,33 @@ def held_before(contacts: Sequence[ContactPair]) -> list[BoolArray]:
     return found
 
 
-def areas(contacts: Sequence[ContactPair]) -> list[npt.NDArray[np.float64]]:
+def drop_doubles(found: list[ContactElements], forces: Sequence[FloatArray]) -> None:
+    """Keep one of two pairs that keep a node out of the same fixed surface.
+
+    Two constraints on one gap are one too many where no master can yield, as over the seam of two
+    plates. A node stays with the one that carried it.
+
+    Args:
+        found: Candidates of each contact, which are replaced.
+        forces: Of each the normal forces of its nodes in the last step [N], shape (share,).
+    """
+    for i, j in combinations(range(len(found)), 2):
+        a, b = found[i], found[j]
+        if a.pair.slave.body is not b.pair.slave.body:
+            continue
+        one, two = (c.pair.slave.points[c.pair.slave.share[c.candidates.node]] for c in (a, b))
+        _, ia, ib = np.intersect1d(one, two, return_indices=True)
+        ca, cb = a.candidates.select(ia), b.candidates.select(ib)
+        double = np.einsum("ni,ni->n", ca.normal, cb.normal) > 1.0 - _ONE
+        double &= np.abs(ca.gap - cb.gap) < _ONE * np.minimum(ca.length, cb.length)
+        double &= a.immovable[ia] & b.immovable[ib]
+        stay = forces[i][ca.node] >= forces[j][cb.node]
+        for k, c, there in ((i, a, ia[double & ~stay]), (j, b, ib[double & stay])):
+            if len(there):
+                found[k] = c.select(~np.isin(np.arange(len(c.candidates.node)), there))
+
+
+def areas(contacts: Sequence[ContactPair]) -> list[FloatArray]:
     """Tributary area of each point of each slave [m^2], (points,), with that of later contacts."""
     found = [c.slave.area.copy() for c in contacts]
     for i, j, _ in _beside(contacts):

@@ -146,10 +146,6 @@ def boundary_of_mesh(body: Any, u: FloatArray) -> FloatArray:
     """Corners of the exterior facets of a body's mesh that this rank has [m], (m, nc, 3).
 
     Collective.
-
-    Args:
-        body: The body.
-        u: Its owned displacements [m].
     """
     mesh = body.mesh
     nodes = oriented_nodes(mesh, compat.exterior_facets(mesh))
@@ -158,8 +154,7 @@ def boundary_of_mesh(body: Any, u: FloatArray) -> FloatArray:
     moved.x.array[: len(here)] = here
     moved.x.scatter_forward()
     blocks = compat.node_blocks(mesh, body.space)[nodes]
-    corners: FloatArray = mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
-    return corners
+    return mesh.geometry.x[nodes] + moved.x.array.reshape(-1, 3)[blocks]
 
 
 def oriented_nodes(mesh: Mesh, local_facets: IntArray) -> IntArray:

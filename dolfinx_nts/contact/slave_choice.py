@@ -32,10 +32,6 @@ def slave_and_master(a: Any, b: Any) -> tuple[Any, Any]:
        there;
     5. stiffnesses within 10 % are alike, too: the slave is the first one.
 
-    Args:
-        a: A surface, or an obstacle.
-        b: The other one.
-
     Raises:
         TypeError: One of them is of no known kind, or both are obstacles.
     """

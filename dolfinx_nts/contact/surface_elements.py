@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.contact.contact_elements import ContactElements, resultant
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution
 from dolfinx_nts.contact.contact_measure import Measured, Slip
 from dolfinx_nts.contact.facet_gap import FacetGap
@@ -25,7 +25,7 @@ from dolfinx_nts.contact.surface_sums import FacetAttachment, Sums
 from dolfinx_nts.interaction.combination import Combination
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled_law
-from dolfinx_nts.kernels.vectors import cross
+from dolfinx_nts.kernels.vectors import cross, resultant
 from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -119,14 +119,10 @@ class SurfaceElements(ContactElements):
 
     @cached_property
     def _elements_of(self) -> IntArray:
-        """How many elements the slaves at the corners have, shape (n, corners).
-
-        Each has a part of a slave's equations, without which one would say nothing of a multiplier
-        of its own.
-        """
+        """How many elements the slaves at the corners have, shape (n, corners)."""
+        # Each has a part of a slave's equations, or it would say nothing of its own multiplier.
         slot = self._slot
-        found: IntArray = np.append(np.bincount(slot[slot >= 0]), 1)[slot]
-        return found
+        return np.append(np.bincount(slot[slot >= 0]), 1)[slot]
 
     @property
     def immovable(self) -> BoolArray:
@@ -136,8 +132,7 @@ class SurfaceElements(ContactElements):
     @property
     def sag(self) -> FloatArray:
         """A part of the facets: where curved bodies touch at a point, means are off."""
-        sag: FloatArray = _SAG * self.candidates.length
-        return sag
+        return _SAG * self.candidates.length
 
     @property
     def tangents(self) -> FloatArray:  # type: ignore[override]
@@ -146,14 +141,8 @@ class SurfaceElements(ContactElements):
 
     @property
     def _held(self) -> BoolArray:  # type: ignore[override]
-        fixed: BoolArray = self.pair.slave.fixed[self._numbers].all(axis=1)
-        return fixed
-
-    @property
-    def _numbers(self) -> IntArray:
-        """Positions of the slaves in their surface."""
-        found: IntArray = self.pair.slave.share[self.candidates.node]
-        return found
+        slave = self.pair.slave
+        return slave.fixed[slave.share[self.candidates.node]].all(axis=1)
 
     def place(self, i: int) -> str:
         """The slave's number in the user's mesh."""
@@ -162,13 +151,11 @@ class SurfaceElements(ContactElements):
     # ---- places
     def _measured(self, y: FloatArray) -> FloatArray:
         """The measure's points (n, points, 3) from the nodes of elements [m]."""
-        x: FloatArray = np.matmul(self.sums.weights, y[self.sums.element])
-        return x
+        return np.matmul(self.sums.weights, y[self.sums.element])
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gaps of the slaves beyond the overlap that is left [m]."""
-        gap: FloatArray = self._gaps(self._measured(x)) + self.law.overlap
-        return gap
+        return self._gaps(self._measured(x)) + self.law.overlap
 
     def gap_at(self, positions: Sequence[FloatArray], path: FloatArray) -> FloatArray:
         """Gaps of the slaves [m] by positions of all points."""
@@ -202,12 +189,7 @@ class SurfaceElements(ContactElements):
 
     # ---- an iterate
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> Contribution:
-        """Residual and tangent, the law after the sums. Collective.
-
-        Args:
-            x: As of `ContactElements.evaluate`.
-            own: "constraints": h^2/2 lambda of the slaves at the corners over `ContactLaw.scale`.
-        """
+        """As of `ContactElements`, by multipliers of the slaves at the corners. Collective."""
         width = self.law.num_constraints
         of_corners = own["constraints"].reshape(self.num_elements, self._corners, width)
         multiplier = self.law.scale[:, None] * of_corners[self._first]
@@ -325,12 +307,9 @@ class SurfaceElements(ContactElements):
             tangent[:, here, here] = padded[:, k, :, 3:] / self._elements_of[:, k, None, None]
 
     # ---- a solution
-    def moment(self, part: Contribution, theta: float) -> FloatArray:
+    def _pushed(self, part: Contribution) -> tuple[FloatArray, FloatArray]:
         """As of `ContactElements`."""
-        start, force = self.measure.start[:, 0], -part.coupling[:, 0]
-        x = self.pair.origin + start + theta * (part.place[:, 0] - start)
-        total: FloatArray = resultant(x, force)[1]
-        return total
+        return part.place[:, 0], -part.coupling[:, 0]
 
     def pressing(self, part: Contribution) -> FloatArray:
         """As of `ContactElements`, of the pressure between the nodes, sum of C_qA lambda_A.
@@ -351,18 +330,11 @@ class SurfaceElements(ContactElements):
         pulls = self.sums.to_points(push)[:, None] * self.measure.normal_at(y)
         return np.einsum("ec,ecz->ez", each, gaps), resultant(self.pair.origin + y[:, 0], pulls)
 
-    def nodal_forces(self, part: Contribution) -> list[FloatArray]:
+    def _pushes(self, part: Contribution) -> list[tuple[IntArray, FloatArray]]:
         """As of `ContactElements`."""
-        force = -part.coupling
         own, master = (number[self.sums.element] for number in self.attachment.numbers)
-        of_slave = np.einsum("nc,ni->nci", self.sums.shape, force[:, 0])
-        found = []
-        both = zip(self.attachment.surfaces, (own, master), (of_slave, force[:, 1:]), strict=True)
-        for surface, number, values in both:
-            total = np.zeros((len(surface.points), 3))
-            np.add.at(total, number, values)
-            found.append(total)
-        return found
+        of_slave = np.einsum("nc,ni->nci", self.sums.shape, -part.coupling[:, 0])
+        return [(own, of_slave), (master, -part.coupling[:, 1:])]
 
 
 class _AtPoints(NamedTuple):

@@ -83,8 +83,7 @@ class Sums(Batch):
 
     def by_slave(self, values: FloatArray) -> FloatArray:
         """Sums of what points have at each corner of theirs (n, corners, k), shape (slaves, k)."""
-        found: FloatArray = self._incidence @ values.reshape(self.slot.size, values.shape[2])
-        return found
+        return self._incidence @ values.reshape(self.slot.size, values.shape[2])
 
     def to_slaves(self, values: FloatArray) -> FloatArray:
         """C times values of points, (n,) or (n, k)."""
@@ -95,13 +94,11 @@ class Sums(Batch):
     def at_corners(self, values: FloatArray) -> FloatArray:
         """Values of slaves (slaves, ..) at each point's corners, 0 at others, (n, corners, ..)."""
         padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
-        found: FloatArray = padded[self.slot]
-        return found
+        return padded[self.slot]
 
     def to_points(self, values: FloatArray) -> FloatArray:
         """C^T times values of slaves (slaves, ..), shape (n, ..)."""
-        found: FloatArray = np.einsum("nc,nc...->n...", self.share, self.at_corners(values))
-        return found
+        return np.einsum("nc,nc...->n...", self.share, self.at_corners(values))
 
     def moves(self, attachment: FacetAttachment, foot: FloatArray) -> list[Any]:
         """Weights of each surface's points in the motion of slaves against their feet, sparse.

@@ -156,8 +156,7 @@ class Surface:
         """Control points (n, nc, 3) from the patches' points (n, q, 3) [m]."""
         if self.weights is None:
             return x
-        result: FloatArray = np.matmul(self.weights[patch], x)
-        return result
+        return np.matmul(self.weights[patch], x)
 
     @cached_property
     def smallest(self) -> float:
@@ -200,8 +199,7 @@ class Surface:
         edges = np.stack([self.facets, np.roll(self.facets, -1, axis=1)], axis=-1)
         key = np.sort(edges.reshape(-1, 2), axis=1)
         _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-        free: npt.NDArray[np.bool_] = (count[inverse.ravel()] == 1).reshape(self.facets.shape)
-        return free
+        return (count[inverse.ravel()] == 1).reshape(self.facets.shape)
 
     def gather(self, values: FloatArray) -> FloatArray:
         """Values at all points, (p, 3), from this rank's owned body coordinates. Collective."""
@@ -217,8 +215,7 @@ class Surface:
         """Whether the points are nodes without mass, shape (p,). Collective."""
         if not self.body.has_massless:
             return np.zeros(len(self.points), dtype=bool)
-        found: npt.NDArray[np.bool_] = self.material.nodal(self.body.massless).all(axis=(1, 2))
-        return found
+        return self.material.nodal(self.body.massless).all(axis=(1, 2))
 
     @cached_property
     def _dealt(self) -> IntArray:
@@ -279,8 +276,7 @@ class Surface:
 
     def positions(self, u: FloatArray) -> FloatArray:
         """Positions of all points [m], shape (p, 3), from this rank's owned displacements."""
-        x: FloatArray = self.reference + self.gather(u)
-        return x
+        return self.reference + self.gather(u)
 
 
 def _distinct(rows: IntArray) -> IntArray:
@@ -303,8 +299,7 @@ def _rank_of(nodes: IntArray, size: int) -> IntArray:
     x = np.asarray(nodes).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
-    rank: IntArray = ((x >> np.uint64(32)) * np.uint64(size) >> np.uint64(32)).astype(int)
-    return rank
+    return ((x >> np.uint64(32)) * np.uint64(size) >> np.uint64(32)).astype(int)
 
 
 def flux(corners: FloatArray) -> FloatArray:

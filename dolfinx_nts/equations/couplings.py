@@ -31,9 +31,6 @@ class OfJoints(NamedTuple):
 class Couplings:
     """What makes the elements of each step.
 
-    Args:
-        system: The scene.
-
     Attributes:
         contacts: What makes the elements of contacts. Used directly only for what contacts alone
             have: closing gaps, checkpoints.

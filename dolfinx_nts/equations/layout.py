@@ -57,8 +57,7 @@ class Layout:
         """Numbers within a field -> numbers in the system vector."""
         start = self._field_start[:, field]
         rank = np.searchsorted(start, index, side="right") - 1
-        system: IntArray = self._rank_start[rank] + self._offset[rank, field] + index - start[rank]
-        return system
+        return self._rank_start[rank] + self._offset[rank, field] + index - start[rank]
 
 
 class ElementBlocks(NamedTuple):

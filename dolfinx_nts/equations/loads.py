@@ -17,10 +17,6 @@ from dolfinx_nts.types import FloatArray
 class Loads:
     """Loads on the bodies in a step; `begin` fixes the step and tells the bodies.
 
-    Args:
-        system: The scene.
-        integrator: Rules of the step.
-
     Attributes:
         moments: Where the forces on each body are taken.
         gravity: What acts of it in the step [m/s^2], shape (3,).
@@ -69,9 +65,6 @@ class Loads:
         methods that carry accelerations, not those where the step takes them. Loads that are
         functions of time differ; of others, and of other methods, it is 0. What loads push at
         prescribed coordinates goes into the supports: their reactions hold it.
-
-        Args:
-            e: Solution of the step.
         """
         rule, state, dt = self._integrator, self._state, self._dt
         work, batches = 0.0, self._system.batches

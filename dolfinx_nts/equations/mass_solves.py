@@ -11,11 +11,7 @@ from dolfinx_nts.types import FloatArray
 
 
 class Saddle:
-    """Factors of a matrix by MUMPS, without equations that repeat others. Collective.
-
-    Args:
-        matrix: PETSc AIJ matrix.
-    """
+    """Factors of a matrix by MUMPS, without equations that repeat others. Collective."""
 
     def __init__(self, matrix: PETSc.Mat) -> None:
         self._x, self._b = matrix.createVecs()
@@ -33,8 +29,7 @@ class Saddle:
         """Solution of A x = right, owned entries. Collective."""
         self._b.array_w[:] = right
         self._ksp.solve(self._b, self._x)
-        solution: FloatArray = self._x.array_r.copy()
-        return solution
+        return self._x.array_r.copy()
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

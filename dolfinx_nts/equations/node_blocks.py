@@ -79,23 +79,13 @@ def _chunks(start: IntArray) -> list[slice]:
 
 
 def _blocks(start: IntArray, entries: Array, chunk: slice) -> Array:
-    """Entries of an AIJ matrix, which come row by row, block by block.
-
-    Args:
-        start: Where its block rows begin, in blocks.
-        entries: Its columns or values.
-        chunk: Range of block rows.
-
-    Returns:
-        Shape (blocks, 3, 3).
-    """
+    """Columns or values of some block rows of an AIJ matrix, block by block, (blocks, 3, 3)."""
     start = start[chunk.start : chunk.stop + 1].astype(np.intp)
     count = np.diff(start)
     # Of the first axis; a node's other rows follow after as many triples as it has blocks.
     triple = np.arange(start[0], start[-1]) + np.repeat(2 * start[:-1], count)
     rows = triple[:, None] + np.repeat(count, count)[:, None] * np.arange(3)
-    blocks: Array = np.take(entries.reshape(-1, 3), rows, axis=0)
-    return blocks
+    return np.take(entries.reshape(-1, 3), rows, axis=0)
 
 
 class NodeBlocks:
@@ -184,13 +174,8 @@ def add(matrix: PETSc.Mat, numbers: IntArray, values: npt.NDArray[np.float64]) -
 def _most_couplings(comm: MPI.Comm, first: IntArray, elements: Sequence[IntArray]) -> IntArray:
     """Upper bound of the blocks that elements need in each of this rank's rows. Collective.
 
-    Args:
-        comm: MPI communicator.
-        first: First node of each rank, and the number of all.
-        elements: As of `NodeBlocks`.
-
-    Returns:
-        In the rank's own columns and in those of others, shape (nodes, 2).
+    In its own columns and in those of others, shape (nodes, 2). `first` is the first node of each
+    rank, and the number of all; elements as of `NodeBlocks`.
     """
     local = int(first[comm.rank + 1] - first[comm.rank])
     count = PETSc.Vec().createMPI((2 * local, None), comm=comm)

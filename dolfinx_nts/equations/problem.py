@@ -20,6 +20,7 @@ from petsc4py import PETSc
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.couplings import Couplings
+from dolfinx_nts.equations.flight import Flight
 from dolfinx_nts.equations.loads import Loads
 from dolfinx_nts.equations.scales import Lengths, Rounding, stiffness_between
 from dolfinx_nts.equations.shared_weight import SharedWeight
@@ -62,8 +63,7 @@ class StepProblem:
         loads: When the step takes which loads.
         supports: Prescribed coordinates in the step.
         batches: Which bodies it evaluates together.
-        first: Displacement of each batch of bodies at t_{n+1} without forces [m], after `begin`.
-        flight: M (u_1 - u_0) of each batch in free flight [kg m], likewise; zero in statics.
+        flight: The step without forces, after `begin`.
     """
 
     def __init__(
@@ -86,6 +86,9 @@ class StepProblem:
         self._again: Evaluation | None = None
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
         self.supports = Supports(system, integrator)
+        self.flight = Flight(
+            self.batches, integrator, self.supports, self.lengths, self._inertial
+        )
         lengths = self.lengths
         self.stabilization = Stabilization(
             system, lengths.radius or lengths.director, lengths.director or lengths.radius,
@@ -120,8 +123,9 @@ class StepProblem:
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
         self._evaluated, self._u0 = {}, self.batches.join(state.u)
         self.loads.begin(state, dt, moments)
-        at_rest = self._fly()
-        lengths, way = self.lengths, [a - b for a, b in zip(self.first, self._u0, strict=True)]
+        at_rest = self.flight.begin(state, self._u0, dt)
+        lengths, first = self.lengths, self.flight.ends
+        way = [a - b for a, b in zip(first, self._u0, strict=True)]
         if again is not None:
             lengths.motion = np.maximum(lengths.motion, lengths.motion_of(again))
             way = [terms.du for terms in again.terms]
@@ -130,41 +134,12 @@ class StepProblem:
         self.rounding.begin(self.factor, length, lengths.moved, lengths.extent)
         step = Step(
             state, dt, self.factor, self.integrator, self.condense,
-            self.batches.split(self.first), self.batches.split(way), lengths.motion, length,
+            self.batches.split(first), self.batches.split(way), lengths.motion, length,
             self.stabilization.stiffness, self.loads.moments, self.rounding.of,
         )  # fmt: skip
         self.couplings.begin(step, again, search)
         self._asleep = self._find_asleep(at_rest & (lengths.motion == 0.0)) if sleep else {}
         self._lay_out(again)
-
-    def _fly(self) -> BoolArray:
-        """Set `first`, `flight` and `lengths`, the step without forces. Collective.
-
-        Returns:
-            Whether each body starts without speed, shape (bodies,).
-        """
-        state, dt, batches = self.state, self.dt, self.batches
-        v0, a0 = batches.rates(state)
-        ahead = [self.integrator.ahead(v, a, dt) for v, a in zip(v0, a0, strict=True)]
-        self.first = [u + du for u, du in zip(self._u0, ahead, strict=True)]
-        for body, u1 in zip(batches.bodies, self.first, strict=True):
-            if body is not batches.rigid:
-                u1[body.fixed] = body.prescribed(state.time + dt)
-        self.supports.begin(state, batches.split(self.first), dt)
-        rates = [v0] + [[dt * a for a in a0 if a is not None]] * bool(state.a)
-        speed = self.lengths.begin(self._u0, rates, self.first)
-        # In statics v only predicts the first guess.
-        moves = (speed > 0.0) & self.integrator.inertia
-        moves[list(self.supports.moving)] = True
-        self.flight = []
-        each = zip(batches.bodies, batches.numbers, ahead, self.first, strict=True)
-        for body, of, du, u1 in each:
-            if not moves[of].any():
-                self.flight.append(np.zeros_like(du))
-                continue
-            flown = du if len(of) > 1 else self.supports.ahead(of[0], du, u1)
-            self.flight.append(self._inertial(body, flown))
-        return speed == 0.0
 
     @property
     def elements(self) -> list[Any]:
@@ -240,11 +215,6 @@ class StepProblem:
         return self.laid.of_body(k)
 
     @property
-    def of_constraints(self) -> slice:
-        """Where the elements' multipliers stand among this rank's unknowns."""
-        return self.laid.of_elements("constraints")
-
-    @property
     def laid(self) -> Unknowns:
         """The layout, after `begin`."""
         assert self.unknowns is not None, "begin comes first"
@@ -272,8 +242,7 @@ class StepProblem:
     def _inertial(self, body: Body, du: FloatArray) -> FloatArray:
         """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
         if self.integrator.inertia:
-            force: FloatArray = body.inertia(du)
-            return force
+            return body.inertia(du)
         return self.stabilization.of(body) * du
 
     def guess(
@@ -294,20 +263,16 @@ class StepProblem:
             again: Solution of this step with fewer elements: its motion and contact forces are
                 taken in place of these.
         """
-        places = self.first if flight else self._u0
+        places = self.flight.ends if flight else self._u0
         if again is not None:
             places = [terms.u1 for terms in again.terms]
         wanted = forces or not self.integrator.inertia
         multipliers = partial(self.couplings.guess, carried=carried) if wanted else None
-        self.laid.guess(places, self.first, self.elements, multipliers)
+        self.laid.guess(places, self.flight.ends, self.elements, multipliers)
 
     # ---- iterates
     def evaluate(self, x: PETSc.Vec) -> Evaluation:
-        """The step equations at an iterate; no state changes. Every rank must call it.
-
-        Args:
-            x: PETSc vector of the unknowns.
-        """
+        """The step equations at an iterate; no state changes. Every rank must call it."""
         values, laid = x.array_r.copy(), self.laid
         if laid.blocks or self._of_none is None:
             parts = self._parts_of_elements(x, values)
@@ -333,12 +298,7 @@ class StepProblem:
         return Evaluation(values, tuple(terms), self.batches.split, parts)
 
     def _parts_of_elements(self, x: PETSc.Vec, values: FloatArray) -> tuple[Any, ...]:
-        """What each batch of elements contributes at an iterate. Collective.
-
-        Args:
-            x: PETSc vector of the unknowns.
-            values: This rank's part of it.
-        """
+        """What elements contribute at an iterate, whose part here is `values`. Collective."""
         laid, elements = self.laid, self.elements
         positions = laid.positions(x, elements)
         own = laid.own_values(values, elements)
@@ -351,15 +311,11 @@ class StepProblem:
         return parts
 
     def _without_elements(self, j: int, u1: FloatArray) -> tuple[FloatArray, ...]:
-        """`BodyTerms` of a batch at a displacement, but for those of elements. Collective.
-
-        Returns:
-            u1, du, internal and external forces, and the equation without elements.
-        """
+        """A batch's u1, du, internal and external force and equation, no elements. Collective."""
         body, du = self.batches.bodies[j], u1 - self._u0[j]
         internal = self.factor * body.internal(u1)
         external = self.factor * body.external(u1, self.loads.gravity)
-        total = self._inertial(body, du) - self.flight[j] + internal - external
+        total = self._inertial(body, du) - self.flight.momentum[j] + internal - external
         return u1, du, internal, external, total
 
     def elsewhere(

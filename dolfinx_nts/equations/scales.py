@@ -22,9 +22,6 @@ _EPS = float(np.finfo(float).eps)
 class Lengths:
     """Lengths of a scene [m], the same on all ranks; `begin` measures a step.
 
-    Args:
-        system: The scene.
-
     Attributes:
         centre: Middle of all bodies in the reference, shape (3,).
         radius: Half the diagonal of the box around them.
@@ -64,8 +61,7 @@ class Lengths:
         local = [batches.motions(du), *map(batches.largest, (places, u, *rates))]
         found = global_max(batches.comm, np.array(local))
         self.motion, self.extent, self.moved = found[:3]
-        speed: FloatArray = found[3:].max(axis=0)
-        return speed
+        return found[3:].max(axis=0)
 
     def displaced(self, fall: float) -> FloatArray:
         """Displacement of each body in the step, at most, shape (bodies,).
@@ -239,8 +235,7 @@ class Rounding:
     def at(self, length: FloatArray) -> FloatArray:
         """`forces` at displacements of these lengths [m], shape (bodies,)."""
         between = _ENDS * self._between * (length + self._extent)
-        rounding: FloatArray = _EPS * (self._diagonal * (length + self._beside) + between)
-        return rounding
+        return _EPS * (self._diagonal * (length + self._beside) + between)
 
     def of(self, bodies: Sequence[int]) -> float:
         """`forces` of some bodies in all [kg m]. Collective."""
@@ -300,5 +295,4 @@ def stiffness_between(
             free = dofs >= 0
             np.add.at(local, batches.body_of(k, dofs[free]), np.square(along[free]))
             first = stop
-    found: FloatArray = np.sqrt(laid.layout.comm.allreduce(local))
-    return found
+    return np.sqrt(laid.layout.comm.allreduce(local))

@@ -55,12 +55,7 @@ def _is_rigid(pair: Any) -> bool:
 
 
 class SharedWeight:
-    """Gaps of rigid bodies without what is redundant in them.
-
-    Args:
-        comm: MPI communicator.
-        contacts: Contacts of the scene.
-    """
+    """Gaps of rigid bodies without what is redundant in them."""
 
     def __init__(self, comm: MPI.Comm, contacts: Sequence[ContactPair]) -> None:
         self._comm = comm

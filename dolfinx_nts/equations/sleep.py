@@ -9,6 +9,7 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.parallel import everywhere
 from dolfinx_nts.types import FloatArray
 
 
@@ -16,10 +17,6 @@ class Sleepers:
     """Finds the bodies at rest whose forces balance, at the price of their loads in each step.
 
     Internal forces are evaluated once for all steps in which a body rests at the same place.
-
-    Args:
-        bodies: Bodies of the system.
-        comm: MPI communicator.
     """
 
     def __init__(self, bodies: Sequence[Body], comm: MPI.Comm) -> None:
@@ -60,6 +57,6 @@ class Sleepers:
 
     def _internal(self, k: int, u: FloatArray) -> FloatArray:
         known = k in self._known and np.array_equal(self._known[k][0], u)
-        if not self._comm.allreduce(known, op=MPI.LAND):
+        if not everywhere(self._comm, known):
             self._known[k] = u, self._bodies[k].internal(u)
         return self._known[k][1]

@@ -52,10 +52,6 @@ class Stabilization:
 
         Where there is none, of the others. Between rigid bodies it is no less than what holds
         these: a soft body elsewhere in the scene does not make their contact soft.
-
-        Args:
-            body: The body.
-            among: Bodies of the contact.
         """
         rigid = bool(among) and all(b.rigid for b in among)
         return self._around(body, _YIELD * self._size, rigid)

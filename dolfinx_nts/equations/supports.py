@@ -63,10 +63,6 @@ class _Ends(NamedTuple):
 class Supports:
     """Prescribed coordinates of a system in a step; `begin` fixes it.
 
-    Args:
-        system: The scene.
-        integrator: Rules of the step.
-
     Attributes:
         moving: Numbers of the bodies whose prescribed coordinates move, before, in or after it.
     """
@@ -125,8 +121,7 @@ class Supports:
             advance(np.ones(1), none, none, self._dt)[which]
             - advance(none, none, none, self._dt)[which]
         )
-        flown: FloatArray = du + (rates[which] - advance(du, v0, a0, self._dt)[which]) / slope
-        return flown
+        return du + (rates[which] - advance(du, v0, a0, self._dt)[which]) / slope
 
     def ahead(self, k: int, ahead: FloatArray, first: FloatArray) -> FloatArray:
         """Motion of a body without forces [m], so that M (du - ahead) has the right rates.
@@ -200,10 +195,6 @@ class Supports:
         """Angular momentum from (y_1 - y_0) x M (v_0 + v_1)/2 on this rank [kg m^2/s], (3,).
 
         It is zero where (v_0 + v_1)/2 is the mean velocity. Collective.
-
-        Args:
-            k: Number of the body.
-            du: Its motion in the step [m].
         """
         if k not in self.moving:
             return np.zeros(3)

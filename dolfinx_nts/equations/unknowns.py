@@ -132,10 +132,6 @@ class Unknowns:
         return blocks
 
     # ---- bodies
-    def of_batch(self, j: int) -> slice:
-        """Where a batch's coordinates that are in the step stand among this rank's unknowns."""
-        return self._places[j]
-
     def of_body(self, k: int) -> slice:
         """Where a body's coordinates stand among this rank's unknowns."""
         place, rigid = self._places[self._batches.batch_of(k)], self._batches.rigid
@@ -282,8 +278,7 @@ class Unknowns:
         self._forces.set(0.0)
         add, reverse = PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE
         self._scatter.scatter(self._local, self._forces, addv=add, mode=reverse)
-        force: FloatArray = self._forces.array_r.copy()
-        return force
+        return self._forces.array_r.copy()
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""

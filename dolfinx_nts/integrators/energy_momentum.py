@@ -9,11 +9,11 @@ import ufl
 from ufl import Form
 from ufl.core.expr import Expr
 
-from dolfinx_nts.integrators.rule import MiddleOfStep, choose
+from dolfinx_nts.integrators.rule import MiddleOfStep
 from dolfinx_nts.kernels.discrete_gradient import gonzalez_stress, mean_value_stress
 from dolfinx_nts.kernels.potential import Potential
 from dolfinx_nts.kernels.strain_energy import StrainEnergy, green_strain
-from dolfinx_nts.validation import is_whole, known_options
+from dolfinx_nts.validation import is_whole, known_options, require_one_of
 
 
 @known_options
@@ -42,8 +42,8 @@ class EnergyMomentum(MiddleOfStep):
     quadrature_points: int = 3
 
     def __post_init__(self) -> None:
-        choose("stress", self.stress, ("gonzalez", "mean-value"))
-        choose("contact_gradient", self.contact_gradient, ("mean-value", "gonzalez"))
+        require_one_of("stress", self.stress, ("gonzalez", "mean-value"))
+        require_one_of("contact_gradient", self.contact_gradient, ("mean-value", "gonzalez"))
         if not (is_whole(self.quadrature_points) and 1 <= self.quadrature_points <= 7):
             raise ValueError(f"quadrature_points={self.quadrature_points!r}: choose 1 to 7")
 

@@ -160,12 +160,6 @@ class WithAccelerations(InTime):
         return v0 + dt * ((1.0 - gamma) * a0 + gamma * a1), a1
 
 
-def choose(name: str, value: str, known: tuple[str, ...]) -> None:
-    """Raise a ValueError unless an option has one of its known values."""
-    if value not in known:
-        raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, known))}")
-
-
 def stress_of(energy: StrainEnergy, h: Expr) -> Expr:
     """P = F S of one displacement gradient in UFL [Pa]."""
     return (ufl.Identity(3) + h) * energy.stress(green_strain(h))

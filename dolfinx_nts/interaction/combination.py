@@ -29,8 +29,7 @@ class Combination(NamedTuple):
 
     def of_constraints(self, multipliers: FloatArray) -> FloatArray:
         """C times values of multipliers (size,): those of constraints, shape (n, m)."""
-        values: FloatArray = (self.weight * multipliers[self.number]).sum(axis=2)
-        return values
+        return (self.weight * multipliers[self.number]).sum(axis=2)
 
     def of_multipliers(self, rows: FloatArray) -> FloatArray:
         """C^T times values of constraints (n, m): those of multipliers, shape (size,)."""

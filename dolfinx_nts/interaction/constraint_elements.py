@@ -67,8 +67,7 @@ def extents_of(equations: Equations, rest: FloatArray) -> FloatArray:
     made_of = np.abs(weights) @ np.abs(rest)[:, None] + np.abs(constants)
     vectors = np.linalg.norm(kernel.factors(weights, constants, rest), axis=3)
     both = made_of.max(axis=3) * vectors[:, :, ::-1]
-    found: FloatArray = both.sum(axis=2).max(axis=1, initial=0.0)
-    return found
+    return both.sum(axis=2).max(axis=1, initial=0.0)
 
 
 class ConstraintPart(NamedTuple):
@@ -159,8 +158,7 @@ class ConstraintElements(PointElements):
     @cached_property
     def _bent(self) -> FloatArray:
         """Largest entry of each constraint's curvature [1/m], shape (n, m)."""
-        bent: FloatArray = np.abs(self.curvature).max(axis=(2, 3), initial=0.0)
-        return bent
+        return np.abs(self.curvature).max(axis=(2, 3), initial=0.0)
 
     def evaluate(self, x: FloatArray, own: Mapping[str, FloatArray]) -> ConstraintPart:
         """Residual and tangent; the multipliers' unknowns are lengths, factor lambda / scale."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -29,8 +29,7 @@ class Arm(NamedTuple):
 
     def at(self, y: FloatArray) -> FloatArray:
         """Their values from nodal vectors (n, k, 3), shape (n, 3)."""
-        found: FloatArray = np.einsum("nk,nki->ni", self.weights, y) + self.constant
-        return found
+        return np.einsum("nk,nki->ni", self.weights, y) + self.constant
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,3 +68,38 @@ class ConstraintRows:
         sides = tuple(side.select(chosen) for side in self.sides)
         others = {f.name: some(getattr(self, f.name)) for f in fields(self) if f.name != "sides"}
         return ConstraintRows(sides, **others)
+
+
+def joined(
+    each: Sequence[ConstraintRows], of: Sequence[tuple[int, ...]], batch: Any
+) -> ConstraintRows:
+    """The elements of joints that are alike as those of one, of the batch that has their bodies.
+
+    Args:
+        each: Those of the joints.
+        of: Numbers of their bodies.
+        batch: A `RigidBatch`.
+    """
+    starts = (batch.first // 3).tolist()
+    first = dict(zip(batch.members.tolist(), starts, strict=True))
+    sides = []
+    for k, body in enumerate(each[0].sides):
+        here = [rows.sides[k] for rows in each]
+        nodes = [s.nodes + first[bodies[k]] for s, bodies in zip(here, of, strict=True)]
+        values = [
+            np.concatenate([getattr(s, name) for s in here])
+            for name in ("weights", "reference", "fixed", "places")
+        ]
+        sides.append(Points(batch, np.concatenate(nodes).astype(body.nodes.dtype), *values))
+
+    def both(name: str) -> Any:
+        found = [getattr(rows, name) for rows in each]
+        if isinstance(found[0], tuple):
+            return type(found[0])(*map(np.concatenate, zip(*found, strict=True)))
+        return np.concatenate(found) if isinstance(found[0], np.ndarray) else found[0]
+
+    others = {f.name: both(f.name) for f in fields(ConstraintRows) if f.name != "sides"}
+    counts = [len(rows.joint) for rows in each]
+    return ConstraintRows(
+        tuple(sides), **others | {"joint": np.repeat(np.arange(len(each)), counts)}
+    )

@@ -17,14 +17,14 @@ from dolfinx_nts.interaction.constraint_elements import (
     extents_of,
     largest_of_joints,
 )
-from dolfinx_nts.interaction.constraint_rows import Arm, ConstraintRows, Upright
+from dolfinx_nts.interaction.constraint_kinematics import Moving
+from dolfinx_nts.interaction.constraint_rows import Arm, ConstraintRows, Upright, joined
 from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.interaction.kinematics import FAR_TURN, OFF, ROUNDED, Kinematics
+from dolfinx_nts.interaction.kinematics import FAR_TURN, Kinematics
 from dolfinx_nts.interaction.point_elements import EveryStep
 from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.interaction.prescribed import times, told
 from dolfinx_nts.kernels import quadratic as kernel
 from dolfinx_nts.parallel import global_max, raise_together
 from dolfinx_nts.state import State
@@ -111,34 +111,10 @@ class Constraints(EveryStep):
             batch: A `RigidBatch`.
             number: For which the batch stands as the body of a side, see `Batches`.
         """
-        each, first = [joint._all for joint in joints], dict(
-            zip(batch.members.tolist(), (batch.first // 3).tolist(), strict=True)
-        )
-        sides = []
-        for k, body in enumerate(each[0].sides):
-            of = [rows.sides[k] for rows in each]
-            nodes = [s.nodes + first[j._of[k]] for s, j in zip(of, joints, strict=True)]
-            values = [
-                np.concatenate([getattr(s, name) for s in of])
-                for name in ("weights", "reference", "fixed", "places")
-            ]
-            sides.append(Points(batch, np.concatenate(nodes).astype(body.nodes.dtype), *values))
-        counts = [len(rows.joint) for rows in each]
-
-        def joined(name: str) -> Any:
-            found = [getattr(rows, name) for rows in each]
-            if isinstance(found[0], tuple):
-                return type(found[0])(*map(np.concatenate, zip(*found, strict=True)))
-            return np.concatenate(found) if isinstance(found[0], np.ndarray) else found[0]
-
-        rows = ConstraintRows(
-            tuple(sides), joined("equations"), joined("upright"), joined("arm"), joined("lent"),
-            np.repeat(np.arange(len(joints)), counts), joined("bodies"), joined("force"),
-            joined("scale"),
-        )  # fmt: skip
+        rows = joined([joint._all for joint in joints], [joint._of for joint in joints], batch)
         new = cls.__new__(cls)
         names = [name for joint in joints for name in joint._names]
-        new._set_up(names, (number,) * len(sides), rows)
+        new._set_up(names, (number,) * len(rows.sides), rows)
         new._members = joints
         new._touched = set().union(*(joint._of for joint in joints))
         return new
@@ -197,8 +173,7 @@ class Constraints(EveryStep):
 
     def _rest_of_rows(self) -> BoolArray:
         """Which of all elements are not in the step."""
-        resting: BoolArray = np.isin(self._all.bodies, list(self._resting)).any(axis=1)
-        return resting
+        return np.isin(self._all.bodies, list(self._resting)).any(axis=1)
 
     def touched(self) -> set[int]:
         """All bodies."""
@@ -312,75 +287,8 @@ class Constraints(EveryStep):
         if not self.elements:
             return []
         (batch,) = self.elements
-        y = self._rest + self._nodal(state.u)
-        gap = self._gap(state, y)
-        first, second, limit, along = self._rates(state, y, dt)
-        own = {"constraints": np.zeros_like(gap)}
-        return [
-            Kinematics(
-                batch.scale[:, None] * np.array([gap, first, second]),
-                np.array([self._by_joint(np.abs(values)) for values in (gap, first)]),
-                np.array([OFF * self._by_joint(np.abs(y)), limit]),
-                along,
-                batch.evaluate(y, own).tangent,
-            )
-        ]
-
-    def _gap(self, state: State, y: FloatArray) -> FloatArray:
-        """G - c at a state with these nodal vectors [m], shape (n, m). Collective."""
-        (weights, constants, _), (c, *_) = self._at(state.time, state.time)
-        found: FloatArray = kernel.value(kernel.factors(weights, constants, y)) - c
-        return found
-
-    def _rates(
-        self, state: State, y: FloatArray, dt: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """First and second derivative in time of g - c at a state. Collective.
-
-        Args:
-            state: The state.
-            y: Its nodal vectors [m], shape (n, k, 3).
-            dt: Time in which prescribed values are told [s]; less the last step at its end.
-
-        Returns:
-            [m/s] and [m/s^2], both (n, m), and of each joint what the first may err by [m/s]: by
-            rounding, by what prescribed values leave open within `dt`, and at the end of a step by
-            its rule for velocities; and `Kinematics.along`.
-        """
-        step = self.step if dt < 0.0 else None
-        if step is None:
-            at, other = state.time, state.time + dt
-        else:
-            at, other = step.state.time + step.dt, step.state.time
-        equations, c = self._at(*times(at, other))
-        gradient, flow, bend = self._flow(state, equations)
-        before = None if step is None else self._flow(step.state, equations)
-        rate, doubt, faster = told(c, at - other, None if before is None else before[1])
-        second = bend - faster
-        if state.a:
-            second += np.einsum("nmai,nai->nm", gradient, self._nodal(state.a))
-        speed, flows, rates, off = (
-            self._by_joint(np.abs(a)) for a in (self._nodal(state.v), flow, rate, doubt)
-        )
-        off = off + OFF * np.maximum(speed, rates)
-        if before is not None:
-            # With v_0 + v_1 = 2 (y_1 - y_0)/h the sum of both ends' G v is 2 (c_1 - c_0)/h and a
-            # quarter of h times the change of (G v)' v.
-            off -= 0.5 * dt * self._by_joint(np.abs(bend - before[2]))
-            off -= ROUNDED * self._by_joint(np.abs(y)) / dt
-        return flow - rate, second, off, np.maximum(flows, rates)
-
-    def _flow(
-        self, state: State, equations: Equations
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """G (n, m, k, 3), G v [m/s] and (G v)' v [m/s^2], both (n, m), at a state."""
-        weights, constants, _ = equations
-        speed, y = self._nodal(state.v), self._rest + self._nodal(state.u)
-        gradient = kernel.gradient(weights, kernel.factors(weights, constants, y))
-        rates = kernel.factors(weights, np.zeros_like(constants), speed)
-        return (
-            gradient, np.einsum("nmai,nai->nm", gradient, speed), 2.0 * kernel.value(rates)
-        )  # fmt: skip
+        of = Moving(self._rest, self._nodal, self._at, self._by_joint, self.step)
+        return [of.kinematics(batch, state, dt)]
 
     def load_step_work(
         self, before: Any, after: Any, start: float, end: float
@@ -395,5 +303,4 @@ class Constraints(EveryStep):
 
     def guess(self, k: int, x: FloatArray) -> FloatArray:
         """Multipliers of the last step."""
-        guess: FloatArray = self._factor * self._rows.force / self._rows.scale[:, None]
-        return guess
+        return self._factor * self._rows.force / self._rows.scale[:, None]

@@ -81,8 +81,7 @@ class Step:
         """
         massless = surface.massless
         if self.integrator.inertia and not massless.any():
-            mass: FloatArray = surface.mass
-            return mass
+            return surface.mass
         change = self.factor * self.integrator.theta
         stiff = change * surface.material.divided(self.stiffness(surface.body, bodies))
         return np.where(massless, stiff, surface.mass) if self.integrator.inertia else stiff

@@ -120,10 +120,9 @@ def differenced(
 def _along(part: Any, v: FloatArray) -> FloatArray:
     """G v: change of the constraints' rows with the nodes' motion (n, k, 3), shape (n, m)."""
     n, width = len(v), 3 * v.shape[1]
-    found: FloatArray = np.einsum(
+    return np.einsum(
         "nma,na->nm", part.tangent[:, width:, :width], v.reshape(n, width)
     )
-    return found
 
 
 def _at_start(matrix: FloatArray, values: FloatArray, dt: float) -> FloatArray:

@@ -22,24 +22,12 @@ from dolfinx_nts.kernels.measures import Gradient
 from dolfinx_nts.types import BoolArray, FloatArray, Settings
 
 
-class Kind(Protocol):
-    """A kind of measure, such as `kernels.measures.Length`; arrays in, arrays out."""
-
-    @staticmethod
-    def value(p: FloatArray, near: FloatArray) -> FloatArray:
-        """Its value, shape (n,), of vectors p (n, v, 3); near a value, where there are several."""
-
-    @staticmethod
-    def gradient(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
-        """Its discrete gradient between vectors a and b, with its values there."""
-
-
 @dataclass(frozen=True, eq=False)
 class Measure:
     """A measure between two bodies, or a body and the ground.
 
     Attributes:
-        kind: How it follows from vectors.
+        kind: How it follows from vectors, such as `kernels.measures.Length`.
         sides: Nodes that these depend on, of each body.
         weights: Of the nodes in the vectors, shape (v, k).
         constants: What is added, shape (v, 3).
@@ -58,8 +46,7 @@ class Measure:
 
     def directed(self, y: FloatArray) -> FloatArray:
         """The same without constants, as of velocities."""
-        found: FloatArray = np.einsum("va,nai->nvi", self.weights, y)
-        return found
+        return np.einsum("va,nai->nvi", self.weights, y)
 
     def nodal(self, values: Sequence[FloatArray]) -> FloatArray:
         """Values at the nodes, (n, k, 3), from those of the bodies' coordinates. Collective."""

@@ -102,8 +102,7 @@ class PointElements:
     def rows(self, part: Any, name: str) -> FloatArray:
         """The residual's rows of a field of own unknowns."""
         start = self.num_coordinates if name == "constraints" else part.residual.shape[1]
-        own: FloatArray = part.residual[:, start:]
-        return own
+        return part.residual[:, start:]
 
     def largest(self, part: Any) -> list[float]:
         """The largest row of its constraints, which are lengths [m], and its extent."""

@@ -20,8 +20,7 @@ _ON_CELL, _ROUNDING = 1e-9, 4 * np.finfo(np.float64).eps
 
 def of_nodes(nodes: IntArray) -> IntArray:
     """Numbers of the coordinates of nodes, shape (*nodes.shape, 3)."""
-    numbers: IntArray = 3 * nodes[..., None] + np.arange(3, dtype=nodes.dtype)
-    return numbers
+    return 3 * nodes[..., None] + np.arange(3, dtype=nodes.dtype)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +99,7 @@ class Points:
         """
         rows, index = self._table
         table = gather_rows(self.body.comm, values.reshape(-1, 3)[rows])
-        found: Array = table[index]
-        return found
+        return table[index]
 
     def gathered(self, values: FloatArray) -> FloatArray:
         """Sums at this rank's owned coordinates, (num_owned,), of values at nodes. Collective.
@@ -115,8 +113,7 @@ class Points:
         first, total = comm.scan(owned) - owned, comm.allreduce(owned)
         whole = np.zeros(total)
         np.add.at(whole, self.flat().ravel(), values.ravel())
-        found: FloatArray = comm.allreduce(whole)[first : first + owned]
-        return found
+        return comm.allreduce(whole)[first : first + owned]
 
     def extent(self, origin: FloatArray) -> float:
         """Largest length whose rounding is in a point's position relative to an origin (3,) [m]."""
@@ -134,8 +131,7 @@ class Points:
         total = np.zeros(int(self.nodes.max(initial=-1)) + 1)
         np.add.at(total, self.nodes, share)
         per_node = self.nodal(values)[:, :, 0] / np.where(self.places, total[self.nodes], 1.0)
-        result: FloatArray = (share * per_node).sum(axis=1)
-        return result
+        return (share * per_node).sum(axis=1)
 
     def at(self, values: FloatArray) -> FloatArray:
         """Values at the points, (n, 3), from this rank's coordinates. Collective.
@@ -149,8 +145,7 @@ class Points:
         """Values at the points, (n, 3), from those at their nodes (n, k, 3)."""
         if self.are_nodes:
             return values[:, 0]
-        combined: FloatArray = np.einsum("na,nai->ni", self.weights, values)
-        return combined
+        return np.einsum("na,nai->ni", self.weights, values)
 
     @cached_property
     def are_nodes(self) -> bool:

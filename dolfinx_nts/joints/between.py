@@ -235,14 +235,6 @@ class Between(Joint, ABC):
             "driven": self.driven,
         }
 
-    def start(self) -> None:
-        """Nothing to remember."""
-        return None
-
-    def potential(self, u: Sequence[FloatArray], history: Any) -> float:
-        """None [J]."""
-        return 0.0
-
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run. Collective."""
         sides = [side.select(slice(self._here)) for side in self.sides]
@@ -301,17 +293,6 @@ def points_of(argument: str, body: Any, x: FloatArray) -> Any:
         return body.points(x)
     except ValueError as error:
         raise ValueError(f"{argument}: {error}") from error
-
-
-def direction(name: str, value: Any) -> FloatArray:
-    """A unit vector (3,) along a given one of any length."""
-    given = vector(name, value, "-")
-    largest = np.abs(given).max()
-    if largest == 0.0:
-        raise ValueError(f"{name}={value!r}: has no direction; pass a vector that is not zero")
-    given = given / largest  # squares of the smallest and largest numbers are none
-    unit: FloatArray = given / np.linalg.norm(given)
-    return unit
 
 
 def triad(axis: FloatArray) -> FloatArray:

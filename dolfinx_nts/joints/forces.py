@@ -17,11 +17,11 @@ from dolfinx_nts.interaction.coupling import Joint, Slopes
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.measured import Measure, Measured, Move, holds
 from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.joints.between import direction, named, points_of, require_directions, triad
+from dolfinx_nts.joints.between import named, points_of, require_directions, triad
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import rank_of
 from dolfinx_nts.types import FloatArray, Vector, Vectors
-from dolfinx_nts.validation import StepFailedError, require_same, vector
+from dolfinx_nts.validation import StepFailedError, direction, require_same, vector
 
 #: Part of their distance from the origin within which two points are one.
 _ROUNDED = 1e-9

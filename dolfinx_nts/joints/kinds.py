@@ -14,21 +14,14 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.joints.between import (
-    ROUNDED,
-    Between,
-    Product,
-    Times,
-    Vector,
-    direction,
-    triad,
-)
+from dolfinx_nts.joints.between import ROUNDED, Between, Product, Times, Vector, triad
 from dolfinx_nts.joints.laws import JointFriction, Motor, laws_on
 from dolfinx_nts.types import Places
 from dolfinx_nts.validation import (
     StepFailedError,
     UserFunctionError,
     at_time,
+    direction,
     floats,
     known_options,
     number_at,

@@ -146,15 +146,11 @@ class OnJoint(Between):
         turns: bool,
     ) -> None:
         super().__init__(joint.ends, f"{joint.name} {word}")
-        if turns:
-            self._on(joint, kernel.Angle, (joint.m1_b, joint.m2_b, joint.m1_a), joint.length)
-        else:
-            self._on(joint, kernel.Along, (joint.n_a, joint.p_a - joint.p_b), 1.0)
+        kind: Any = kernel.Angle if turns else kernel.Along
+        angle, way = (joint.m1_b, joint.m2_b, joint.m1_a), (joint.n_a, joint.p_a - joint.p_b)
+        rows = [(v.weights, v.constant) for v in (angle if turns else way)]
+        self._lay(kind, joint.sides, rows, joint.length if turns else 1.0)
         self.law, self.entry = law(self.measure.length), entry
-
-    def _on(self, joint: Any, kind: Any, vectors: tuple[Any, ...], length: float) -> None:
-        """Set the measure of the joint's vectors."""
-        self._lay(kind, joint.sides, [(v.weights, v.constant) for v in vectors], length)
 
 
 def laws_on(
@@ -215,9 +211,8 @@ def _asking(joint: Any, motor: Motor) -> Callable[..., FloatArray]:
         return found.reshape(at.shape)
 
     def ask(time: float, at: FloatArray, rate: FloatArray) -> FloatArray:
-        found: FloatArray = call_together(
+        return call_together(
             joint.comm, f"motor of {joint.name!r}", of, time, at, rate, shown=motor
         )
-        return found
 
     return ask

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from dolfinx_nts.interaction.coupling import Joint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.joints.between import named, points_of
 from dolfinx_nts.kernels import facets as fc
+from dolfinx_nts.types import IntArray, Settings
 from dolfinx_nts.validation import known_options
 
 #: Nodes lie on a surface up to this part of its largest facet; weights up to the other hold none.
@@ -68,13 +70,7 @@ class Tie(Joint):
         self.name, self.bodies = named("Tie", (body, flexible), name), (body, flexible)
         mine = surface.share
         self.numbers = surface.original[mine]
-        nodes = np.sort(surface.original).astype(np.int64)
-        #: What a restart compares.
-        self.settings = {
-            "bodies": [body.name, flexible.name],
-            "nodes": len(nodes),
-            "which nodes": zlib.crc32(nodes.tobytes()),
-        }
+        self.settings = _settings(self.bodies, surface.original)
         at = points_of(f"surface of {self.name!r}", body, surface.reference)
         if not body.rigid:
             _check_covered(self.name, body, surface, at)
@@ -91,6 +87,16 @@ class Tie(Joint):
         return Constraints(
             self.name, bodies, self._sides, Equations(both, constants, np.zeros((n, 3)))
         )
+
+
+def _settings(bodies: Sequence[Body], numbers: IntArray) -> Settings:
+    """What a restart compares: names of bodies, and input numbers of nodes."""
+    nodes = np.sort(numbers).astype(np.int64)
+    return {
+        "bodies": [body.name for body in bodies],
+        "nodes": len(nodes),
+        "which nodes": zlib.crc32(nodes.tobytes()),
+    }
 
 
 def _check_covered(name: str, body: Any, surface: Surface, at: Points) -> None:
@@ -167,13 +173,7 @@ class Seam(Joint):
             )
         self._sides: tuple[Points, ...] = (at.select(mine), held.select(mine))
         self._scale, self._product = np.sqrt(lengths), product[mine]
-        numbers = np.sort(edge.original[first] // 2).astype(np.int64)
-        #: What a restart compares.
-        self.settings = {
-            "bodies": [shell.name, other.name],
-            "nodes": len(numbers),
-            "which nodes": zlib.crc32(numbers.tobytes()),
-        }
+        self.settings = _settings(self.bodies, edge.original[first] // 2)
 
     def coupling(self, bodies: tuple[int, ...]) -> Constraints:
         """Its constraints in a run: one element a node, places and then the angle."""

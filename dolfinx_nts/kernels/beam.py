@@ -36,8 +36,7 @@ def shapes(nodes: int, at: FloatArray) -> tuple[FloatArray, FloatArray]:
 def stretches(x: FloatArray, at: FloatArray) -> FloatArray:
     """|dX/dxi| of elements at points [m], shape (n, p), by their nodes x (n, nodes, 3) [m]."""
     _, slopes = shapes(x.shape[1], at)
-    found: FloatArray = np.linalg.norm(np.einsum("pa,nai->npi", slopes, x), axis=2)
-    return found
+    return np.linalg.norm(np.einsum("pa,nai->npi", slopes, x), axis=2)
 
 
 def points(nodes: int) -> tuple[FloatArray, FloatArray]:
@@ -92,16 +91,14 @@ def shares(x: FloatArray) -> FloatArray:
     nodes = x.shape[1]
     at, parts = np.polynomial.legendre.leggauss(nodes)
     values, _ = shapes(nodes, at)
-    found: FloatArray = np.einsum("p,np,pa,pb->nab", parts, stretches(x, at), values, values)
-    return found
+    return np.einsum("p,np,pa,pb->nab", parts, stretches(x, at), values, values)
 
 
 def strains(of: energy.Elements, y: FloatArray) -> FloatArray:
     """Gamma_1, Gamma_2, E_33 [-], K [1/m] less those of the reference, shape (n, points, 6)."""
     changes = energy.changes(of, y)
     points = changes.shape[1] // 9  # told, as a rank may have no element
-    found: FloatArray = changes.reshape(len(y), points, 9) @ _SUMS.T
-    return found
+    return changes.reshape(len(y), points, 9) @ _SUMS.T
 
 
 def resultants(

@@ -25,9 +25,6 @@ _FIRST = 100
 def canonical(form: Any) -> Any:
     """A form whose signature does not depend on what was made before it.
 
-    Args:
-        form: In UFL.
-
     Returns:
         The form itself, or one with the same integrals of Constants and Functions that stand for
         the given ones, with their `_cpp_object`, which is all that DOLFINx asks of them.

@@ -21,8 +21,7 @@ _EPS = float(np.finfo(float).eps)
 def _legendre(degree: int, points: int) -> FloatArray:
     """Legendre's polynomial at the Gauss points, shape (points,)."""
     x = np.polynomial.legendre.leggauss(points)[0]
-    values: FloatArray = np.polynomial.legendre.legval(x, np.eye(degree + 1)[degree])
-    return values
+    return np.polynomial.legendre.legval(x, np.eye(degree + 1)[degree])
 
 
 #: Gauss points and weights on [0, 1].
@@ -159,8 +158,7 @@ def _between(
     """Weighted sum of a function at points between; all in one batch, for few pairs cost calls."""
     pi = pi0 + tau[:, None, None] * (pi1 - pi0)
     values = function(pi.reshape(-1, pi.shape[2]))
-    total: FloatArray = np.tensordot(weight, values.reshape(*pi.shape[:2], *values.shape[1:]), 1)
-    return total
+    return np.tensordot(weight, values.reshape(*pi.shape[:2], *values.shape[1:]), 1)
 
 
 def _gonzalez_increment(pi0: FloatArray, pi1: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -190,8 +188,7 @@ def gonzalez(
     # g(pi_1) - g(pi_0) by the exact mean value: the difference of values would leave rounding noise
     # ~ eps / |Dpi|^2 in the tangent.
     defect = np.einsum("nmp,np->nm", mean_value(pi0, pi1, gradient, points) - middle, dpi)
-    discrete: FloatArray = middle + (defect * inverse)[:, :, None] * dpi[:, None]
-    return discrete
+    return middle + (defect * inverse)[:, :, None] * dpi[:, None]
 
 
 def gonzalez_tangent(

@@ -103,10 +103,6 @@ class Beside:
     """A call in a thread beside what else there is to do; in a forked process it is made again.
 
     What it raises is raised by `result`.
-
-    Args:
-        function: What is called.
-        arguments: Its arguments.
     """
 
     def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:

@@ -75,8 +75,7 @@ class Along:
     @staticmethod
     def value(p: FloatArray, near: FloatArray) -> FloatArray:
         """Its value [m], shape (n,), of vectors (n, 2, 3); `near` plays no part."""
-        found: FloatArray = np.einsum("ni,ni->n", p[:, 0], p[:, 1])
-        return found
+        return np.einsum("ni,ni->n", p[:, 0], p[:, 1])
 
     @staticmethod
     def gradient(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
@@ -106,8 +105,7 @@ class Angle:
         """Its value [rad] on the turn nearest to `near`, shape (n,), of vectors (n, 3, 3)."""
         cos, sin = _plane(p).T
         off = np.arctan2(sin, cos) - near
-        found: FloatArray = near + off - 2.0 * np.pi * np.round(off / (2.0 * np.pi))
-        return found
+        return near + off - 2.0 * np.pi * np.round(off / (2.0 * np.pi))
 
     @staticmethod
     def gradient(a: FloatArray, b: FloatArray, at_a: FloatArray, at_b: FloatArray) -> Gradient:
@@ -126,8 +124,7 @@ class Angle:
 
 def _plane(p: FloatArray) -> FloatArray:
     """The invariants (m_1 . m, m_2 . m), shape (n, 2)."""
-    z: FloatArray = np.einsum("nki,ni->nk", p[:, :2], p[:, 2])
-    return z
+    return np.einsum("nki,ni->nk", p[:, :2], p[:, 2])
 
 
 def _slopes(p: FloatArray) -> FloatArray:
@@ -173,8 +170,7 @@ class Linear(NamedTuple):
 
     def value(self, x: FloatArray) -> FloatArray:
         """V [J]."""
-        energy: FloatArray = 0.5 * self.stiffness * (x - self.rest) ** 2
-        return energy
+        return 0.5 * self.stiffness * (x - self.rest) ** 2
 
     def quotient(self, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
         """[V(b) - V(a)]/(b - a) and its derivative by b."""
@@ -208,8 +204,7 @@ class Stored:
         if self._given is not None:
             return _called(self._given, x)
         step = _IMAGINARY * self._size(x)
-        slope: FloatArray = np.imag(self.value(x + 1j * step)) / step
-        return slope
+        return np.imag(self.value(x + 1j * step)) / step
 
     def slope(self, x: FloatArray) -> FloatArray:
         """V'' by central differences of V'."""

@@ -48,8 +48,7 @@ _ROW, _COLUMN = (
 def _cubics(s: FloatArray) -> FloatArray:
     """Cubics and their derivatives at s, shape (order 4, n, 4)."""
     powers = s[:, None] ** np.arange(4)
-    result: FloatArray = np.matmul(powers, _DERIVATIVES.transpose(0, 2, 1))
-    return result
+    return np.matmul(powers, _DERIVATIVES.transpose(0, 2, 1))
 
 
 def _derivative(xi: FloatArray, orders: list[tuple[int, int]]) -> list[FloatArray]:

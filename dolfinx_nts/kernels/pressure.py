@@ -17,8 +17,7 @@ def _coefficients() -> FloatArray:
     """A_IJK of B(y, z)_I = A_IJK y_J x z_K, antisymmetric in J and K, shape (4, 4, 4)."""
     values, slopes = shapes(POINTS)
     whole = np.einsum("pi,pj,pk->ijk", values, slopes[:, 0], slopes[:, 1])
-    found: FloatArray = 0.5 * (whole - whole.transpose(0, 2, 1))
-    return found
+    return 0.5 * (whole - whole.transpose(0, 2, 1))
 
 
 _A = _coefficients()
@@ -30,14 +29,12 @@ _CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
 
 def _turned(y: FloatArray) -> FloatArray:
     """Matrix of z -> B(y, z) for y (n, 4, 3), shape (n, 4, 3, 4, 3)."""
-    found: FloatArray = np.einsum("ijk,njb,abc->niakc", _A, y, _CROSS, optimize=True)
-    return found
+    return np.einsum("ijk,njb,abc->niakc", _A, y, _CROSS, optimize=True)
 
 
 def _product(y: FloatArray, z: FloatArray) -> FloatArray:
     """B(y, z), shape (n, 4, 3)."""
-    found: FloatArray = np.einsum("niakc,nkc->nia", _turned(y), z)
-    return found
+    return np.einsum("niakc,nkc->nia", _turned(y), z)
 
 
 def force(x0: FloatArray, x1: FloatArray, theta: float | None) -> FloatArray:

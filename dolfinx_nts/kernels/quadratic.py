@@ -32,20 +32,17 @@ def factors(weights: FloatArray, constants: FloatArray, y: FloatArray) -> FloatA
     n, m, _, k = weights.shape
     # One product for all constraints of an element: numpy takes as long for each small one.
     products = np.matmul(weights.reshape(n, 2 * m, k), y)
-    found: FloatArray = products.reshape(len(products), m, 2, 3) + constants
-    return found
+    return products.reshape(len(products), m, 2, 3) + constants
 
 
 def value(vectors: FloatArray) -> FloatArray:
     """Their products v . w, shape (n, m)."""
-    found: FloatArray = (vectors[:, :, 0] * vectors[:, :, 1]).sum(axis=2)
-    return found
+    return (vectors[:, :, 0] * vectors[:, :, 1]).sum(axis=2)
 
 
 def gradient(weights: FloatArray, vectors: FloatArray) -> FloatArray:
     """V_a w + W_a v, the derivative of `value` by y_a, shape (n, m, k, 3)."""
-    found: FloatArray = np.matmul(weights.transpose(0, 1, 3, 2), vectors[:, :, ::-1])
-    return found
+    return np.matmul(weights.transpose(0, 1, 3, 2), vectors[:, :, ::-1])
 
 
 def curvature(weights: FloatArray) -> FloatArray:
@@ -75,8 +72,7 @@ def elements(weights: FloatArray, hessian: FloatArray, y: FloatArray) -> Element
 
 def changes(of: Elements, y: FloatArray) -> FloatArray:
     """Products less those of the reference, shape (n, m)."""
-    found: FloatArray = quadratic.value(_factors(of.weights, y)) - of.rest
-    return found
+    return quadratic.value(_factors(of.weights, y)) - of.rest
 
 
 def _factors(weights: FloatArray, y: FloatArray) -> FloatArray:
@@ -92,8 +88,7 @@ def _gradient(of: Elements, y: FloatArray) -> FloatArray:
 def energy(of: Elements, y: FloatArray) -> FloatArray:
     """V [J], shape (n,)."""
     change = changes(of, y)
-    found: FloatArray = 0.5 * np.einsum("ni,nij,nj->n", change, of.hessian, change)
-    return found
+    return 0.5 * np.einsum("ni,nij,nj->n", change, of.hessian, change)
 
 
 def _stress(of: Elements, y0: FloatArray, y1: FloatArray, theta: float | None) -> FloatArray:
@@ -102,8 +97,7 @@ def _stress(of: Elements, y0: FloatArray, y1: FloatArray, theta: float | None) -
         change = 0.5 * (changes(of, y0) + changes(of, y1))
     else:
         change = changes(of, y0 + theta * (y1 - y0))
-    found: FloatArray = np.matmul(of.hessian, change[:, :, None])[:, :, 0]
-    return found
+    return np.matmul(of.hessian, change[:, :, None])[:, :, 0]
 
 
 def force(of: Elements, y0: FloatArray, y1: FloatArray, theta: float | None) -> FloatArray:
@@ -118,8 +112,7 @@ def force(of: Elements, y0: FloatArray, y1: FloatArray, theta: float | None) -> 
     """
     place = y0 + (0.5 if theta is None else theta) * (y1 - y0)
     stress = _stress(of, y0, y1, theta)
-    found: FloatArray = np.matmul(stress[:, None], _gradient(of, place))[:, 0]
-    return found
+    return np.matmul(stress[:, None], _gradient(of, place))[:, 0]
 
 
 def tangent(of: Elements, y0: FloatArray, y1: FloatArray, theta: float | None) -> FloatArray:

@@ -99,11 +99,7 @@ class OfC:
 
 
 class OfInvariants:
-    """W of an `Isotropic` material.
-
-    Args:
-        material: The material.
-    """
+    """W of an `Isotropic` material."""
 
     def __init__(self, material: Isotropic) -> None:
         self._material = material

@@ -56,8 +56,7 @@ class Planes(NamedTuple):
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the cross product of vectors in a plane, (..., 2)."""
-    product: FloatArray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def fans(facets: IntArray, edge: IntArray) -> IntArray:
@@ -67,8 +66,7 @@ def fans(facets: IntArray, edge: IntArray) -> IntArray:
     one = np.r_[3 * f + k, 3 * f + (k + 1) % 3]
     two = np.r_[3 * g + (j + 1) % 3, 3 * g + j]
     joined = coo_array((np.ones(len(one)), (one, two)), shape=(facets.size, facets.size))
-    fan: IntArray = connected_components(joined, directed=False)[1].reshape(facets.shape)
-    return fan
+    return connected_components(joined, directed=False)[1].reshape(facets.shape)
 
 
 def lines(facets: IntArray, edge: IntArray, x: FloatArray) -> IntArray:
@@ -100,21 +98,17 @@ def _rings(fan: IntArray, point: IntArray, node: IntArray) -> tuple[IntArray, Bo
 
 
 def _fit(linear: FloatArray, p: FloatArray) -> FloatArray:
-    """Weights of data at places p in the linear unknowns of a quadratic that fits them best.
+    """Weights (n, u, r) of data at places p (n, r, 2) in the quadratics that fit them best.
 
     Args:
         linear: Linear unknowns in each datum, shape (n, r, u).
-        p: Places [-], shape (n, r, 2).
-
-    Returns:
-        Shape (n, u, r).
+        p: Places [-].
     """
     (n, r, u), (s, t) = linear.shape, p.transpose(2, 0, 1)
     rows = np.zeros((n, r + 3, u + 3))
     rows[:, :r, :u], rows[:, :r, u:] = linear, np.stack([s * s, s * t, t * t], axis=2)
     rows[:, r:, u:] = _RIDGE * np.eye(3)
-    weights: FloatArray = np.linalg.pinv(rows)[:, :u, :r]
-    return weights
+    return np.linalg.pinv(rows)[:, :u, :r]
 
 
 def planes(facets: IntArray, fan: IntArray, x: FloatArray, rims: Rims) -> Planes:

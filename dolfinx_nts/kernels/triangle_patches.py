@@ -142,7 +142,7 @@ def _elevated(points: FloatArray, degree: int) -> FloatArray:
 def _edge(
     ends: FloatArray, tangents: FloatArray, across: FloatArray, parts: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The first two rows of control points of the piece beside an edge.
+    """The first two rows of control points, (5, ...) and (4, ...), of the piece beside an edge.
 
     Args:
         ends: Both ends of the edge, shape (2, ...).
@@ -150,9 +150,6 @@ def _edge(
         across: Vectors across it there, shape (2, ...).
         parts: What the derivatives towards the third corner have of across and along, at both ends,
             shape (2 ends, 2, ...), to be multiplied with the others.
-
-    Returns:
-        Rows of shape (5, ...) and (4, ...).
     """
     cubic = np.stack([ends[0], ends[0] + tangents[0] / 3, ends[1] - tangents[1] / 3, ends[1]])
     row, slope = _elevated(cubic, _DEGREE), 3.0 * np.diff(cubic, axis=0)
@@ -231,8 +228,7 @@ def _middles() -> FloatArray:
     at = np.array([[1.0, 1.0], [0.5, 0.5]]) / 3
     across = along(at, np.array([[1.0, -1.0]] * 2))[:, :, 2:4]
     jumps = np.einsum("naj,kag->knjg", across, jump).reshape(-1, 21)
-    weights: FloatArray = -np.linalg.pinv(jumps[:, 18:]) @ jumps[:, :18]
-    return weights
+    return -np.linalg.pinv(jumps[:, 18:]) @ jumps[:, :18]
 
 
 def _own_points(facets: IntArray, planes: Planes) -> tuple[IntArray, FloatArray]:
@@ -317,8 +313,7 @@ def _weights(d: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray
 
     def derivative(k: int, direction: FloatArray) -> FloatArray:
         """Return the derivative by a direction (m, 2) in the plane of corner k, shape (m, q)."""
-        result: FloatArray = np.einsum("ma,maq->mq", direction, d[:, k])
-        return result
+        return np.einsum("ma,maq->mq", direction, d[:, k])
 
     rows, seconds = [], []
     for k in range(3):

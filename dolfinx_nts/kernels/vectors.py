@@ -11,8 +11,12 @@ _ONE, _TWO = [1, 2, 0], [2, 0, 1]
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """A x b of vectors (..., 3)."""
-    product: FloatArray = a[..., _ONE] * b[..., _TWO] - a[..., _TWO] * b[..., _ONE]
-    return product
+    return a[..., _ONE] * b[..., _TWO] - a[..., _TWO] * b[..., _ONE]
+
+
+def resultant(x: FloatArray, force: FloatArray) -> FloatArray:
+    """Sum of forces (n, 3) at points (n, 3), and of their moments about the origin, (2, 3)."""
+    return np.array([force.sum(axis=0), cross(x, force).sum(axis=0)])
 
 
 def range_of(moved: FloatArray, around: FloatArray | float = 0.0) -> FloatArray:

@@ -216,12 +216,7 @@ def step_terms(problem: StepProblem, step: Evaluation) -> dict[str, float]:
 
 
 def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
-    """External work of an accepted step by the elements of each joint on this rank [J], (joints,).
-
-    Args:
-        problem: Equations of the step.
-        step: Their solution.
-    """
+    """External work of an accepted step by elements, of each joint on this rank [J], (joints,)."""
     work = np.zeros(len(problem.system.joints))
     for coupling, (k, *_), parts in problem.couplings.of_joints(step):
         # Several that are evaluated together prescribe nothing.
@@ -231,13 +226,7 @@ def told_by_joints(problem: StepProblem, step: Evaluation) -> FloatArray:
 
 
 def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch]:
-    """Changes of facet in an accepted step, the same on all ranks. Every rank must call it.
-
-    Args:
-        problem: Equations of the step.
-        step: Its solution.
-        time: End of the step [s].
-    """
+    """Changes of facet in an accepted step, the same on all ranks. Every rank must call it."""
     if not problem.system.contacts:
         return []
     found = []

@@ -66,8 +66,7 @@ class ContactLoads(NamedTuple):
             return force
         slave = contact.pair.slave
         slave.body.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.SUM)
-        own: FloatArray = found[slave.share] / self.factor
-        return own
+        return found[slave.share] / self.factor
 
 
 def labels(system: System) -> list[str]:
@@ -135,14 +134,7 @@ def spread(
 def _of_slave(
     pair: ContactPair, own: ContactHistory, press: FloatArray, area: FloatArray
 ) -> dict[str, tuple[float, FloatArray]]:
-    """Name -> value elsewhere and values at this rank's slave nodes.
-
-    Args:
-        pair: The contact.
-        own: What it remembers.
-        press: Contact forces [N].
-        area: Of the nodes [m^2].
-    """
+    """Name -> value elsewhere and values at this rank's slave nodes; of forces [N], areas [m^2]."""
     gap, near = own.gap, np.isfinite(own.gap)
     fields = {
         "contact_force": (0.0, press),
@@ -157,12 +149,7 @@ def _of_slave(
 
 
 def functions(body: Body, fields: dict[str, FloatArray]) -> dict[str, Any]:
-    """DOLFINx Functions of nodal fields on the body's mesh, of its degree. Collective.
-
-    Args:
-        body: The body.
-        fields: As of `at_nodes`.
-    """
+    """DOLFINx Functions of nodal fields on the body's mesh, of its degree. Collective."""
     scalars, of_vector = body.space.sub(0).collapse()
     # Its nodes may have other owners than those of the vectors.
     first = fem.Function(body.space)

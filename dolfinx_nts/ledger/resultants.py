@@ -49,10 +49,6 @@ def at_start(system: System) -> dict[str, FloatArray]:
 def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     """Forces of a step [N], where its integrator takes them, the same on all ranks. Collective.
 
-    Args:
-        problem: Equations of the step.
-        step: Their solution.
-
     Returns:
         By column:
             - of each body: forces of its conditions [N], or their moments [N m], (conditions, 3);

@@ -95,8 +95,7 @@ class _Series:
 
     def _nodal(self, values: FloatArray) -> FloatArray:
         """Values of owned blocks in the order of the file, on rank 0."""
-        gathered: FloatArray = gather_on_root(self.body.comm, values[self._blocks])[self._order]
-        return gathered
+        return gather_on_root(self.body.comm, values[self._blocks])[self._order]
 
     def create(self) -> None:
         """Write the mesh; rank 0 only."""

@@ -16,7 +16,15 @@ from dolfinx_nts.contact.skins import oriented_nodes
 from dolfinx_nts.output.plots import save_figure
 from dolfinx_nts.parallel import gather_on_root, write_on_root
 from dolfinx_nts.types import FloatArray
-from dolfinx_nts.validation import StrPath, as_path, floats, items, require_bool, require_positive
+from dolfinx_nts.validation import (
+    StrPath,
+    as_path,
+    floats,
+    items,
+    require_bool,
+    require_one_of,
+    require_positive,
+)
 
 
 def picture(
@@ -69,8 +77,7 @@ def _has_mesh(body: Any) -> bool:
 
 def check_picture(bodies: Sequence[Any], colour: str, view: Any, limits: Any, width: float) -> None:
     """Raise unless the arguments of `picture` fit."""
-    if not (isinstance(colour, str) and colour in _COLOURS):
-        raise ValueError(f"colour={colour!r}: choose one of {', '.join(map(repr, _COLOURS))}")
+    require_one_of("colour", colour, _COLOURS)
     if not bodies:
         raise ValueError(f"bodies={bodies!r}: pass at least one")
     for name, values in (("view", view), ("limits", (0, 1) if limits is None else limits)):
@@ -225,8 +232,7 @@ def _normals(x: FloatArray) -> FloatArray:
     """Unit normals of quadrilaterals (n, 4, 3), zero where degenerate."""
     normal = np.cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])
     size = np.linalg.norm(normal, axis=1, keepdims=True)
-    unit: FloatArray = normal / np.where(size > 0, size, 1.0)
-    return unit
+    return normal / np.where(size > 0, size, 1.0)
 
 
 def colour_scale(drawn: Sequence[Drawn], colour: str, limits: Any) -> Any:

@@ -106,8 +106,7 @@ def loads(system: System) -> Rows:
 def _settings(item: Any) -> dict[str, Any]:
     """`settings` of a body, joint or obstacle, as they come back from JSON; functions are None."""
     text = json.dumps(item.settings, default=lambda a: a.tolist() if hasattr(a, "tolist") else None)
-    found: dict[str, Any] = json.loads(text)
-    return found
+    return json.loads(text)
 
 
 def _describe_contact(pair: Any) -> dict[str, Any]:
@@ -165,11 +164,7 @@ def listed(sentences: list[str]) -> str:
 
 # ---- a state in the numberings of the file
 class Numbering:
-    """Between the arrays of the ranks and those of the file. Collective.
-
-    Args:
-        system: The scene.
-    """
+    """Between the arrays of the ranks and those of the file. Collective."""
 
     def __init__(self, system: System) -> None:
         self.system, self.comm = system, system.comm
@@ -290,8 +285,7 @@ class Numbering:
             problem = f"{problem}; {remedy}"
         if problem is not None:
             raise ValueError(problem)
-        found: Array = rows[name][np.searchsorted(known, numbers)]
-        return found
+        return rows[name][np.searchsorted(known, numbers)]
 
     def _share(self, tables: Tables, place: str, names: Sequence[str]) -> Any:
         here = {n: tables[f"{place}/{n}"] for n in names if f"{place}/{n}" in tables}

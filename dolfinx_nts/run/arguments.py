@@ -11,7 +11,7 @@ from dolfinx_nts.run.start import refuse_moved
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.start.massless_start import check_massless
 from dolfinx_nts.system import System
-from dolfinx_nts.validation import is_finite, require_bool, require_same
+from dolfinx_nts.validation import is_finite, require_bool, require_one_of, require_same
 
 #: PETSc's own tests of convergence, in whose place `StepSolver` has one of its own.
 _WITHOUT_EFFECT = {"snes_rtol", "snes_atol", "snes_stol", "snes_convergence_test"}
@@ -68,9 +68,7 @@ def check_impact(system: System, integrator: Integrator, impact: Any, restitutio
 
     Arguments are those of `Stepper`.
     """
-    if not isinstance(impact, str) or impact not in IMPACTS:
-        known = ", ".join(map(repr, IMPACTS))
-        raise ValueError(f"impact={impact!r}: choose one of {known}")
+    require_one_of("impact", impact, IMPACTS)
     if not (is_finite(restitution) and 0.0 <= restitution <= 1.0):
         raise ValueError(f"restitution={restitution!r}: must lie between 0 and 1")
     if impact == "published" and restitution != 1.0:

@@ -38,12 +38,7 @@ class Ledger:
         self._restated: dict[str, Any] | None = None
 
     def open(self, state: State, start: Solution | None) -> None:
-        """Write the row of the start. Collective.
-
-        Args:
-            state: What the run starts with.
-            start: What it goes on from.
-        """
+        """Write the row of the start. Collective."""
         forces = resultants.at_start(self._system) | carried_forces(self._system, start)
         self._solution.rows = Table([balance.first_row(self._system, state) | forces])
 
@@ -103,12 +98,7 @@ class Ledger:
         return self._last[2]
 
     def enter(self, problem: StepProblem, trial: Trial) -> None:
-        """Write the row of a step that is accepted, and hold it to its promises. Collective.
-
-        Args:
-            problem: Equations of the step.
-            trial: Its solution.
-        """
+        """Write the row of a step that is accepted, and hold it to its promises. Collective."""
         step, impact, rows = trial.step, trial.impact, self._solution.rows
         before = self._last_row()
         known = {"time": trial.state.time, "newton_iterations": step.iterations}

@@ -87,10 +87,6 @@ class Checkpoint:
 class Saver:
     """Writes the checkpoints of a run; every method is collective.
 
-    Args:
-        checkpoint: Where and how often.
-        stepper: Of the run.
-
     Attributes:
         pace: Of the run, if it has one.
 

@@ -61,12 +61,7 @@ def _pseudo_times(load_steps: Any, begin: float) -> list[float]:
 
 
 def _begin(start: Any, system: System) -> tuple[Any, float]:
-    """What an equilibrium goes on from, and its pseudo time. Collective.
-
-    Args:
-        start: As of `equilibrium`.
-        system: The scene, if it is one.
-    """
+    """What an equilibrium goes on from, and its pseudo time; arguments as of it. Collective."""
     if start is None or not isinstance(system, System):
         return start, 0.0
     found = of_file(start, system)

@@ -16,9 +16,6 @@ class Interrupts:
 
     Outside of the main thread Python lets no one handle signals, and those that are ignored, as
     SIGINT in a job that a shell keeps in the background, stay so.
-
-    Args:
-        comm: MPI communicator.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:

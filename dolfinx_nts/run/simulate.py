@@ -28,6 +28,7 @@ from dolfinx_nts.validation import (
     items,
     known_options,
     require_bool,
+    require_one_of,
     require_positive,
 )
 
@@ -239,9 +240,7 @@ def _newton(newton: Newton | None, accuracy: str | None) -> Newton | None:
         return newton
     if newton is not None:
         raise ValueError(f"accuracy={accuracy!r}, newton={newton!r}: pass one of them")
-    if not (isinstance(accuracy, str) and accuracy in ACCURACY):
-        known = ", ".join(map(repr, ACCURACY))
-        raise ValueError(f"accuracy={accuracy!r}: choose one of {known}")
+    require_one_of("accuracy", accuracy, ACCURACY)
     return ACCURACY[accuracy]
 
 

@@ -18,8 +18,9 @@ from dolfinx_nts.run.solution import Equilibrium, Restart, Solution
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.start import consistent
 from dolfinx_nts.start.initial_contact_forces import with_resting_forces
+from dolfinx_nts.start.taken_over import is_like, state_from
 from dolfinx_nts.state import State
-from dolfinx_nts.system import System, is_like
+from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray, Options
 from dolfinx_nts.validation import UserFunctionError, is_finite
 
@@ -93,10 +94,6 @@ def refuse_written(system: System, time: float) -> None:
     pictures would show it, and a mesh whose nodes are moved would have other forces. Other runs of
     the same bodies may have written, too.
 
-    Args:
-        system: Its bodies.
-        time: At the state of the run [s].
-
     Raises:
         UserFunctionError: Something was written; what was into u and v is undone.
     """
@@ -130,9 +127,6 @@ def refuse_moved_meshes(system: System) -> None:
     """Raise a ValueError on every rank if a body's mesh has other places than it was made with.
 
     Mass, surfaces and forces would be of different meshes. Collective.
-
-    Args:
-        system: Its bodies.
     """
     for body in system.bodies:
         text = (
@@ -206,15 +200,11 @@ def first_state(system: System, start: Any, time: Any) -> State:
             "simulate(...) or of restart(...), or load(...) of a saved equilibrium"
         )
     time = None if time is None else float(time)
-    return system.state_from(start.system, start.state, moving=start.moving, time=time)
+    return state_from(system, start.system, start.state, moving=start.moving, time=time)
 
 
 def incomplete(start: Solution | None) -> str | None:
-    """What is wrong with an equilibrium that ended before its last load step, or None.
-
-    Args:
-        start: As of `simulate`.
-    """
+    """What is wrong with an equilibrium that ended before its last load step, or None."""
     # One that is still running is asked for by a writer of its own, which knows.
     fine = ("completed", "running")
     if start is None or start.moving or start.state is None or start.status.startswith(fine):
@@ -254,10 +244,6 @@ def refuse_moved(system: System) -> None:
 
 def carried_forces(system: System, start: Solution | None) -> dict[str, FloatArray]:
     """Resultants of contacts with which a run begins: the last ones of where it goes on from.
-
-    Args:
-        system: The scene.
-        start: As of `simulate`.
 
     Returns:
         By column of the balance table; without a start none, and of its other contacts zeros.

@@ -72,12 +72,7 @@ def tell_couplings(
 
 
 def tell_stressed(solution: Solution, time: float) -> None:
-    """Warn of bodies whose undeformed state is under stress, as their first step has shown.
-
-    Args:
-        solution: The run.
-        time: When [s].
-    """
+    """Warn of bodies whose undeformed state is under stress, as their first step has shown."""
     sizes = {body.name: body.stressed for body in solution.system.bodies}
     found = {name: size for name, size in sizes.items() if size is not None}
     if not found or "stress at rest" in solution.warnings:
@@ -94,12 +89,7 @@ def tell_stressed(solution: Solution, time: float) -> None:
 
 
 def tell_pieces(solution: Solution, time: float) -> None:
-    """Warn of solid bodies whose mesh falls into pieces. Collective.
-
-    Args:
-        solution: The run.
-        time: When it begins [s].
-    """
+    """Warn of solid bodies whose mesh falls into pieces. Collective."""
     found = {body.name: body.pieces for body in solution.system.bodies if body.pieces > 1}
     for name, pieces in found.items():
         solution.warn(

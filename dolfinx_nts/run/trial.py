@@ -46,10 +46,6 @@ class Trial(NamedTuple):
 def solved(problem: StepProblem, solver: StepSolver) -> Evaluation:
     """Solution of a step, sought again for as long as its motion may have passed by a contact.
 
-    Args:
-        problem: Equations of the step, which has begun.
-        solver: Solves them.
-
     Raises:
         StepFailedError: Not solved, or no search found all contacts.
     """
@@ -72,13 +68,7 @@ def solved(problem: StepProblem, solver: StepSolver) -> Evaluation:
 
 
 def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
-    """State at t_{n+1}. Collective.
-
-    Args:
-        problem: Equations of the step.
-        step: Their solution.
-        time: t_{n+1} [s].
-    """
+    """State at t_{n+1}. Collective."""
     old, dt, batches = problem.state, problem.dt, problem.batches
     u, v, a = (list(values) for values in (old.u, old.v, old.a))
     ends = [
@@ -144,8 +134,7 @@ class LastSteps:
         if not self._recent:
             return None
         steps, forces = zip(*self._recent, strict=True)
-        mean: FloatArray = np.average([force[k] for force in forces], axis=0, weights=steps)
-        return mean
+        return np.average([force[k] for force in forces], axis=0, weights=steps)
 
     @property
     def lengths(self) -> list[float]:

@@ -10,7 +10,13 @@ import numpy as np
 from dolfinx_nts.solve.linear_solver import SOLVERS, choose
 from dolfinx_nts.system import System
 from dolfinx_nts.types import Options
-from dolfinx_nts.validation import is_finite, is_whole, known_options, require_bool
+from dolfinx_nts.validation import (
+    is_finite,
+    is_whole,
+    known_options,
+    require_bool,
+    require_one_of,
+)
 
 #: Coordinates of shells from which a Krylov solver is worth it where they are stiff and steps long.
 _MANY = 2000
@@ -74,9 +80,7 @@ class Newton:
             raise ValueError(f"max_iterations={self.max_iterations!r}: must be at least 1")
         if self.max_retries < 0:
             raise ValueError(f"max_retries={self.max_retries!r}: must not be negative")
-        if self.linear_solver not in SOLVERS:
-            known = ", ".join(map(repr, SOLVERS))
-            raise ValueError(f"linear_solver={self.linear_solver!r}: choose one of {known}")
+        require_one_of("linear_solver", self.linear_solver, SOLVERS)
 
     def keeps(self, system: System, inertia: bool) -> bool:
         """Whether matrices are kept while an iterative solver is in use. Collective.

@@ -114,12 +114,7 @@ class AugmentedMatrix:
         return found
 
     def split_bodies(self, snes: PETSc.SNES, operator: PETSc.Mat) -> None:
-        """Tell continua, for a multigrid, from other bodies. Collective, before the first solve.
-
-        Args:
-            snes: Configured with `mixed`.
-            operator: What it solves with.
-        """
+        """Tell continua, for a multigrid, from other bodies. Collective, before the first solve."""
         ksp = snes.getKSP()
         ksp.setOperators(operator, self.matrix.operator)
         pc = ksp.getPC()

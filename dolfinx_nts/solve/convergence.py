@@ -88,7 +88,7 @@ def _forces_on(
 ) -> list[FloatArray]:
     """Of each batch the given forces where it is free, then all of the step's, (5, num_owned)."""
     found = []
-    each = zip(problem.batches.bodies, forces, problem.flight, e.terms, strict=True)
+    each = zip(problem.batches.bodies, forces, problem.flight.momentum, e.terms, strict=True)
     for body, own, flight, terms in each:
         rows = np.array([own, flight, terms.internal, terms.external, terms.coupling])
         rows[0, body.fixed] = 0.0

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation
-from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.parallel import everywhere, global_sum
 from dolfinx_nts.solve.convergence import ratios
 
 #: Friction where a failed load step starts, over its bound, from which on a body slides.
@@ -59,9 +57,7 @@ def diagnosis(
         endless = [
             body.name
             for body, terms in bodies
-            if not problem.system.comm.allreduce(
-                bool(np.isfinite(getattr(terms, kind)).all()), op=MPI.LAND
-            )
+            if not everywhere(problem.system.comm, np.isfinite(getattr(terms, kind)).all())
         ]
         if endless:
             names = ", ".join(map(repr, endless))
@@ -76,12 +72,7 @@ def diagnosis(
 
 
 def used_up(problem: StepProblem, e: Evaluation) -> str:
-    """Of statics, which body slides as friction alone holds it, or nothing. Collective.
-
-    Args:
-        problem: The step.
-        e: The last iterate.
-    """
+    """Of statics, which body slides as friction alone holds it, or nothing. Collective."""
     system = problem.system
     if problem.integrator.inertia:
         return ""

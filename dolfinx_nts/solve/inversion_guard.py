@@ -18,11 +18,7 @@ _SHORTENED = 5
 
 
 class InversionGuard:
-    """Watches the cells of a step's iterates and shortens updates that would invert them.
-
-    Args:
-        problem: Equations of the step.
-    """
+    """Watches the cells of a step's iterates and shortens updates that would invert them."""
 
     def __init__(self, problem: StepProblem) -> None:
         self._problem = problem

@@ -22,9 +22,6 @@ _SLIDING = 8
 class Iterates:
     """Evaluates the iterates of a step and counts how often elements change their status.
 
-    Args:
-        problem: Equations of the step.
-
     Attributes:
         last: Evaluation of the last iterate.
         flips: Of each batch of elements how often each has changed its status.
@@ -68,11 +65,7 @@ class Iterates:
         self._fewest, self._patience = np.inf, _PATIENCE
 
     def at(self, x: PETSc.Vec) -> Evaluation:
-        """Evaluation at an iterate, reused while SNES asks for the same one. Collective.
-
-        Args:
-            x: PETSc vector of the unknowns.
-        """
+        """Evaluation at an iterate, reused while SNES asks for the same one. Collective."""
         last = self.last
         same = last is not None and np.array_equal(last.x, x.array_r)
         if everywhere(self._problem.system.comm, same):

@@ -22,9 +22,6 @@ class LentStiffness:
     solution moves, and falls as soon as it is not needed. Nothing is lent where
     `releasing_motions` tells nothing: beyond 20,000 coordinates, where nodes slip, and under loads
     that follow a body.
-
-    Args:
-        problem: Equations of the step.
     """
 
     def __init__(self, problem: StepProblem) -> None:

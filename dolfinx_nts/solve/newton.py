@@ -1,4 +1,4 @@
-"""PETSc SNES for a step: Jacobian, convergence per block."""
+"""PETSc SNES for a step: attempts at it, and when it counts as solved."""
 
 from __future__ import annotations
 
@@ -13,20 +13,18 @@ from petsc4py import PETSc
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.contact.contact_elements import UNSETTLED
 from dolfinx_nts.equations.assembly import StepMatrix
-from dolfinx_nts.equations.least_norm import NullSpace, form_tree
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.solve.accuracy import EXACT, Newton
-from dolfinx_nts.solve.augmented import AugmentedMatrix
 from dolfinx_nts.solve.convergence import leaves_work, ratios
 from dolfinx_nts.solve.failure import contact_on, diagnosis, used_up
-from dolfinx_nts.solve.fieldsplit import keep_bodies, set_schur, take_bodies
 from dolfinx_nts.solve.inversion_guard import InversionGuard
 from dolfinx_nts.solve.iterates import Iterates
-from dolfinx_nts.solve.jacobian_reuse import KeptTangents
 from dolfinx_nts.solve.lent_stiffness import LentStiffness
 from dolfinx_nts.solve.presets import Presets
+from dolfinx_nts.solve.redundancy import Redundancy
+from dolfinx_nts.solve.step_jacobian import StepJacobian
 from dolfinx_nts.types import Options
 from dolfinx_nts.validation import StepFailedError
 
@@ -62,7 +60,6 @@ class StepSolver:
 
     Attributes:
         iterates: Iterates of the step.
-        matrix: Jacobian as SNES sees it, after `assemble`.
         snes: The PETSc SNES, after `prepare`.
     """
 
@@ -74,17 +71,14 @@ class StepSolver:
             problem.system, newton, preset, petsc_options, problem.condense,
             problem.integrator.inertia,
         )  # fmt: skip
-        self._tangents = KeptTangents(problem, lambda: self._presets.keeps)
+        self._jacobian = StepJacobian(problem, self._presets)
+        self._tangents = self._jacobian.tangents
         self.iterates, self._upright = Iterates(problem), InversionGuard(problem)
         self._lent, self._wanders = LentStiffness(problem), False
-        self._assembled: Evaluation | None = None
         self._passed: Evaluation | None = None
         self._version, self._solved, self._patient = -1, False, True
         self._raised: StepFailedError | None = None
-        joints = problem.system.joint_bodies[: len(problem.system.declared_joints)]
-        self._independent: bool | None = True if form_tree(joints) else None
-        self.matrix: StepMatrix | None = None
-        self._augmented: AugmentedMatrix | None = None
+        self._repeats = Redundancy(problem)
         self.snes: PETSc.SNES = None
 
     @property
@@ -93,11 +87,11 @@ class StepSolver:
 
         Of `Presets`, and whether constraints of joints repeat each other, as the first step found.
         """
-        return *self._presets.memory, self._independent
+        return *self._presets.memory, self._repeats.independent
 
     def resume(self, memory: Sequence[Any]) -> None:
         """Go on from another run's memory, before the first step."""
-        *of_presets, self._independent = memory
+        *of_presets, self._repeats.independent = memory
         self._presets.resume(of_presets)
 
     def forget(self) -> None:
@@ -120,12 +114,12 @@ class StepSolver:
             last = self._attempt()
             iterations += last.iterations
             if not self.problem.wake(last):
-                return replace(self._of_least_norm(last), iterations=iterations)
+                found = self._repeats.of_least_norm(last, self._worst)
+                return replace(found, iterations=iterations)
 
     def _attempt(self) -> Evaluation:
         """Solve the step with the candidates that have unknowns."""
         self.prepare()
-        assert self.matrix is not None
         iterations, unsolved = 0, False
         couplings, moves = self.problem.couplings, self.problem.integrator.inertia
         may_slip = couplings.contacts.may_slip
@@ -139,7 +133,7 @@ class StepSolver:
             self._begin(retry, slides=slides, again=retry > first, unsolved=unsolved)
             try:
                 self._raised = None
-                self._presets.options.check(self.snes, self.matrix.operator, self._source.operator)
+                self._presets.options.check(self.snes, *self._jacobian.operators)
                 self.snes.solve(None, self.problem.x)
             except PETSc.Error as error:
                 # E.g. a factorisation of redundant constraints; what it leaves is not to be used.
@@ -202,26 +196,6 @@ class StepSolver:
         if slides:
             self.iterates.slide_first()
 
-    def _of_least_norm(self, solved: Evaluation) -> Evaluation:
-        """The solution with multipliers of least norm, where constraints repeat each other."""
-        problem = self.problem
-        if self._independent:
-            return solved
-        bodies = problem.couplings.bodies
-        space = NullSpace(
-            problem.laid, problem.system.comm, problem.elements, bodies, solved.parts
-        )
-        if self._independent is None:
-            self._independent = space.is_empty()
-            if self._independent:
-                return solved
-        here = problem.of_constraints
-        with problem.x as x:
-            x[here] = solved.x[here] - space.part(solved.x[here])
-        e = problem.evaluate(problem.x)
-        # An element of the user's own may have a compliance.
-        return replace(e, min_det=solved.min_det) if self._worst(e) <= 1.0 else solved
-
     def _attempt_otherwise(self, preset: int, iterations: int) -> Evaluation:
         """Solve the step anew, after the linear solver failed or took too long.
 
@@ -258,67 +232,24 @@ class StepSolver:
 
         The bodies' parts may be of an earlier iterate, see `Newton.reuse`.
         """
-        bodies, fresh = self._tangents.at(e)
-        new, options = self.matrix is None, self._presets.options
-        if self.matrix is None:
-            self.matrix = StepMatrix(
-                self.problem.laid.layout,
-                bodies,
-                self.problem.laid.blocks,
-                split=options.split,
-                blocked=options.blocked,
-            )
-            if options.augmented:
-                self._augmented = AugmentedMatrix(self.problem, bodies)
-        elif self._solved and self.problem.laid.own and not options.augmented:
-            # Of an augmented matrix contacts that close change the bodies' part.
-            keep_bodies(self.snes, not fresh)
-        if fresh or new or self.problem.laid.blocks:
-            tangents = [part.tangent for part in e.parts] if self.problem.laid.blocks else []
-            self.matrix.assemble(tangents, fresh=fresh)
-            if self._augmented is not None:
-                self._augmented.assemble(tangents, fresh=fresh)
-        self._tangents.remember()
-        if self.snes is not None:
-            self._refresh_schur()
-        self._assembled = e
-        return self.matrix
+        return self._jacobian.assemble(e, self.snes, solved=self._solved)
 
     @property
-    def _source(self) -> StepMatrix:
-        """What the preconditioner is made of."""
-        assert self.matrix is not None
-        return self.matrix if self._augmented is None else self._augmented.matrix
+    def matrix(self) -> StepMatrix | None:
+        """Jacobian as SNES sees it, after `assemble`."""
+        return self._jacobian.matrix
 
     def _configure(self) -> None:
-        assert self.matrix is not None
         petsc_compat.free_dropped(self.problem.system.comm)  # what earlier runs left
         self.snes = PETSc.SNES().create(self.problem.system.comm)
         self._f = self.problem.x.duplicate()
         self.snes.setFunction(self._function, self._f)
-        self.snes.setJacobian(self._jacobian, self.matrix.operator, self._source.operator)
+        self.snes.setJacobian(self._at_iterate, *self._jacobian.operators)
         self.snes.setConvergenceTest(self._converged)
         self.snes.setLineSearchPreCheck(self._check_update)
         self.snes.setTolerances(max_it=self.newton.max_iterations)
-        split = self.matrix if self.problem.laid.own else None
         self._solved = False
-        options = self._presets.options
-        ours = options.by_rank and self.problem.system.comm.size > 1
-        bodies = self.matrix.whole_bodies() if ours else None
-        whole = bodies is not None
-        mixed = self._augmented is not None and self._augmented.mixed
-        options.configure(self.snes, split, len(self.problem.laid.awake), whole=whole, mixed=mixed)
-        self._refresh_schur()
-        if self._augmented is not None and mixed:
-            self._augmented.split_bodies(self.snes, self.matrix.operator)
-        if bodies is not None:
-            take_bodies(self.snes, self.matrix.operator, bodies, split is not None)
-
-    def _refresh_schur(self) -> None:
-        """Give the preset's field split the Schur complement of the matrix as it is now."""
-        if self.problem.laid.own and self._presets.options.schur:
-            assert self.matrix is not None
-            set_schur(self.snes, self.matrix.schur())
+        self._jacobian.configure(self.snes)
 
     # ---- SNES callbacks
     def _function(self, _snes: Any, x: PETSc.Vec, f: PETSc.Vec) -> None:
@@ -328,9 +259,9 @@ class StepSolver:
             self._raised = error
             raise
 
-    def _jacobian(self, _snes: Any, x: PETSc.Vec, _j: Any, _p: Any) -> None:
+    def _at_iterate(self, _snes: Any, x: PETSc.Vec, _j: Any, _p: Any) -> None:
         e = self.iterates.at(x)
-        if e is not self._assembled:
+        if e is not self._jacobian.assembled:
             if self._lent.at(e, wanders=self._wanders):
                 self._tangents.due = True
             self.assemble(e)
@@ -437,12 +368,7 @@ class StepSolver:
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
         self._presets.options.remove()
-        if self.matrix is not None:
-            self.matrix.destroy()
-            self.matrix = None
-        if self._augmented is not None:
-            self._augmented.destroy()
-            self._augmented = None
+        self._jacobian.destroy()
         if self.snes is not None:
             self.snes.destroy()
             self._f.destroy()

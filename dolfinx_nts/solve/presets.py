@@ -194,12 +194,7 @@ class Presets:
         snes.getKSP().setTolerances(rtol=rtol, max_it=limit)
 
     def why_failed(self, snes: PETSc.SNES, reason: int) -> tuple[str, bool]:
-        """PETSc's reason of a failure in words, and whether they say what to do.
-
-        Args:
-            snes: The SNES that failed.
-            reason: Its own reason.
-        """
+        """PETSc's reason of a failure in words, and whether they say what to do."""
         if reason != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
             return f"SNES reason {reason}", False
         ksp = snes.getKSP()

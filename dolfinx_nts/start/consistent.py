@@ -142,10 +142,6 @@ def _drives(joint: Any) -> bool:
 def fitted(problem: StepProblem, state: State) -> Fitted | None:
     """The end of a step with the velocities of its drives. Collective.
 
-    Args:
-        problem: Equations of the step.
-        state: At its end, as its integrator has it.
-
     Returns:
         None where no drive is missed.
     """

@@ -33,11 +33,6 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
     each over the body's stiffness, so that soft bodies count beside stiff ones. A turn of a
     straight beam about its own axis is none: it moves nothing, and how straight it is, which
     decides whether anything resists it, is chance.
-
-    Args:
-        problem: Equations of a load step.
-        solver: Its solver.
-        step: Its solution.
     """
     operator = solver.assemble(step).operator
     comm, bodies = problem.system.comm, problem.system.bodies
@@ -96,11 +91,9 @@ def free_motion(problem: StepProblem, solver: StepSolver, step: Evaluation) -> s
 
 
 def _least(sizes: FloatArray, among: BoolArray) -> FloatArray:
-    """The combination of some of the modes that is resisted least, shape (modes,).
+    """The combination (modes,) of some modes that is resisted least.
 
-    Args:
-        sizes: Products of the modes' images, and of the modes, shape (2, modes, modes).
-        among: Which modes it may have.
+    By products of the modes' images, and of the modes, shape (2, modes, modes).
     """
     found = np.zeros(len(among))
     resistance, forces = np.sqrt(sizes.diagonal(axis1=1, axis2=2))
@@ -123,14 +116,8 @@ def _rigid(
 ) -> tuple[list[FloatArray], FloatArray, bool]:
     """Three translations and three rotations about the middle of the places. Collective.
 
-    Args:
-        y: Nodal vectors [m], shape (n, 3).
-        places: Which of them are places; directors only turn.
-        comm: MPI communicator.
-
-    Returns:
-        The motions, the axes of the rotations, shape (3, 3), and whether all places are on the last
-        one.
+    Of nodal vectors y [m], (n, 3), some of them places. With the axes of the rotations, (3, 3), and
+    whether all places are on the last one.
     """
     total = comm.allreduce(np.array([*y[places].sum(axis=0), places.sum()]))
     arm = y - np.where(places[:, None], total[:3] / total[3], 0.0)

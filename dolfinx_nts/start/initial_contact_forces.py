@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from mpi4py import MPI
-
 import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Newmark
 from dolfinx_nts.interaction.evaluation import Evaluation
+from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.newton import StepSolver
 from dolfinx_nts.state import State
@@ -57,13 +56,13 @@ def with_resting_forces(
     """
     system = problem.system
     known = any(contact.force.any() for contact in state.contacts)
-    if not system.contacts or system.comm.allreduce(known, op=MPI.LOR):
+    if not system.contacts or anywhere(system.comm, known):
         return state
     start = replace(state, a=tuple(np.zeros_like(v) for v in state.v))
     problem.begin(start, _SHORT * dt)
     batches = (*problem.couplings.contacts.elements, *problem.couplings.contacts.idle)
     touches = any(_closed(c).any() for c in batches)
-    if not system.comm.allreduce(touches, op=MPI.LOR):
+    if not anywhere(system.comm, touches):
         return state
     # With beta = 1/2 a step moves by h v_0 + h^2/2 a_1: a_0, which is sought, plays no part.
     rule = Newmark(beta=0.5, gamma=1.0)
@@ -99,5 +98,4 @@ def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:
 
 def _closed(c: ContactElements) -> BoolArray:
     """Which candidates touch at the start."""
-    closed: BoolArray = np.abs(c.candidates.gap) <= _CLOSED * c.candidates.length
-    return closed
+    return np.abs(c.candidates.gap) <= _CLOSED * c.candidates.length

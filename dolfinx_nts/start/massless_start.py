@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from mpi4py import MPI
-
 import numpy as np
 
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.parallel import global_max
+from dolfinx_nts.parallel import anywhere, global_max
 from dolfinx_nts.start.consistent import accelerating_forces
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
@@ -24,13 +22,7 @@ _SLOW = 0.4
 
 
 def check_massless(system: System, integrator: Integrator, impact: str) -> None:
-    """Raise a ValueError on every rank where massless nodes make no sense. Collective.
-
-    Args:
-        system: The scene.
-        integrator: Of the run.
-        impact: As of `simulate`.
-    """
+    """Raise a ValueError on every rank where massless nodes make no sense. Collective."""
     with_massless = [b.name for b in system.bodies if b.has_massless]
     if not with_massless:
         return
@@ -66,11 +58,6 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
     A step balances the mean of its ends. A force missing at one end returns with the other sign at
     the next.
 
-    Args:
-        problem: Equations of the run.
-        state: At the start.
-        dt: First step [s].
-
     Returns:
         Force [N], and the text: empty where what is missing is small beside the internal forces.
     """
@@ -79,7 +66,7 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
     chosen = [body.has_massless for body in bodies]
     both = zip(bodies, state.u, chosen, strict=True)
     moved = any(some and bool(u.any()) for _, u, some in both)
-    if not problem.system.comm.allreduce(moved, op=MPI.LOR):
+    if not anywhere(problem.system.comm, moved):
         return worst, text
     forces = accelerating_forces(problem, state, dt)
     for body, (force, _), u, some in zip(bodies, forces, state.u, chosen, strict=True):
@@ -103,9 +90,6 @@ def off_balance(problem: StepProblem, state: State, dt: float) -> tuple[float, s
 
 def thick_layer(system: System) -> tuple[float, str]:
     """The massless layer with friction that is too thick by most for an impact. Collective.
-
-    Args:
-        system: The scene.
 
     Returns:
         Time of a shear wave through it over that of a pressure wave through the body, and a

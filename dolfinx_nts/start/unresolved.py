@@ -50,11 +50,6 @@ def tell_unresolved(problem: StepProblem, state: State, dt: float) -> tuple[floa
     coordinate in bodies and joints. On flexible bodies, also behind joints, none is: the mass that
     moves depends on how fast it moves.
 
-    Args:
-        problem: Equations of the run.
-        state: At the start.
-        dt: First step [s].
-
     Returns:
         How many times it is too fast, and a sentence with a remedy.
     """
@@ -140,9 +135,6 @@ class DamperWatch:
 
     What they hold back from rest, or only slowly drag along, has the right places and forces
     however stiff they are, so that only what happens tells.
-
-    Args:
-        problem: Equations of the run.
     """
 
     def __init__(self, problem: StepProblem) -> None:
@@ -151,9 +143,6 @@ class DamperWatch:
 
     def look(self, state: State) -> tuple[float, str] | None:
         """Look at a solved step, before the next one begins. Collective.
-
-        Args:
-            state: At its end.
 
         Returns:
             As of `tell_unresolved`.

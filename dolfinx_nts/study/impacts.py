@@ -79,8 +79,7 @@ def bar(comm: MPI.Comm, mass: str, *, gravity: bool = False, elements: int = 50)
     demo = load("bar_impact")
 
     def force(t: FloatArray) -> FloatArray:
-        exact: FloatArray = demo.AREA * demo.exact(t, gravity)[1]
-        return exact
+        return demo.AREA * demo.exact(t, gravity)[1]
 
     system = demo.scene(comm, elements, gravity, mass)
     return Problem(
@@ -195,8 +194,7 @@ def sphere(comm: MPI.Comm, mass: str, *, cells: int = 8, steps: int = 60) -> Pro
     pair = nts.ContactPair(slave=slave, master=nts.Plane((0, 0, -1.0 - gap), (0, 0, 1)))
 
     def force(t: FloatArray) -> FloatArray:
-        f: FloatArray = np.interp(t - gap / exact.speed, times, forces, left=0.0, right=0.0)
-        return f
+        return np.interp(t - gap / exact.speed, times, forces, left=0.0, right=0.0)
 
     end = gap / exact.speed + 1.15 * times[-1]
     return Problem(nts.System([body], contacts=[pair]), dt, end, force, True, 4, "balanced")
@@ -251,8 +249,7 @@ class Recorder:
     def _approach(self, stepper: nts.Stepper) -> FloatArray:
         """Velocity of the first body, against the second if there is one [m/s]."""
         v = [nts.motion_of(body).velocity for body in stepper.system.bodies]
-        speed: FloatArray = v[0] - v[1] if len(v) > 1 else v[0]
-        return speed
+        return v[0] - v[1] if len(v) > 1 else v[0]
 
 
 def measure(problem: str, way: str, comm: MPI.Comm) -> dict[str, Any]:

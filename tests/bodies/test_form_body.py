@@ -285,7 +285,7 @@ def test_bad_input(change, kind, pattern):
 
 @pytest.mark.mpi
 def test_spaces_and_surfaces_that_are_refused():
-    scalar = compat.scalar_space(box(cells=1), "Lagrange", 1)
+    scalar = compat.function_space(box(cells=1), "Lagrange", 1)
     with pytest.raises(ValueError, match="pass a continuous Lagrange space"):
         nts.FormBody(scalar, energy, density=RHO)
     string = nts.FormBody(

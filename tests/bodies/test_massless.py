@@ -305,7 +305,7 @@ def test_jacobian(rule, friction):
     )
     state = replace(state, contacts=(history,))
     problem.begin(state, dt)
-    here = problem.of_constraints
+    here = problem.laid.of_elements("constraints")
     with problem.x as x:
         x[:] += 0.01 * rng.uniform(-1, 1, len(x))
         x[here] = 0.05 * rng.uniform(-1, 1, here.stop - here.start)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.mpi
 
 def field(mesh, value, upper=None):
     """A Function of degree 0, of another value in the upper half."""
-    found = fem.Function(compat.scalar_space(mesh, "DG", 0))
+    found = fem.Function(compat.function_space(mesh, "DG", 0))
     number = mesh.topology.index_map(3)
     cells = np.arange(number.size_local + number.num_ghosts)
     x = mesh.geometry.x[compat.geometry_dofmap(mesh)].mean(axis=1)

@@ -19,6 +19,7 @@ import dolfinx_nts as nts
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.contact import crossings, intrusion, obstacle_crossings, overlap
 from dolfinx_nts.kernels import compiled
+from dolfinx_nts.start.taken_over import state_from
 
 COMM = MPI.COMM_WORLD
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
@@ -1062,7 +1063,7 @@ def test_a_start_from_another_run_around_an_obstacle_is_refused(cells, caplog):
     ball = nts.Sphere((2.5, 0.5, 0.5), 0.2)
     start = unit_cube(ball, cells=cells, velocity=(2.0, 0, 0))
     with pytest.raises(ValueError, match="^contact 'cube-sphere': 'sphere' starts inside 'cube'"):
-        start.state_from(free, run.state, moving=False)
+        state_from(start, free, run.state, moving=False)
     options = {"dt": 1e-3, "t_end": run.state.time + 2e-3, "start": run}
     told = nts.simulate(start, nts.EnergyMomentum(), **options)
     assert told.status.startswith("completed, but 'sphere' lies inside 'cube'")

@@ -124,7 +124,7 @@ def test_matrix_is_the_derivative_of_the_residual():
     problem = stepper.problem
     matrix = stepper.solver.assemble(problem.evaluate(problem.x)).operator
     way, there = problem.x.duplicate(), problem.x.duplicate()
-    here = slice(0, problem.of_constraints.start)
+    here = slice(0, problem.laid.of_elements("constraints").start)
     values = np.zeros(len(problem.x.array_r))
     values[here] = np.random.default_rng(COMM.rank).normal(size=here.stop)
     values[problem.laid.held] = 0.0

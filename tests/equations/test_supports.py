@@ -138,7 +138,7 @@ def test_what_fails_is_told_on_all_ranks():
     with pytest.raises(ValueError, match="is on another mesh; make it on that of the body"):
         nts.Continuum(box(), MATERIAL, density=1e3, bcs=[nts.Dirichlet(top, function_of(mesh))])
     for degree in (0, 1):
-        broken = fem.Function(compat.cell_vector_space(mesh, "DG", degree))
+        broken = fem.Function(compat.function_space(mesh, "DG", degree, (3,)))
         words = "may have several values at a node; interpolate it into a continuous space"
         with pytest.raises(ValueError, match=f"^Dirichlet.value of .*: {words}"):
             nts.Continuum(mesh, MATERIAL, density=1e3, bcs=[nts.Dirichlet(top, broken)])

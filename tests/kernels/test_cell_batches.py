@@ -193,7 +193,8 @@ print(os.waitstatus_to_exitcode(status), beside.result() == here)
 def test_with_fields_of_parameters():
     """Cells with moduli of their own, and a Constant in the exponent."""
     mesh = box(CellType.hexahedron)
-    stiffness, exponent = fem.Function(compat.scalar_space(mesh, "DG", 0)), fem.Constant(mesh, 1.3)
+    stiffness = fem.Function(compat.function_space(mesh, "DG", 0))
+    exponent = fem.Constant(mesh, 1.3)
     stiffness.interpolate(lambda x: 1e5 * (1.0 + x[0]))
     body = nts.Continuum(mesh, lambda c: stiffness * ufl.tr(c) ** exponent, density=1e3)
     work = body._forms._compiled(nts.Midpoint())[0]

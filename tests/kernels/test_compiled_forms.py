@@ -70,7 +70,7 @@ def test_a_users_flags_are_kept(tmp_path):
 def own_scene(mesh):
     """A step of a body whose forms hold all that UFL counts: a user's W, and virtual work."""
     mu, lam, drag = (fem.Constant(mesh, value) for value in (4e5, 6e5, 2e3))
-    grade = fem.Function(compat.scalar_space(mesh, "DG", 0))
+    grade = fem.Function(compat.function_space(mesh, "DG", 0))
     grade.x.array[:] = 1.0
 
     def energy(c):
@@ -90,7 +90,7 @@ def own_scene(mesh):
 def count_up(mesh, margin):
     """Make Constants, Functions, indices and labels up to `margin` below a count of more digits."""
     number = fem.Constant(mesh, 0.0).count()
-    space = ufl.Coefficient(compat.scalar_space(mesh, "DG", 0)).ufl_function_space()
+    space = ufl.Coefficient(compat.function_space(mesh, "DG", 0)).ufl_function_space()
     for _ in range(10 ** len(str(number + margin)) - margin - number - 1):
         fem.Constant(mesh, 0.0), ufl.Index(), ufl.variable(ufl.as_ufl(1.0)), ufl.Coefficient(space)
 

@@ -39,10 +39,10 @@ def test_they_are_as_they_were(cell, mpi_tmp_path):
     """Scalars, vectors and tensors in cells and at nodes, at their places on any ranks."""
     body, system = moving(cell)
     spaces = {
-        "heat": compat.scalar_space(body.mesh, "Lagrange", 1),
+        "heat": compat.function_space(body.mesh, "Lagrange", 1),
         "flow": compat.vector_space(body.mesh, 1),
-        "tensor": compat.tensor_space(body.mesh, "Lagrange", 1),
-        "damage": compat.scalar_space(body.mesh, "DG", 0),
+        "tensor": compat.function_space(body.mesh, "Lagrange", 1, (3, 3)),
+        "damage": compat.function_space(body.mesh, "DG", 0),
     }
     laws = {
         "heat": lambda x: x[0] + 2 * x[2],
@@ -82,7 +82,7 @@ def test_what_cannot_be_written_is_refused(mpi_tmp_path):
     body, system = moving()
     with pytest.raises(TypeError, match=r"functions\[0\]=3: pass a sequence of Functions, or"):
         Fields(mpi_tmp_path, functions=[3])
-    for space in (compat.vector_space(body.mesh, 2), compat.scalar_space(body.mesh, "DG", 1)):
+    for space in (compat.vector_space(body.mesh, 2), compat.function_space(body.mesh, "DG", 1)):
         writer = Fields(mpi_tmp_path, functions=[fem.Function(space)])
         with pytest.raises(ValueError, match="other values than one at each node or in each cell"):
             nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=1e-4, output=[writer])
@@ -98,7 +98,7 @@ def named(space, name):
 def test_two_fields_of_one_name_are_refused(names, mpi_tmp_path):
     """One of the two would be missing in the file."""
     body, system = moving()
-    space = compat.scalar_space(body.mesh, "DG", 0)
+    space = compat.function_space(body.mesh, "DG", 0)
     functions = [nts.von_mises, *(named(space, name) for name in names)]
     writer = Fields(mpi_tmp_path, functions=functions)
     text = rf"of body 'soft': there is another field '{names[-1] or 'f'}' in its file"
@@ -109,7 +109,7 @@ def test_two_fields_of_one_name_are_refused(names, mpi_tmp_path):
 @mpi
 def test_a_function_on_no_mesh_of_the_scene_is_refused(mpi_tmp_path):
     _, system = moving()
-    elsewhere = fem.Function(compat.scalar_space(box(cells=1), "DG", 0))
+    elsewhere = fem.Function(compat.function_space(box(cells=1), "DG", 0))
     writer = Fields(mpi_tmp_path, functions=[nts.von_mises, elsewhere])
     with pytest.raises(ValueError, match=r"functions\[1\]=f: is on none of the bodies' meshes"):
         nts.simulate(system, nts.EnergyMomentum(), dt=1e-4, t_end=1e-4, output=[writer])

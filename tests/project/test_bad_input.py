@@ -248,7 +248,7 @@ def of_another_mesh(kind):
     """A UFL scalar that lives on another mesh than the bodies."""
     other = box()
     return {
-        "function": lambda: fem.Function(compat.scalar_space(other, "DG", 0), name="stiffness"),
+        "function": lambda: fem.Function(compat.function_space(other, "DG", 0), name="stiffness"),
         "constant": lambda: fem.Constant(other, 1.0),
         "coordinate": lambda: ufl.SpatialCoordinate(other)[0],
     }[kind]()

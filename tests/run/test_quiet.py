@@ -16,7 +16,7 @@ from dolfinx_nts import dolfinx_compat as compat, forms
 
 mesh = create_box(MPI.COMM_SELF, [[0, 0, 0], [1, 1, 1]], [1, 1, 1], CellType.tetrahedron)
 space = compat.vector_space(mesh, 1)
-compat.scalar_space(mesh, "DG", 0), compat.tensor_space(mesh, "DG", 0)
+compat.function_space(mesh, "DG", 0), compat.function_space(mesh, "DG", 0, (3, 3))
 w = ufl.TestFunction(space)
 forms.compile_forms([{form}])
 """

@@ -41,10 +41,6 @@ def places_of(mesh: Mesh) -> int:
 def check_mesh(mesh: Mesh, name: str) -> None:
     """Raise on every rank unless the mesh is a valid 3D mesh of degree 1.
 
-    Args:
-        mesh: DOLFINx mesh.
-        name: Of its body, for messages.
-
     Raises:
         TypeError: It is no mesh.
         ValueError: Cells of another kind, not finite, inverted or overlapping.
@@ -146,8 +142,7 @@ def pieces_of(mesh: Mesh) -> int:
 def _joined(one: IntArray, two: IntArray, count: int) -> tuple[int, IntArray]:
     """Number of parts of a graph with these edges and so many nodes, and each node's part."""
     edges = coo_matrix((np.ones(len(one), dtype=bool), (one, two)), (count, count))
-    found: tuple[int, IntArray] = connected_components(edges, directed=False)
-    return found
+    return connected_components(edges, directed=False)
 
 
 def _hashed(a: HashArray) -> HashArray:

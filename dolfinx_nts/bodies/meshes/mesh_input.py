@@ -109,7 +109,7 @@ class Part:
                 f"values={dict(values)!r}: body {self.name!r} is made of {wanted}; pass a value "
                 "for each of them and for nothing else"
             )
-        found = fem.Function(compat.scalar_space(self.mesh, "DG", 0))
+        found = fem.Function(compat.function_space(self.mesh, "DG", 0))
         dofs = compat.cell_dofs(found.function_space)[self.cell_tags.indices, 0]
         found.x.array[dofs] = [values[known[tag]] for tag in here.tolist()]
         return found
@@ -309,10 +309,7 @@ def _part(comm: MPI.Comm, name: str, body: Any, surfaces: Mapping[str, int]) -> 
 def _find_facets(mesh: Mesh, facets: IntArray, tags: IntArray) -> tuple[IntArray, IntArray]:
     """This rank's facets with the given nodes, ascending, and their tags.
 
-    Args:
-        mesh: dolfinx mesh with facets.
-        facets: Input node numbers, ascending in each row, shape (k, facet corners).
-        tags: Shape (k,).
+    Of input node numbers, ascending in each row, shape (k, facet corners), and tags (k,).
     """
     facet_map = mesh.topology.index_map(2)
     every = np.arange(facet_map.size_local + facet_map.num_ghosts, dtype=np.int32)

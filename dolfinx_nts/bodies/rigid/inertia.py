@@ -18,6 +18,8 @@ from dolfinx_nts.validation import floats
 ROUNDED = 1e-9
 #: Part of the largest moment by which equal ones may differ by the rounding of a mesh.
 _EQUAL = 1e-9
+#: Part of the mass that matrices lend to directors without any.
+_LENT = 1e-8
 
 
 class Inertia(NamedTuple):
@@ -45,8 +47,7 @@ class Inertia(NamedTuple):
     @property
     def moments(self) -> FloatArray:
         """Principal moments of inertia [kg m^2], shape (3,)."""
-        found: FloatArray = self.euler.sum() - self.euler
-        return found
+        return self.euler.sum() - self.euler
 
     @property
     def length(self) -> float:
@@ -65,6 +66,16 @@ class Inertia(NamedTuple):
     def nodal_mass(self) -> FloatArray:
         """Of the centre m, of the directors E_i / l^2 [kg], shape (4,)."""
         return np.array([self.mass, *(self.euler / self.length**2)])
+
+    @property
+    def lent(self) -> FloatArray:
+        """What matrices lend to directors without mass where a rotation has no inertia [kg], (4,).
+
+        As about the axis of a rod: Newton's updates leave that rotation alone then.
+        """
+        masses = self.nodal_mass
+        few = np.count_nonzero(masses[1:]) < 2
+        return np.where((masses == 0.0) & few, _LENT * self.mass, 0.0)
 
 
 def _not_rounding(euler: FloatArray) -> FloatArray:

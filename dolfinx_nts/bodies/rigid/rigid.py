@@ -2,43 +2,39 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-from dolfinx import fem
 from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
-from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.directors import Directors
+from dolfinx_nts.bodies.mesh_body import MeshBody
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh, places_of
+from dolfinx_nts.bodies.nodal_values import motion_on
 from dolfinx_nts.bodies.rigid.inertia import Inertia, inertia_of, principal
 from dolfinx_nts.bodies.rigid.rigid_loads import PrescribedMotion, RigidLoads, VectorInTime
+from dolfinx_nts.bodies.rigid.rigid_matrix import RigidMatrix
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,
     is_number,
     require_positive_parameter,
     values_of,
 )
-from dolfinx_nts.contact.facet_choice import choose_facets
-from dolfinx_nts.contact.skins import skin_of_mesh
-from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels.vectors import cross, range_of
 from dolfinx_nts.parallel import gather_rows, raise_together, rank_of
-from dolfinx_nts.types import FloatArray, IntArray, Marker, Places, Settings, Values, Vector
+from dolfinx_nts.types import FloatArray, IntArray, Places, Settings, Values
 from dolfinx_nts.validation import (
     UserFunctionError,
     known_options,
-    require_bool,
     require_name,
     require_positive,
     require_same,
@@ -46,13 +42,9 @@ from dolfinx_nts.validation import (
     vectors,
 )
 
-#: Part of the mass that the matrix lends to directors without mass where a rotation has no
-#: inertia, as about the axis of a rod: Newton's updates leave that rotation alone then.
-_LENT = 1e-8
-
 
 @known_options
-class RigidBody(Body):
+class RigidBody(MeshBody):
     """A rigid body on a DOLFINx mesh, with twelve coordinates and six constraints.
 
     Its coordinates are those of four nodes: the centre of mass phi and D_i = l d_i, l the radius of
@@ -118,8 +110,7 @@ class RigidBody(Body):
         self.mesh, self.density, self.degree = mesh, density, 1
         self.made_on = places_of(mesh)
         self.space = compat.vector_space(mesh, 1)
-        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
-        self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
+        self.u, self.v = motion_on(self.space, name)
         self._densities = [] if is_number(density) else [density]
         self._measured = self.parameters()
         self._set_up(mesh.comm, inertia_of(self.space, density), **given)
@@ -212,9 +203,9 @@ class RigidBody(Body):
         held = self.points(self.centre).select(slice(0, int(comm.rank == self.owner)))
         self._directors_held = Directors(self, held, self.length, np.arange(len(held)))
         self.joints = () if self._drive.turns else (self._directors_held,)
-        self._matrix: Any = None
-        # Mass factor that it holds, and PETSc's count of changes since.
-        self._holds: tuple[float, int] | None = None
+        self._matrix = RigidMatrix(
+            self.comm, self.nodal_mass + self.lent, self.fixed, self.mass
+        )
         #: Of each node the largest weight in a point of the mesh, shape (4,).
         self.reach = np.ones(4)
         if self.mesh is not None:
@@ -232,10 +223,8 @@ class RigidBody(Body):
         y, masses = self._inertia.nodes, self._inertia.nodal_mass
         self.reference: FloatArray = y.ravel()[: self.num_owned]
         self.nodal_mass: FloatArray = np.repeat(masses, 3)[: self.num_owned]
-        #: Mass that matrices have beside `nodal_mass` [kg], see `_LENT`.
-        self.lent = np.zeros(self.num_owned)
-        if np.count_nonzero(masses[1:]) < 2:
-            self.lent[np.repeat(masses == 0.0, 3)[: self.num_owned]] = _LENT * self.mass
+        #: Mass that matrices have beside `nodal_mass` [kg], see `Inertia.lent`.
+        self.lent: FloatArray = np.repeat(self._inertia.lent, 3)[: self.num_owned]
         speeds = np.vstack([linear, np.cross(turning, y[1:])])
         self.initial_velocity = speeds.ravel()[: self.num_owned]
         self._fixed = np.repeat([self._drive.moves] + 3 * [self._drive.turns], 3)
@@ -259,14 +248,12 @@ class RigidBody(Body):
         They are the principal axes of inertia as they stand now, so this is not the identity at the
         start. The rotation from there is `body.rotation @ at_start.T`, with a copy of it made then.
         """
-        turned: FloatArray = self._y[1:].T / self.length
-        return turned
+        return self._y[1:].T / self.length
 
     @property
     def angular_velocity(self) -> FloatArray:
         """1/2 sum d_i x v_i [rad/s], shape (3,), the same on all ranks."""
-        spin: FloatArray = 0.5 * cross(self._y[1:], self._v[1:]).sum(axis=0) / self.length**2
-        return spin
+        return 0.5 * cross(self._y[1:], self._v[1:]).sum(axis=0) / self.length**2
 
     # ---- points
     def _weights(self, x: FloatArray) -> FloatArray:
@@ -282,86 +269,29 @@ class RigidBody(Body):
         return Points(self, nodes, weights, np.tile(y, (n, 1, 1)), fixed, places)
 
     def points(self, x: Places) -> Points:
-        """Material points, inside the body or not, for joints and springs.
-
-        Args:
-            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
-
-        Raises:
-            ValueError: x is no array of points.
-        """
+        """As of `Body`, inside the body or not."""
         return self._points(self._weights(vectors("x", x, "points [m]")))
 
     def directions(self, x: Places) -> Points:
-        """Directions that turn with the body, for joints.
-
-        Args:
-            x: At the start [-], shape (3,) or (n, 3), the same on all ranks.
-
-        Raises:
-            ValueError: x is no array of vectors.
-        """
+        """As of `Body`."""
         local = vectors("x", x, "vectors") @ self._inertia.axes / self.length
         return self._points(np.column_stack([np.zeros(len(local)), local]))
 
     def directions_at(self, direction: FloatArray, x: Places) -> Points:
-        """A direction, which turns alike at all points.
-
-        Args:
-            direction: At the start [-], shape (3,).
-            x: Reference position of a point [m].
-        """
+        """As of `Body`; it turns alike at all points."""
         return self.directions(direction)
 
     def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
-        """Nodes of the mesh as material points, for surfaces.
-
-        Args:
-            nodes: Global numbers in `space`, shape (n,).
-            x: Their reference positions [m], shape (n, 3).
-        """
+        """As of `Body`."""
         return self._points(self._weights(x))
 
     def at_mesh(self, values: FloatArray) -> FloatArray:
-        """Values at the mesh's nodes on this rank, as of `space`, from the coordinates. Collective.
-
-        Args:
-            values: At the owned coordinates, shape (num_owned,).
-        """
+        """As of `Body`. Collective."""
         owned = self.space.dofmap.index_map.size_local
-        return (self._mesh_weights[:owned] @ self._everywhere(values)).ravel()
+        return (self._mesh_weights[:owned] @ gather_rows(self.comm, values.reshape(-1, 3))).ravel()
 
-    def _everywhere(self, values: FloatArray) -> FloatArray:
-        """Nodal vectors (4, 3) on all ranks. Collective."""
-        return gather_rows(self.comm, values.reshape(-1, 3))
-
-    def surface(
-        self,
-        marker: Marker,
-        tag: int | None = None,
-        *,
-        normal: Vector | None = None,
-        angle: float | None = None,
-        smoothing: bool = False,
-        mass: str = "consistent",
-    ) -> Surface:
-        """A part of the boundary for contact, as of `Continuum.surface`.
-
-        Args:
-            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
-                meshtags.
-            tag: Value in the meshtags.
-            normal: As of `Continuum.surface`.
-            angle: As of `Continuum.surface` [degrees].
-            smoothing: Whether slaves touch a smooth surface when this one is the master.
-            mass: "consistent"; no node of a rigid body can lose its mass.
-
-        Raises:
-            TypeError: smoothing is no bool.
-            ValueError: The body has no mesh; no facet, or interior facets, or none that faces
-                `normal`; normal or angle is none; mass is another one.
-        """
-        require_bool("smoothing", smoothing)
+    def _check_surface(self, mass: str) -> None:
+        """As of `MeshBody`."""
         if mass != "consistent":
             raise ValueError(
                 f"mass={mass!r} of a surface of {self.name!r}: a rigid body has no nodes that "
@@ -371,9 +301,6 @@ class RigidBody(Body):
             raise ValueError(
                 f"body {self.name!r}: has no mesh, so no surface; make it by RigidBody(mesh, ...)"
             )
-        what = f"marker of a surface of {self.name!r}"
-        found = choose_facets(self.mesh, marker, tag, normal, angle, what)
-        return Surface(self, skin_of_mesh(self, found), smoothing)
 
     def motion_range(self, du: FloatArray) -> FloatArray:
         """Bounds on the motion of the mesh's points on this rank, see `Body` [m]."""
@@ -433,24 +360,13 @@ class RigidBody(Body):
     def tangent(self, u1: FloatArray, mass: float, stiffness: float) -> PETSc.Mat:
         """Return mass M less stiffness times the derivative of the torque's forces."""
         self.check_alive()
-        if self._matrix is None:
-            self._matrix = petsc_compat.dense_matrix(self.comm, self.num_owned)
-        constant = not self._loads.turn
-        if constant and self._holds == (mass, self._matrix.stateGet()):
-            return self._matrix
+        if not self._loads.turn:
+            return self._matrix.at(mass, None)
+        turning = np.zeros((9, 9))
         if self.num_owned:
-            whole = np.diag(mass * (self.nodal_mass + self.lent))
-            if not constant:
-                by_directors = self._loads.gradient(self._directors(u1))
-                whole[3:, 3:] -= stiffness * self._theta * by_directors
-            if self.fixed.size:
-                whole[self.fixed] = whole[:, self.fixed] = 0.0
-                whole[self.fixed, self.fixed] = mass * self.mass or 1.0
-            numbers = np.arange(12, dtype=PETSc.IntType)
-            self._matrix.setValues(numbers, numbers, whole.ravel())
-        self._matrix.assemble()
-        self._holds = (mass, self._matrix.stateGet()) if constant else None
-        return self._matrix
+            by_directors = self._loads.gradient(self._directors(u1))
+            turning = stiffness * self._theta * by_directors
+        return self._matrix.at(mass, turning)
 
     def nodal_stiffness(self) -> FloatArray:
         """None [N/m]."""
@@ -527,5 +443,4 @@ class RigidBody(Body):
     def destroy(self) -> None:
         """Free the PETSc objects; the body is of no use then."""
         super().destroy()
-        if self._matrix is not None:
-            self._matrix.destroy()
+        self._matrix.destroy()

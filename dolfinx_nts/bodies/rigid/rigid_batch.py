@@ -88,8 +88,7 @@ class RigidBatch(Body):
     def motions(self, du: FloatArray) -> FloatArray:
         """`motion_of_points` of each member on this rank [m], shape (own,)."""
         moved = np.abs(du).reshape(-1, 4, 3)
-        found: FloatArray = np.einsum("bk,bki->bi", self._reach, moved).max(axis=1, initial=0.0)
-        return found
+        return np.einsum("bk,bki->bi", self._reach, moved).max(axis=1, initial=0.0)
 
     def turns(self, u0: FloatArray, u1: FloatArray) -> FloatArray:
         """`turn` of each member on this rank [rad], shape (own,)."""

@@ -107,8 +107,7 @@ class RigidLoads:
         """
         squares = directors.T @ directors
         whole = np.trace(squares) * np.eye(3) - squares
-        turning: FloatArray = np.linalg.solve(whole, self.torque)
-        return turning
+        return np.linalg.solve(whole, self.torque)
 
     def gradient(self, directors: FloatArray) -> FloatArray:
         """Derivative of the torque's forces t x D_i by the directors, shape (9, 9)."""

@@ -196,5 +196,4 @@ def _first(
             f"{what}={direction!r}: along the axis at x={x[off.argmax()].tolist()}; pass a vector, "
             "or a function x (3, n) -> (3, n), that is across it everywhere"
         )
-    found: FloatArray = across / left[:, None]
-    return found
+    return across / left[:, None]

@@ -167,12 +167,7 @@ class Beam(DirectorBody):
         return kernel.resultants(strain * self.section.stiffness, y, self._rest, self.length)
 
     def directions_at(self, direction: FloatArray, x: Places) -> Points:
-        """A direction that turns with a node, for joints. Collective.
-
-        Args:
-            direction: At the start [-], shape (3,).
-            x: Reference position of the node [m], as of `points`.
-        """
+        """As of `Body`, at a node. Collective."""
         nodes = self.points(x).nodes[:, 0] // 4
         local = self._director_mesh.directors[nodes] @ direction / self.length
         return self.points_of(nodes, np.column_stack([np.zeros(len(local)), local]))

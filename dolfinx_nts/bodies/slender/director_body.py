@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from dolfinx import fem
 from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 from scipy.spatial import cKDTree
@@ -19,7 +17,7 @@ from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet
 from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
-from dolfinx_nts.bodies.nodal_values import cell_function
+from dolfinx_nts.bodies.nodal_values import cell_function, motion_on
 from dolfinx_nts.bodies.slender import turns
 from dolfinx_nts.bodies.slender.director_matrix import DirectorMatrix
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, WholeSkin
@@ -57,13 +55,9 @@ class DirectorBody(Body):
 
     # ---- what each kind has of its own
     def _elements_of(self, y: FloatArray) -> tuple[kernel.Elements, FloatArray]:
-        """This rank's elements from their reference.
+        """This rank's elements from their reference y [m], shape (n, k, 3).
 
-        Args:
-            y: Nodal vectors [m], shape (n, k, 3).
-
-        Returns:
-            The elements, and int N_a N_b of their nodes [m or m^2], shape (n, nodes, nodes).
+        And int N_a N_b of their nodes [m or m^2], shape (n, nodes, nodes).
         """
         raise NotImplementedError
 
@@ -81,11 +75,7 @@ class DirectorBody(Body):
         raise NotImplementedError
 
     def _felt(self, turn: float) -> tuple[float, float]:
-        """Turn that the strains of an element feel, and its slope.
-
-        Args:
-            turn: Between neighbouring nodes [rad].
-        """
+        """Turn that strains feel where neighbouring nodes turn by so much [rad], and its slope."""
         raise NotImplementedError
 
     # ---- set-up
@@ -97,8 +87,7 @@ class DirectorBody(Body):
         told = turns.that_leaves(self._felt, turns.TOLD)
         self.low_dets = float(np.cos(told)), float(np.cos(turns.NAMED))
         self.space = compat.vector_space(mesh, degree)
-        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
-        self.u, self.v = (fem.Function(self.space, name=f"{stem}_{s}") for s in "uv")
+        self.u, self.v = motion_on(self.space, name)
 
     def _set_up(
         self,
@@ -158,8 +147,7 @@ class DirectorBody(Body):
     def _vectors_at(self, nodes: IntArray) -> FloatArray:
         """Nodal vectors of nodes in the reference [m], shape (n, vectors, 3)."""
         x, directors = self._director_mesh.x[nodes], self._director_mesh.directors[nodes]
-        found: FloatArray = np.concatenate([x[:, None], self.length * directors], axis=1)
-        return found
+        return np.concatenate([x[:, None], self.length * directors], axis=1)
 
     def _set_up_elements(self) -> None:
         """This rank's elements, and their mass."""
@@ -188,8 +176,7 @@ class DirectorBody(Body):
     def file_order(self) -> IntArray:
         """Nodal vectors of all ranks in an order that does not depend on the ranks, see `Body`."""
         k = self._width // 3
-        order: IntArray = (k * self._director_mesh.order[:, None] + np.arange(k)).ravel()
-        return order
+        return (k * self._director_mesh.order[:, None] + np.arange(k)).ravel()
 
     # ---- values of this rank's elements
     def _of_elements(self, owned: FloatArray) -> FloatArray:
@@ -231,14 +218,7 @@ class DirectorBody(Body):
 
     # ---- points
     def points(self, x: Places) -> Points:
-        """Nodes as material points, for joints and springs. Collective.
-
-        Args:
-            x: Reference positions of nodes [m], shape (3,) or (n, 3), the same on all ranks.
-
-        Raises:
-            ValueError: x is no array of points, or one of them is no node.
-        """
+        """As of `Body`, of nodes alone: ValueError for a point that is none. Collective."""
         given, of = vectors("x", x, "points [m]"), self._director_mesh.x
         distance, nodes = cKDTree(of).query(given)
         off = distance > _AT_NODE * np.ptp(of, axis=0).max()
@@ -251,12 +231,7 @@ class DirectorBody(Body):
         return self.points_of(nodes, self._place)
 
     def at_nodes(self, nodes: IntArray, x: FloatArray) -> Points:
-        """Nodes of the mesh as material points. Collective.
-
-        Args:
-            nodes: Global numbers in `space`, shape (n,), the same on all ranks.
-            x: Their reference positions [m], shape (n, 3).
-        """
+        """As of `Body`. Collective."""
         return self.points_of(np.asarray(nodes), self._place)
 
     def points_of(self, nodes: IntArray, weights: FloatArray) -> Points:
@@ -430,8 +405,7 @@ class DirectorBody(Body):
     def turn(self, u0: FloatArray, u1: FloatArray) -> float:
         """Largest turn between two displacements on this rank [rad]."""
         (directors,) = self.joints
-        turned: float = directors.largest_turn(self.reference + u0, self.reference + u1)
-        return turned
+        return directors.largest_turn(self.reference + u0, self.reference + u1)
 
     def accept(self, u: FloatArray, v: FloatArray) -> None:
         """Make u and v the body's current state. Collective."""

@@ -52,8 +52,7 @@ class ElementValues:
         self._shared.ghostUpdate(PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
         with self._shared.localForm() as local:
             values = local.array_r.reshape(-1, self._width)[self.nodes]
-        found: FloatArray = values.reshape(len(self.nodes), self.num_vectors, 3)
-        return found
+        return values.reshape(len(self.nodes), self.num_vectors, 3)
 
     def sums(self, values: FloatArray) -> FloatArray:
         """Sums at this rank's coordinates of what elements contribute, (n, 3 k). Collective."""
@@ -61,8 +60,7 @@ class ElementValues:
             size = local.getLocalSize()
             local.array_w[:] = np.bincount(self._rows, values.ravel(), minlength=size)
         self._shared.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
-        owned: FloatArray = self._shared.array_r.copy()
-        return owned
+        return self._shared.array_r.copy()
 
     def matrix(self, of_nodes: IntArray) -> PETSc.Mat:
         """Matrix of triplets: of elements, of single nodes, and of the whole diagonal. Collective.

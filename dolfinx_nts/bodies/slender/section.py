@@ -182,17 +182,9 @@ def _section(
     area: float, second: tuple[float, float], twist: float, shear: float,
     young: float, poisson: float, density: float, outline: FloatArray,
 ) -> Section:  # fmt: skip
-    """A section of one material.
+    """A section of one material; `second` moments about the axes 1 and 2 [m^4], `twist` [m^4].
 
-    Args:
-        area: [m^2].
-        second: Second moments about the axes 1 and 2 [m^4].
-        twist: Torsion constant [m^4].
-        shear: Part of G A that resists shear.
-        young: Young's modulus [Pa].
-        poisson: Poisson's ratio.
-        density: [kg/m^3].
-        outline: [m], shape (k, 2).
+    Of `shear` the part of G A that resists shear; `outline` [m], shape (k, 2).
     """
     modulus = young / (2 * (1 + poisson))
     return Section(

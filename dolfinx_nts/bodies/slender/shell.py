@@ -14,7 +14,6 @@ from dolfinx_nts.bodies.slender.midsurface import check_midsurface, midsurface_o
 from dolfinx_nts.bodies.slender.node_conditions import Clamp, Load
 from dolfinx_nts.bodies.slender.pressure import Pressure
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.interaction.points import Points
 from dolfinx_nts.kernels import shell as kernel
 from dolfinx_nts.kernels.quadratic import Elements
@@ -24,6 +23,7 @@ from dolfinx_nts.validation import (
     known_options,
     require_bool,
     require_name,
+    require_one_of,
     require_positive,
     vector,
 )
@@ -159,7 +159,7 @@ class Shell(DirectorBody):
             ValueError: side is unknown, or the marker selects nothing.
         """
         require_bool("smoothing", smoothing)
-        choose("side", side, SIDES)
+        require_one_of("side", side, SIDES)
         x = self._director_mesh.x[self._skin.whole_skin.node]
         chosen = self._skin.marked(marker, self._skin.whole_skin.part == SIDES.index(side), x)
         return self._skin.surface(chosen, smoothing)
@@ -182,15 +182,7 @@ class Shell(DirectorBody):
         return force, moment
 
     def directions_at(self, direction: FloatArray, x: Places) -> Points:
-        """The director of a node, for joints. Collective.
-
-        Args:
-            direction: At the start [-], shape (3,).
-            x: Reference position of the node [m], as of `points`.
-
-        Raises:
-            ValueError: The direction is not along the director.
-        """
+        """As of `Body`, at a node; ValueError unless along its director. Collective."""
         nodes = self.points(x).nodes[:, 0] // 2
         director = self._director_mesh.directors[nodes[0], 0]
         along = float(director @ direction)

@@ -99,8 +99,7 @@ class Determinants:
     @cached_property
     def _inverse(self) -> FloatArray:
         """One over det(dX/dxi) [1/m^3], shape (cells, points)."""
-        found: FloatArray = 1.0 / self._dets(self._reference)
-        return found
+        return 1.0 / self._dets(self._reference)
 
     def _dets(self, x: FloatArray) -> FloatArray:
         """det(dx/dxi) of nodes' positions x [m^3], shape (cells, points)."""
@@ -108,6 +107,16 @@ class Determinants:
         batches, self._x[:] = self._batches, x
         batches.add(np.empty(0), out.reshape(-1))
         return out
+
+    def refuse_inverted(self, u: FloatArray, name: str) -> None:
+        """Raise on every rank if a start, as of `smallest`, turns a cell of a body inside out."""
+        det, place = min(self._comm.allgather(self.smallest(u)), key=lambda found: found[0])
+        if det <= 0.0:
+            where = ", ".join(f"{x:.4g}" for x in place)
+            raise ValueError(
+                f"displacement of {name!r}: with its Dirichlet values at t=0 it turns a cell "
+                f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
+            )
 
     @np.errstate(over="ignore", invalid="ignore")  # an iterate may run off
     def smallest(self, u: FloatArray) -> tuple[float, FloatArray]:
@@ -161,12 +170,6 @@ def forbidden(system: Any, dets: FloatArray) -> FloatArray:
 
 
 def describe(body: Body, u: FloatArray) -> tuple[str, str]:
-    """Where a body's smallest det F is, and what may prevent it, see `Body`. Collective.
-
-    Args:
-        body: The body.
-        u: Its displacements [m].
-    """
+    """Where a body's smallest det F is, and what may prevent it, see `Body`. Collective."""
     found = body.comm.allgather(body.smallest_det(u))
-    text: tuple[str, str] = body.describe_det(*min(found, key=lambda one: one[0]))
-    return text
+    return body.describe_det(*min(found, key=lambda one: one[0]))

@@ -26,15 +26,12 @@ from petsc4py import PETSc
 
 from dolfinx_nts import petsc_compat
 from dolfinx_nts.interaction.points import of_nodes
-from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.parallel import anywhere, global_sum
 from dolfinx_nts.types import Array, BoolArray, FloatArray, IntArray
 
 
 class MassMatrix:
     """Mass matrix of a body.
-
-    Args:
-        form: Compiled mass.
 
     Attributes:
         matrix: PETSc matrix, the same scalar in each of the three directions.
@@ -71,8 +68,7 @@ class MassMatrix:
         """M v. Collective."""
         self._in.array_w[:] = v
         self.matrix.mult(self._in, self._out)
-        product: FloatArray = self._out.array_r.copy()
-        return product
+        return self._out.array_r.copy()
 
     # ---- nodes without mass
     def redistribute(self, massless: BoolArray, x: FloatArray, fixed: IntArray) -> str:
@@ -186,8 +182,7 @@ class _Products:
         """M times nodal scalars, shape (n,). Collective."""
         self._in.array_w[:] = np.repeat(values, 3)
         self._matrix.mult(self._in, self._out)
-        product: FloatArray = self._out.array_r[::3].copy()
-        return product
+        return self._out.array_r[::3].copy()
 
     def destroy(self) -> None:
         """Free the vectors."""
@@ -198,9 +193,9 @@ class _Products:
 def _levels(mass: _Products, massless: BoolArray, comm: MPI.Comm) -> IntArray | None:
     """Cells from each node to one with mass, shape (n,); None if some node reaches none."""
     level, layer = np.where(massless, -1, 0), 0
-    while comm.allreduce(bool((level < 0).any()), op=MPI.LOR):
+    while anywhere(comm, bool((level < 0).any())):
         near = (level < 0) & (mass.times((level == layer).astype(float)) != 0.0)
-        if not comm.allreduce(bool(near.any()), op=MPI.LOR):
+        if not anywhere(comm, bool(near.any())):
             return None
         layer += 1
         level[near] = layer
@@ -254,15 +249,13 @@ def _polynomials(x: FloatArray, comm: MPI.Comm) -> FloatArray:
     size = 0.5 * float((ends[0] + ends[1]).max())
     one = np.column_stack([np.ones(len(x)), (x - 0.5 * (ends[0] - ends[1])) / size])
     pairs = [one[:, i] * one[:, j] for i in range(4) for j in range(i, 4)]
-    columns: FloatArray = np.column_stack(pairs)
-    return columns
+    return np.column_stack(pairs)
 
 
 def _moments(affine: FloatArray, products: list[FloatArray], comm: MPI.Comm) -> FloatArray:
     """Return the moments of mass in the order of `_polynomials`, shape (10,). Collective."""
     local = [float(affine[:, i] @ products[j]) for i in range(4) for j in range(i, 4)]
-    total: FloatArray = comm.allreduce(np.array(local))
-    return total
+    return comm.allreduce(np.array(local))
 
 
 def _factors(

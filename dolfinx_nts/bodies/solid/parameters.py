@@ -75,3 +75,20 @@ def values_of(parameters: Iterable[Any]) -> FloatArray:
     """Values of Constants and Functions one after another, shape (n,)."""
     values = [p.value if isinstance(p, fem.Constant) else p.x.array for p in parameters]
     return np.concatenate([np.empty(0), *map(np.ravel, values)])
+
+
+class Taken:
+    """Values of Constants and Functions as something was made of them."""
+
+    def __init__(self, parameters: Iterable[Any]) -> None:
+        self._parameters = list(parameters)
+        self.take()
+
+    def take(self) -> None:
+        """Take the values of now."""
+        self._values = values_of(self._parameters)
+
+    @property
+    def changed(self) -> bool:
+        """Whether they are others now, on this rank."""
+        return not np.array_equal(values_of(self._parameters), self._values)

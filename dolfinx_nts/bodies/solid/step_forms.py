@@ -58,6 +58,17 @@ def checked_form(
     return form
 
 
+def check_extra_form(body: Any, extra_form: ExtraForm, w: Any) -> None:
+    """Raise on every rank unless a form of the user's is linear in the test function w alone."""
+    # Sums, as those that it will be given.
+    given = body.u + body.v, body.u - body.v, w, fem.Constant(body.mesh, 0.0)
+    checked_form(
+        body, f"extra_form={extra_form!r}", lambda: extra_form(*given), {w},
+        "is not linear in the test function w alone",
+        "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx",
+    )  # fmt: skip
+
+
 class StepForms:
     """What a body's energy does in a step, compiled once for each integrator.
 

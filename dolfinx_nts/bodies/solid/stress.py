@@ -69,8 +69,7 @@ def _cauchy(body: Any) -> Any:
 
 def _cell_means(body: Any, value: Any, name: str) -> Any:
     """Means of a scalar or 3 x 3 tensor in UFL over each cell, as a Function. Collective."""
-    make = compat.tensor_space if value.ufl_shape else compat.scalar_space
-    space = make(body.mesh, "DG", 0)
+    space = compat.function_space(body.mesh, "DG", 0, value.ufl_shape)
     q, one = ufl.TestFunction(space), ufl.as_ufl(1.0)
     if value.ufl_shape:
         one = ufl.as_tensor([[1.0] * 3] * 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -16,49 +15,33 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
-from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.bodies.conditions import Dirichlet, Supports
+from dolfinx_nts.bodies.mesh_body import MeshBody
 from dolfinx_nts.bodies.meshes.mesh_check import pieces_of, places_of
-from dolfinx_nts.bodies.nodal_values import nodal_values
+from dolfinx_nts.bodies.nodal_values import motion_on, nodal_values
 from dolfinx_nts.bodies.solid.inversion import Determinants
 from dolfinx_nts.bodies.solid.mass import MassMatrix, waves
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.bodies.solid.parameters import (
     Parameter,
+    Taken,
     in_expressions,
     is_number,
     require_positive_parameter,
     values_of,
 )
-from dolfinx_nts.bodies.solid.step_forms import StepForms, checked_form, fill
-from dolfinx_nts.contact.facet_choice import choose_facets
-from dolfinx_nts.contact.skins import skin_of_mesh
+from dolfinx_nts.bodies.solid.step_forms import StepForms, check_extra_form, fill
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.forms import compile_forms
 from dolfinx_nts.integrators import Integrator
-from dolfinx_nts.integrators.rule import choose
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.interaction.points import Points, in_mesh
-from dolfinx_nts.parallel import gather_on_root, raise_together
-from dolfinx_nts.types import (
-    ExtraForm,
-    FloatArray,
-    IntArray,
-    Marker,
-    Places,
-    Settings,
-    Values,
-    Vector,
-)
-from dolfinx_nts.validation import (
-    UserFunctionError,
-    require_bool,
-    require_name,
-    vectors,
-)
+from dolfinx_nts.parallel import anywhere, gather_on_root, raise_together
+from dolfinx_nts.types import ExtraForm, FloatArray, IntArray, Places, Settings, Values
+from dolfinx_nts.validation import UserFunctionError, require_bool, require_name, vectors
 
 
-class UflBody(Body):
+class UflBody(MeshBody):
     """A body whose coordinates are the nodes of a Lagrange space of 3-vectors.
 
     A kind of body calls `_stand`, then `_set_forms`, and has `_mass_form` and `_virtual_work`.
@@ -92,9 +75,7 @@ class UflBody(Body):
         self.mesh = space.mesh
         self.made_on = places_of(self.mesh)
         self.comm = petsc_compat.petsc_communicator(self.mesh.comm)
-        # DOLFINx makes C identifiers of the names.
-        stem = re.sub(r"\W", "_", name, flags=re.ASCII)
-        self.u, self.v = (fem.Function(space, name=f"{stem}_{s}") for s in "uv")
+        self.u, self.v = motion_on(space, name)
         self.num_owned = 3 * space.dofmap.index_map.size_local
         self.reference = space.tabulate_dof_coordinates().ravel()[: self.num_owned].copy()
         self._stiffness: FloatArray | None = None
@@ -127,71 +108,8 @@ class UflBody(Body):
         """As of `Body`."""
         return pieces_of(self.mesh) if self.mesh.topology.dim == 3 else 1
 
-    def surface(
-        self,
-        marker: Marker,
-        tag: int | None = None,
-        *,
-        normal: Vector | None = None,
-        angle: float | None = None,
-        smoothing: bool = False,
-        mass: str = "consistent",
-    ) -> Surface:
-        """A part of the boundary for contact.
-
-        With smoothing, a slave touches a smooth surface through the nodes instead of the flat or
-        bilinear facets of a master. It is linear in the nodes, so momentum and energy are kept as
-        without. Over quadrilaterals lie bicubic patches of Overhauser's cubics (Catmull and Rom
-        1974), over each triangle three quartic ones (Clough and Tocher 1965; Shirman and Sequin
-        1987) whose tangent planes fit the rings of its nodes, of any number of neighbours. The
-        normal no longer jumps from facet to facet, and the energy lost or gained by changes of
-        facet (`contact_defect`) falls: on a cylinder more than 1e4 times on even quadrilaterals, 20
-        to 100 times where they differ by up to a half in size, 4e3 times and more on triangles,
-        even or not. For smoothing in contact see Wriggers, Krstulovic-Opara and Korelc (2001) and
-        Puso and Laursen (2002). Limits:
-
-        - It is not smooth at edges whose facets meet at more than 60 degrees, at nodes where other
-          than four quadrilaterals meet, and at nodes whose triangles see no common plane, such as
-          corners where three sharp edges meet on a flat side. A warning tells how many facets.
-        - It bulges beyond the facets by what they cut off the curve, an eighth of the angle between
-          neighbours times the size of a facet: gaps are measured from there.
-        - Beyond its facet a patch goes on as a polynomial, which is good for half a facet; let no
-          slave slide over more than a third of a facet in a step.
-        - An element of a pair takes some ten times as long, and a triangle some 8 kB on each rank.
-          As a slave, a surface is not changed.
-
-        With mass="redistributed" the nodes of a slave surface have no mass (theory section 16;
-        Khenous, Laborde and Renard 2008): other nodes get it, and the body keeps its mass, centre
-        of mass and inertia. An impact then stops no mass at once, so its contact forces do not
-        alternate from step to step. The laws of contact and friction hold for the forces at
-        t_{n+1}, and those of the step are the mean of both ends, so that momenta and the ledger
-        are as exact as without (`massless_defect` in the balance). Only the slave of a contact may
-        have it, of a Continuum with some four cells behind the surface, with `EnergyMomentum()` or
-        `Midpoint()` and without restored impacts. `equilibrium` refuses it: a run begins from that
-        of a body of the same mesh and name without it. Gravity then moves with the mass, so that
-        what rests under its weight starts as far off balance, which the run tells.
-
-        Args:
-            marker: Callable x (3, n) -> bool (n,) that holds at all corners of a facet, or facet
-                meshtags.
-            tag: Value in the meshtags.
-            normal: Choose those of the marker's facets that face this way, an outward normal of the
-                reference of any length, shape (3,); `angle` says how nearly.
-            angle: With `normal`, the largest angle between both. Without it, the feature angle: go
-                on from the marker's facets, also to others, over all edges at which the boundary
-                turns by less, so that one facet of a face without sharp edges, such as a cylinder's
-                mantle, is enough to have it all. Above 0, up to 180 [degrees].
-            smoothing: Whether slaves touch a smooth surface when this one is the master.
-            mass: "consistent" or "redistributed".
-
-        Raises:
-            TypeError: smoothing is no bool.
-            ValueError: Degree above 1, no facet, or interior facets, or none that faces `normal`;
-                normal or angle is none, or normal is given alone; mass is unknown, too little of
-                the body is left beside the surface to take its mass, or the body has moved already.
-        """
-        require_bool("smoothing", smoothing)
-        choose("mass", mass, ("consistent", "redistributed"))
+    def _check_surface(self, mass: str) -> None:
+        """As of `MeshBody`."""
         if self.mesh.topology.dim != 3:
             raise ValueError(
                 f"body {self.name!r}: contact surfaces are boundaries of 3D meshes, not of "
@@ -202,15 +120,9 @@ class UflBody(Body):
                 f"degree={self.degree!r} of body {self.name!r}: surfaces, of contacts and of "
                 "ties, need degree 1; pass degree=1, on a finer mesh for the same accuracy"
             )
-        what = f"marker of a surface of {self.name!r}"
-        found = choose_facets(self.mesh, marker, tag, normal, angle, what)
-        surface = Surface(self, skin_of_mesh(self, found), smoothing)
-        if mass == "redistributed":
-            self._make_massless(surface)
-        return surface
 
     def _make_massless(self, surface: Surface) -> None:
-        """Take the mass of a surface's nodes, and give it to others. Collective."""
+        """As of `MeshBody`."""
         self.check_alive()
         what = f"mass='redistributed' of a surface of {self.name!r}"
         if self._forms.used:
@@ -236,14 +148,7 @@ class UflBody(Body):
         )  # fmt: skip
 
     def points(self, x: Places) -> Points:
-        """Material points, for joints and springs. Collective.
-
-        Args:
-            x: Reference positions [m], shape (3,) or (n, 3), the same on all ranks.
-
-        Raises:
-            ValueError: x is no array of points, or one of them lies in no cell.
-        """
+        """As of `Body`; ValueError for a point in no cell. Collective."""
         return in_mesh(self, vectors("x", x, "points [m]"), "x")
 
     def file_order(self) -> IntArray:
@@ -274,51 +179,34 @@ class UflBody(Body):
         self.v.x.scatter_forward()
         self.initial_velocity = self.v.x.array[: self.num_owned].copy()
         self.u.x.array[:] = self._given("displacement", displacement, "m")
-        self.starts_moved = self.comm.allreduce(bool(self.u.x.array.any()), op=MPI.LOR)
+        self.starts_moved = anywhere(self.comm, bool(self.u.x.array.any()))
         self.u.x.array[self.fixed] = self.prescribed(0.0)
         self.u.x.scatter_forward()
         self.initial_displacement = self.u.x.array[: self.num_owned].copy()
-        self._refuse_inversion()
+        if self._determinants is not None and self.starts_moved and not self.allow_inversion:
+            self._determinants.refuse_inverted(self.u.x.array, self.name)
 
     def _given(self, name: str, given: Any, unit: str) -> FloatArray:
         """Values of an argument at all nodes of this rank, shape (coordinates,)."""
         return nodal_values(self.space, name, self.name, given, unit).ravel()
 
-    def _refuse_inversion(self) -> None:
-        """Raise on every rank if the start turns a cell inside out."""
-        if self._determinants is None or not self.starts_moved or self.allow_inversion:
-            return
-        smallest = self._determinants.smallest(self.u.x.array)
-        det, place = min(self.comm.allgather(smallest), key=lambda found: found[0])
-        if det <= 0.0:
-            where = ", ".join(f"{x:.4g}" for x in place)
-            raise ValueError(
-                f"displacement of {self.name!r}: with its Dirichlet values at t=0 it turns a cell "
-                f"inside out, det F = {det:.3g} near X = ({where}); pass a smoother or smaller one"
-            )
-
     def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
         """Compile mass and energy in UFL and any loads, which are returned."""
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         mass = self._mass_form(v, w)
-        of_energy, self._mass_parameters = (
+        of_energy, of_mass = (
             in_expressions((part.integrand() for part in form.integrals()), [self.u])
             for form in (energy, mass)
         )
-        self._parameters = [*of_energy, *self._mass_parameters]
-        self._taken = self.parameters()
+        self._parameters = [*of_energy, *of_mass]
+        self._taken = Taken(self._parameters), Taken(of_mass)
         if self._extra_form is not None:
-            self._check_extra_form(self._extra_form, w)
-        self._energy_form, of_mass, *compiled = compile_forms([energy, mass, *loads])
+            check_extra_form(self, self._extra_form, w)
+        self._energy_form, mass_form, *compiled = compile_forms([energy, mass, *loads])
         self._load = np.zeros(self.num_owned)
-        self._mass = MassMatrix(of_mass)
-        self._take_mass()
-        return compiled
-
-    def _take_mass(self) -> None:
-        """Take over the mass matrix as it was assembled."""
+        self._mass = MassMatrix(mass_form)
         self.nodal_mass = self._mass.nodal
-        self._mass_values = values_of(self._mass_parameters)
+        return compiled
 
     def _density(self, density: Any) -> Any:
         """A density as the forms take it: bodies of any number share compiled forms.
@@ -335,15 +223,6 @@ class UflBody(Body):
         if problem:
             raise ValueError(f"density={density!s} of {self.name!r}: {problem}")
         return density
-
-    def _check_extra_form(self, extra_form: ExtraForm, w: Any) -> None:
-        # Sums, as those that it will be given.
-        given = self.u + self.v, self.u - self.v, w, fem.Constant(self.mesh, 0.0)
-        checked_form(
-            self, f"extra_form={extra_form!r}", lambda: extra_form(*given), {w},
-            "is not linear in the test function w alone",
-            "return a UFL form like 3.0 * ufl.inner(v, w) * ufl.dx",
-        )  # fmt: skip
 
     # ---- as of Body
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
@@ -433,13 +312,13 @@ class UflBody(Body):
         """
         if not self._parameters:
             return
-        known = (self._parameters, self._taken), (self._mass_parameters, self._mass_values)
-        changed = np.array([not np.array_equal(values_of(p), last) for p, last in known])
+        changed = np.array([taken.changed for taken in self._taken])
         self.comm.Allreduce(MPI.IN_PLACE, changed, op=MPI.LOR)
         if not changed.any():
             return
         self._refuse_values()
-        self._taken, self._stiffness = self.parameters(), None
+        self._taken[0].take()
+        self._stiffness = None
         if not changed[1]:
             return
         if self.has_massless:
@@ -448,7 +327,8 @@ class UflBody(Body):
                 "took it from its nodes; keep it, or use mass='consistent'"
             )
         self._mass.assemble()
-        self._take_mass()
+        self._taken[1].take()
+        self.nodal_mass = self._mass.nodal
         total = self.comm.allreduce(float(self.nodal_mass.sum())) / 3.0
         if not total > 0.0:
             raise UserFunctionError(

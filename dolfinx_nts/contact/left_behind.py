@@ -1,0 +1,65 @@
+"""Nodes that an accepted step leaves beside a surface, or behind it without contact."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+
+from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.contact.contact_law import Contribution
+from dolfinx_nts.contact.pair import ContactPair
+from dolfinx_nts.interaction.coupling import StepWarning
+from dolfinx_nts.parallel import global_max
+
+#: Depth in facet sizes from which on a node behind a surface that it passed by is told.
+_BESIDE = 1e-3
+#: Depth in facet sizes from which on a node is told that lies behind its facet without a force.
+_UNHELD = 1e-6
+
+
+def beside(
+    comm: MPI.Comm, pairs: Sequence[ContactPair], deepest: Sequence[tuple[float, int]]
+) -> Iterator[StepWarning]:
+    """Nodes that have passed by a surface's edge and lie behind it. Collective.
+
+    Args:
+        comm: MPI communicator.
+        pairs: The contacts.
+        deepest: Of each, this rank's deepest such node: depth in facet sizes, and input number.
+    """
+    depths = global_max(comm, np.array([depth for depth, _ in deepest]))
+    if depths.max(initial=0.0) <= _BESIDE:
+        return
+    found = comm.allgather(deepest)
+    for k in np.flatnonzero(depths > _BESIDE):
+        depth, node = max(of_rank[k] for of_rank in found)
+        name = pairs[k].name
+        text = (
+            f"node {node} of contact {name!r} has passed the master's edge and lies {depth:.3g}"
+            " of a facet behind its surface, where nothing holds it; let the master's surface "
+            "reach farther"
+        )
+        yield StepWarning("node beside a surface", float(depth), text, (name,))
+
+
+def unheld(
+    comm: MPI.Comm, elements: Sequence[ContactElements], parts: Sequence[Contribution]
+) -> Iterator[StepWarning]:
+    """Nodes behind their facets whose forces would be rounding of other forces. Collective."""
+    depths = [
+        (-part.gap / c.candidates.length)[~part.active].max(initial=0.0)
+        for c, part in zip(elements, parts, strict=True)
+    ]
+    for c, depth in zip(elements, global_max(comm, np.array(depths)), strict=True):
+        # Without friction no force counts as rounding.
+        if c.pair.friction and depth > _UNHELD:
+            text = (
+                f"nodes of contact {c.pair.name!r} lie up to {depth:.3g} of a facet behind their "
+                "master without contact: a force that holds them is below the rounding of the "
+                "forces in the bodies, where friction has no direction; pass friction=0, or "
+                "let the bodies differ less in stiffness and weight"
+            )
+            yield StepWarning("contact below rounding", float(depth), text, (c.pair.name,), True)

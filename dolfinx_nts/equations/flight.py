@@ -1,0 +1,69 @@
+"""The step without forces: where bodies would fly, and with which momentum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from dolfinx_nts.bodies.batches import Batches
+from dolfinx_nts.bodies.body import Body
+from dolfinx_nts.equations.scales import Lengths
+from dolfinx_nts.equations.supports import Supports
+from dolfinx_nts.state import State
+from dolfinx_nts.types import BoolArray, FloatArray
+
+
+class Flight:
+    """Free flight of a system's bodies over a step; `begin` fixes it.
+
+    Args:
+        batches: Bodies that are evaluated together.
+        integrator: Rules of the step.
+        supports: Prescribed coordinates, which begin the step here.
+        lengths: Those of the step, which begin it here.
+        inertial: M du of a motion of a batch [kg m]; in statics the force of the stabilization [N].
+
+    Attributes:
+        ends: Displacement of each batch at t_{n+1} [m].
+        momentum: M (u_1 - u_0) of each batch [kg m]; zero in statics.
+    """
+
+    def __init__(
+        self, batches: Batches, integrator: Any, supports: Supports, lengths: Lengths,
+        inertial: Callable[[Body, FloatArray], FloatArray],
+    ) -> None:  # fmt: skip
+        self._batches, self._integrator, self._inertial = batches, integrator, inertial
+        self._supports, self._lengths = supports, lengths
+        self.ends: list[FloatArray] = []
+        self.momentum: list[FloatArray] = []
+
+    def begin(self, state: State, u0: Sequence[FloatArray], dt: float) -> BoolArray:
+        """Fly from the state at t_n, displacements u0 of each batch [m]. Collective.
+
+        Returns:
+            Whether each body starts without speed, shape (bodies,).
+        """
+        batches, integrator = self._batches, self._integrator
+        v0, a0 = batches.rates(state)
+        ahead = [integrator.ahead(v, a, dt) for v, a in zip(v0, a0, strict=True)]
+        self.ends = [u + du for u, du in zip(u0, ahead, strict=True)]
+        for body, u1 in zip(batches.bodies, self.ends, strict=True):
+            if body is not batches.rigid:
+                u1[body.fixed] = body.prescribed(state.time + dt)
+        self._supports.begin(state, batches.split(self.ends), dt)
+        rates = [v0] + [[dt * a for a in a0 if a is not None]] * bool(state.a)
+        speed = self._lengths.begin(u0, rates, self.ends)
+        # In statics v only predicts the first guess.
+        moves = (speed > 0.0) & integrator.inertia
+        moves[list(self._supports.moving)] = True
+        self.momentum = []
+        each = zip(batches.bodies, batches.numbers, ahead, self.ends, strict=True)
+        for body, of, du, u1 in each:
+            if not moves[of].any():
+                self.momentum.append(np.zeros_like(du))
+                continue
+            flown = du if len(of) > 1 else self._supports.ahead(of[0], du, u1)
+            self.momentum.append(self._inertial(body, flown))
+        return speed == 0.0
