@@ -20,7 +20,7 @@ from dolfinx_nts.interaction.coupling import StepWarning
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, global_max
-from dolfinx_nts.state import ContactHistory
+from dolfinx_nts.state import ContactHistory, State
 from dolfinx_nts.types import BoolArray, FloatArray
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
@@ -59,6 +59,7 @@ class ContactSearch:
         self._cover, self._repeats = [0.0] * len(contacts), 0
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
+        self._begun: State | None = None
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
         before = zip(contacts, held_before(contacts), strict=True)
@@ -91,7 +92,7 @@ class ContactSearch:
         touching = slice(len(self.elements))
         self._carried = history if again is None else self.history(again.parts[touching])
         self._step, self._old, self._placed = step, history, {}
-        if step.dt:
+        if step.dt or self._begun is None:
             self._begun = step.state
         self._repeats = 0 if again is None else self._repeats
         time = step.state.time
@@ -192,7 +193,7 @@ class ContactSearch:
         )  # fmt: skip
         if pair.friction and not step.dt:
             # A load step is relaxed in several solutions, and friction knows of all of them.
-            begun = self._begun
+            begun = self._begun or step.state
             since = pair.positions([begun.u[b] for b in bodies])
             slid = elements.slid_since(since, pair.path(begun.time, begun.time)[0])
             law = replace(law, slid=slid)
