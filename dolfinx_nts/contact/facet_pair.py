@@ -11,7 +11,7 @@ import numpy as np
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
 from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE, ConvexEdges, middles
-from dolfinx_nts.contact.edge_contact import EdgeContact
+from dolfinx_nts.contact.edges import Edges, sharp_edges
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.pair import (
@@ -22,6 +22,7 @@ from dolfinx_nts.contact.pair import (
     Found,
     Motion,
 )
+from dolfinx_nts.contact.rims import Rims, facets_around
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets, nts_element
@@ -69,12 +70,21 @@ class FacetPair(ContactPair, master=Surface):
                 "choose disjoint markers, or pass one surface to SelfContact"
             )
 
-    def parts(self, name: str) -> tuple[EdgeContact, ...]:
-        """The contact of edges with edges, where both surfaces have any."""
-        if not self.edges:
-            return ()
-        contact = EdgeContact(self, name)
-        return (contact,) if all(len(edges.ends) for edges in contact.edges) else ()
+    @property
+    def has_edges(self) -> bool:
+        """As of `ContactPair`: those of bodies with cells in space."""
+        meshes = [body.mesh for body in self.bodies]
+        return self.edges and all(m is not None and m.topology.dim == 3 for m in meshes)
+
+    @cached_property
+    def sharp_edges(self) -> tuple[Edges, Edges]:
+        """Sharp edges of the slave's and of the master's body in the surfaces. Collective."""
+        slave, master = (sharp_edges(s.body.boundary(), s) for s in self.surfaces)
+        return slave, master
+
+    @cached_property
+    def _rims(self) -> Rims:
+        return Rims(self, self._free_edges, self.sharp_edges[1])
 
     @cached_property
     def sag(self) -> float:
@@ -168,7 +178,7 @@ class FacetPair(ContactPair, master=Surface):
         node = np.flatnonzero(closest.facet >= 0)
         found, lost = self._measure(x, master, node, closest.facet[node], closest.xi[node], reach)
         if motion is not None:
-            found = self._along_paths(found, x, master, motion._replace(reach=reach))
+            found = self._along_paths(found, slaves, master, motion._replace(reach=reach))
         beside = (found.gap < -OUTSIDE * found.length) & ~known[found.node]
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
@@ -243,12 +253,8 @@ class FacetPair(ContactPair, master=Surface):
         at = self.slave.facets
         facet, edge = np.nonzero(self.slave.boundary_edges)
         ends = [at[facet, edge], at[facet, (edge + 1) % at.shape[1]]]
-        order = np.argsort(at.ravel(), kind="stable")
-        points = at.ravel()[order]
-        first = np.searchsorted(points, self.slave.share)
-        last = np.searchsorted(points, self.slave.share, side="right")
-        count = np.where(np.isin(self.slave.share, np.concatenate(ends)), 0, last - first)
-        return order // at.shape[1], first, count
+        of, first, count = facets_around(self.slave)
+        return of, first, np.where(np.isin(self.slave.share, np.concatenate(ends)), 0, count)
 
     def _beside(self, node: IntArray, facet: IntArray) -> BoolArray:
         """Which sharp edges of facets end the surface for nodes, shape (n, nc).
@@ -306,16 +312,21 @@ class FacetPair(ContactPair, master=Surface):
         return found.select(over | (closest.distance[found.node] <= self.adjust))
 
     def _along_paths(
-        self, found: Candidates, x: FloatArray, master: FloatArray, motion: Motion
+        self,
+        found: Candidates,
+        slave: FloatArray,
+        master: FloatArray,
+        motion: Motion,
     ) -> Candidates:
         """Candidates with the facets that their paths lead to in place of the closest. Collective.
 
         Args:
             found: Candidates of the closest facets.
-            x: This rank's slaves at t_n [m], shape (share, 3).
+            slave: Points of the slave at t_n [m].
             master: Points of the master at t_n [m].
             motion: Expected in the step.
         """
+        x = slave[self.slave.share]
         slave_path, master_path = self._gather_paths(motion.paths)
         found = self._round_edges(found, x, master, slave_path, master_path)
         found = self._past_edges(found, x, master, slave_path, master_path, motion.reach)
@@ -325,6 +336,9 @@ class FacetPair(ContactPair, master=Surface):
             start, _ = compiled.closest_point(x[node], corners[facet])
             other, _ = self._measure(x, master, node, facet, start, motion.reach)
             found = _replace(found, other)
+        if self.has_edges:
+            ways = slave_path, master_path
+            found = self._rims.without_tilted(found, (slave, master), ways)
         aimed = motion.aimed
         if self.is_long(motion.reach):
             stops = self._stops(np.arange(len(x)), master)

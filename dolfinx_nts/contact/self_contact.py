@@ -60,7 +60,7 @@ class SelfContact(FacetPair):
     def __init__(self, surface: Surface, *, friction: float = 0.0) -> None:
         if not isinstance(surface, Surface):
             raise TypeError(f"surface={surface!r}: pass a Surface, e.g. body.surface(marker)")
-        super().__init__(surface, surface, friction=friction)
+        super().__init__(surface, surface, friction=friction, edges=False)
 
     def _check_surfaces(self) -> None:
         body = self.slave.body
