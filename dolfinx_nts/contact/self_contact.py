@@ -11,7 +11,8 @@ from scipy.sparse.csgraph import connected_components
 
 from dolfinx_nts.contact import passages, search
 from dolfinx_nts.contact.along_surface import Neighbourhoods
-from dolfinx_nts.contact.facet_pair import FacetPair, opposite
+from dolfinx_nts.contact.facet_pair import FacetPair
+from dolfinx_nts.contact.facing import opposite
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, Candidates, Found, Motion
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import facets
@@ -97,7 +98,7 @@ class SelfContact(FacetPair):
             admits=search.Admits(faces, apart),
         )  # fmt: skip
 
-    def _stops(self, node: IntArray, master: FloatArray) -> passages.Stops:
+    def stops(self, node: IntArray, master: FloatArray) -> passages.Stops:
         """Those that face the node and share no corner with facets of it."""
         number, (nodal, normal) = self.slave.share[node], self._normals(master)
 
@@ -171,18 +172,18 @@ class SelfContact(FacetPair):
             return found
         return found._replace(candidates=c.select(self._one_sided(c, current, positions[0])))
 
-    def _measure(
+    def measure(
         self, x: FloatArray, master: FloatArray, node: IntArray, facet: IntArray, start: FloatArray,
         reach: float | None,
     ) -> tuple[Candidates, IntArray]:  # fmt: skip
         """As of `FacetPair`, but nothing is held in the plane of a facet beyond which it is."""
-        found, beyond = super()._measure(x, master, node, facet, start, reach)
+        found, beyond = super().measure(x, master, node, facet, start, reach)
         number, nc = self.slave.share[found.node], self.slave.facets.shape[1]
         zero = np.zeros(len(number))
         own = self._own.beside(number, found.facet, zero)
         excess = facets.edge_excess(found.xi, nc)
         for edge in range(nc):
-            other = self._edges.beside[found.facet, edge] // nc
+            other = self.convex.beside[found.facet, edge] // nc
             out = (excess[:, edge] > search.PREFERENCE) & (other >= 0)
             own |= out & self._own.beside(number, np.maximum(other, 0), zero)
         return found.select(~own), beyond
