@@ -43,6 +43,25 @@ class ContactHistory(NamedTuple):
         )
 
 
+class EdgeHistory(NamedTuple):
+    """What the edges of a contact remember that press on each other, on this rank; axis 0 = pair.
+
+    Attributes:
+        pair: Numbers of the slave's and of the master's edge, shape (n, 2).
+        force: Contact force p_N [N], shape (n,).
+        tangential: Friction force on the slave [N], shape (n, 3).
+    """
+
+    pair: IntArray
+    force: FloatArray
+    tangential: FloatArray
+
+    @classmethod
+    def of_start(cls) -> EdgeHistory:
+        """Return that of edges that have not touched yet."""
+        return cls(np.empty((0, 2), dtype=np.int64), np.empty(0), np.empty((0, 3)))
+
+
 @dataclass(frozen=True, eq=False)
 class State:
     """Everything a step starts from; never changed, a step makes a new one.
@@ -54,6 +73,7 @@ class State:
         a: Owned accelerations of each body [m/s^2], where the integrator carries any; else empty.
         contacts: What each contact remembers of its slave nodes.
         joints: What each of `System.joints` remembers.
+        edges: What the edges of each contact remember; empty without contacts.
     """
 
     time: float
@@ -62,6 +82,7 @@ class State:
     a: tuple[FloatArray, ...]
     contacts: tuple[ContactHistory, ...]
     joints: tuple[Any, ...]
+    edges: tuple[EdgeHistory, ...] = ()
 
     def acceleration(self, k: int) -> FloatArray | None:
         """Of a body [m/s^2], where the integrator carries any."""

@@ -14,12 +14,13 @@ from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.bodies.conditions import jumps
 from dolfinx_nts.contact.crossings import point
+from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidates, ContactPair
 from dolfinx_nts.contact.shared_nodes import areas, check_shared
 from dolfinx_nts.interaction.coupling import Joint, is_joint
 from dolfinx_nts.parallel import need_kernels
-from dolfinx_nts.state import ContactHistory, State
+from dolfinx_nts.state import ContactHistory, EdgeHistory, State
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items, known_options, require_same, vector
 
@@ -48,6 +49,7 @@ class System:
         size: Coordinates of all bodies.
         declared_joints: As given, each followed by its parts.
         joints: These, then those that bodies bring, such as what keeps a rigid body rigid.
+        edges: Contact of edges by the number of the contact that has any.
 
     Raises:
         TypeError: An item is no body or no contact.
@@ -72,15 +74,7 @@ class System:
         )
         wanted = "joints; the class of a joint of your own inherits from nts.Joint"
         given_joints = items("joints", joints, is_joint, wanted)
-        with_parts = [part for joint in given_joints for part in (joint, *joint.parts)]
-        both: set[frozenset[int]] = set()
-        for k, pair in enumerate(self.contacts):
-            # Of two pairs that exchange slave and master one has the edges.
-            key = frozenset(map(id, pair.surfaces))
-            if key not in both and (parts := pair.parts(f"edges of contact {k}, {pair.name}")):
-                with_parts += parts
-                both.add(key)
-        self.joints = tuple(with_parts)
+        self.joints = tuple(part for joint in given_joints for part in (joint, *joint.parts))
         if not self.bodies:
             raise ValueError(f"bodies={bodies!r}: pass at least one body")
         self.comm = self.bodies[0].comm
@@ -106,6 +100,11 @@ class System:
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
+        self.edges: dict[int, EdgeContact] = {}
+        for k, (pair, numbers) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
+            if pair.has_edges:
+                before = tuple(self.edges.values())
+                self.edges[k] = EdgeContact(pair, numbers, before)
         check_shared(self.contacts)
         if self.contacts:
             need_kernels(self.comm)
@@ -201,6 +200,7 @@ class System:
             a=(),
             contacts=tuple(ContactHistory.of_start(len(c.slave.share)) for c in self.contacts),
             joints=tuple(joint.start() for joint in self.joints),
+            edges=tuple(EdgeHistory.of_start() for _ in self.contacts),
         )
 
     @staticmethod

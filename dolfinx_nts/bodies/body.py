@@ -91,6 +91,7 @@ class Body:
     destroyed: bool = False
     _accepted: tuple[FloatArray, FloatArray] | None = None
     _shown: tuple[FloatArray, ...] = ()
+    _boundary: Surface | None = None
 
     def __repr__(self) -> str:
         # One of a class of the user's own may not have its name yet.
@@ -345,8 +346,10 @@ class Body:
         return replace(points, fixed=points.nodal(prescribed))
 
     def boundary(self) -> Surface:
-        """The whole boundary of a body with a mesh, for looks at what lies inside. Collective."""
-        return Surface(self, skin_of_mesh(self, compat.exterior_facets(self.mesh)))
+        """The whole boundary of a body with a mesh, made once. Collective."""
+        if self._boundary is None:
+            self._boundary = Surface(self, skin_of_mesh(self, compat.exterior_facets(self.mesh)))
+        return self._boundary
 
     def boundary_now(self, u: FloatArray) -> FloatArray:
         """This rank's part of the whole boundary, corners of facets [m], (m, nc, 3). Collective.

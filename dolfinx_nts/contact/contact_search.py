@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from types import MappingProxyType
 
 from mpi4py import MPI
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
+from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.left_behind import beside, unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
 from dolfinx_nts.contact.shared_nodes import drop_doubles, held_before
@@ -48,14 +50,16 @@ class ContactSearch:
     """
 
     def __init__(
-        self, contacts: Sequence[ContactPair], bodies: Sequence[tuple[int, ...]], comm: MPI.Comm
-    ) -> None:
+        self, contacts: Sequence[ContactPair], bodies: Sequence[tuple[int, ...]], comm: MPI.Comm,
+        edges: Mapping[int, EdgeCoupling] = MappingProxyType({}),
+    ) -> None:  # fmt: skip
         self._pairs, self._comm = contacts, comm
         self.bodies = list(bodies)
         self.elements: list[ContactElements] = []
         self.idle: list[ContactElements] = []
         self.idle_gaps: list[FloatArray] = []
         self.beside = [(0.0, -1)] * len(contacts)
+        self._edges = edges
         self._cover, self._repeats = [0.0] * len(contacts), 0
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
@@ -81,12 +85,9 @@ class ContactSearch:
 
     # ---- elements of a step
     def begin(
-        self,
-        step: Step,
-        history: tuple[ContactHistory, ...],
-        again: Evaluation | None,
+        self, step: Step, history: tuple[ContactHistory, ...], again: Evaluation | None,
         search: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Make the elements of a step, as of `Coupling`. Collective."""
         # Their forces are the first guess: of t_n, or of the solution that is gone on from.
         touching = slice(len(self.elements))
@@ -176,7 +177,10 @@ class ContactSearch:
             # In statics steps may be of any length, and what they carry inside is looked for.
             self._old[k].followed if step.integrator.inertia else None,
         )
+        beyond = self._edges[k].find(positions, found) if k in self._edges else ()
         found = found.select(~self._foreign[k][found.node])
+        if len(beyond):
+            found = found.select(~np.isin(pair.slave.share[found.node], beyond))
         overlap, ramp = self._old[k].overlap[found.node], step.integrator.ramp
         start, end = step.state.time, step.state.time + step.dt
         found = found._replace(gap=found.gap + (1.0 - ramp(start)) * overlap)
@@ -246,9 +250,7 @@ class ContactSearch:
         self._choose()
         return True
 
-    def misses(
-        self, e: Evaluation, parts: Sequence[Contribution], motion: FloatArray
-    ) -> bool:
+    def misses(self, e: Evaluation, parts: Sequence[Contribution], motion: FloatArray) -> bool:
         """Return whether a step may have passed by a contact that was no candidate. Collective.
 
         Raises:

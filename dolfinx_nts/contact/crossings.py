@@ -200,9 +200,8 @@ class Watched:
             remedy = f"the facet of nodes {facet} of {two!r} did not hold it: use a smaller dt"
         else:
             remedy = (
-                "contact holds nodes of the slave out of facets, and edges out of edges where the "
-                "pair has edges=True: pass that, use a finer mesh of the slave there, round the "
-                "edges, or exchange slave and master"
+                "contact holds nodes of the slave out of facets, and sharp edges out of edges: use "
+                "a finer mesh of the slave there, or exchange slave and master"
             )
         depth, size = float(found.depth[i]), float(found.size[i])
         if found.middle[i]:

@@ -1,4 +1,4 @@
-"""Contact of the sharp edges of one surface with those of another (theory section 18).
+"""Contact of the sharp edges of one body with those of another (theory section 18).
 
 The difference of two edges is a parallelogram, whose gap from the origin is that of the edges: the
 measure is `FacetGap`, at points of its own, and the law is that of contact.
@@ -7,51 +7,23 @@ measure is `FacetGap`, at points of its own, and the law is that of contact.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_measure import Batch
-from dolfinx_nts.contact.edges import SHARES, Near, near, sharp_edges
-from dolfinx_nts.contact.facet_gap import FacetGap
-from dolfinx_nts.contact.pair import MARGIN, Candidates
+from dolfinx_nts.contact.edges import SHARES, Edges, within
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.interaction.coupling import Joint
-from dolfinx_nts.interaction.elements import Step
-from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.interaction.kinematics import Kinematics
-from dolfinx_nts.interaction.point_elements import EveryStep
 from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.kernels import compiled, facets
 from dolfinx_nts.kernels.vectors import cross
-from dolfinx_nts.state import State
-from dolfinx_nts.types import FloatArray, IntArray, Settings
+from dolfinx_nts.parallel import global_sum
+from dolfinx_nts.state import EdgeHistory
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
-_EPS = float(np.finfo(float).eps)
-#: A gap of so many roundings of positions counts as closed.
-_TOUCH = 4.0
-#: Edges that have passed each other by this part of a facet, beside the step's motion, touch.
-_NEAR = 1e-6
 _STILL = np.zeros(3), np.zeros(3)
-
-
-class EdgeHistory(NamedTuple):
-    """What edges remember that have met on this rank; axis 0 = pair.
-
-    Attributes:
-        own: Edges of the slave, shape (n,).
-        other: Edges of the master, shape (n,).
-        force: Contact force p_N [N], shape (n,).
-        tangential: Friction force on the slave [N], shape (n, 3).
-    """
-
-    own: IntArray
-    other: IntArray
-    force: FloatArray
-    tangential: FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -118,12 +90,6 @@ class EdgeElements(ContactElements):
         """Name for messages."""
         return f"edges of {self.pair.name}"
 
-    def ratios(
-        self, part: Any, largest: Any, motion: float, rounded: float, rtol: float
-    ) -> dict[str, float]:
-        """As of `ContactElements`."""
-        return super().ratios(part, np.asarray(largest), motion, rounded, rtol)
-
     def resultant(self, part: Any, k: int, u: FloatArray) -> FloatArray:
         """As of `Elements.resultant`. Collective."""
         side = self.attachment.sides[k]
@@ -135,158 +101,100 @@ class EdgeElements(ContactElements):
         return np.stack([*sums, place, np.full(3, float(len(y)))])
 
 
-class EdgeContact(Joint):
+class EdgeContact:
     """Sharp convex edges of a pair's slave, which must not pass through those of its master.
+
+    They are those of the bodies' whole boundaries that have a facet in the pair's surfaces. They
+    are found when the surfaces come near each other for the first time.
 
     Args:
         pair: The pair.
-        name: For messages.
-
-    Attributes:
-        surfaces: Whole boundaries of the slave's and of the master's body.
-        edges: Edges in these, of the pair's surfaces.
-
-    Raises:
-        ValueError: A body is no solid one, with a mesh of cells.
+        bodies: Numbers of its bodies in the system.
+        before: Those of pairs that were declared before, whose edges it leaves to them.
     """
 
-    def __init__(self, pair: Any, name: str) -> None:
-        self.pair, self.name, self.bodies = pair, name, pair.bodies
-        for body in self.bodies:
-            if body.mesh is None or body.mesh.topology.dim != 3:
-                raise ValueError(
-                    f"edges=True: body {body.name!r} of contact {pair.name!r} has no mesh of cells "
-                    "in space, whose edges could meet others; leave edges out"
-                )
-        self.surfaces = tuple(body.boundary() for body in self.bodies)
-        both = zip(self.surfaces, pair.surfaces, strict=True)
-        self.edges = [sharp_edges(whole, part) for whole, part in both]
+    def __init__(
+        self, pair: Any, bodies: tuple[int, ...], before: Sequence[EdgeContact]
+    ) -> None:
+        self.pair, self.bodies = pair, bodies
+        self._before = [other for other in before if {*other.bodies} == {*bodies}]
 
-    def positions(self, u: Sequence[FloatArray]) -> list[FloatArray]:
+    @cached_property
+    def edges(self) -> tuple[Edges, Edges]:
+        """Those of the slave and of the master. Collective."""
+        edges: tuple[Edges, Edges] = self.pair.sharp_edges
+        return edges
+
+    @cached_property
+    def ends(self) -> list[IntArray]:
+        """Their ends among the points of the pair's surfaces, shape (n, 2)."""
+        both = zip(self.edges, self.pair.surfaces, strict=True)
+        return [np.searchsorted(s.points, e.surface.points[e.ends]) for e, s in both]
+
+    @cached_property
+    def mine(self) -> BoolArray:
+        """Which of the slave's edges this rank computes."""
+        slave = self.pair.slave
+        comm = slave.body.comm
+        mine: BoolArray = slave.original[self.ends[0]].sum(axis=1) % comm.size == comm.rank
+        return mine
+
+    @cached_property
+    def size(self) -> float:
+        """Of the smallest facet [m]."""
+        return min(surface.smallest for surface in self.pair.surfaces)
+
+    def positions(self, u: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Positions of all points of both boundaries in the pair's frame [m]. Collective.
 
         Args:
             u: Owned displacements of each body [m].
         """
-        both = zip(self.surfaces, u, strict=True)
-        return [surface.positions(each) - self.pair.origin for surface, each in both]
+        both = zip(self.edges, self._references, u, strict=True)
+        slave, master = (start + edges.surface.gather(each) for edges, start, each in both)
+        return slave, master
 
     @cached_property
-    def settings(self) -> Settings:
-        """What a restart compares."""
-        return {"friction": self.pair.friction, "edges": [len(e.ends) for e in self.edges]}
+    def _references(self) -> list[FloatArray]:
+        return [edges.surface.reference - self.pair.origin for edges in self.edges]
 
-    def start(self) -> EdgeHistory:
-        """Return that none has met."""
-        none = np.empty(0, dtype=np.int64)
-        return EdgeHistory(none, none, np.empty(0), np.empty((0, 3)))
+    def nodal_forces(self, history: EdgeHistory) -> FloatArray:
+        """Forces of its edges at the points of the slave, half of each at either end [N], (p,).
 
-    def coupling(self, bodies: tuple[int, ...]) -> EdgeCoupling:
-        """What makes its elements in a run."""
-        return EdgeCoupling(self, bodies)
+        Collective.
+        """
+        force = np.zeros(len(self.pair.slave.points))
+        if len(history.pair):
+            np.add.at(force, self.ends[0][history.pair[:, 0]], 0.5 * history.force[:, None])
+        return global_sum(self.pair.slave.body.comm, force)
+
+    def within(self, x: tuple[FloatArray, FloatArray], reach: float) -> IntArray:
+        """Its pairs of edges that are nearer than a reach, see `edges.within`.
+
+        Without those that nothing can move, those of pairs declared before, and those that share a
+        node. Collective.
+        """
+        found = within(self.edges, x, reach)
+        sides = zip(self.pair.surfaces, self.ends, found.T, strict=True)
+        moves = [~surface.fixed[ends[k]].all(axis=(1, 2)) for surface, ends, k in sides]
+        keep = moves[0] | moves[1]
+        for other in self._before:
+            for one, two in ((0, 1), (1, 0)):
+                if (other.bodies[one], other.bodies[two]) == self.bodies:
+                    keep &= ~(other.has(one, self, 0, found) & other.has(two, self, 1, found))
+        if self.bodies[0] == self.bodies[1]:
+            one, two = (e.ends[k] for e, k in zip(self.edges, found.T, strict=True))
+            keep &= (one[:, :, None] != two[:, None, :]).all(axis=(1, 2))
+        return found[keep]
+
+    def has(self, side: int, other: EdgeContact, k: int, found: IntArray) -> BoolArray:
+        """Which edges of side k of another one's pairs (n, 2) are among those of a side here."""
+        here, there = (_keys(e) for e in (self.edges[side], other.edges[k]))
+        return np.isin(there[found[:, k]], here)
 
 
-class EdgeCoupling(EveryStep):
-    """Makes the elements of edges that may meet in a step.
-
-    Args:
-        contact: The scene's part.
-        bodies: Numbers of its bodies in the system.
-    """
-
-    def __init__(self, contact: EdgeContact, bodies: tuple[int, ...]) -> None:
-        super().__init__(bodies, self._elements)
-        self._contact, self._cover = contact, 0.0
-        slave = contact.surfaces[0]
-        comm, ends = slave.body.comm, slave.original[contact.edges[0].ends]
-        self._mine = ends.sum(axis=1) % comm.size == comm.rank
-
-    def _reach(self, motion: FloatArray) -> float:
-        return float(np.sqrt(3.0) * sum(motion[b] for b in self.bodies[0]))
-
-    def _elements(self, step: Step, history: EdgeHistory) -> EdgeElements:
-        contact, pair, of = self._contact, self._contact.pair, self.bodies[0]
-        surfaces = contact.surfaces
-        size = min(surface.smallest for surface in surfaces)
-        reach = self._reach(step.motion)
-        self._cover = reach + MARGIN * size
-        u0 = [step.state.u[b] for b in of]
-        u1 = [u + step.ahead[b] for u, b in zip(u0, of, strict=True)]
-        found, ahead = (self._near(contact.positions(u)) for u in (u0, u1))
-        key = len(contact.edges[1].ends)
-        will = (ahead.own * key + ahead.other)[ahead.inside]
-        held = history.own * key + history.other
-        pairs = found.own * key + found.other
-        known = np.isin(pairs, held)
-        ahead_of = found.gap > -reach - _NEAR * size
-        chosen = (found.inside | np.isin(pairs, will)) & (known | ahead_of)
-        chosen &= self._mine[found.own]
-        found = Near._make(a[chosen] for a in found)
-        ends = [edges.ends[k] for edges, k in zip(contact.edges, found[:2], strict=True)]
-        turned = found.turned
-        ends[0] = np.where(turned[:, None], ends[0][:, ::-1], ends[0])
-        y = found.ends.copy()
-        y[turned, :2] = y[turned, 1::-1]
-        x = np.matmul(SHARES, y)
-        xi, _ = compiled.project(x[:, 0], x[:, 1:], np.zeros((len(x), 2)))
-        _, _, normal = facets.frame(x[:, 1:], xi)
-        length = facets.size(x[:, 1:])
-        candidates = Candidates(
-            found.own, found.other, found.other, xi, normal, found.gap, length
-        )
-        rule = step.integrator
-        measure = FacetGap(
-            start=x, xi=xi, normal=normal, length=length, rule=rule.contact_gradient,
-            theta=rule.theta, condense=step.condense,
-        )  # fmt: skip
-        attachment = EdgeAttachment(
-            slave=surfaces[0], master=surfaces[1], own=ends[0], other=ends[1]
-        )
-        made = elements_of(pair, candidates, attachment, measure, step)
-        gap = _EPS * (made.extent + float(max(step.length[b] for b in of)))
-        force = step.force_rounding(of) if pair.friction else 0.0
-        law = replace(made.law, rounding=_TOUCH * gap, force_rounding=_TOUCH * force)
-        return EdgeElements(
-            pair=pair, candidates=candidates, attachment=attachment, measure=measure, law=law
-        )
-
-    def _near(self, positions: Sequence[FloatArray]) -> Near:
-        """Pairs of edges within reach at positions of all points [m]."""
-        contact = self._contact
-        slave, master = zip(contact.surfaces, contact.edges, positions, strict=True)
-        return near(slave, master, self._cover)
-
-    def misses(self, e: Evaluation, parts: Sequence[Any], motion: FloatArray) -> bool:
-        """Whether bodies have moved farther than edges were looked for."""
-        return self._reach(motion) > self._cover
-
-    def guess(self, k: int, x: FloatArray) -> FloatArray:
-        """Multipliers of the forces of the last step."""
-        c, old = self.elements[k], self._history
-        assert self.step is not None
-        key = len(self._contact.edges[1].ends)
-        where = {int(i): n for n, i in enumerate(old.own * key + old.other)}
-        at = np.array([where.get(int(i), -1) for i in c.candidates.node * key + c.candidates.facet],
-                      dtype=int)  # fmt: skip
-        force = np.append(old.force, 0.0)[at]
-        tangential = np.vstack([old.tangential, np.zeros(3)])[at]
-        found = c.multipliers(force, np.zeros_like(tangential) if c.law.redundant else tangential)
-        guess: FloatArray = self.step.factor * found / c.law.scale[:, None]
-        return guess
-
-    def smallest(self, parts: Sequence[Any]) -> dict[str, float]:
-        """The smallest gap."""
-        return {"min_gap": float(parts[0].gap.min(initial=np.inf))}
-
-    def history(self, parts: Sequence[Any]) -> EdgeHistory:
-        """The pairs that carry, and their forces."""
-        c, part, step = self.elements[0], parts[0], self.step
-        assert step is not None
-        on = part.active
-        force = -part.multiplier[:, 0] / step.factor
-        tangential = part.tangential / step.factor
-        return EdgeHistory(c.candidates.node[on], c.candidates.facet[on], force[on], tangential[on])
-
-    def kinematics(self, state: State, dt: float) -> list[Kinematics | None]:
-        """Starts need not fit what is one-sided."""
-        return [None] * len(self.elements)
+def _keys(edges: Edges) -> IntArray:
+    """Numbers of edges that say which edge of the boundary it is."""
+    low, high = np.sort(edges.ends, axis=1).T
+    keys: IntArray = low * len(edges.surface.points) + high
+    return keys

@@ -1,12 +1,13 @@
-"""Which sides of a master may hold slave nodes: those that the slave's body faces there."""
+"""Which facets face which nodes: at rims that lie on each other a side may be as near as a face."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.contact.convex_edges import middles
+from dolfinx_nts.contact.convex_edges import ConvexEdges, middles
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
@@ -14,89 +15,145 @@ from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 #: a right angle do not, also where bodies that are pressed have turned them by 17 degrees.
 _FACING = 0.3
 
-#: Numbers of slaves and of facets -> which of these pairs face each other.
-Faces = Callable[[IntArray, IntArray], BoolArray]
+
+class _Normals(NamedTuple):
+    """Unit normals of the slave's facets, in the mean at this rank's slaves, of the master's."""
+
+    own: FloatArray
+    mean: FloatArray
+    other: FloatArray
 
 
-class Facing:
-    """Directions in which the body of a slave faces others at its nodes. Collective.
+class _Around:
+    """Facets of a body around the nodes of its surface, declared or not. Collective.
 
-    A node faces what one of the body's facets there does, also one that is not declared: it keeps
-    at most the angle to the declared one that it has in the reference.
-
-    Args:
-        slave: The slave.
+    Attributes:
+        points: Points of the surface at facets, one facet after another.
+        rows: The facets: declared ones, then those beyond open edges.
+        of: Facets of the rank's slaves in a row.
+        first: Where those of each begin.
+        count: How many they are; 0 where an open edge ends the body, as of a shell: what is beyond
+            it may face anything.
     """
 
     def __init__(self, slave: Surface) -> None:
         self._slave, at = slave, slave.facets
         facet, edge = np.nonzero(slave.boundary_edges)
         ends = np.stack([at[facet, edge], at[facet, (edge + 1) % at.shape[1]]], axis=1)
-        beside = _beside(slave, ends)
-        known = beside[:, 0] > 0.0
+        normal = _beyond(slave, ends)
+        known = normal.any(axis=1)
         self._facet, self._ends = facet[known], ends[known]
-        own, along = self._along(slave.reference)
-        # Both parts of the other normal, along the facet's own and out of the facet at this edge.
-        parts = [np.einsum("ni,ni->n", beside[known, 1:], way) for way in (own, along)]
-        self._parts = np.stack(parts, axis=1)
-        rows = np.concatenate([
+        # Its parts along the declared facet's normal, and out of that facet at the edge.
+        axes = self._axes(slave.reference)
+        self._parts = np.einsum("nai,ni->na", axes, normal[known])
+        self.points = np.concatenate([at.ravel(), self._ends.ravel()])
+        self.rows = np.concatenate([
             np.repeat(np.arange(len(at)), at.shape[1]),
             np.repeat(len(at) + np.arange(len(self._facet)), 2),
         ])  # fmt: skip
-        self._points, self._rows = np.concatenate([at.ravel(), self._ends.ravel()]), rows
-        order = np.argsort(self._points, kind="stable")
-        points = self._points[order]
-        self._of, self._first = rows[order], np.searchsorted(points, slave.share)
-        number = np.searchsorted(points, slave.share, side="right") - self._first
-        # What is beyond an edge that ends the body, as of a shell, may face anything.
-        self._count = np.where(np.isin(slave.share, ends[~known]), 0, number)
+        order = np.argsort(self.points, kind="stable")
+        points = self.points[order]
+        self.of, self.first = self.rows[order], np.searchsorted(points, slave.share)
+        number = np.searchsorted(points, slave.share, side="right") - self.first
+        self.count = np.where(np.isin(slave.share, ends[~known]), 0, number)
 
-    def _along(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Normals of facets at open edges, and unit vectors out of them there, (n, 3) each."""
+    def _axes(self, x: FloatArray) -> FloatArray:
+        """Unit normals of facets at open edges, and out of these there, shape (n, 2, 3)."""
         _, normal = middles(x[self._slave.facets[self._facet]])
-        edge = np.diff(x[self._ends], axis=1)[:, 0]
-        way = np.cross(edge, normal)
-        return normal, way / np.linalg.norm(way, axis=1)[:, None]
+        way = np.cross(np.diff(x[self._ends], axis=1)[:, 0], normal)
+        return np.stack([normal, way / np.linalg.norm(way, axis=1)[:, None]], axis=1)
 
-    def of(self, x: FloatArray, corners: FloatArray) -> Faces:
-        """Which facets face which of this rank's slaves.
+    def beyond(self, x: FloatArray) -> FloatArray:
+        """Normals of what is beyond open edges, shape (n, 3), of points x [m]."""
+        normal: FloatArray = np.einsum("na,nai->ni", self._parts, self._axes(x))
+        return normal
+
+
+class Facing:
+    """Which facets of a master face which of this rank's slaves.
+
+    Only over sharp edges a node that no facet of its own brings against a side of the master may be
+    near it, as at rims that lie on each other. Without these all that is near faces the nodes. A
+    node faces what any facet of its body there does, also one that is not declared: that keeps the
+    angle to the declared one beside it that it has in the reference.
+
+    Args:
+        slave: The slave.
+        master: The master.
+        edges: Edges of the master.
+    """
+
+    def __init__(self, slave: Surface, master: Surface, edges: ConvexEdges) -> None:
+        self._slave, self._master, self._edges = slave, master, edges
+        self._normals: _Normals | None = None
+
+    def look(self, slaves: FloatArray, corners: FloatArray) -> None:
+        """Note where the facets are.
 
         Args:
-            x: Points of the slave [m].
-            corners: Of the master's facets [m], shape (m, nc, 3).
+            slaves: Points of the slave [m].
+            corners: Corners of the master's facets [m].
         """
-        slave = self._slave
-        own, other = middles(x[slave.facets])[1], middles(corners)[1]
-        beside = np.einsum("na,nai->ni", self._parts, np.stack(self._along(x), axis=1))
-        own = np.concatenate([own, beside])
+        if not len(self._slave.facets) or not self._edges.sharp.any():
+            return
+        around, other = self._around, middles(corners)[1]
+        own = np.concatenate([middles(slaves[self._slave.facets])[1], around.beyond(slaves)])
         # The tip of a needle has facets that face nothing ahead of it, but their mean does.
-        mean = np.zeros_like(x)
-        np.add.at(mean, self._points, own[self._rows])
-        mean = mean[slave.share]
+        mean = np.zeros_like(slaves)
+        np.add.at(mean, around.points, own[around.rows])
+        mean = mean[self._slave.share]
         mean /= np.maximum(np.linalg.norm(mean, axis=1), np.finfo(float).tiny)[:, None]
+        self._normals = _Normals(own, mean, other)
 
-        def faces(node: IntArray, facet: IntArray) -> BoolArray:
-            number = self._count[node]
-            pair = np.repeat(np.arange(len(node)), number)
-            start = np.cumsum(number) - number
-            mine = self._of[self._first[node][pair] + np.arange(len(pair)) - start[pair]]
-            found = (number == 0) | opposite(mean[node], other[facet])
-            found[pair[opposite(own[mine], other[facet[pair]])]] = True
-            return found
+    @property
+    def all(self) -> bool:
+        """Whether all that is near faces the nodes."""
+        return self._normals is None
 
-        return faces
+    def faces(self, node: IntArray, facet: IntArray) -> BoolArray:
+        """Which facets, -1 none, face the rank's slaves, shape (n,)."""
+        found = np.ones(len(node), dtype=bool)
+        if self._normals is not None:
+            some = np.flatnonzero(facet >= 0)
+            found[some] = self._oppose(self._normals, node[some], facet[some])
+        return found
+
+    def _oppose(self, normals: _Normals, node: IntArray, facet: IntArray) -> BoolArray:
+        around, (own, mean, other) = self._around, normals
+        number = around.count[node]
+        pair = np.repeat(np.arange(len(node)), number)
+        start = np.cumsum(number) - number
+        mine = around.of[around.first[node][pair] + np.arange(len(pair)) - start[pair]]
+        found = (number == 0) | opposite(mean[node], other[facet])
+        found[pair[opposite(own[mine], other[facet[pair]])]] = True
+        return found
+
+    @cached_property
+    def _around(self) -> _Around:
+        return _Around(self._slave)
+
+    def beside(self, node: IntArray, facet: IntArray) -> BoolArray:
+        """Which sharp edges of facets end the surface for nodes, shape (n, nc).
+
+        The facet beyond does not face the node.
+        """
+        ends = np.zeros((len(node), self._master.facets.shape[1]), dtype=bool)
+        if self._normals is None:
+            return ends
+        beside, joined = self._edges.beside[facet], self._edges.joined[facet]
+        some, edge = np.nonzero((beside >= 0) & (joined < 0))
+        ends[some, edge] = ~self.faces(node[some], beside[some, edge] // ends.shape[1])
+        return ends
 
 
-def _beside(slave: Surface, ends: IntArray) -> FloatArray:
-    """Whether facets of the body go on beyond edges of its surface, and their normals, (n, 4).
-
-    Collective.
+def _beyond(slave: Surface, ends: IntArray) -> FloatArray:
+    """Normals of a body's facets beyond edges of its surface, 0 where it ends, (n, 3). Collective.
 
     Args:
         slave: The surface.
         ends: Edges that it ends at, shape (n, 2).
     """
-    found = np.zeros((len(ends), 4))
+    found = np.zeros((len(ends), 3))
     if not len(ends) or slave.body.mesh is None:
         return found
     whole = slave.body.boundary()
@@ -110,8 +167,7 @@ def _beside(slave: Surface, ends: IntArray) -> FloatArray:
     for side in here.tolist():
         facet = side // at.shape[1]
         if tuple(sorted(at[facet].tolist())) not in slave.facet_points:
-            row = found[rows[int(number[side])]]
-            row[0], row[1:] = 1.0, normal[facet]
+            found[rows[int(number[side])]] = normal[facet]
     return found
 
 

@@ -36,8 +36,6 @@ class ObstaclePair(ContactPair, master=Obstacle):
     """
 
     def _set_up(self) -> None:
-        if self.edges:
-            raise ValueError(f"edges=True: {self.master.name!r} has no edges; leave edges out")
         self.obstacle: Obstacle = self.master.about(self.origin)
 
     @property

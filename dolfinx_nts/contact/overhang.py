@@ -131,7 +131,7 @@ def inside_rim(
     Args:
         contact: A contact of two surfaces.
         positions: Of all points of both, as of `ContactPair.positions` [m].
-        force: Normal force of each point of the slave [N].
+        force: Normal force of each point of the slave, also of its edges [N].
         held: As of `overhang`.
     """
     (x, y), slave, master = positions, contact.slave, contact.master

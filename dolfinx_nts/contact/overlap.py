@@ -22,7 +22,8 @@ from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
 from dolfinx_nts.contact.overhang import inside_rim
 from dolfinx_nts.contact.self_crossings import SelfPair
 from dolfinx_nts.contact.surfaces import Surface
-from dolfinx_nts.kernels.vectors import range_of
+from dolfinx_nts.kernels.vectors import range_of, relative_way
+from dolfinx_nts.state import EdgeHistory
 from dolfinx_nts.types import BoolArray, FloatArray
 
 
@@ -52,12 +53,15 @@ class OverlapWatch:
     """
 
     def __init__(self, system: Any) -> None:
-        self._comm, self._bodies = system.comm, system.bodies
-        self._surfaces: dict[int, Surface] = {}
+        self._comm, self._bodies, self._along = system.comm, system.bodies, system.edges
         self._edges: dict[int, InnerEdges] = {}
 
         def start() -> tuple[FloatArray, ...]:
             return system.initial_state().u
+
+        def boundary(k: int) -> Surface:
+            whole: Surface = system.bodies[k].boundary()
+            return whole
 
         between: dict[tuple[tuple[int, ...], bool], list[Any]] = {}
         obstacles: list[ObstacleContact] = []
@@ -67,14 +71,13 @@ class OverlapWatch:
                 alike = [c.slave for c in system.contacts if _same_obstacle(contact, c)]
                 slaves = [s for s in alike if len(s.facets)]
                 obstacles.append(
-                    ObstacleContact(contact, bodies[0], slaves, self._boundary, start)
+                    ObstacleContact(contact, bodies[0], slaves, boundary, start)
                 )
             elif len(contact.bodies) == 2 and all(b.mesh is not None for b in contact.bodies):
                 itself = contact.slave is contact.master
                 between.setdefault((tuple(sorted(bodies)), itself), []).append(contact)
         pairs = [
-            (SelfPair if itself else BodyPair)(k, c, self._boundary)
-            for (k, itself), c in between.items()
+            (SelfPair if itself else BodyPair)(k, c, boundary) for (k, itself), c in between.items()
         ]
         self._pairs: list[BodyPair | ObstacleContact] = [*obstacles, *pairs]
         self._movers: list[list[Any]] = [
@@ -94,6 +97,7 @@ class OverlapWatch:
         time: float = 0.0,
         *,
         forces: Sequence[FloatArray] = (),
+        edges: Sequence[EdgeHistory] = (),
         last: bool = False,
     ) -> list[Finding]:
         """The worst finding of each kind and pair, if a look is due. Collective, same on all ranks.
@@ -103,6 +107,7 @@ class OverlapWatch:
             time: At which they are so [s].
             forces: Of each contact of the system the normal forces of its share [N]; may be left
                 out, and then contact inside a rim or in an inner edge is not told.
+            edges: What the edges of each contact remember; left out with `forces`.
             last: Look again wherever anything has moved.
         """
         now = [pair.where(u, time) for pair in self._pairs]
@@ -118,7 +123,7 @@ class OverlapWatch:
                 found += pair.passed(before.where, now[k], way, before.pause.through)
             findings += [f for f in found if f.depth > self._allowed[k]]
             if everywhere and isinstance(pair, BodyPair):
-                findings += self._of_contacts(pair, u, everywhere)
+                findings += self._of_contacts(pair, u, everywhere, edges)
             self._looked[k] = _Looked(now[k], pause)
         worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
@@ -135,7 +140,11 @@ class OverlapWatch:
         return [contact.slave.at_all(force) for (contact, _), force in both]
 
     def _of_contacts(
-        self, pair: BodyPair, u: Sequence[FloatArray], everywhere: Sequence[FloatArray]
+        self,
+        pair: BodyPair,
+        u: Sequence[FloatArray],
+        everywhere: Sequence[FloatArray],
+        edges: Sequence[EdgeHistory],
     ) -> Iterator[Finding]:
         """What is told of contacts by their forces. Collective.
 
@@ -145,18 +154,24 @@ class OverlapWatch:
             pair: The bodies between which they are.
             u: As of `look`.
             everywhere: Normal forces of all points of each contact's slave [N].
+            edges: As of `look`.
         """
         for k, (contact, bodies) in enumerate(self._contacts):
             # The surface of a contact of a body with itself may end where the body does not.
-            if contact not in pair.contacts or len(set(bodies)) < 2 or not everywhere[k].any():
+            if contact not in pair.contacts or len(set(bodies)) < 2:
+                continue
+            carry = everywhere[k]
+            if k in self._along:
+                # Edges carry at a rim, where they cross it: between their nodes.
+                carry = carry + self._along[k].nodal_forces(edges[k])
+            if not carry.any():
                 continue
             positions = contact.positions([u[b] for b in bodies])
             if k not in self._edges:
                 self._edges[k] = InnerEdges(contact.master.facets, positions[1])
             held = self._held_otherwise(k, everywhere)
             yield from filter(None, (
-                # Over a rim edges carry, where they take part.
-                None if contact.edges else inside_rim(contact, positions, everywhere[k], held),
+                inside_rim(contact, positions, carry, held),
                 in_inner_edge(self._edges[k], contact, positions, everywhere[k]),
             ))  # fmt: skip
 
@@ -196,19 +211,12 @@ class OverlapWatch:
                 # An obstacle has no body.
                 moved[i, j] = range_of(change) if body is None else body.motion_range(change)
         self._comm.Allreduce(MPI.IN_PLACE, moved, op=MPI.MAX)
-        apart = np.maximum(moved[:, 0, 0] + moved[:, 1, 1], moved[:, 1, 0] + moved[:, 0, 1])
-        ways = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+        ways = relative_way(moved).tolist()
         due = []
-        for (k, looked), way in zip(self._looked.items(), ways.tolist(), strict=True):
+        for (k, looked), way in zip(self._looked.items(), ways, strict=True):
             if way > (0.0 if last else looked.pause.due):
                 due.append((k, way))
         return fresh + due
-
-    def _boundary(self, k: int) -> Surface:
-        """The whole boundary of a body with a mesh. Collective."""
-        if k not in self._surfaces:
-            self._surfaces[k] = self._bodies[k].boundary()
-        return self._surfaces[k]
 
 
 def _same_obstacle(one: Any, two: Any) -> bool:

@@ -121,8 +121,8 @@ class ContactPair:
             without strain or force, as if they stood on the master: what the nodes of two meshes
             miss each other by. The gap that they start with goes on being none; bodies are drawn
             where their meshes are, and may be that deep inside each other without a warning. At
-            most half a facet of the master inwards; edges of `edges=True` stay as meshed [m].
-        edges: Keep sharp edges of both bodies out of each other, too.
+            most half a facet of the master inwards; edges stay as meshed [m].
+        edges: Whether sharp edges of solid and rigid bodies are kept out of each other, too.
         integration: What of the slave is kept out: its "nodes", or the "surface" between them in
             the mean around each node, by points of all facets (theory section 17).
 
@@ -135,9 +135,9 @@ class ContactPair:
     Raises:
         TypeError: `slave` is no Surface, or `master` of no known kind.
         ValueError: friction or `adjust` is negative or no number, `interference` or `integration`
-            is unknown, the surfaces share nodes, `edges` or "surface" of an obstacle, which has
-            none, or "surface" between rigid bodies, of a smoothed master, of nodes without mass or
-            with `adjust`.
+            is unknown, the surfaces share nodes, "surface" of an obstacle, which has no facets, or
+            "surface" between rigid bodies, of a smoothed master, of nodes without mass or with
+            `adjust`.
     """
 
     #: Class of pairs for each class of masters.
@@ -159,7 +159,7 @@ class ContactPair:
 
     def __init__(
         self, slave: Surface, master: Any, *, friction: float = 0.0, interference: str = "refuse",
-        adjust: float = 0.0, edges: bool = False, integration: str = "nodes",
+        adjust: float = 0.0, edges: bool = True, integration: str = "nodes",
     ) -> None:  # fmt: skip
         _check_friction(friction)
         require_bool("edges", edges)
@@ -226,9 +226,10 @@ class ContactPair:
     def _set_up(self) -> None:
         """Check the master and prepare the search."""
 
-    def parts(self, name: str) -> tuple[Any, ...]:
-        """What comes with it beside its own elements, as joints of a System with this name."""
-        return ()
+    @property
+    def has_edges(self) -> bool:
+        """Whether sharp edges of both sides may meet."""
+        return False
 
     def sag(self, points: BoolArray) -> float:
         """How deep flat facets of the master cut into a curved surface, in facet sizes.

@@ -159,6 +159,12 @@ def apart(points: FloatArray, corners: FloatArray, reach: float) -> bool:
     return outside > reach + ROUNDING * (magnitude + outside)
 
 
+def distance(points: FloatArray, others: FloatArray) -> float:
+    """Distance between the boxes around two sets of points [m], shape (..., 3) each; 0 inside."""
+    one, two = range_of(points), range_of(others)
+    return float(np.linalg.norm(np.maximum(0.0, -(one + two[::-1]))))
+
+
 def _nothing(n: int) -> Closest:
     """The result for n points without a facet."""
     return Closest(np.full(n, -1), np.full((n, 2), np.nan), np.full(n, np.inf))

@@ -61,7 +61,7 @@ class SelfContact(FacetPair):
     def __init__(self, surface: Surface, *, friction: float = 0.0) -> None:
         if not isinstance(surface, Surface):
             raise TypeError(f"surface={surface!r}: pass a Surface, e.g. body.surface(marker)")
-        super().__init__(surface, surface, friction=friction)
+        super().__init__(surface, surface, friction=friction, edges=False)
 
     def _check_surfaces(self) -> None:
         body = self.slave.body
@@ -98,7 +98,7 @@ class SelfContact(FacetPair):
             admits=search.Admits(faces, apart),
         )  # fmt: skip
 
-    def _stops(self, node: IntArray, master: FloatArray) -> passages.Stops:
+    def stops(self, node: IntArray, master: FloatArray) -> passages.Stops:
         """Those that face the node and share no corner with facets of it."""
         number, (nodal, normal) = self.slave.share[node], self._normals(master)
 
@@ -172,18 +172,18 @@ class SelfContact(FacetPair):
             return found
         return found._replace(candidates=c.select(self._one_sided(c, current, positions[0])))
 
-    def _measure(
+    def measure(
         self, x: FloatArray, master: FloatArray, node: IntArray, facet: IntArray, start: FloatArray,
         reach: float | None,
     ) -> tuple[Candidates, IntArray]:  # fmt: skip
         """As of `FacetPair`, but nothing is held in the plane of a facet beyond which it is."""
-        found, beyond = super()._measure(x, master, node, facet, start, reach)
+        found, beyond = super().measure(x, master, node, facet, start, reach)
         number, nc = self.slave.share[found.node], self.slave.facets.shape[1]
         zero = np.zeros(len(number))
         own = self._own.beside(number, found.facet, zero)
         excess = facets.edge_excess(found.xi, nc)
         for edge in range(nc):
-            other = self._edges.beside[found.facet, edge] // nc
+            other = self.convex.beside[found.facet, edge] // nc
             out = (excess[:, edge] > search.PREFERENCE) & (other >= 0)
             own |= out & self._own.beside(number, np.maximum(other, 0), zero)
         return found.select(~own), beyond

@@ -271,8 +271,8 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         """
         if not self.is_long(reach):
             return None
-        x, paths = positions[0][self.slave.share], self._gather_paths(motions)
-        through = np.flatnonzero(self._came_through(x, positions[1], *paths, held) >= 0)
+        x, paths = positions[0][self.slave.share], self.slave_paths.gather(motions)
+        through = np.flatnonzero(self.slave_paths.came_through(x, positions[1], *paths, held) >= 0)
         text = None
         if through.size:
             text = (

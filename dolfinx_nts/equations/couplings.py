@@ -11,12 +11,14 @@ from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution
 from dolfinx_nts.contact.contact_search import ContactSearch
+from dolfinx_nts.contact.edge_contact import EdgeElements
+from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.equations.least_norm import hanging
 from dolfinx_nts.interaction.constraints import Constraints
 from dolfinx_nts.interaction.coupling import Coupling, JointCoupling
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
-from dolfinx_nts.state import ContactHistory
+from dolfinx_nts.state import ContactHistory, EdgeHistory
 from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
 
@@ -34,12 +36,16 @@ class Couplings:
     Attributes:
         contacts: What makes the elements of contacts. Used directly only for what contacts alone
             have: closing gaps, checkpoints.
+        edges: What makes those of edges, by the number of the contact.
         joints: What makes those of `System.joints`.
         mechanisms: How many groups of bodies joints link.
     """
 
     def __init__(self, system: System) -> None:
-        self.contacts = ContactSearch(system.contacts, system.contact_bodies, system.comm)
+        self.edges = {k: EdgeCoupling(edges) for k, edges in system.edges.items()}
+        self.contacts = ContactSearch(
+            system.contacts, system.contact_bodies, system.comm, self.edges
+        )
         both = zip(system.joints, system.joint_bodies, strict=True)
         each: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
         _lend_less(system, each)
@@ -52,16 +58,24 @@ class Couplings:
         linked = _linked(system.joint_bodies[:declared])
         self.mechanisms = max(linked, default=-1) + 1
         self._linked = [np.array([linked[k] for k in of if k < declared]) for _, of in self.joints]
+        # Batches of elements of contacts and of edges in the step, which come first.
+        self._touching = 0
 
     @property
     def _all(self) -> list[Coupling]:
-        return [self.contacts, *(coupling for coupling, _ in self.joints)]
+        return [self.contacts, *self.edges.values(), *(coupling for coupling, _ in self.joints)]
 
     def begin(self, step: Step, again: Evaluation | None, search: bool) -> None:
         """Make the elements of a step; arguments as of `Coupling.begin`. Collective."""
         state = step.state
         self._remembered = state.contacts
+        for k, edges in self.edges.items():
+            edges.begin(step, state.edges[k], again, search)
         self.contacts.begin(step, state.contacts, again, search)
+        for edges in self.edges.values():
+            edges.make()
+        own: list[Coupling] = [self.contacts, *self.edges.values()]
+        self._touching = sum(len(coupling.elements) for coupling in own)
         for coupling, of in self.joints:
             history = tuple(state.joints[k] for k in of) if len(of) > 1 else state.joints[of[0]]
             coupling.begin(step, history, again, search)
@@ -70,6 +84,8 @@ class Couplings:
     def elements(self) -> list[Any]:
         """Batches of elements in the step."""
         found: list[Any] = list(self.contacts.elements)
+        for edges in self.edges.values():
+            found += edges.elements
         for coupling, _ in self.joints:
             found += coupling.elements
         return found
@@ -82,7 +98,7 @@ class Couplings:
     @property
     def linked(self) -> list[Any]:
         """Number of the mechanism of each of `elements`, (n,) of many joints; None: of none."""
-        found: list[Any] = [None] * len(self.contacts.elements)
+        found: list[Any] = [None] * self._touching
         for (coupling, _), linked in zip(self.joints, self._linked, strict=False):
             for batch in coupling.elements:
                 several = len(linked) > 1
@@ -91,29 +107,51 @@ class Couplings:
 
     def each(self, e: Evaluation) -> Iterator[tuple[Coupling, tuple[Any, ...]]]:
         """All with their parts of an evaluation."""
-        yield self.contacts, e.parts[: len(self.contacts.elements)]
-        for coupling, _, parts in self.of_joints(e):
-            yield coupling, parts
+        start = 0
+        for coupling in self._all:
+            stop = start + len(coupling.elements)
+            yield coupling, e.parts[start:stop]
+            start = stop
 
     def of_joints(
         self, e: Evaluation
     ) -> Iterator[tuple[JointCoupling, list[int], tuple[Any, ...]]]:
         """`joints` with their parts of an evaluation."""
-        start = len(self.contacts.elements)
+        start = self._touching
         for coupling, of in self.joints:
             stop = start + len(coupling.elements)
             yield coupling, of, e.parts[start:stop]
             start = stop
 
-    def history(self, e: Evaluation) -> tuple[Any, tuple[Any, ...]]:
-        """What contacts, and each of `System.joints`, remember of an accepted step."""
+    def of_edges(self, e: Evaluation) -> Iterator[tuple[int, EdgeElements, Contribution]]:
+        """Numbers of contacts whose edges are near each other, their elements and parts."""
+        start = len(self.contacts.elements)
+        for k, coupling in self.edges.items():
+            for batch in coupling.elements:
+                part: Any = e.parts[start]
+                yield k, batch, part
+                start += 1
+
+    def forget_solution(self) -> None:
+        """Guess contact forces of t_n again, where those of a solution of the step led nowhere."""
+        self.contacts.forget_solution()
+        for edges in self.edges.values():
+            edges.forget_solution()
+
+    def history(
+        self, e: Evaluation
+    ) -> tuple[tuple[ContactHistory, ...], tuple[Any, ...], tuple[EdgeHistory, ...]]:
+        """What contacts, each of `System.joints`, and edges remember of an accepted step."""
         out: list[Any] = [None] * self._number
         for coupling, of, parts in self.of_joints(e):
             found = coupling.history(parts)
             for k, own in zip(of, found if len(of) > 1 else [found], strict=True):
                 out[k] = own
         contacts = self.contacts.history(e.parts[: len(self.contacts.elements)])
-        return contacts, tuple(out)
+        edges = [EdgeHistory.of_start() for _ in contacts]
+        for k, _, part in self.of_edges(e):
+            edges[k] = self.edges[k].history([part])
+        return contacts, tuple(out), tuple(edges)
 
     def touching(
         self, e: Evaluation

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-_NAMES = "facets.h", "facets.c", "nts_element.c", "contact_law.c"
+_NAMES = "facets.h", "facets.c", "nts_element.c", "contact_law.c", "edges.c"
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 _FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
 
@@ -60,6 +60,24 @@ class Law(ctypes.Structure):
     ]
 
 
+class Edges(ctypes.Structure):
+    """Sharp edges of a boundary; see `edges.c`."""
+
+    _fields_ = [  # noqa: RUF012
+        ("nc", _INT),
+        *((name, _ARRAY) for name in ("x", "way", "ends", "corners", "of_surface", "goes_on")),
+    ]
+
+
+class EdgeLimits(ctypes.Structure):
+    """Which pairs of edges count; see `edges.c`."""
+
+    _fields_ = [  # noqa: RUF012
+        *((name, _REAL) for name in ("parallel", "end", "outside")),
+        *((name, _REAL) for name in ("level", "steep", "flat", "by_node")),
+    ]
+
+
 class FieldTable(ctypes.Structure):
     """A Function in a form; see `cell_batches.c`."""
 
@@ -78,6 +96,7 @@ class Together(ctypes.Structure):
 #: Arguments of the loop in `cell_batches.c`.
 ASSEMBLE = (_LONG, *(_ARRAY,) * 3, _INT, *(_ARRAY,) * 3)
 _FACET, _LIMITS = ctypes.POINTER(Facet), ctypes.POINTER(Limits)
+_EDGES = ctypes.POINTER(Edges)
 #: Arguments of the kernels.
 _KERNELS = {
     "project": (_FACET, _LIMITS, _LONG, *(_ARRAY,) * 4),
@@ -86,6 +105,11 @@ _KERNELS = {
         *(_FACET, _LIMITS, _LONG, _ARRAY, _ARRAY),
         *(_LONG, _ARRAY, _ARRAY, _REAL, *(_ARRAY,) * 3),
     ),
+    "closest_edges": (
+        *(_EDGES, _EDGES, ctypes.POINTER(EdgeLimits)),
+        *(_REAL, _REAL, _REAL, _LONG, *(_ARRAY,) * 7),
+    ),
+    "tilted": (_INT, *(_ARRAY,) * 5, _REAL, _LONG, *(_ARRAY,) * 3),
     "condensed": (_FACET, _INT, _ARRAY, _ARRAY, _INT, _LONG, *(_ARRAY,) * 13),
     "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 16),
     "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),

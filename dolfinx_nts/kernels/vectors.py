@@ -33,6 +33,18 @@ def range_of(moved: FloatArray, around: FloatArray | float = 0.0) -> FloatArray:
     return np.array([end.max(axis=1, initial=-np.inf) for end in ends])
 
 
+def relative_way(moved: FloatArray) -> FloatArray:
+    """Bounds on motions relative to each other, shape (n,).
+
+    Args:
+        moved: Largest motion of two sets of points along the axes and against, as of `range_of`,
+            shape (n, 2, 2, 3).
+    """
+    apart = np.maximum(moved[:, 0, 0] + moved[:, 1, 1], moved[:, 1, 0] + moved[:, 0, 1])
+    way: FloatArray = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+    return way
+
+
 def solve_2x2(
     a: tuple[FloatArray, FloatArray, FloatArray, FloatArray], b: tuple[FloatArray, FloatArray]
 ) -> FloatArray:

@@ -26,42 +26,47 @@ class ContactLoads(NamedTuple):
     """Contact forces of a step, as its elements have them.
 
     Attributes:
-        elements: Those of each contact.
+        elements: Those of each contact: of nodes, and of edges that are near each other.
         parts: Their solution.
         factor: What the step equations multiply forces by [s^2].
     """
 
-    elements: tuple[Any, ...]
-    parts: tuple[Any, ...]
+    elements: tuple[tuple[Any, ...], ...]
+    parts: tuple[tuple[Any, ...], ...]
     factor: float
 
     @classmethod
     def of_step(cls, problem: StepProblem, step: Evaluation) -> ContactLoads:
         """Of a solved step; its tangents are not kept."""
-        both = problem.couplings.touching(step)
-        parts = tuple(part._replace(tangent=np.empty(0)) for _, part, _ in both)
-        return cls(tuple(elements for elements, _, _ in both), parts, problem.factor)
+        couplings = problem.couplings
+        both = [[(c, part)] for c, part, _ in couplings.touching(step)]
+        for k, c, part in couplings.of_edges(step):
+            both[k].append((c, part))
+        elements = tuple(tuple(c for c, _ in of) for of in both)
+        parts = tuple(tuple(p._replace(tangent=np.empty(0)) for _, p in of) for of in both)
+        return cls(elements, parts, problem.factor)
 
     def on(self, k: int) -> list[tuple[Surface, FloatArray]]:
         """Forces of a contact on the points of its surfaces [N], (p, 3) each. Collective."""
-        contact, found = self.elements[k], []
-        surfaces = (contact.pair.slave, contact.pair.master)
-        # An obstacle has no points.
-        for surface, force in zip(surfaces, contact.nodal_forces(self.parts[k]), strict=False):
+        both, found = zip(self.elements[k], self.parts[k], strict=True), []
+        each = zip(*(c.nodal_forces(part) for c, part in both), strict=True)
+        for surface, forces in zip(self.elements[k][0].pair.surfaces, each, strict=True):
+            force = sum(forces[1:], forces[0])
             surface.body.comm.Allreduce(MPI.IN_PLACE, force, op=MPI.SUM)
             found.append((surface, force / self.factor))
         return found
 
-
     def pressing(self, k: int, force: FloatArray) -> FloatArray:
         """Contact forces p_N of this rank's slave nodes as their body feels them [N]. Collective.
+
+        Those of edges are left out.
 
         Args:
             k: Number of the contact.
             force: Those of its law, shape (share,).
         """
-        contact = self.elements[k]
-        found = contact.pressing(self.parts[k])
+        contact = self.elements[k][0]
+        found = contact.pressing(self.parts[k][0])
         if found is None:
             return force
         slave = contact.pair.slave

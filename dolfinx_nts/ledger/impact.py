@@ -21,6 +21,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
+from dolfinx_nts.contact.edge_contact import EdgeElements
 from dolfinx_nts.equations.assembly import StepMatrix
 from dolfinx_nts.equations.mass_solves import Saddle, solve_mass
 from dolfinx_nts.equations.problem import StepProblem
@@ -55,7 +56,7 @@ class Impact(NamedTuple):
 def restored(
     problem: StepProblem, step: Evaluation, state: State, restitution: float
 ) -> Impact | None:
-    """The state after impulses on the nodes that came into contact in a step. Collective.
+    """The state after impulses on the nodes and edges that came into contact in a step. Collective.
 
     Args:
         problem: Equations of the step.
@@ -73,7 +74,9 @@ def restored(
     if not pushes.sum() > 0.0:
         return None
     _refuse_moved(problem, step)
-    groups = _groups(problem, pushes > 0.0)
+    bodies_of = [system.contact_bodies[new.contact] for new in contacts]
+    both = zip(bodies_of, pushes, strict=True)
+    groups = _groups(problem, [bodies for bodies, push in both if push > 0.0])
     forces = _forces(problem, contacts)
     change = _response(problem, step, forces)
     # Not the work of the impulses alone: velocities fit the joints in the mean of two steps only.
@@ -87,18 +90,18 @@ def restored(
         speed, ease = works[groups == group].sum(axis=0)
         if not ease > 0.0:
             continue
-        own = [_group(groups, bodies) == group for bodies in system.contact_bodies]
+        own = [_group(groups, bodies) == group for bodies in bodies_of]
         plastic = -speed / ease
         above = max(2.0 * float(lost[own].sum()) / ease + plastic**2, 0.0)
         share = plastic + restitution * math.sqrt(above)
         shares[groups == group] = share
         energy += share * (speed + 0.5 * share * ease)
     v = tuple(a + share * dv for a, share, dv in zip(state.v, shares, change, strict=True))
-    impulses = np.zeros((2, len(contacts), 3))
-    for k, (new, bodies) in enumerate(zip(contacts, system.contact_bodies, strict=True)):
+    impulses = np.zeros((2, len(system.contacts), 3))
+    for new, bodies in zip(contacts, bodies_of, strict=True):
         of = _group(groups, bodies)
         share = float(shares[groups == of].max()) if of >= 0 else 0.0
-        impulses[:, k] = share * new.impulse
+        impulses[:, new.contact] += share * new.impulse
     comm.Allreduce(MPI.IN_PLACE, impulses, op=MPI.SUM)
     return Impact(replace(state, v=v), energy, impulses)
 
@@ -117,14 +120,12 @@ def _refuse_moved(problem: StepProblem, step: Evaluation) -> None:
         )
 
 
-def _groups(problem: StepProblem, touched: Sequence[bool]) -> npt.NDArray[np.int_]:
+def _groups(problem: StepProblem, touched: list[tuple[int, ...]]) -> npt.NDArray[np.int_]:
     """Bodies that new touches or joints link have one number; -1: nothing moves freely."""
     system = problem.system
     free = np.array([body.num_owned - body.fixed.size for body in system.bodies])
     groups = np.where(system.comm.allreduce(free) > 0, np.arange(len(free)), -1)
-    both = zip(system.contact_bodies, touched, strict=True)
-    links = [bodies for bodies, new in both if new] + list(system.joint_bodies)
-    for bodies in links:
+    for bodies in (*touched, *system.joint_bodies):
         linked = {int(groups[b]) for b in bodies} - {-1}
         if linked:
             groups[np.isin(groups, list(linked))] = min(linked)
@@ -137,9 +138,10 @@ def _group(groups: npt.NDArray[np.int_], bodies: Sequence[int]) -> int:
 
 
 class _New(NamedTuple):
-    """What nodes of a contact do that came to touch in a step.
+    """What nodes or edges of a contact do that came to touch in a step.
 
     Attributes:
+        contact: Number of the contact.
         batch: Elements of the contact.
         push: Impulse of the step along the normals [N s], their sum on this rank.
         rows: Of the elements' coordinates [N s], shape (elements, coordinates).
@@ -147,6 +149,7 @@ class _New(NamedTuple):
         lost: Energy that they have lost on this rank [J].
     """
 
+    contact: int
     batch: Any
     push: float
     rows: FloatArray
@@ -155,13 +158,25 @@ class _New(NamedTuple):
 
 
 def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
-    """What came to touch in a step, of each contact."""
+    """What came to touch in a step, of each contact: nodes, and edges if any are. Collective."""
     found, rate = [], problem.integrator.rate(problem.dt)
-    for batch, part, old in problem.couplings.touching(step):
-        new = part.active & ~(old.force[batch.candidates.node] > 0.0)
+    couplings = problem.couplings
+    nodes = [
+        (k, batch, part, old.force[batch.candidates.node] > 0.0)
+        for k, (batch, part, old) in enumerate(couplings.touching(step))
+    ]
+    edges = [(k, c, part, couplings.edges[k].pressed) for k, c, part in couplings.of_edges(step)]
+    for k, batch, part, pressed in (*nodes, *edges):
+        new = part.active & ~pressed
         force = np.where(new, -part.multiplier[:, 0], 0.0)
         lost = float(force @ batch.candidates.gap) / problem.factor
-        found.append(_New(batch, rate * force.sum(), *batch.impulse(part, rate * force), lost))
+        push = rate * force
+        rows, impulse = batch.impulse(part, push)
+        if isinstance(batch, EdgeElements):
+            first = problem.system.contact_bodies[k][0]
+            pushed = SimpleNamespace(residual=-rows)
+            impulse = batch.resultant(pushed, 0, step.bodies[first].u1)[:2]
+        found.append(_New(k, batch, push.sum(), rows, impulse, lost))
     return found
 
 

@@ -64,11 +64,15 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     held = {body: terms for body, terms in each if body is not batches.rigid}
     parts = [body.reactions(terms.residual, terms.u1) for body, terms in held.items()]
     forces = [part.force.sum(axis=0) for _, part, _ in contacts]
-    parts.append(np.reshape(forces, (len(contacts), 3)))
     moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
-    parts.append(np.reshape(moments, (len(contacts), 3)))
+    parts += (np.reshape(each, (len(contacts), 3)) for each in (forces, moments))
     both = zip(batches.join(problem.state.u), step.terms, strict=True)
     u = batches.split([u0 + problem.integrator.theta * terms.du for u0, terms in both])
+    for k, edges, part in problem.couplings.of_edges(step):
+        first = problem.system.contact_bodies[k][0]
+        force, moment, *_ = edges.resultant(part, 0, u[first])
+        parts[-2][k] += force
+        parts[-1][k] += moment
     coupled = {id(batch): part for batch, part in zip(problem.elements, step.parts, strict=True)}
     of_joints = _of_joints(problem, coupled, u)
     parts.append(of_joints.reshape(-1, 3))

@@ -1,8 +1,8 @@
 """Files of states, checkpoints and saved runs: HDF5, in numberings that do not depend on the ranks.
 
-Version 7, with h5py's names of types:
+Version 8, with h5py's names of types:
 
-- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (7) and
+- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (8) and
   `package` (the version that wrote it);
 - `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
   to the run, see `dolfinx_nts.run.checkpoint`;
@@ -11,6 +11,7 @@ Version 7, with h5py's names of types:
   fields of the run, of an equilibrium `rate` [m] and `force` [N], see `Equilibrium`;
 - `contacts/K/NAME`, of contact K, shape (slave nodes, ...): `number`, the input number of the node,
   ascending, and the fields of `ContactHistory`; further ones of the run;
+- `edges/K/NAME`, of the edges of contact K that press on each other: the fields of `EdgeHistory`;
 - `joints/K/number` and `joints/K/value`, of joint K of `System.joints` that remembers something,
   one row an element;
 - `balance/table`, shape (rows, numbers of a row): the columns of the balance table side by side;
@@ -42,7 +43,7 @@ import numpy as np
 
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.parallel import gather_on_root, gather_rows, raise_together
-from dolfinx_nts.state import ContactHistory, State
+from dolfinx_nts.state import ContactHistory, EdgeHistory, State
 from dolfinx_nts.system import System
 from dolfinx_nts.types import Array, FloatArray, IntArray, Rows
 
@@ -55,7 +56,7 @@ _OTHER = {
     CHECKPOINT: "it is no checkpoint; pass the path that Checkpoint had",
     SOLUTION: "it holds no saved run; pass the path that Solution.save had",
 }
-_VERSION = 7
+_VERSION = 8
 #: What stands between the HDF5 part and its checksum.
 _MARK = b"crc32"
 #: Options of bodies that are loads and supports.
@@ -217,13 +218,15 @@ class Numbering:
             for k, rows in enumerate(self.to_file(values) if values else []):
                 tables[f"bodies/{k}/{name}"] = rows
         tables |= {f"bodies/{k}/reference": rows for k, rows in enumerate(self.reference)}
-        for k, (pair, history) in enumerate(
-            zip(self.system.contacts, state.contacts, strict=True)
-        ):
+        for k, (pair, history) in enumerate(zip(self.system.contacts, state.contacts, strict=True)):
             numbers = pair.slave.original[pair.slave.share]
             more = {name: values[k] for name, values in nodal.items()}
             more |= {"number": numbers, **history._asdict()}
             tables |= self._rows(f"contacts/{k}", more)
+        for k, edges in enumerate(state.edges):
+            found = {name: gather_on_root(self.comm, v) for name, v in edges._asdict().items()}
+            order = np.lexsort(found["pair"].T[::-1]) if self.comm.rank == 0 else []
+            tables |= {f"edges/{k}/{name}": rows[order] for name, rows in found.items()}
         for k, joint in enumerate(self.system.joints):
             value = state.joints[k]
             raise_together(self.comm, _misfit(joint, value), TypeError)
@@ -254,7 +257,16 @@ class Numbering:
             self.from_file(tables, "a") if accelerations else (),
             contacts=tuple(itertools.starmap(ContactHistory, zip(*parts, strict=True))),
             joints=tuple(joints),
+            edges=tuple(self._edges(tables, k) for k in range(len(self.system.contacts))),
         )
+
+    def _edges(self, tables: Tables, k: int) -> EdgeHistory:
+        """What the edges of a contact remember that this rank computes. Collective."""
+        rows = self._share(tables, f"edges/{k}", EdgeHistory._fields)
+        if k not in self.system.edges or rows is None or not len(rows["pair"]):
+            return EdgeHistory.of_start()
+        mine = self.system.edges[k].mine[rows["pair"][:, 0]]
+        return EdgeHistory(**{name: values[mine] for name, values in rows.items()})
 
     def nodal(self, tables: Tables, name: str) -> list[Array]:
         """Return an array of each contact at this rank's slave nodes. Collective."""

@@ -334,7 +334,9 @@ class Stepper:
         """`look` at bodies inside each other."""
         if self._overlap is not None:
             state, forces = self.state, [c.force for c in self.state.contacts]
-            for found in self._overlap.look(state.u, state.time, forces=forces, last=last):
+            for found in self._overlap.look(
+                state.u, state.time, forces=forces, edges=state.edges, last=last
+            ):
                 self.solution.warn(
                     found.kind, state.time, found.depth, found.text, grave=found.grave,
                     about=found.about,

@@ -90,8 +90,7 @@ def state_after(problem: StepProblem, step: Evaluation, time: float) -> State:
         after = batches.split([a1 for _, a1 in ends if a1 is not None])
         for k in problem.awake:
             a[k] = after[k]
-    contacts, joints = problem.couplings.history(step)
-    return State(time, tuple(u), tuple(v), tuple(a), contacts, joints)
+    return State(time, tuple(u), tuple(v), tuple(a), *problem.couplings.history(step))
 
 
 def _moves(problem: StepProblem, *ends: Sequence[FloatArray]) -> FloatArray:

@@ -186,7 +186,7 @@ class StepSolver:
             if retry == 0:
                 self.problem.first_guess()
             else:
-                self.problem.couplings.contacts.forget_solution()
+                self.problem.couplings.forget_solution()
                 self.problem.guess(flight=False, forces=False)
             if unsolved:
                 # What failed to factorise once fails from then on.

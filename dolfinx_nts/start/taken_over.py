@@ -58,18 +58,20 @@ def state_from(
         old = other.bodies[index[body.name]]
         _check_start(body, old, now, time)
     found = system.initial_state()
-    contacts = list(found.contacts)
+    contacts, edges = list(found.contacts), list(found.edges)
     for k, pair in enumerate(system.contacts):
         for j, known in enumerate(other.contacts):
             if pair.is_like(known):
-                contacts[k] = state.contacts[j]
+                contacts[k], edges[k] = state.contacts[j], state.edges[j]
                 _check_jump(pair, known, state.time, time)
     joints = list(found.joints)
     for k, joint in enumerate(system.joints):
         for known, history in zip(other.joints, state.joints, strict=True):
             if is_like(joint, known):
                 joints[k] = history
-    start = replace(found, time=time, u=u, contacts=tuple(contacts), joints=tuple(joints))
+    start = replace(
+        found, time=time, u=u, contacts=tuple(contacts), joints=tuple(joints), edges=tuple(edges)
+    )
     if moving:
         v = tuple(state.v[index[b.name]].copy() for b in system.bodies)
         a = tuple(state.a[index[b.name]].copy() for b in system.bodies) if state.a else ()

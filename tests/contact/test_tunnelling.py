@@ -303,7 +303,8 @@ def test_cubes_off_centre_win_no_energy(integrator, accuracy, dt, n):
     rule = CONTACT_RULES[integrator]
     run = nts.simulate(system, rule, dt=dt, t_end=0.12, accuracy=accuracy)
     table, energy = run.balance, run.balance["energy"]
-    assert run.status == "completed" and table["active"].max() == n * n
+    # All nodes, and where the rims of the two cross.
+    assert run.status == "completed" and n * n <= table["active"].max() <= n * n + 2
     # Of the slaves at the rim some do lie behind the master's surface for a while.
     assert run.warnings["node beside a surface"].worst > 0.1
     assert np.diff(energy).max() <= 1e-3 * energy[0]

@@ -1,0 +1,361 @@
+"""Which facets the paths of a slave's nodes lead to in a step, and which they have passed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dolfinx_nts.contact import passages, search
+from dolfinx_nts.contact.convex_edges import ASIDE, OUTSIDE
+from dolfinx_nts.contact.pair import MARGIN, Candidates, Motion
+from dolfinx_nts.kernels import compiled, facets, nts_element
+from dolfinx_nts.parallel import anywhere, raise_together
+from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.validation import StepFailedError
+
+#: Patches of a smooth surface part by less than this part of the way beyond their borders.
+_APART = 0.1
+
+
+class SlavePaths:
+    """Where the nodes of a pair's slave go over its master.
+
+    Args:
+        pair: The `FacetPair`.
+    """
+
+    def __init__(self, pair: Any) -> None:
+        self._pair, self._slave, self._master = pair, pair.slave, pair.master
+        self._convex = pair.convex
+
+    def lead(
+        self,
+        found: Candidates,
+        slave: FloatArray,
+        master: FloatArray,
+        motion: Motion,
+    ) -> Candidates:
+        """Candidates with the facets that their paths lead to in place of the closest. Collective.
+
+        Args:
+            found: Candidates of the closest facets.
+            slave: Points of the slave at t_n [m].
+            master: Points of the master at t_n [m].
+            motion: Expected in the step.
+        """
+        x = slave[self._slave.share]
+        slave_path, master_path = self.gather(motion.paths)
+        found = self._round_edges(found, x, master, slave_path, master_path)
+        found = self._past_edges(found, x, master, slave_path, master_path, motion.reach)
+        change, facet = self._crossings(found, master, 0.5 * slave_path, 0.5 * master_path)
+        corners, node = master[self._master.facets], found.node[change]
+        if len(node):
+            start, _ = compiled.closest_point(x[node], corners[facet])
+            other, _ = self._pair.measure(x, master, node, facet, start, motion.reach)
+            found = _replace(found, other)
+        if self._pair.has_edges:
+            ways = slave_path, master_path
+            found = self._pair.rims.without_tilted(found, (slave, master), ways)
+        aimed = motion.aimed
+        if self._pair.is_long(motion.reach):
+            stops = self._pair.stops(np.arange(len(x)), master)
+            hit, _ = passages.first_hits(
+                x, slave_path, corners, master_path[self._master.facets], stops
+            )
+            aimed = np.where(hit >= 0, hit, aimed)
+        node = np.flatnonzero(aimed >= 0)
+        if len(node):
+            start, _ = compiled.closest_point(x[node], corners[aimed[node]])
+            other, _ = self._pair.measure(x, master, node, aimed[node], start, None)
+            found = _replace(found, other)
+        return found
+
+    def _round_edges(
+        self,
+        found: Candidates,
+        x: FloatArray,
+        master: FloatArray,
+        slave_path: FloatArray,
+        master_path: FloatArray,
+    ) -> Candidates:
+        """Candidates closest to an edge of two facets, with the one that they will be outside of.
+
+        Both facets of a convex edge are as near, but a node is outside the body where it is outside
+        one of them: the plane of the other one would hold what passes beside the body.
+
+        Args:
+            found: Candidates of the closest facets.
+            x: This rank's slaves at t_n [m], shape (share, 3).
+            master: Points of the master at t_n [m].
+            slave_path: Expected motion of these slaves in the step [m], shape (share, 3).
+            master_path: That of the points of the master [m].
+        """
+        nc = self._master.facets.shape[1]
+        excess = facets.edge_excess(found.xi, nc)
+        beyond = np.flatnonzero(excess.max(axis=1) > search.PREFERENCE)
+        if not beyond.size:
+            return found
+        near, excess, moved = found.select(beyond), excess[beyond], master + master_path
+        end = (x + slave_path)[near.node]
+        far, best = self._gap_at(near.facet, near.xi, end, moved), near.facet.copy()
+        for edge in range(nc):
+            other = self._convex.beside[near.facet, edge] // nc
+            some = np.flatnonzero((excess[:, edge] > search.PREFERENCE) & (other >= 0))
+            some = some[self._pair.facing.faces(near.node[some], other[some])]
+            if not some.size:
+                continue
+            start, _ = compiled.closest_point(end[some], moved[self._master.facets[other[some]]])
+            gap = self._gap_at(other[some], start, end[some], moved)
+            outer = gap > far[some] + search.PREFERENCE * near.length[some]
+            best[some[outer]], far[some[outer]] = other[some[outer]], gap[outer]
+        change = np.flatnonzero(best != near.facet)
+        if not change.size:
+            return found
+        return self._moved_to(found, near.node[change], best[change], x, master)
+
+    def _moved_to(
+        self,
+        found: Candidates,
+        node: IntArray,
+        facet: IntArray,
+        x: FloatArray,
+        master: FloatArray,
+    ) -> Candidates:
+        """Candidates with other facets for some nodes, shape (n,) each."""
+        start, _ = compiled.closest_point(x[node], master[self._master.facets[facet]])
+        other, _ = self._pair.measure(x, master, node, facet, start, None)
+        return _replace(found, other)
+
+    def _past_edges(
+        self,
+        found: Candidates,
+        x: FloatArray,
+        master: FloatArray,
+        slave_path: FloatArray,
+        master_path: FloatArray,
+        reach: float,
+    ) -> Candidates:
+        """Candidates that will cross a facet's plane beyond its edge, with the facet beyond that.
+
+        Arguments as of `_round_edges` and `Motion`.
+        """
+        # A facet is 2 xi wide, and less along its heights; most nodes come to no edge of theirs.
+        nc = self._master.facets.shape[1]
+        beyond = facets.edge_excess(found.xi, nc).max(axis=1, initial=-1.0)
+        near = self._convex.sharp[found.facet] & (beyond + 4.0 * reach / found.length > ASIDE)
+        if not near.any():
+            return found
+        some = found.select(near)
+        end, moved = (x + slave_path)[some.node], master + master_path
+        some = some.select(self._gap_at(some.facet, some.xi, end, moved) < 0.0)
+        if not some.node.size:
+            return found
+        node = some.node
+        facet = self._passed(x[node], slave_path[node], some.facet, master, master_path)
+        change = (facet >= 0) & self._pair.facing.faces(node, facet)
+        if not change.any():
+            return found
+        return self._moved_to(found, node[change], facet[change], x, master)
+
+    def _passed(
+        self,
+        x: FloatArray,
+        way: FloatArray,
+        facet: IntArray,
+        master: FloatArray,
+        master_path: FloatArray,
+    ) -> IntArray:
+        """Facets that nodes pass when they cross the planes of others, or -1, shape (n,).
+
+        The plane of a facet goes on beyond its edges, the body does not: what crosses it beyond a
+        sharp convex edge passes the facet on the other side of that edge.
+
+        Args:
+            x: Nodes at t_n [m], shape (n, 3).
+            way: Their motion [m], shape (n, 3).
+            facet: Facets, shape (n,).
+            master: Points of the master at t_n [m].
+            master_path: Their motion [m].
+        """
+        patch, control, xi, good = self._pair.projected(x, master, facet, np.zeros((len(x), 2)))
+        carried, gaps = self._master.control_points(master_path, patch), []
+        for place, points in ((x, control), (x + way, control + carried)):
+            xi, _ = compiled.project(place, points, xi)
+            foot, _, normal = facets.frame(points, xi)
+            gaps.append(np.einsum("ni,ni->n", normal, place - foot))
+        above, below = gaps
+        length = facets.size(master[self._master.facets[facet]])
+        sinks = np.flatnonzero(good & (below < -OUTSIDE * length) & (below < above))
+        part = np.clip(above[sinks] / (above - below)[sinks], 0.0, 1.0)
+        at, found = x[sinks] + part[:, None] * way[sinks], np.full(len(x), -1)
+        found[sinks] = self._convex.across(at, facet[sinks], master, master_path, part)
+        return found
+
+    def _gap_at(
+        self, facet: IntArray, xi: FloatArray, points: FloatArray, master: FloatArray
+    ) -> FloatArray:
+        """Distance of points (n, 3) from their facets' tangent planes at `xi` (n, 2) [m], (n,)."""
+        foot, _, normal = facets.frame(master[self._master.facets[facet]], xi)
+        gap: FloatArray = np.einsum("ni,ni->n", normal, points - foot)
+        return gap
+
+    def _crossings(
+        self, c: Candidates, master: FloatArray, slave_motion: FloatArray, master_motion: FloatArray
+    ) -> tuple[IntArray, IntArray]:
+        """Candidates that slide over an edge before the middle of the step, and their next facet.
+
+        A facet that holds the longer part of the path makes g_0 as often positive as negative, so
+        that what changes of facet cost and bring cancels in the long run.
+        """
+        nc = self._master.facets.shape[1]
+        pair = self._master.control_points(master, c.patch)
+        shape, _, _ = facets.shape(c.xi, pair.shape[1])
+        _, tangents, _ = facets.frame(pair, c.xi)
+        motion = slave_motion[c.node]
+        carried = self._master.control_points(master_motion, c.patch)
+        motion = motion - np.einsum("ni,nij->nj", shape, carried)
+        metric = np.einsum("naj,nbj->nab", tangents, tangents)
+        along = np.einsum("naj,nj->na", tangents, motion)
+        slide = nts_element.solve(metric, along[:, :, None])[:, :, 0]
+        before, after = (facets.edge_excess(xi, nc) for xi in (c.xi, c.xi + slide))
+        edge = after.argmax(axis=1)
+        pairs = np.arange(len(edge))
+        joined = self._convex.joined[c.facet, edge]
+        # On an edge rounding must not decide: a node that stays at its facet there is within it.
+        within = before.max(axis=1) <= search.PREFERENCE
+        over = within & (after[pairs, edge] > search.PREFERENCE)
+        change = np.flatnonzero(over & (joined >= 0))
+        return change, joined[change] // nc
+
+    def missed(
+        self,
+        positions: Sequence[FloatArray],
+        motions: Sequence[FloatArray],
+        reach: float,
+        held: IntArray,
+        aimed: IntArray,
+    ) -> IntArray | None:
+        """What `ContactPair.missed` returns. Collective."""
+        comm = self._slave.body.comm
+        by_edges = np.flatnonzero((held >= 0) & self._convex.sharp[held])
+        let_go = np.flatnonzero((held < 0) & (aimed >= 0) & self._convex.sharp[aimed])
+        aside = self._convex.sharp.any() and anywhere(comm, bool(by_edges.size or let_go.size))
+        if not (aside or self._pair.is_long(reach)):
+            return None
+        x, paths = positions[0][self._slave.share], self.gather(motions)
+        if aside:
+            self._refuse_cut_corners(x, positions[1], *paths, let_go)
+        hit = np.full(len(held), -1)
+        if self._pair.is_long(reach):
+            hit = self.came_through(x, positions[1], *paths, held)
+        if by_edges.size:
+            beyond = self._held_beyond(x + paths[0], positions[1], paths[1], held, by_edges)
+            hit[by_edges] = np.where(beyond >= 0, beyond, hit[by_edges])
+        return hit
+
+    def _held_beyond(
+        self,
+        end: FloatArray,
+        master: FloatArray,
+        master_path: FloatArray,
+        held: IntArray,
+        some: IntArray,
+    ) -> IntArray:
+        """Facet across the edge that some slaves are held beyond at the end, or -1, shape (n,).
+
+        Args:
+            end: This rank's slaves there [m], shape (share, 3).
+            master: Points of the master at t_n [m].
+            master_path: Their motion [m].
+            held: Facets that hold the slaves, shape (share,).
+            some: Numbers of slaves, shape (n,).
+        """
+        moved, found, start = master + master_path, np.full(len(some), -1), np.zeros((len(some), 2))
+        _, _, xi, converged = self._pair.projected(end[some], moved, held[some], start)
+        excess = facets.edge_excess(xi, self._master.facets.shape[1]).max(axis=1)
+        out = np.flatnonzero(converged & (excess > ASIDE))
+        node, whole = some[out], np.ones(len(out))
+        other = self._convex.across(end[node], held[node], master, master_path, whole)
+        found[out] = np.where(self._pair.facing.faces(node, other), other, -1)
+        return found
+
+    def strayed(
+        self, positions: Sequence[FloatArray], found: Candidates, due: FloatArray
+    ) -> float:
+        """As of `ContactPair`, over edges of curved surfaces."""
+        x, master = positions[0][self._slave.share][found.node], positions[1]
+        _, _, xi, converged = self._pair.projected(x, master, found.facet, found.xi)
+        excess = facets.edge_excess(xi, self._master.facets.shape[1])
+        joined = self._convex.joined[found.facet, excess.argmax(axis=1)]
+        out = np.flatnonzero(converged & (excess.max(axis=1) > ASIDE) & (joined >= 0))
+        if self._master.weights is not None:
+            return float((_APART * excess[out].max(axis=1)).max(initial=0.0))
+        other, corners = joined[out] // excess.shape[1], master[self._master.facets]
+        foot, _ = compiled.closest_point(x[out], corners[other])
+        off = self._gap_at(other, foot, x[out], master) - due[out]
+        return float((np.abs(off) / facets.size(corners[other])).max(initial=0.0))
+
+    def _refuse_cut_corners(
+        self,
+        x: FloatArray,
+        master: FloatArray,
+        slave_path: FloatArray,
+        master_path: FloatArray,
+        some: IntArray,
+    ) -> None:
+        """Raise where slaves that are let go cut a corner of the master. Collective.
+
+        Arguments as of `_round_edges`, of the solved step, and numbers of these slaves.
+        """
+        cut = self._convex.cut_corners(
+            x[some], slave_path[some], master, master_path, self._pair.stops(some, master)
+        )
+        node = self._slave.original[self._slave.share[some[cut]]]
+        text = None
+        if node.size:
+            text = (
+                f"contact {self._pair.name!r}: node {node[0]} hits {self._pair.master_name!r} and "
+                "slides over its edge within the step; use a smaller dt"
+            )
+        comm = self._slave.body.comm
+        raise_together(comm, text, lambda told: StepFailedError(told, advises=True))
+
+    def came_through(
+        self,
+        x: FloatArray,
+        master: FloatArray,
+        slave_path: FloatArray,
+        master_path: FloatArray,
+        held: IntArray,
+    ) -> IntArray:
+        """`missed` of nodes that have passed a facet, with arguments as of `_round_edges`."""
+        at = self._master.facets
+        stops = self._pair.stops(np.arange(len(x)), master)
+        hit, _ = passages.first_hits(x, slave_path, master[at], master_path[at], stops)
+        node = np.flatnonzero((hit >= 0) & (hit != held))
+        end, moved = (x + slave_path)[node], master + master_path
+        start = np.zeros((len(node), 2))
+        _, control, xi, converged = self._pair.projected(end, moved, hit[node], start)
+        foot, _, normal = facets.frame(control, xi)
+        length = facets.size(moved[at[hit[node]]])
+        depth = (np.einsum("ni,ni->n", normal, foot - end) + self._pair.offset[node]) / length
+        # A node that is held at another facet may end a little behind this one.
+        deep = depth > np.where(held[node] >= 0, MARGIN, OUTSIDE)
+        hit[np.setdiff1d(np.arange(len(hit)), node[deep | ~converged])] = -1
+        return hit
+
+    def gather(self, paths: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Displacements of this rank's slaves and of all points of the master [m]. Collective."""
+        slave = self._slave.gather(paths[0])[self._slave.share]
+        return slave, self._master.gather(paths[1])
+
+
+def _replace(found: Candidates, other: Candidates) -> Candidates:
+    """Candidates with the others in place of those of the same nodes, in the order of the nodes."""
+    stay = ~np.isin(found.node, other.node)
+    order = np.argsort(np.concatenate([found.node[stay], other.node]))
+    return Candidates(
+        *(np.concatenate([a[stay], b])[order] for a, b in zip(found, other, strict=True))
+    )
