@@ -35,6 +35,10 @@ from dolfinx_nts.state import State
 from dolfinx_nts.system import System
 from dolfinx_nts.types import BoolArray, FloatArray
 
+#: Share of the stiffness around them that matrices of a load step lend to directors, which may be
+#: free to spin, as those of a string between hinges: rounding alone would say how far.
+_SPIN = 1e-11
+
 
 class StepProblem:
     """Equations of one step of a system; `begin` fixes the step.
@@ -361,8 +365,12 @@ class StepProblem:
     def body_tangent(self, j: int, u1: FloatArray) -> PETSc.Mat:
         """PETSc matrix of a batch at a displacement, without contact: its bodies in the step."""
         a = self._tangent_of_batch(j, u1)
-        if self.lent:
-            _add_to_diagonal(a, self.lent * self.stabilization.stiffness(self.batches.bodies[j]))
+        body = self.batches.bodies[j]
+        spins = not (self.integrator.inertia or body.rigid or body.places.all())
+        if self.lent or spins:
+            share = np.where(np.repeat(body.places, 3), 0.0, _SPIN if spins else 0.0)
+            share = np.maximum(self.lent, share)
+            _add_to_diagonal(a, share * self.stabilization.stiffness(body))
         return self.laid.part(j, a)
 
     def _tangent_of_batch(self, j: int, u1: FloatArray) -> PETSc.Mat:
