@@ -10,12 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dolfinx_nts.contact.contact_law import ContactLaw, Contribution, Together
-from dolfinx_nts.contact.contact_measure import Attachment, Batch, ContactMeasure, Slip
+from dolfinx_nts.contact.contact_measure import Attachment, Batch, ContactMeasure, Slip, fixed_of
 from dolfinx_nts.contact.pair import Candidates, ContactPair
-from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.interaction.combination import Combination, of_multipliers
 from dolfinx_nts.interaction.constraint_elements import SHIFT
-from dolfinx_nts.interaction.elements import Step, over
+from dolfinx_nts.interaction.elements import over
 from dolfinx_nts.kernels import compiled_law, nts_element
 from dolfinx_nts.kernels.vectors import resultant
 from dolfinx_nts.parallel import gather_rows
@@ -105,7 +104,7 @@ class ContactElements(Batch):
     @property
     def immovable(self) -> BoolArray:
         """Whether all coordinates of the pairs' masters are prescribed, shape (n,)."""
-        return _fixed(self.attachment)[:, self._own :].all(axis=(1, 2))
+        return fixed_of(self.attachment)[:, self._own :].all(axis=(1, 2))
 
     @property
     def sag(self) -> FloatArray | float:
@@ -187,7 +186,7 @@ class ContactElements(Batch):
     @cached_property
     def _held(self) -> BoolArray:
         """Which slaves move as prescribed, shape (n,)."""
-        return _fixed(self.attachment)[:, : self._own].all(axis=(1, 2))
+        return fixed_of(self.attachment)[:, : self._own].all(axis=(1, 2))
 
     def multipliers(self, normal: FloatArray, tangential: FloatArray) -> FloatArray:
         """Multipliers of given contact forces on the slaves [N], shape (n, constraints).
@@ -413,50 +412,3 @@ class ContactElements(Batch):
                 remedy = "infinite friction may let it neither stick nor leave: try friction=1e4"
             text += f": it flips between {states} and {UNSETTLED}{remedy}"
         return float(weight[i]), text
-
-
-def _fixed(attachment: Attachment) -> BoolArray:
-    """Which coordinates of the surfaces' points are prescribed, shape (n, sum of p, 3)."""
-    both = zip(attachment.surfaces, attachment.numbers, strict=True)
-    return np.concatenate([surface.fixed[number] for surface, number in both], axis=1)
-
-
-def _moves(attachment: Attachment, foot: FloatArray) -> FloatArray:
-    """Weights of the surfaces' points in the motion of slaves against their feet, (n, sum of p)."""
-    weights = np.concatenate([np.ones((len(foot), 1)), -foot], axis=1)
-    if attachment.shares is None:
-        return weights
-    return np.einsum("nk,nkp->np", weights, attachment.shares)
-
-
-def elements_of(
-    pair: Any, found: Candidates, attachment: Attachment, measure: ContactMeasure, step: Step
-) -> ContactElements:
-    """Elements of a pair's candidates in a step, by its law. Collective."""
-    moves = _moves(attachment, measure.foot)
-    fixed = _fixed(attachment)
-    scales = [step.scale(surface, pair.bodies) for surface in attachment.surfaces]
-    scale = np.concatenate(
-        [s[number] for s, number in zip(scales, attachment.numbers, strict=True)], axis=1
-    )
-    own = attachment.numbers[0].shape[1]
-    eases = moves**2 / scale
-    ease = (eases * ~fixed.all(axis=2))[:, own:].sum(axis=1)
-    scale = 1.0 / eases[:, :own].sum(axis=1)
-    prescribed = None
-    if pair.friction:
-        square = moves**2
-        free = np.einsum("np,npi->ni", square, ~fixed) / square.sum(axis=1)[:, None]
-        prescribed = PrescribedSlip(
-            start=measure.start, foot=measure.foot, normal=measure.normal,
-            tangents=measure.tangents, free=free,
-        )  # fmt: skip
-    law = ContactLaw(
-        friction=pair.friction, yields=pair.yields, redundant=pair.redundant,
-        row=3 * measure.start.shape[1] + measure.num_augmented,
-        num_normal=measure.num_normal, scale=scale, yielding=scale / (1.0 + scale * ease),
-        size=measure.length, prescribed=prescribed,
-    )  # fmt: skip
-    return ContactElements(
-        pair=pair, candidates=found, attachment=attachment, measure=measure, law=law
-    )

@@ -151,3 +151,9 @@ class Attachment(Protocol):
 
     def select(self, chosen: BoolArray) -> Self:
         """That of some elements, see `Batch`."""
+
+
+def fixed_of(attachment: Attachment) -> BoolArray:
+    """Which coordinates of the surfaces' points are prescribed, shape (n, sum of p, 3)."""
+    both = zip(attachment.surfaces, attachment.numbers, strict=True)
+    return np.concatenate([surface.fixed[number] for surface, number in both], axis=1)

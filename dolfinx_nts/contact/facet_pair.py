@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.contact import passages, search
-from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
+from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.convex_edges import OUTSIDE, ConvexEdges, middles
 from dolfinx_nts.contact.edges import Edges, sharp_edges
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.facing import Facing
+from dolfinx_nts.contact.making import elements_of
 from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.pair import (
     MARGIN,

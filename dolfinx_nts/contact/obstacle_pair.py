@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dolfinx_nts.contact.contact_elements import ContactElements, elements_of
+from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.contact.making import elements_of
 from dolfinx_nts.contact.node_attachment import NodeAttachment
 from dolfinx_nts.contact.obstacle_gap import ObstacleGap
 from dolfinx_nts.contact.obstacles import Obstacle

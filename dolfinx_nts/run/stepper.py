@@ -440,11 +440,7 @@ class Stepper:
         return self.state.contacts[k].force if mean is None else mean
 
     def jumps_at_start(self, dt: float) -> str:
-        """What a failure may come of that `jumps` tells, in the first steps. Collective.
-
-        Args:
-            dt: First step [s].
-        """
+        """What a failure in the first steps, of dt [s], may come of, see `jumps`. Collective."""
         late = self.state.time > self.solution.rows[0]["time"] + _FIRST * dt
         return "" if late or self._start is not None else jumps(self.system.bodies)
 
