@@ -218,8 +218,12 @@ class FacetPair(ContactPair, master=Surface):
         if again.size:
             admits = search.Admits(lambda point, facet: facing.faces(again[point], facet))
             other = search.closest_facets(x[again], corners, reach=reach, admits=admits)
+            # Over an edge of the one that is near, not through the body.
+            at = self.master.facets
+            one, two = at[found.facet[again]], at[other.facet]
+            meet = (other.facet >= 0) & (one[:, :, None] == two[:, None]).any(axis=(1, 2))
             for values, better in zip(found, other, strict=True):
-                values[again] = better
+                values[again[meet]] = better[meet]
         return found
 
     def _told(self, hidden: Candidates, current: IntArray) -> Candidates:

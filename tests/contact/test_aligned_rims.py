@@ -5,6 +5,7 @@ from mpi4py import MPI
 import gmsh
 import numpy as np
 import pytest
+from dolfinx.mesh import CellType
 from scenes import box, everywhere
 
 import dolfinx_nts as nts
@@ -83,3 +84,19 @@ def test_a_bottom_that_is_declared_alone_does_not_pass_through_a_wall():
     nts.simulate(system, nts.EnergyMomentum(), dt=2e-3, t_end=0.5, accuracy="balanced")
     # It is at the wall after 0.4 s.
     assert nts.motion_of(cube).velocity[0] < 0.0
+
+
+@pytest.mark.parametrize("cell", [CellType.hexahedron, CellType.tetrahedron])
+def test_a_brick_on_a_plate_that_is_thinner(cell):
+    """Its top faces the plate's bottom, but that is not beyond an edge of what is near."""
+    fixed = nts.RigidBody(
+        box((-1, -1, -0.2), (1, 1, 0), (1, 1, 1), cell), density=1e3, motion=(0, 0, 0), name="plate"
+    )
+    brick = nts.RigidBody(
+        box((-0.5, -0.25, 0), (0.5, 0.25, 0.3), (4, 2, 1), cell), density=1e3, name="brick"
+    )
+    pair = nts.ContactPair(brick.surface(everywhere), fixed.surface(everywhere))
+    system = nts.System([brick, fixed], contacts=[pair], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.02)
+    assert run.status == "completed"
+    assert np.abs(nts.motion_of(brick).velocity).max() < 1e-9

@@ -88,7 +88,7 @@ def slide(
     pair = nts.ContactPair(PointSurface(mass, start), master)
     pair.slave.fixed[:, :2] = True
     if variant == "start":
-        pair._crossings = lambda *_: (np.empty(0, dtype=int), np.empty(0, dtype=int))
+        pair.slave_paths._crossings = lambda *_: (np.empty(0, dtype=int), np.empty(0, dtype=int))
     system = nts.System([mass, body], contacts=[pair], gravity=(0, 0, -WEIGHT))
     # The weight is large: what 1e-13 leaves of it, times the way, is 1e-11 of the energy.
     newton = nts.Newton(rtol=1e-14)

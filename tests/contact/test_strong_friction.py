@@ -263,6 +263,6 @@ def test_one_large_element_presses_a_plate_of_400_facets(integrator, friction):
     run = nts.simulate(system, integrator, dt=1e-3, t_end=0.02, accuracy="balanced")
     assert run.status.startswith("completed") and run.retries == 0
     assert set(run.warnings) == {"contact inside a rim"}  # 0.4 m of plate under 1 m of cube
-    assert run.balance["active"].max() == 1
+    assert run.balance["active"].max() == 3
     closed = PROMISED["balanced"] if integrator.closes_ledger else 1e-5
     assert ledger_or_word(run, closed) < closed
