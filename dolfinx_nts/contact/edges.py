@@ -22,14 +22,14 @@ SHARES = np.array(
 )
 #: Edges with a smaller sine between them are parallel. Ends of edges are their nodes', as far as
 #: this in convective coordinates. Cosine by which the way between edges may leave the cones of
-#: normals that they belong to. An edge is level with a facet up to this cosine; then so much of it
-#: belongs to a node over the facet, which lies on it up to this part of the edges' lengths. Nodes
-#: beyond the facet's rim are not the facet's up to the steeper cosine.
+#: normals that they belong to, as where faces bow. An edge is level with a facet up to this cosine;
+#: then so much of it belongs to a node over the facet, which lies on it up to this part of the
+#: edges' lengths. Nodes beyond the facet's rim are not the facet's up to the steeper cosine.
 LEVEL = 0.1
 #: Two edges that meet with a smaller cosine are one line.
 _STRAIGHT = -0.95
 _LIMITS = library.EdgeLimits(
-    parallel=0.05, end=1e-6, outside=1e-3, level=LEVEL, steep=0.6, by_node=0.05, flat=1e-5
+    parallel=0.05, end=1e-6, outside=5e-2, level=LEVEL, steep=0.6, by_node=0.05, flat=1e-5
 )
 
 

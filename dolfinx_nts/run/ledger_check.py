@@ -169,8 +169,8 @@ class LedgerCheck:
         if gain > _GAIN * energy + self._rounding:
             where = balance.expelled(problem, step)
             text = (
-                f"nodes that start behind their facets bring an energy of {gain:.3g} to "
-                f"{before['energy']:.3g}, most {where}; after changes of facet {remedy}"
+                f"nodes that start behind their facets bring an energy of {gain:.3g} into "
+                f"a scene of {before['energy']:.3g}, most {where}; after changes of facet {remedy}"
             )
         elif gain > 0.0 and total > _GAIN * self._largest + self._rounding:
             gain, text = total, (

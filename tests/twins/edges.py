@@ -4,7 +4,7 @@ import numpy as np
 
 
 def closest(
-    edges, x, pairs, parallel=0.05, end=1e-6, outside=1e-3, level=0.1, steep=0.6, flat=1e-5,
+    edges, x, pairs, parallel=0.05, end=1e-6, outside=5e-2, level=0.1, steep=0.6, flat=1e-5,
     by_node=0.05,
 ):  # fmt: skip
     """Gap, whether they meet, whether a_1 and a_2 change places, nodes."""
