@@ -915,7 +915,11 @@ def test_the_linear_solver_is_the_one_that_took_over(mpi_tmp_path):
     again, system = Presets(), corner()
     found = go(system, output=[again], start=nts.restart(previous(path), system))
     assert again.names == presets.names[18:]
-    assert_same(whole, found)
+    if COMM.size == 1:
+        assert_same(whole, found)
+    # On ranks MUMPS rounds anew, and Newton's method ends anywhere within its tolerance, each step.
+    steps = len(whole.balance["time"])
+    assert distance(whole, found) < steps * nts.Newton().rtol
 
 
 @pytest.mark.mpi
