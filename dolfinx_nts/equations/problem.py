@@ -87,6 +87,7 @@ class StepProblem:
         self._shared = SharedWeight(system.comm, system.contacts)
         self.unknowns: Unknowns | None = None
         self.version, self.dives, self.lent = 0, False, 0.0
+        self._spins = [not integrator.inertia and _may_spin(b) for b in self.batches.bodies]
         self._again: Evaluation | None = None
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
         self.supports = Supports(system, integrator)
@@ -365,8 +366,7 @@ class StepProblem:
     def body_tangent(self, j: int, u1: FloatArray) -> PETSc.Mat:
         """PETSc matrix of a batch at a displacement, without contact: its bodies in the step."""
         a = self._tangent_of_batch(j, u1)
-        body = self.batches.bodies[j]
-        spins = not (self.integrator.inertia or body.rigid or body.places.all())
+        body, spins = self.batches.bodies[j], self._spins[j]
         if self.lent or spins:
             share = np.where(np.repeat(body.places, 3), 0.0, _SPIN if spins else 0.0)
             share = np.maximum(self.lent, share)
@@ -419,6 +419,16 @@ class StepProblem:
         if self.unknowns is not None:
             self.unknowns.destroy()
         self.unknowns, self._numbers = None, None
+
+
+def _may_spin(body: Body) -> bool:
+    """Whether none of a body's directors is prescribed. Collective."""
+    if body.rigid:
+        return False
+    directors = ~np.repeat(body.places, 3)
+    local = np.array([directors.any(), directors[body.fixed].any()], dtype=float)
+    some, clamped = global_max(body.comm, local)
+    return bool(some and not clamped)
 
 
 def _add_to_diagonal(a: Any, values: FloatArray) -> None:
