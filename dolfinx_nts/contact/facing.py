@@ -51,10 +51,8 @@ class _Around:
             np.repeat(np.arange(len(at)), at.shape[1]),
             np.repeat(len(at) + np.arange(len(self._facet)), 2),
         ])  # fmt: skip
-        order = np.argsort(self.points, kind="stable")
-        points = self.points[order]
-        self.of, self.first = self.rows[order], np.searchsorted(points, slave.share)
-        number = np.searchsorted(points, slave.share, side="right") - self.first
+        order, self.first, number = at_points(self.points, slave.share)
+        self.of = self.rows[order]
         self.count = np.where(np.isin(slave.share, ends[~known]), 0, number)
 
     def _axes(self, x: FloatArray) -> FloatArray:
@@ -169,6 +167,19 @@ def _beyond(slave: Surface, ends: IntArray) -> FloatArray:
         if tuple(sorted(at[facet].tolist())) not in slave.facet_points:
             found[rows[int(number[side])]] = normal[facet]
     return found
+
+
+def at_points(
+    points: IntArray, share: IntArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Order that brings equal points (n,) together, and where those of each of `share` are then.
+
+    Returns:
+        The order, shape (n,), the first of each of `share` in it, and their number.
+    """
+    order = np.argsort(points, kind="stable")
+    first = np.searchsorted(points[order], share)
+    return order, first, np.searchsorted(points[order], share, side="right") - first
 
 
 def opposite(one: FloatArray, two: FloatArray) -> BoolArray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from dolfinx_nts.contact import search
 from dolfinx_nts.contact.edges import Edges
+from dolfinx_nts.contact.facing import at_points
 from dolfinx_nts.contact.pair import Candidates
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels import compiled, facets, library
@@ -85,8 +86,5 @@ class Rims:
 def facets_around(surface: Surface) -> tuple[IntArray, IntArray, IntArray]:
     """Facets of this rank's slaves in a row, where those of each begin, and how many they are."""
     at = surface.facets
-    order = np.argsort(at.ravel(), kind="stable")
-    points = at.ravel()[order]
-    first = np.searchsorted(points, surface.share)
-    last = np.searchsorted(points, surface.share, side="right")
-    return order // at.shape[1], first, last - first
+    order, first, count = at_points(at.ravel(), surface.share)
+    return order // at.shape[1], first, count

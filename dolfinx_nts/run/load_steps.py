@@ -164,7 +164,9 @@ class LoadStepper(Stepper):
         missing, size = abs(row["ledger_residual"]), self._largest
         loads = sum(float(np.abs(t.external).sum()) for t in step.bodies)
         pressed = float(np.abs(forces_now[resultants.CONTACT_FORCES]).sum())
-        pressed += self.system.comm.allreduce(loads) + self._rounded_force(step)
+        pressed += self.system.comm.allreduce(loads)
+        if not missing <= _OPEN * size:
+            pressed += self._rounded_force(step)
         rounding = _ROUNDING * self.problem.rounded_length * pressed
         if not missing <= _OPEN * size + rounding:
             text = (
@@ -357,12 +359,13 @@ class LoadStepper(Stepper):
                     allowed = next(strays, np.inf)
                     if problem.couplings.contacts.strayed(step) <= allowed:
                         return step, state, iterations, relaxed
-                    # On the facets that its nodes have come to, the rest is another one.
-                    search, last = True, np.inf
-                    continue
                 terms = balance.step_terms(problem, step)
                 for name in relaxed.of_joints:
                     relaxed.lost[name] += terms[name]
+                if left <= 1.0:
+                    # On the facets that its nodes have come to, the rest is another one.
+                    search, last = True, np.inf
+                    continue
                 moved = float(problem.lengths.motion_of(step).max()) / size
                 share = problem.stabilization.share
                 if left < _RELIEVED * last:
