@@ -288,6 +288,8 @@ def function_space(
 ) -> fem.FunctionSpace:
     """Space of the family ("Lagrange" or "DG") of scalars, 3-vectors or 3 x 3 tensors."""
     if OLD:
+        if family == "DG" and cell_name(msh) == "hexahedron":
+            family = "DQ"
         with _told_compiler("an element"):
             if not shape:
                 return fem.FunctionSpace(msh, (family, degree))

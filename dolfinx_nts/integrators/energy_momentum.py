@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import ufl
@@ -56,11 +57,10 @@ class EnergyMomentum(MiddleOfStep):
 
     def piola(self, energy: StrainEnergy, h0: Expr, h1: Expr) -> Expr:
         """First Piola-Kirchhoff stress P = F_m S(E_0, E_1) in UFL [Pa] of F = 1 + H."""
-        e0, e1 = green_strain(h0), green_strain(h1)
-        if self.stress == "gonzalez":
-            stress = gonzalez_stress(energy, e0, e1)
-        else:
-            stress = mean_value_stress(energy, e0, e1, self.quadrature_points)
+        rule = gonzalez_stress
+        if self.stress == "mean-value":
+            rule = partial(mean_value_stress, points=self.quadrature_points)
+        stress = energy.between(green_strain(h0), green_strain(h1), rule)
         return (ufl.Identity(3) + 0.5 * (h0 + h1)) * stress
 
     def virtual_work(self, potential: Potential, u0: Expr, u1: Expr, w: Expr) -> Form:

@@ -63,7 +63,15 @@ class Path(NamedTuple):
     difference: Expr
 
 
-class OfC:
+class Plain:
+    """An energy whose stress at a point depends on the strain there alone."""
+
+    def between(self, e0: Expr, e1: Expr, discrete: DiscreteStress) -> Expr:
+        """Discrete derivative of the energy between two strains by a rule (UFL)."""
+        return discrete(self, e0, e1)
+
+
+class OfC(Plain):
     """W(C) at C = 1 + 2 E.
 
     Args:
@@ -98,7 +106,7 @@ class OfC:
         return Path(power, middle, self._function(c1) - self._function(c0))
 
 
-class OfInvariants:
+class OfInvariants(Plain):
     """W of an `Isotropic` material."""
 
     def __init__(self, material: Isotropic) -> None:
@@ -159,3 +167,5 @@ def _polynomial(coefficients: Sequence[Any], x: float) -> Expr:
 
 
 StrainEnergy = OfC | OfInvariants
+#: A rule's discrete derivative of an energy between two strains.
+DiscreteStress = Callable[[Any, Expr, Expr], Expr]

@@ -15,11 +15,13 @@ from dolfinx.mesh import Mesh
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
+from dolfinx_nts.bodies.solid.cell_means import CellMeans
 from dolfinx_nts.bodies.solid.materials import misfit, with_constants
 from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
+from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, Settings, Values
@@ -28,6 +30,7 @@ from dolfinx_nts.validation import (
     items,
     known_options,
     require_name,
+    require_one_of,
     vector_in_time,
 )
 
@@ -68,6 +71,9 @@ class Continuum(UflBody):
         allow_inversion: Accept steps that turn a cell inside out, det F <= 0 at a corner or
             quadrature point, with a warning in the Solution; else such a step is cut, and the
             run stops where that does not help. W(C) cannot see it.
+        volume: "projected": W takes the change of volume of each cell in the mean, so that cells do
+            not lock where the material hardly changes its volume (nu near 0.5), and bend more
+            easily; for hexahedra of degree 1. "full": W at each point, as it is.
 
     Attributes:
         u: Displacement [m], dolfinx Function of the last accepted state.
@@ -101,6 +107,7 @@ class Continuum(UflBody):
         quadrature_degree: int | None = None,
         extra_form: ExtraForm | None = None,
         allow_inversion: bool = False,
+        volume: str = "full",
     ) -> None:
         if not callable(material):
             raise TypeError(
@@ -115,6 +122,12 @@ class Continuum(UflBody):
         require_name("name", name)
         traction = items("traction", traction, lambda t: isinstance(t, Traction), "Traction")
         check_mesh(mesh, name)
+        require_one_of("volume", volume, ("full", "projected"))
+        if volume == "projected" and (degree != 1 or compat.cell_name(mesh) != "hexahedron"):
+            raise ValueError(
+                f"volume={volume!r} of {name!r}: is for hexahedra of degree 1, not for "
+                f"{compat.cell_name(mesh)}s of degree {degree}; use volume='full'"
+            )
         quadrature_degree = quadrature_degree or 2 * degree
         super().__init__(
             compat.vector_space(mesh, degree), degree, name, extra_form, quadrature_degree,
@@ -132,8 +145,11 @@ class Continuum(UflBody):
         self._stand(bcs, velocity, displacement)
         self._rho = self._density(density)
         self.law = strain_energy(with_constants(material, self.mesh))
-        load = self._load_in_ufl()
-        (self._load_form,) = self._set_forms(self._energy() * self._dx, load)
+        self._volume = volume
+        self._check_energy()
+        law, means = self.energy()
+        energy, load = law(green_strain(ufl.grad(self.u))), self._load_in_ufl()
+        (self._load_form,) = self._set_forms(energy * self._dx, load, means=means)
         self._assembled_loads = np.zeros(3 * len(self._loads))
         self._seen_at_rest = False
         self.stressed = None
@@ -171,9 +187,17 @@ class Continuum(UflBody):
             load += ufl.inner(value, w) * self._ds(k)
         return load
 
-    def _energy(self) -> Any:
-        """W of the displacement in UFL; what is wrong with it raises on every rank."""
-        problem, cause, energy = None, None, None
+    def energy(self) -> tuple[Any, CellMeans | None]:
+        """W as a function of Green's strain in UFL that forces are made of, and means it makes."""
+        if self._volume == "full":
+            return self.law, None
+        means = CellMeans(self.space, self._dx)
+        shear = means.mean(shear_modulus(self.law), given=True)
+        return ProjectedVolume(self.law, shear, means.mean), means
+
+    def _check_energy(self) -> None:
+        """Raise on every rank if something is wrong with W."""
+        problem, cause = None, None
         try:
             with compat.without_floats():
                 energy = ufl.as_ufl(self.law(green_strain(ufl.grad(self.u))))
@@ -187,7 +211,6 @@ class Continuum(UflBody):
                 problem = misfit([energy], self.mesh.ufl_domain())
         text = f"material={self.material!r} of {self.name!r}: W(C) {problem}"
         raise_together(self.comm, text if problem else None, TypeError, cause)
-        return energy
 
     def _mass_form(self, v: Any, w: Any) -> Any:
         """Mass in UFL."""
@@ -202,8 +225,8 @@ class Continuum(UflBody):
 
     def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
         """Virtual work of the rule's stress in UFL."""
-        h0, h1 = ufl.grad(u0), ufl.grad(u1)
-        return ufl.inner(rule.piola(self.law, h0, h1), ufl.grad(w)) * self._dx
+        (law, means), h0, h1 = self.energy(), ufl.grad(u0), ufl.grad(u1)
+        return ufl.inner(rule.piola(law, h0, h1), ufl.grad(w)) * self._dx, means
 
     # ---- as of Body
     @property

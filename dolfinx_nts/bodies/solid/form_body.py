@@ -210,9 +210,9 @@ class FormBody(UflBody):
             form = self._given_mass(v, w)
         return self._integrated(form, self._of_mass)
 
-    def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
+    def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> tuple[Any, None]:
         """Virtual work of the potential by the rule in UFL."""
-        return rule.virtual_work(self._potential, u0, u1, w)
+        return rule.virtual_work(self._potential, u0, u1, w), None
 
 
 def _check_callables(energy: Any, strain: Any, mass: Any) -> None:

@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
+from dolfinx_nts.bodies.solid.cell_means import CellMeans
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.integrators import Integrator
@@ -77,7 +78,7 @@ class StepForms:
     Args:
         space: Function space of the displacements.
         virtual_work: The internal virtual work in UFL by an integrator, between two displacements:
-            (rule, u0, u1, w) -> form.
+            (rule, u0, u1, w) -> form, and the means that it holds, or None.
         mass: Kinetic energy's second derivative in UFL, (v, w) -> form.
         extra: As `extra_form` of `Continuum`.
         check_alive: Raises an error once the body was destroyed.
@@ -86,14 +87,14 @@ class StepForms:
     def __init__(
         self,
         space: fem.FunctionSpace,
-        virtual_work: Callable[[Integrator, Any, Any, Any], Any],
+        virtual_work: Callable[[Integrator, Any, Any, Any], tuple[Any, CellMeans | None]],
         mass: MassForm,
         extra: ExtraForm | None,
         check_alive: Callable[[], None],
     ) -> None:
         self._check_alive = check_alive
         self._space, self._virtual_work, self._mass, self._extra = space, virtual_work, mass, extra
-        self._forms: dict[Integrator, tuple[Any, Any, Any]] = {}
+        self._forms: dict[Integrator, tuple[Any, Any, Any, CellMeans | None]] = {}
         self._u0, self._u1, self._drift = (fem.Function(space) for _ in range(3))
         # What multiplies mass and stiffness: in one Constant, as UFL sorts several by their counts
         # as text, and a form would be compiled again where 9 and 10 meet.
@@ -111,10 +112,12 @@ class StepForms:
 
     def begin(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n."""
-        self._work, self._tangent, self._extra_work = self._compiled(rule)
+        self._work, self._tangent, self._extra_work, self._means = self._compiled(rule)
         if self._matrix is None:
             self._matrix = petsc_compat.create_matrix(self._tangent)
         fill(self._u0, moment.u0)
+        if self._means is not None:
+            self._means.evaluate()
         if self._extra is not None:
             self._rate.value, self._time.value = moment.rate, moment.time
             if moment.drift is not None:
@@ -122,7 +125,7 @@ class StepForms:
 
     def internal(self, u1: FloatArray) -> FloatArray:
         """Internal forces of the step [N]."""
-        fill(self._u1, u1)
+        self._move_to(u1)
         return self.assemble(self._work)
 
     def extra(self, u1: FloatArray) -> FloatArray | float:
@@ -144,21 +147,31 @@ class StepForms:
             masks: Of prescribed coordinates, whose rows and columns are left out.
             diagonal: What stands on the diagonal there.
         """
-        fill(self._u1, u1)
+        self._move_to(u1)
         self._factors.value = mass, stiffness
         petsc_compat.assemble_matrix(self._matrix, self._tangent, masks, diagonal)
+        if self._means is not None:
+            self._means.add_to(self._matrix, stiffness, masks)
         return self._matrix
+
+    def _move_to(self, u1: FloatArray) -> None:
+        """Set the displacement at t_{n+1}, and the means there."""
+        fill(self._u1, u1)
+        if self._means is not None:
+            self._means.evaluate(everything=False)
 
     def forces(self, rule: Integrator, u0: FloatArray, u1: FloatArray) -> FloatArray:
         """Internal forces by a rule between two displacements [N]; set the state anew after it."""
-        work = self._compiled(rule)[0]
+        work, *_, means = self._compiled(rule)
         fill(self._u0, u0)
         fill(self._u1, u1)
+        if means is not None:
+            means.evaluate()
         return self.assemble(work)
 
     def stiffness_at_rest(self) -> FloatArray:
         """Diagonal of the tangent in equilibrium, without deformation [N/m]."""
-        tangent = self._compiled(EQUILIBRIUM)[1]
+        _, tangent, _, means = self._compiled(EQUILIBRIUM)
         kept, rate = [f.x.array.copy() for f in (self._u0, self._u1)], self._rate.value.copy()
         for u in (self._u0, self._u1):
             u.x.array[:] = 0.0
@@ -166,6 +179,9 @@ class StepForms:
         # The matrix of the step may be kept from an earlier one.
         matrix = petsc_compat.create_matrix(tangent)
         petsc_compat.assemble_matrix(matrix, tangent, (), 0.0)
+        if means is not None:
+            means.evaluate()
+            means.add_to(matrix, 1.0, ())
         diagonal = matrix.getDiagonal()
         found: FloatArray = diagonal.array_r.copy()
         for petsc_object in (diagonal, matrix):
@@ -201,12 +217,12 @@ class StepForms:
             if a is not None:
                 a.destroy()
 
-    def _compiled(self, rule: Integrator) -> tuple[Any, Any, Any]:
-        """Internal virtual work, tangent and extra virtual work by a rule."""
+    def _compiled(self, rule: Integrator) -> tuple[Any, Any, Any, CellMeans | None]:
+        """Internal virtual work, tangent, extra virtual work and means in cells by a rule."""
         if rule not in self._forms:
             du, w = ufl.TrialFunction(self._space), ufl.TestFunction(self._space)
-            virtual = work = self._virtual_work(rule, self._u0, self._u1, w)
-            extra = None
+            work, means = self._virtual_work(rule, self._u0, self._u1, w)
+            virtual, extra = work, None
             if self._extra is not None:
                 moved = self._u1 - self._u0
                 place, velocity = self._u0 + rule.theta * moved, self._rate * moved
@@ -219,7 +235,11 @@ class StepForms:
             if rule.inertia:
                 tangent += self._factors[0] * self._mass(du, w)
             forms = compile_forms([work, tangent] + ([] if extra is None else [extra]))
-            self._forms[rule] = forms[0], forms[1], forms[2] if extra is not None else None
+            if means is not None:
+                means.compile(self._u1)
+                means.compile_derivatives(self._u1, work, w)
+            of_extra = None if extra is None else forms[2]
+            self._forms[rule] = forms[0], forms[1], of_extra, means
         return self._forms[rule]
 
 

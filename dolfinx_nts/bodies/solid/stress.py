@@ -63,8 +63,12 @@ def _cauchy(body: Any) -> Any:
         name = getattr(body, "name", body)
         raise TypeError(f"body={name!r}: has no material W(C), so no stress; pass a Continuum")
     h = ufl.grad(body.u)
-    f = ufl.Identity(3) + h
-    return f * body.law.stress(green_strain(h)) * f.T / ufl.det(f)
+    law, means = body.energy()
+    f, stress = ufl.Identity(3) + h, law.stress(green_strain(h))
+    if means is not None:
+        means.compile(body.u)
+        means.evaluate()
+    return f * stress * f.T / ufl.det(f)
 
 
 def _cell_means(body: Any, value: Any, name: str) -> Any:

@@ -19,6 +19,7 @@ from dolfinx_nts.bodies.conditions import Dirichlet, Supports
 from dolfinx_nts.bodies.mesh_body import MeshBody
 from dolfinx_nts.bodies.meshes.mesh_check import pieces_of, places_of
 from dolfinx_nts.bodies.nodal_values import motion_on, nodal_values
+from dolfinx_nts.bodies.solid.cell_means import CellMeans
 from dolfinx_nts.bodies.solid.inversion import Determinants
 from dolfinx_nts.bodies.solid.mass import MassMatrix, waves
 from dolfinx_nts.bodies.solid.materials import misfit
@@ -99,8 +100,10 @@ class UflBody(MeshBody):
         if self._given_density is not None:
             require_positive_parameter("density", self._given_density, "kg/m^d")
 
-    def _virtual_work(self, rule: Integrator, u0: Any, u1: Any, w: Any) -> Any:
-        """Internal virtual work between two displacements by a rule, in UFL."""
+    def _virtual_work(
+        self, rule: Integrator, u0: Any, u1: Any, w: Any
+    ) -> tuple[Any, CellMeans | None]:
+        """Internal virtual work between two displacements by a rule in UFL, and means in it."""
         raise NotImplementedError
 
     @cached_property
@@ -190,12 +193,24 @@ class UflBody(MeshBody):
         """Values of an argument at all nodes of this rank, shape (coordinates,)."""
         return nodal_values(self.space, name, self.name, given, unit).ravel()
 
-    def _set_forms(self, energy: Any, *loads: Any) -> list[Any]:
-        """Compile mass and energy in UFL and any loads, which are returned."""
+    def _set_forms(
+        self, energy: Any, *loads: Any, means: CellMeans | None = None
+    ) -> list[Any]:
+        """Compile mass and energy in UFL and any loads, which are returned.
+
+        Args:
+            energy: Of `self.u`.
+            loads: Linear forms.
+            means: Means in cells that the energy holds.
+        """
         v, w = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
-        mass = self._mass_form(v, w)
+        mass, own = self._mass_form(v, w), [self.u]
+        if means is not None:
+            own += means.functions
+            means.compile(self.u)
+        self._means = means
         of_energy, of_mass = (
-            in_expressions((part.integrand() for part in form.integrals()), [self.u])
+            in_expressions((part.integrand() for part in form.integrals()), own)
             for form in (energy, mass)
         )
         self._parameters = [*of_energy, *of_mass]
@@ -280,6 +295,8 @@ class UflBody(MeshBody):
         """Strain energy on this rank [J]."""
         kept = self.u.x.array.copy()
         fill(self.u, u)
+        if self._means is not None:
+            self._means.evaluate()
         value = self._energy_form.value()
         self.u.x.array[:] = kept
         return value
