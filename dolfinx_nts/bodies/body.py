@@ -270,6 +270,23 @@ class Body:
         """Values of the material that a caller may change during a run, shape (n,)."""
         return np.empty(0)
 
+    def stress_jumps(self) -> FloatArray | None:
+        """Squares of what the stress jumps between cells, and of the stress, see `StressJumps`.
+
+        None: it is no solid of cells. Collective.
+        """
+        return None
+
+    @property
+    def remedy_of_locking(self) -> str:
+        """What to do where its cells are too stiff."""
+        return "use a finer mesh"
+
+    @property
+    def is_thin(self) -> bool:
+        """Whether it has one cell of degree 1 over its thickness. Collective."""
+        return False
+
     def take_parameters(self) -> None:
         """Take over changed `parameters` where not all that is made of them is asked for anew.
 

@@ -39,7 +39,6 @@ INLINE Real choose(Mask yes, Real a, Real b) { return (Real)((yes & (Mask)a) | (
     }
 
 LANEWISE(sqrt)
-LANEWISE(exp)
 LANEWISE(sin)
 LANEWISE(cos)
 LANEWISE(tan)
@@ -87,6 +86,26 @@ INLINE Real each_log(Real x)
                    - ((half - (s * (half + (even + odd)) + k * 1.90821492927058770002e-10)) - f);
     const Real outside = choose(x < 0.0, EACH(NAN), choose(x == 0.0, EACH(-INFINITY), x)); /* inf and NaN stay */
     return choose((x > 0.0) & (x < INFINITY), y, outside);
+}
+
+/* The exponential as in FDLIBM (Sun Microsystems 2004), whose error is below one unit in the last place:
+   x = k ln 2 + r, exp(r) = 1 + r + r c / (2 - c) with c = r - r^2 P(r^2); 2^k in two parts, as small numbers need. */
+INLINE Real each_exp(Real x)
+{
+    const Real near = choose(x > 720.0, EACH(720.0), choose(x < -750.0, EACH(-750.0), x)); /* NaN stays */
+    const Real shift = EACH(0x1.8p52); /* what is added to it is rounded to a whole number */
+    const Real whole = (near * 1.44269504088896338700e+00 + shift) - shift;
+    const Mask k = __builtin_convertvector(choose(whole == whole, whole, ZERO), Mask);
+    const Real high = near - whole * 6.93147180369123816490e-01, low = whole * 1.90821492927058770002e-10;
+    const Real r = high - low, t = r * r;
+    const Real even = t * (1.66666666666666019037e-01
+                           + t * (-2.77777777770155933842e-03
+                                  + t * (6.61375632143793436117e-05
+                                         + t * (-1.65339022054652515390e-06 + t * 4.13813679705723846039e-08))));
+    const Real c = r - even;
+    const Real y = 1.0 - ((low - r * c / (2.0 - c)) - high);
+    const Mask half = k >> 1;
+    return y * (Real)((half + 1023) << 52) * (Real)((k - half + 1023) << 52);
 }
 
 INLINE Real power_of_whole(Real x, int n)

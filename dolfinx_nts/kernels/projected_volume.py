@@ -8,7 +8,7 @@ from typing import NamedTuple
 import ufl
 from ufl.core.expr import Expr
 
-from dolfinx_nts.kernels.precise import cofactor, expm1, invariants, log1p
+from dolfinx_nts.kernels.precise import cofactor, invariants, log1p
 from dolfinx_nts.kernels.strain_energy import DiscreteStress, StrainEnergy
 
 #: Increments below this part are for the series of the logarithm.
@@ -33,6 +33,8 @@ class _Volume(NamedTuple):
         mean: theta - 1, the cell's mean of J - 1.
         log: ln J.
         log_mean: ln theta.
+        root: J^(1/3).
+        mean_root: theta^(1/3).
         strain: Green's strain of C (theta/J)^(2/3), whose determinant is theta^2.
     """
 
@@ -41,6 +43,8 @@ class _Volume(NamedTuple):
     mean: Expr
     log: Expr
     log_mean: Expr
+    root: Expr
+    mean_root: Expr
     strain: Expr
 
     @property
@@ -75,6 +79,10 @@ class ProjectedVolume:
         """Derivative by E, symmetric: the second Piola-Kirchhoff stress [Pa]."""
         return self.between(e, e, lambda law, a, _: law.stress(a))
 
+    def at_point(self, e: Expr) -> Expr:
+        """Stress of the law at the strain with the cell's volume [Pa], without the pressure."""
+        return self._law.stress(self._volume(e).strain)
+
     def between(self, e0: Expr, e1: Expr, discrete: DiscreteStress) -> Expr:
         """Discrete derivative of the energy of a cell between two strains [Pa] (theory 19.2).
 
@@ -84,25 +92,22 @@ class ProjectedVolume:
             discrete: The rule's discrete derivative of the law.
         """
         same = e0 is e1
-        start, end = self._volume(e0), self._volume(e1)
-        if same:
-            end = start
+        start = self._volume(e0)
+        end = start if same else self._volume(e1)
         stress = discrete(self._law, start.strain, end.strain)
         c = ufl.Identity(3) + e0 + e1
         along = 0.5 * ufl.inner(stress, c)
         misfit = self._shear / 3 * (start.misfit + end.misfit)
-        j0, j1 = (ufl.exp(at.log / 3) for at in (start, end))  # cube roots
-        c0, c1 = (ufl.exp(at.log_mean / 3) for at in (start, end))
+        j0, j1, c0, c1 = start.root, end.root, start.mean_root, end.mean_root
         of_mean = (c0 + c1) / (c0**2 + c0 * c1 + c1**2)
         of_point = (j0 + j1) / (j0**2 * j1**2 * (j0**2 + j0 * j1 + j1**2))
         push = along * 0.5 * (1 / j0**2 + 1 / j1**2) * of_mean
-        push -= misfit * _of_log(start.mean, end.mean)
-        pull = misfit * _of_log(start.change, end.change)
+        push -= misfit * _of_log(start.mean, end.mean, start.log_mean, end.log_mean)
+        pull = misfit * _of_log(start.change, end.change, start.log, end.log)
         pull -= along * 0.5 * (c0**2 + c1**2) * of_point
         middle = start.cofactor if same else cofactor(c)
         whole = (start.cofactor + 4 * middle + end.cofactor) / 6
         volume = whole / (2 + start.change + end.change)
-        # Half of either end's (theta/J)^(2/3).
         factors = 0.5 * ((c0 / j0) ** 2 + (c1 / j1) ** 2)
         return factors * stress + 2 * (self._mean(push) + pull) * volume
 
@@ -112,15 +117,21 @@ class ProjectedVolume:
         change = grown / (1 + ufl.sqrt(1 + grown))
         mean, log = self._mean(change), 0.5 * log1p(grown)
         log_mean = log1p(mean)
-        one_less = expm1(2 / 3 * (log_mean - log))
-        strain = e + one_less * (e + 0.5 * ufl.Identity(3))
-        return _Volume(cofactor(ufl.Identity(3) + 2 * e), change, mean, log, log_mean, strain)
+        root, mean_root = ufl.exp(log / 3), ufl.exp(log_mean / 3)
+        # Differences from 1, of which the roots have lost digits.
+        less, mean_less = (
+            x / (r**2 + r + 1) for x, r in ((change, root), (mean, mean_root))
+        )
+        grows = (mean_less - less) * (mean_root + root) / root**2  # (theta/J)^(2/3) - 1
+        strain = e + grows * (e + 0.5 * ufl.Identity(3))
+        of_c = cofactor(ufl.Identity(3) + 2 * e)
+        return _Volume(of_c, change, mean, log, log_mean, root, mean_root, strain)
 
 
-def _of_log(a: Expr, b: Expr) -> Expr:
-    """Difference of ln(1 + b) and ln(1 + a) over b - a, which may be zero."""
+def _of_log(a: Expr, b: Expr, log_a: Expr, log_b: Expr) -> Expr:
+    """Difference of ln(1 + b) and ln(1 + a), which are known, over b - a, which may be zero."""
     y = (b - a) / (1 + a)
     series = 1 - y * (1 / 2 - y * (1 / 3 - y * (1 / 4 - y * (1 / 5 - y / 6))))
     # The addend is far below any increment that counts; it keeps 0/0 away at rest.
-    quotient = log1p(y) / (y + 1e-200)
-    return ufl.conditional(ufl.lt(abs(y), _SMALL), series, quotient) / (1 + a)
+    quotient = (log_b - log_a) / (b - a + 1e-200)
+    return ufl.conditional(ufl.lt(abs(y), _SMALL), series / (1 + a), quotient)

@@ -70,6 +70,14 @@ class Plain:
         """Discrete derivative of the energy between two strains by a rule (UFL)."""
         return discrete(self, e0, e1)
 
+    def at_point(self, e: Expr) -> Expr:
+        """Stress, which is that of the law at each point [Pa]."""
+        return self.stress(e)
+
+    def stress(self, e: Expr) -> Expr:
+        """dW/dE, symmetric: the second Piola-Kirchhoff stress [Pa]."""
+        raise NotImplementedError
+
 
 class OfC(Plain):
     """W(C) at C = 1 + 2 E.

@@ -19,6 +19,7 @@ from dolfinx_nts.petsc_compat import close_at_exit
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme, same_run
 from dolfinx_nts.run.balance_table import Ledger
 from dolfinx_nts.run.ledger_check import LedgerCheck
+from dolfinx_nts.run.locking_watch import LockingWatch
 from dolfinx_nts.run.material_watch import MaterialWatch
 from dolfinx_nts.run.run_file import Saved
 from dolfinx_nts.run.solution import Restart, Solution
@@ -127,7 +128,7 @@ class Stepper:
         self._project_start = project_start
         self._before_step = before_step
         self.newton = newton or Newton()
-        self._materials = MaterialWatch(system)
+        self._materials, self._locking = MaterialWatch(system), LockingWatch(system)
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
             system, integrator, rtol=self.newton.rtol, condense=self.newton.condense, sleep=sleep
@@ -329,6 +330,9 @@ class Stepper:
         """
         tell_stressed(self.solution, self.state.time)
         self._look_inside(last)
+        self._locking.look(last=last)
+        if last:
+            self._locking.tell(self.solution, self.state.time)
 
     def _look_inside(self, last: bool) -> None:
         """`look` at bodies inside each other."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 from ufl.algorithms.analysis import extract_coefficients
 from ufl.core.expr import Expr
@@ -18,6 +19,41 @@ from dolfinx_nts.forms import CellForm, compile_forms
 from dolfinx_nts.types import FloatArray
 
 
+class _Mean(NamedTuple):
+    """A Function of degree 0 and what it is the mean of.
+
+    Attributes:
+        function: The Function.
+        expression: In UFL.
+        taken: Its parameters, if it holds nothing else.
+    """
+
+    function: fem.Function
+    expression: Expr
+    taken: Taken | None
+
+
+class _OfCells:
+    """Entries of linear forms in each of this rank's cells.
+
+    Args:
+        space: Of their test function, whose cells share no entries.
+    """
+
+    def __init__(self, space: fem.FunctionSpace) -> None:
+        topology = space.mesh.topology
+        self.cells, block = topology.index_map(topology.dim).size_local, space.dofmap.bs
+        dofs = compat.cell_dofs(space)[: self.cells]
+        self._entries = (block * dofs[:, :, None] + np.arange(block)).reshape(self.cells, -1)
+        self._size = space.dofmap.index_map.size_local * space.dofmap.index_map_bs
+
+    def __call__(self, form: CellForm) -> FloatArray:
+        """Entries of a form, shape (cells, entries)."""
+        values = np.zeros(self._size)
+        form.add(values)
+        return values[self._entries]
+
+
 class CellMeans:
     """Functions of degree 0 that are the cells' means of expressions with the displacement.
 
@@ -25,21 +61,33 @@ class CellMeans:
     through them stays within the cells, so that matrices keep their entries.
 
     Args:
-        space: Function space of the displacements.
-        dx: Measure of the mesh.
+        mesh: DOLFINx mesh.
+        dx: Measure of it.
 
     Attributes:
-        functions: The means.
+        dx: The measure.
+        space: Function space of the means.
+        sums: Entries of forms on it.
+        volume: Of this rank's cells [m^3], shape (cells,), once compiled.
+        moving: Numbers of the means that the unknown displacement changes, once compiled.
     """
 
-    def __init__(self, space: fem.FunctionSpace, dx: Any) -> None:
-        self._space, self._dx = space, dx
-        self._constant = compat.function_space(space.mesh, "DG", 0)
-        self._expressions: list[Expr] = []
-        self.functions: list[fem.Function] = []
-        self._taken: list[Taken | None] = []
-        self._compiled: list[Any] = []
-        self._moving: list[int] = []
+    def __init__(self, mesh: Mesh, dx: Any) -> None:
+        self.dx, self.space = dx, compat.function_space(mesh, "DG", 0)
+        self.sums = _OfCells(self.space)
+        self.moving: list[int] = []
+        self._means: list[_Mean] = []
+        self._forms: list[CellForm] = []
+
+    @property
+    def functions(self) -> list[fem.Function]:
+        """The means."""
+        return [mean.function for mean in self._means]
+
+    @property
+    def expressions(self) -> list[Expr]:
+        """What they are the means of."""
+        return [mean.expression for mean in self._means]
 
     def mean(self, expression: Expr, *, given: bool = False) -> Expr:
         """A Function that is the mean of an expression once `evaluate` was called.
@@ -48,12 +96,11 @@ class CellMeans:
             expression: In UFL.
             given: Whether it holds parameters alone.
         """
-        self._expressions.append(expression)
-        self.functions.append(fem.Function(self._constant))
-        self._taken.append(Taken(in_expressions([expression])) if given else None)
-        return self.functions[-1]
+        function = fem.Function(self.space)
+        taken = Taken(in_expressions([expression])) if given else None
+        self._means.append(_Mean(function, expression, taken))
+        return function
 
-    # ---- values
     def compile(self, unknown: Any) -> None:
         """Compile the means.
 
@@ -61,17 +108,18 @@ class CellMeans:
             unknown: Displacement [m] that changes; what does not depend on it is evaluated by
                 `evaluate(everything=True)` alone.
         """
-        q, moving = ufl.TestFunction(self._constant), {unknown}
-        for k, expression in enumerate(self._expressions):
-            if moving & set(extract_coefficients(expression)):
-                moving.add(self.functions[k])
-                self._moving.append(k)
-        own = [ufl.inner(expression, q) * self._dx for expression in self._expressions]
-        volume, *self._compiled = compile_forms([ufl.as_ufl(1.0) * q * self._dx, *own])
-        self._volume = self._of_cells(volume)
-        for k, taken in enumerate(self._taken):
-            if taken is not None:
-                self._take(k)
+        moving = {unknown}
+        for k, mean in enumerate(self._means):
+            if moving & set(extract_coefficients(mean.expression)):
+                moving.add(mean.function)
+                self.moving.append(k)
+        q = ufl.TestFunction(self.space)
+        own = [ufl.inner(mean.expression, q) * self.dx for mean in self._means]
+        volume, *self._forms = compile_forms([ufl.as_ufl(1.0) * q * self.dx, *own])
+        self.volume = self.sums(volume)[:, 0]
+        for k, mean in enumerate(self._means):
+            if mean.taken is not None:
+                self.set(k, self.sums(self._forms[k])[:, 0])
 
     def evaluate(self, *, everything: bool = True) -> None:
         """Give the means their values at the displacements of now.
@@ -79,105 +127,103 @@ class CellMeans:
         Args:
             everything: Also what does not depend on the unknown displacement.
         """
-        each = zip(self.functions, self._compiled, self._taken, strict=True)
-        for k, (function, form, taken) in enumerate(each):
-            if taken is None and (everything or k in self._moving):
-                function.x.array[: len(self._volume)] = self._of_cells(form) / self._volume
-            elif taken is not None and everything and taken.changed:
-                self._take(k)
+        for k, form in enumerate(self._forms):
+            taken, due = self._means[k].taken, k in self.moving
+            if everything and not due:
+                due = taken is None or taken.changed
+            if due:
+                self.set(k, self.sums(form)[:, 0])
+            if due and taken is not None:
+                taken.take()
 
-    def _take(self, k: int) -> None:
-        """Evaluate a mean of parameters."""
-        taken = self._taken[k]
-        assert taken is not None
-        taken.take()
-        values = self.functions[k].x.array
-        values[: len(self._volume)] = self._of_cells(self._compiled[k]) / self._volume
+    def set(self, k: int, sums: FloatArray) -> None:
+        """Give a mean its values, from integrals over this rank's cells, shape (cells,)."""
+        self._means[k].function.x.array[: self.sums.cells] = sums / self.volume
 
-    def _of_cells(self, form: CellForm) -> FloatArray:
-        """A linear form of degree 0 in this rank's cells, in their order, shape (cells,)."""
-        values = np.zeros(self._constant.dofmap.index_map.size_local)
-        form.add(values)
-        return values
-
-    # ---- derivatives
-    def compile_derivatives(self, unknown: Any, work: Any, w: Any) -> None:
-        """Compile the derivatives through the means of a linear form.
+    def derivatives(self, k: int, unknown: Any, apart: Any, one: Any) -> dict[int, CellForm]:
+        """Derivatives of a mean times the cells' volumes.
 
         Args:
-            unknown: Displacement that changes.
-            work: The form.
-            w: Its test function.
+            k: Its number.
+            unknown: The displacement.
+            apart: Test function of displacements in each cell.
+            one: Function of degree 0 that is 1.
+
+        Returns:
+            By the displacement (-1), and by the means before it (their numbers) that it holds.
         """
-        mesh, count = self._space.mesh, mesh_cells(self._space.mesh)
-        degree = compat.lagrange_degree(self._space)
+        expression, q = self._means[k].expression, ufl.TestFunction(self.space)
+        held = set(extract_coefficients(expression))
+        forms = {-1: ufl.derivative(expression * self.dx, unknown, apart)}
+        for j in self.moving[: self.moving.index(k)]:
+            function = self._means[j].function
+            if function in held:
+                forms[j] = ufl.derivative(expression * q * self.dx, function, one)
+        return dict(zip(forms, compile_forms(list(forms.values())), strict=True))
+
+
+class FormWithMeans:
+    """A linear form that holds means in cells, and its derivative by the displacement.
+
+    Args:
+        form: In UFL.
+        w: Its test function, on the space of the displacements.
+        unknown: The displacement.
+        means: What the form holds, none of them compiled.
+    """
+
+    def __init__(self, form: Any, w: Any, unknown: Any, means: CellMeans) -> None:
+        self._means, space = means, w.ufl_function_space()
+        means.compile(unknown)
+        degree = compat.lagrange_degree(space)
         assert degree is not None
         # Entries of a linear form with such a test function are those of each cell alone.
-        broken = compat.function_space(mesh, "DG", degree, (3,))
-        apart, q = ufl.TestFunction(broken), ufl.TestFunction(self._constant)
-        self._dofs = compat.cell_dofs(broken)[:count]
-        self._nodes = compat.cell_dofs(self._space)[:count].astype(PETSc.IntType)
-        one = fem.Function(self._constant)
+        broken = compat.function_space(space.mesh, "DG", degree, (3,))
+        apart, one = ufl.TestFunction(broken), fem.Function(means.space)
         one.x.array[:] = 1.0
-        work, forms, self._chain = ufl.replace(work, {w: apart}), [], []
-        for k in self._moving:
-            expression, function = self._expressions[k], self.functions[k]
-            forms.append(ufl.derivative(expression * self._dx, unknown, apart))
-            forms.append(ufl.derivative(work, function, one))
-            earlier = [j for j in self._moving if j < k]
-            held = set(extract_coefficients(expression))
-            links = [j for j in earlier if self.functions[j] in held]
-            self._chain.append(links)
-            for j in links:
-                forms.append(ufl.derivative(expression * q * self._dx, self.functions[j], one))
-        self._derivatives = compile_forms(forms)
-        self._broken_size = 3 * broken.dofmap.index_map.size_local
+        self._apart = _OfCells(broken)
+        nodes = compat.cell_dofs(space)[: self._apart.cells].astype(PETSc.IntType)
+        coordinates = 3 * nodes[:, :, None] + np.arange(3, dtype=PETSc.IntType)
+        self._dofs = coordinates.reshape(self._apart.cells, -1)
+        index_map = space.dofmap.index_map
+        self._size = 3 * (index_map.size_local + index_map.num_ghosts)
+        work = ufl.replace(form, {w: apart})
+        pushes = [ufl.derivative(work, means.functions[k], one) for k in means.moving]
+        self._form, *self._pushes = compile_forms([form, *pushes])
+        self._derivatives = [means.derivatives(k, unknown, apart, one) for k in means.moving]
+
+    def evaluate(self, *, everything: bool = True) -> None:
+        """Evaluate the means; arguments as of `CellMeans`."""
+        self._means.evaluate(everything=everything)
+
+    def add(self, values: FloatArray) -> None:
+        """Add the form to this rank's values, ghosts included."""
+        self._form.add(values)
 
     def add_to(self, matrix: PETSc.Mat, factor: float, masks: Sequence[Any]) -> None:
-        """Add to a matrix what the displacement does through the means. Collective.
+        """Add what the displacement does through the means, as evaluated last. Collective.
 
         Args:
             matrix: Derivative of the form with the means as they are.
             factor: Of what is added.
             masks: DOLFINx conditions whose rows and columns are left out.
         """
-        free, forms = np.ones(3 * self._space_nodes()), iter(self._derivatives)
+        means, free = self._means, np.ones(self._size)
         for mask in masks:
             free[mask.dof_indices()[0]] = 0.0
-        free = free.reshape(-1, 3)[self._nodes].reshape(len(self._nodes), -1)
+        free = free[self._dofs]
         rows: dict[int, FloatArray] = {}
-        width = free.shape[1]
-        added = np.zeros((len(free), width, width))
-        for k, links in zip(self._moving, self._chain, strict=True):
-            row, push = self._apart(next(forms)), self._apart(next(forms))
-            for j in links:
-                row += self._of_cells(next(forms))[:, None] * rows[j]
-            rows[k] = row
-            row /= self._volume[:, None]
-            added += push[:, :, None] * row[:, None, :]
-        added *= factor * free[:, :, None] * free[:, None, :]
-        nodes = self._nodes
-        # One row of blocks for each node of each cell.
-        blocks = added.reshape(-1, nodes.shape[1], 3, nodes.shape[1], 3).swapaxes(2, 3)
-        start = np.arange(nodes.size + 1, dtype=PETSc.IntType) * nodes.shape[1]
-        cols = np.repeat(nodes, nodes.shape[1], axis=0)
-        matrix.setValuesBlockedLocalIJV(
-            start, cols.ravel(), blocks.ravel(), addv=PETSc.InsertMode.ADD_VALUES,
-            rowmap=nodes.ravel(),
+        added = np.zeros((*free.shape, free.shape[1]))
+        for k, of, forms in zip(means.moving, self._pushes, self._derivatives, strict=True):
+            push, row = self._apart(of), self._apart(forms[-1])
+            for j in forms.keys() - {-1}:
+                row += means.sums(forms[j]) * rows[j]
+            rows[k] = row / means.volume[:, None]
+            added += (push * free)[:, :, None] * (factor * rows[k] * free)[:, None, :]
+        dofs, width = self._dofs, self._dofs.shape[1]
+        start = np.arange(dofs.size + 1, dtype=PETSc.IntType) * width
+        matrix.setValuesLocalIJV(
+            start, np.repeat(dofs, width, axis=0).ravel(), added.ravel(),
+            addv=PETSc.InsertMode.ADD_VALUES, rowmap=dofs.ravel(),
         )  # fmt: skip
         matrix.assemble()
-
-    def _space_nodes(self) -> int:
-        index_map = self._space.dofmap.index_map
-        return int(index_map.size_local + index_map.num_ghosts)
-
-    def _apart(self, form: CellForm) -> FloatArray:
-        """A linear form's entries of each cell, shape (cells, coordinates of a cell)."""
-        values = np.zeros(self._broken_size)
-        form.add(values)
-        return values.reshape(-1, 3)[self._dofs].reshape(len(self._dofs), -1)
-
-
-def mesh_cells(mesh: Any) -> int:
-    """Number of this rank's own cells."""
-    return int(mesh.topology.index_map(mesh.topology.dim).size_local)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,13 @@ from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
 from dolfinx_nts.bodies.solid.cell_means import CellMeans
 from dolfinx_nts.bodies.solid.materials import misfit, with_constants
 from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
+from dolfinx_nts.bodies.solid.stress_jumps import StressJumps
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
-from dolfinx_nts.parallel import raise_together
+from dolfinx_nts.parallel import anywhere, raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
@@ -152,6 +154,7 @@ class Continuum(UflBody):
         (self._load_form,) = self._set_forms(energy * self._dx, load, means=means)
         self._assembled_loads = np.zeros(3 * len(self._loads))
         self._seen_at_rest = False
+        self._jumps: tuple[StressJumps, CellMeans | None] | None = None
         self.stressed = None
 
     # ---- set-up
@@ -191,7 +194,7 @@ class Continuum(UflBody):
         """W as a function of Green's strain in UFL that forces are made of, and means it makes."""
         if self._volume == "full":
             return self.law, None
-        means = CellMeans(self.space, self._dx)
+        means = CellMeans(self.mesh, self._dx)
         shear = means.mean(shear_modulus(self.law), given=True)
         return ProjectedVolume(self.law, shear, means.mean), means
 
@@ -235,6 +238,49 @@ class Continuum(UflBody):
         loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
         own = {"material": self.material, "density": self.density, "degree": self.degree}
         return own | loads | super().settings
+
+    def stress_jumps(self) -> FloatArray:
+        """As of `Body`."""
+        if self._jumps is None:
+            law, means = self.energy()
+            stress = law.at_point(green_strain(ufl.grad(self.u)))
+            if means is not None:
+                means.compile(self.u)
+            self._jumps = StressJumps(stress, self.mesh, self._dx), means
+        jumps, means = self._jumps
+        if means is not None:
+            means.evaluate()
+        return jumps.sums()
+
+    @property
+    def remedy_of_locking(self) -> str:
+        """As of `Body`."""
+        if self._linear and compat.cell_name(self.mesh) == "tetrahedron":
+            return "use a finer mesh, hexahedra, or degree=2 if it touches nothing"
+        if self._linear and self._volume == "full":
+            return "use volume='projected', or a finer mesh"
+        return "use a finer mesh"
+
+    @property
+    def _linear(self) -> bool:
+        return self.degree == 1
+
+    @cached_property
+    def is_thin(self) -> bool:  # type: ignore[override]
+        """As of `Body`."""
+        if not self._linear:
+            return False
+        outside = compat.exterior_facets(self.mesh)
+        on_boundary = fem.locate_dofs_topological(self.space, 2, outside)
+        count = self.space.dofmap.index_map.size_local
+        inside = count - np.count_nonzero(np.unique(on_boundary) < count)
+        return not anywhere(self.comm, bool(inside))
+
+    def destroy(self) -> None:
+        """As of `Body`."""
+        super().destroy()
+        if self._jumps is not None:
+            self._jumps[0].destroy()
 
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n and the loads of the step."""

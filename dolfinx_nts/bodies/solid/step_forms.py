@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts import petsc_compat
-from dolfinx_nts.bodies.solid.cell_means import CellMeans
+from dolfinx_nts.bodies.solid.cell_means import CellMeans, FormWithMeans
 from dolfinx_nts.bodies.solid.materials import misfit
 from dolfinx_nts.forms import assemble_vector, compile_forms
 from dolfinx_nts.integrators import Integrator
@@ -94,7 +94,7 @@ class StepForms:
     ) -> None:
         self._check_alive = check_alive
         self._space, self._virtual_work, self._mass, self._extra = space, virtual_work, mass, extra
-        self._forms: dict[Integrator, tuple[Any, Any, Any, CellMeans | None]] = {}
+        self._forms: dict[Integrator, tuple[Any, Any, Any, FormWithMeans | None]] = {}
         self._u0, self._u1, self._drift = (fem.Function(space) for _ in range(3))
         # What multiplies mass and stiffness: in one Constant, as UFL sorts several by their counts
         # as text, and a form would be compiled again where 9 and 10 meet.
@@ -217,7 +217,7 @@ class StepForms:
             if a is not None:
                 a.destroy()
 
-    def _compiled(self, rule: Integrator) -> tuple[Any, Any, Any, CellMeans | None]:
+    def _compiled(self, rule: Integrator) -> tuple[Any, Any, Any, FormWithMeans | None]:
         """Internal virtual work, tangent, extra virtual work and means in cells by a rule."""
         if rule not in self._forms:
             du, w = ufl.TrialFunction(self._space), ufl.TestFunction(self._space)
@@ -234,12 +234,11 @@ class StepForms:
             tangent = self._factors[1] * ufl.derivative(virtual, self._u1, du)
             if rule.inertia:
                 tangent += self._factors[0] * self._mass(du, w)
-            forms = compile_forms([work, tangent] + ([] if extra is None else [extra]))
-            if means is not None:
-                means.compile(self._u1)
-                means.compile_derivatives(self._u1, work, w)
-            of_extra = None if extra is None else forms[2]
-            self._forms[rule] = forms[0], forms[1], of_extra, means
+            together = None if means is None else FormWithMeans(work, w, self._u1, means)
+            own = [work] if together is None else []
+            *own, made = compile_forms([*own, tangent])
+            of_extra = None if extra is None else compile_forms([extra])[0]
+            self._forms[rule] = (own or [together])[0], made, of_extra, together
         return self._forms[rule]
 
 

@@ -1,0 +1,77 @@
+"""What tells of cells that are too stiff, against the table of another program (theory 19.7)."""
+
+from mpi4py import MPI
+
+import pytest
+from dolfinx.mesh import CellType, GhostMode, create_box
+
+import dolfinx_nts as nts
+
+COMM = MPI.COMM_WORLD
+
+
+def bar(cells, poisson, *, height=1.0, kind=CellType.hexahedron, **options):
+    """A bar of length 10 and width 1 that a small load bends, and its equilibrium."""
+    ends = ((0.0, 0.0, 0.0), (10.0, 1.0, height))
+    mesh = create_box(COMM, ends, cells, kind, ghost_mode=GhostMode.shared_facet)
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1.0, poisson=poisson), density=1.0,
+        bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9)],
+        traction=[nts.Traction(lambda x: x[0] > 10 - 1e-9, (0.0, 0.0, 1e-6 * height**2))],
+        **options,
+    )  # fmt: skip
+    return body, nts.equilibrium(nts.System([body]))
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("cells", "poisson", "options", "share"),
+    [
+        ((20, 2, 2), 0.3, {}, 0.106), ((40, 4, 4), 0.3, {}, 0.032), ((20, 2, 2), 0.4999, {}, 0.97),
+        ((20, 2, 2), 0.4999, {"volume": "projected"}, 0.23),
+        ((80, 2, 2), 0.3, {"height": 0.1}, 0.29),
+    ],
+)  # fmt: skip
+def test_jumps_of_the_stress(cells, poisson, options, share):
+    body, run = bar(cells, poisson, **options)
+    jumps, whole = body.stress_jumps()
+    assert jumps / whole == pytest.approx(share, rel=0.05)
+    assert ("locking" in run.warnings) == (share > 0.1)
+
+
+@pytest.mark.mpi
+def test_one_layer_of_cells_is_told():
+    _, run = bar((20, 1, 1), 0.3)
+    assert "locking" not in run.warnings
+    assert "no node inside" in run.warnings["one cell thick"].text
+
+
+def test_tetrahedra_are_told_of():
+    body, run = bar((20, 2, 2), 0.3, kind=CellType.tetrahedron)
+    assert "degree=2" in run.warnings["locking"].text and body.name in run.warnings["locking"].about
+
+
+def test_a_wave_is_no_locking():
+    """Stress jumps at the front of a wave in the first steps, and little once it has spread."""
+    ends = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    mesh = create_box(COMM, ends, (8, 8, 8), CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, velocity=(1.0, 0.0, 0.0),
+        name="cube",
+    )  # fmt: skip
+    wall = nts.Plane(point=(1.004, 0.0, 0.0), normal=(-1.0, 0.0, 0.0))
+    contact = nts.ContactPair(body.surface(lambda x: x[0] > 1 - 1e-9), wall)
+    s = nts.Stepper(nts.System([body], contacts=[contact]), nts.EnergyMomentum())
+    shares = []
+    for _ in range(40):
+        s.advance(1e-3)
+        jumps, whole = body.stress_jumps()
+        shares.append(jumps / whole if whole else 0.0)
+    s.look(last=True)
+    assert max(shares) > 0.15 and not set(s.solution.warnings) & {"locking", "one cell thick"}
+    s.close()
+
+
+def test_degree_2_is_sound():
+    _, run = bar((20, 2, 2), 0.3, degree=2)
+    assert not set(run.warnings) & {"locking", "one cell thick"}

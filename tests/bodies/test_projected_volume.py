@@ -1,0 +1,284 @@
+"""`volume="projected"` against an independent program, published figures and finite differences."""
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import CellType, GhostMode, create_box
+from integrators import MID_STEP
+from measures import STENCIL
+from rotations import rotation
+
+import dolfinx_nts as nts
+from dolfinx_nts.bodies.solid.step_forms import fill
+from dolfinx_nts.integrators.static import EQUILIBRIUM
+from dolfinx_nts.interaction.evaluation import EvaluationPoint
+
+COMM = MPI.COMM_WORLD
+#: What Q2/P1 elements give on a fine mesh; Euler and Bernoulli's deflection of the bar is 4000.
+DEFLECTION = {0.3: 4001.1, 0.4999: 3938.4, 0.499999: 3938.4}
+
+
+def box(cells, ends=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), comm=COMM):
+    return create_box(comm, ends, cells, CellType.hexahedron, ghost_mode=GhostMode.shared_facet)
+
+
+def body_of(mesh, material=None, **options):
+    given = {"density": 1e3, "volume": "projected", **options}
+    return nts.Continuum(mesh, material or nts.NeoHookean(young=1e6, poisson=0.45), **given)
+
+
+def largest(x):
+    return COMM.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX)
+
+
+# ---- bending
+def bar(cells, poisson, metre=1.0, **options):
+    """Deflection of a bar under a small load at its end, over load and length."""
+    mesh = box(cells, (np.zeros(3), metre * np.array([10.0, 1.0, 1.0])))
+    load, end = 1e-6, 10.0 * metre * (1 - 1e-9)
+    body = body_of(
+        mesh, nts.NeoHookean(young=1.0, poisson=poisson), density=1.0,
+        bcs=[nts.Dirichlet(lambda x: x[0] < 1e-9 * metre)],
+        traction=[nts.Traction(lambda x: x[0] > end, (0.0, 0.0, load))], **options,
+    )  # fmt: skip
+    assert nts.equilibrium(nts.System([body])).status == "completed"
+    owned = body.reference.reshape(-1, 3)[:, 0] > end
+    return largest(body.u.x.array[: body.num_owned].reshape(-1, 3)[owned, 2]) / load / metre
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("cells", "poisson", "share"),
+    [
+        ((20, 2, 2), 0.3, 94.3), ((20, 1, 1), 0.3, 116.1), ((10, 1, 1), 0.3, 87.1),
+        ((20, 2, 2), 0.4999, 94.3), ((20, 1, 1), 0.4999, 136.1), ((20, 2, 2), 0.499999, 94.3),
+    ],
+)  # fmt: skip
+def test_bars_bend_as_in_another_program(cells, poisson, share):
+    """Theory 19.5, per cent of the reference."""
+    assert 100.0 * bar(cells, poisson) / DEFLECTION[poisson] == pytest.approx(share, abs=0.1)
+
+
+@pytest.mark.parametrize("metre", [1e-3, 1e3])
+def test_units_of_a_bar(metre):
+    assert bar((10, 1, 1), 0.4999, metre) == pytest.approx(bar((10, 1, 1), 0.4999), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_cook_s_membrane():
+    """Deflection of the middle of the loaded side in plane strain: 16.4326 (Krysl, FinEALE).
+
+    With n = 16 it is 16.12: the second term of the energy makes cells stiffer than projection alone
+    does (16.19 here, 16.2 in theory 19.5).
+    """
+    n = 32
+    mesh = box((n, n, 1))
+    x = mesh.geometry.x
+    s, t = x[:, 0].copy(), x[:, 1].copy()
+    x[:, 0], x[:, 1] = 48.0 * s, 44.0 * s + t * (44.0 - 28.0 * s)
+    mu, lam, load = 0.375, 7500.0, 1e-5
+    poisson = lam / (2 * (lam + mu))
+    body = body_of(
+        mesh, nts.NeoHookean(young=2 * mu * (1 + poisson), poisson=poisson),
+        bcs=[
+            nts.Dirichlet(lambda x: x[0] < 1e-9),
+            nts.Dirichlet(lambda x: x[2] > -1.0, components=[2]),
+        ],
+        traction=[nts.Traction(lambda x: x[0] > 48 - 1e-9, (0.0, load / 16.0, 0.0))],
+    )  # fmt: skip
+    assert nts.equilibrium(nts.System([body])).status == "completed"
+    at = body.reference.reshape(-1, 3)
+    middle = np.abs(at[:, :2] - [48.0, 52.0]).max(axis=1) < 1e-9
+    found = largest(body.u.x.array[: body.num_owned].reshape(-1, 3)[middle, 1]) / load
+    assert found == pytest.approx(16.4326, rel=0.01)
+
+
+# ---- forces
+def distorted():
+    mesh = box((2, 1, 1), ((0.0, 0.0, 0.0), (2.0, 1.0, 1.2)), MPI.COMM_SELF)
+    x = mesh.geometry.x
+    x += 0.08 * np.sin(5.0 * x[:, [1, 2, 0]])
+    return mesh
+
+
+def own_energy(c):
+    """A Mooney and Rivlin material as a plain function of C."""
+    i3 = ufl.det(c)
+    return 0.2 * ufl.tr(c) + 0.1 * ufl.tr(ufl.cofac(c)) - 0.4 * ufl.ln(i3) + 2.0 * (i3 - 1) ** 2
+
+
+OF = {"neo-Hookean": nts.NeoHookean(young=1.0, poisson=0.4), "own": own_energy}
+
+
+def between(body, seed=0):
+    rng = np.random.default_rng(seed)
+    return 0.06 * rng.standard_normal((2, body.num_owned))
+
+
+def differences(function, x, step=1e-3):
+    """Derivatives of an array's function by finite differences, as columns."""
+    columns = []
+    for e in step * np.eye(len(x)):
+        columns.append(sum(w * function(x + k * e) for k, w in STENCIL) / step)
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("name", OF)
+def test_forces_are_the_slope_of_the_energy(name):
+    body = body_of(distorted(), OF[name])
+    _, u = between(body)
+    found = body._forms.forces(EQUILIBRIUM, u, u)
+    slope = differences(body.potential, u)
+    assert np.abs(found - slope).max() < 1e-9 * np.abs(slope).max()
+
+
+@pytest.mark.parametrize("name", OF)
+def test_work_is_the_change_of_the_energy(name):
+    body = body_of(distorted(), OF[name])
+    u0, u1 = between(body)
+    work = body._forms.forces(nts.EnergyMomentum(), u0, u1) @ (u1 - u0)
+    change = body.potential(u1) - body.potential(u0)
+    assert abs(work - change) < 1e-14 * body.potential(u1)
+
+
+def test_small_motions_keep_their_digits():
+    """Energies of motions a million times smaller differ by its square."""
+    body = body_of(distorted(), OF["neo-Hookean"])
+    u0, u1 = 1e-6 * between(body)
+    work = body._forms.forces(nts.EnergyMomentum(), u0, u1) @ (u1 - u0)
+    change = body.potential(u1) - body.potential(u0)
+    assert abs(work - change) < 1e-13 * body.potential(u1)
+
+
+@pytest.mark.parametrize("rule", [*MID_STEP.values(), EQUILIBRIUM], ids=[*MID_STEP, "static"])
+def test_tangent(rule):
+    """With some coordinates prescribed, whose rows and columns hold the diagonal alone."""
+    body = body_of(distorted(), bcs=[nts.Dirichlet(lambda x: x[0] < 0.3, components=[1])])
+    u0, u1 = between(body)
+    moment = EvaluationPoint(u0, 0.0)
+    body.begin_step(rule, moment)
+    matrix = body.tangent(u1, 0.0, 1.0)
+    expected = differences(body.internal, u1)
+    free = np.setdiff1d(np.arange(len(u1)), body.fixed)
+    found = matrix[:, :]
+    scale = np.abs(expected).max()
+    assert np.abs((found - expected)[np.ix_(free, free)]).max() < 1e-8 * scale
+    assert not found[np.ix_(body.fixed, free)].any() and not found[np.ix_(free, body.fixed)].any()
+
+
+@pytest.mark.mpi
+def test_tangent_on_ranks():
+    """K x against differences, where nodes of a cell belong to several ranks."""
+    body = body_of(box((3, 2, 2)))
+    x = body.reference.reshape(-1, 3)
+    u, way = 0.05 * np.sin(3 * x[:, [1, 2, 0]]).ravel(), np.cos(4 * x[:, [2, 0, 1]]).ravel()
+    body.begin_step(EQUILIBRIUM, EvaluationPoint(0 * u, 0.0))
+    matrix = body.tangent(u, 0.0, 1.0)
+    to, out = matrix.createVecs()
+    to.array_w[:] = way
+    matrix.mult(to, out)
+    expected = sum(w * body.internal(u + 1e-3 * k * way) for k, w in STENCIL) / 1e-3
+    assert largest(out.array_r - expected) < 1e-8 * largest(expected)
+
+
+def test_uniform_strain_is_that_of_the_law():
+    """Where J is the same everywhere, nothing is projected: patch test with any affine motion."""
+    mesh = distorted()
+    whole, full = body_of(mesh), body_of(mesh, volume="full")
+    f = rotation(0.7, (1.0, 2.0, 3.0)) @ np.array([[1.3, 0.2, 0.0], [0.0, 0.9, 0.1], [0, 0, 1.1]])
+    u = (whole.reference.reshape(-1, 3) @ (f - np.eye(3)).T).ravel()
+    forces = [b._forms.forces(EQUILIBRIUM, u, u) for b in (whole, full)]
+    assert np.abs(forces[0] - forces[1]).max() < 1e-12 * np.abs(forces[1]).max()
+    stresses = []
+    for body in (whole, full):
+        fill(body.u, u)
+        stresses.append(nts.cauchy_stress(body).x.array)
+    assert np.abs(stresses[0] - stresses[1]).max() < 1e-12 * np.abs(stresses[1]).max()
+
+
+def test_stress_balances_a_load():
+    """Mean stress over a section of a squeezed block, nearly incompressible, is force over area."""
+    body = body_of(
+        box((3, 3, 3)), nts.NeoHookean(young=1e6, poisson=0.4999),
+        bcs=[nts.Dirichlet(lambda x: x[2] < 1e-9)],
+        traction=[nts.Traction(lambda x: x[2] > 1 - 1e-9, (0.0, 0.0, -1e2))],
+    )  # fmt: skip
+    assert nts.equilibrium(nts.System([body])).status == "completed"
+    stress = nts.cauchy_stress(body).x.array.reshape(-1, 3, 3)[:, 2, 2]
+    # Layers of nine cells each, of equal volume.
+    local = np.array([stress.sum(), len(stress)])
+    total, count = COMM.allreduce(local)
+    assert total / count == pytest.approx(-1e2, rel=1e-3)
+
+
+# ---- motion
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", MID_STEP)
+def test_a_spinning_bar_keeps_what_it_should(integrator):
+    """Nearly incompressible, bent at the start, as fast as its waves; 20 steps."""
+
+    def thrown(x):
+        return np.array([0.3 * x[2], 4.0 * (x[0] - 1.0), 2.0 * np.cos(x[0])])
+
+    mesh = box((5, 2, 2), ((0.0, 0.0, 0.0), (2.0, 0.4, 0.4)))
+    body = body_of(mesh, nts.NeoHookean(young=1e5, poisson=0.49), velocity=thrown)
+    run = nts.simulate(nts.System([body]), MID_STEP[integrator], dt=2e-3, t_end=0.04)
+    balance = run.balance
+    assert run.status.startswith("completed")
+    assert balance["potential"].max() > 0.01 * balance["kinetic"][0]
+    for name in ("linear_momentum", "angular_momentum"):
+        moved = np.abs(balance[name] - balance[name][0]).max()
+        assert moved < 1e-12 * np.abs(balance[name][0]).max()
+    if integrator == "energy-momentum":
+        moved = np.abs(balance["energy"] - balance["energy"][0]).max()
+        assert moved < 1e-12 * balance["energy"][0]
+
+
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_contact_with_friction_closes_the_ledger():
+    a = body_of(box((3, 3, 3)), name="a", velocity=(3.0, 0.5, 0.0))
+    ends = ((1.004, -0.1, -0.1), (2.004, 1.1, 1.1))
+    b = body_of(box((2, 4, 4), ends), name="b")
+    contact = nts.ContactPair(
+        a.surface(lambda x: x[0] > 1 - 1e-9), b.surface(lambda x: x[0] < 1.004 + 1e-9),
+        friction=0.3,
+    )  # fmt: skip
+    run = nts.simulate(nts.System([a, b], contacts=[contact]), nts.EnergyMomentum(),
+                       dt=1e-3, t_end=0.02)  # fmt: skip
+    balance = run.balance
+    assert balance["active"].max() > 4 and balance["friction_dissipation"][-1] > 0.0
+    start = balance["energy"][0]
+    assert np.abs(balance["ledger_residual"]).max() < 1e-11 * start
+    for name in ("linear_momentum", "angular_momentum"):
+        moved = np.abs(balance[name] - balance[name][0]).max()
+        assert moved < 1e-12 * np.abs(balance[name][0]).max()
+
+
+# ---- parameters and refusals
+def test_parameters_may_change_between_steps():
+    """Half the modulus halves the energy, the second term included."""
+    mesh = distorted()
+    young = fem.Constant(mesh, 2.0)
+    body = body_of(mesh, nts.NeoHookean(young=young, poisson=0.4))
+    _, u = between(body)
+    stiff = body.potential(u)
+    young.value = 1.0
+    assert body.potential(u) == pytest.approx(0.5 * stiff, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "told"),
+    [
+        (CellType.tetrahedron, {}, "tetrahedrons of degree 1"),
+        (CellType.hexahedron, {"degree": 2}, "hexahedrons of degree 2"),
+        (CellType.hexahedron, {"volume": "mean"}, "volume='mean'"),
+    ],
+)
+def test_refused(kind, options, told):
+    mesh = create_box(COMM, ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), (2, 2, 2), kind)
+    with pytest.raises(ValueError, match=told):
+        body_of(mesh, **options)
