@@ -9,7 +9,6 @@ import numpy as np
 
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.facet_pair import OVERHANG, FacetPair
-from dolfinx_nts.contact.node_attachment import beside
 from dolfinx_nts.contact.pair import MARGIN, Found, Motion
 from dolfinx_nts.contact.segments import near, segments
 from dolfinx_nts.contact.surface_elements import SurfaceElements, surface_elements
@@ -234,23 +233,9 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         sums = Sums(
             slaves=len(found.node), element=np.cumsum(new) - 1, slot=points.slot,
             share=np.where(points.slot >= 0, points.part, 0.0), shape=points.shape,
-            weights=self._weights(points), cut=points.cut,
+            cut=points.cut,
         )  # fmt: skip
         return surface_elements(self, found, attachment, measure, sums, step)
-
-    def _weights(self, points: OverMaster) -> FloatArray:
-        """Weights of the nodes of elements in points and control points."""
-        material = self.slave.material
-        of_corners = material.weights[self.slave.facets[points.own]]
-        n, corners, nodes = of_corners.shape
-        own = (points.shape[:, :, None] * of_corners).reshape(n, corners * nodes)
-        control = self.master.facet_weights
-        if control is None:
-            width = self.master.facet_nodes.nodes.shape[1]
-            of_master = np.broadcast_to(np.eye(width), (len(own), width, width))
-        else:
-            of_master = control[points.other]
-        return beside(own, of_master)
 
     def strayed(self, positions: Sequence[FloatArray], found: Any, due: FloatArray) -> float:
         """None: where pieces are cut is looked at elsewhere, see `SurfaceElements.is_stale`."""

@@ -27,7 +27,7 @@ static inline double larger(double a, double b) { return a > b ? a : b; }
 static inline double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 /* sum n_i v_i */
-static inline void combine(int nc, const double *n, const double (*v)[3], double *out)
+static inline void combine(int nc, const double *restrict n, const double (*restrict v)[3], double *restrict out)
 {
     out[0] = out[1] = out[2] = 0.0;
     for (int i = 0; i < nc; i++)

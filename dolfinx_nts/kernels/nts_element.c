@@ -3,53 +3,22 @@
    `condensed` is contact/facet_gap.py, _condensed, with kernels/nts_element.py, element, of the
    mean-value rule, which have the numbers of the formulas and are compared with this by
    tests/kernels/test_compiled.py. Of the invariants (theory 3) it takes only the sums that they
-   stand in: with v = sum_I v_I y_I for each set of weights, v_I y_I . y_J u_J = v . u.
+   stand in: with v = sum_I v_I y_I for each set of weights, v_I y_I . y_J u_J = v . u. */
 
-   `over_surface` is the same at points of a slave's facets, summed up there (theory 17). */
-
-#include "facets.h"
-
-/* Gauss points: as many as kernels/nts_element.py, GAUSS_POINTS, has at most. */
-enum { WIDTH = 3 * CONTROL, SUMS = 6, MOST_POINTS = 6 };
-
-#define INLINE static inline __attribute__((always_inline))
-
-typedef struct {
-    Facet facet;
-    int points, tangential;
-    const double *tau, *weight;
-} Rule;
-
-/* A pair at t_n and t_{n+1}: y_I = x_I - x_s, d, f, with d at t_{n+1} found from f. */
-typedef struct {
-    double y[2][CONTROL][3], d[2][3], f[2][2];
-} Place;
-
-/* Its derivatives by the y_I: of x_s, whose sums are with them zero, they are minus their sums. */
-typedef struct {
-    /* Force, its columns by lambda_N and by lambda_T over the facet's size, and by y. */
-    double force[WIDTH], by_normal[WIDTH], by_slip[2][WIDTH], stiffness[WIDTH][WIDTH];
-    /* Gap, shape functions at its foot, and the gradient of f. */
-    double gap, n[CONTROL], foot[2][WIDTH];
-} Pair;
-
-/* y, its two tangents and three bends where f is; and in the middle of both ends. */
-typedef double Sums[SUMS][3];
+#include "nts_element.h"
 
 static inline double mix(double t, double a, double b) { return (1.0 - t) * a + t * b; }
-
-INLINE void sums(int nc, const Shape n, const double (*y)[3], Sums out)
-{
-    combine(nc, n[0][0], y, out[0]);
-    for (int order = 1, k = 1; order < 3; order++)
-        for (int b = 0; b <= order; b++, k++)
-            combine(nc, n[order][b], y, out[k]);
-}
 
 static inline void cross(const double *a, const double *b, double factor, double *out)
 {
     for (int i = 0; i < 3; i++)
         out[i] = factor * (a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3]);
+}
+
+INLINE void clear(int size, double *out)
+{
+    for (int i = 0; i < size; i++)
+        out[i] = 0.0;
 }
 
 static inline void invert(double a[2][2])
@@ -59,20 +28,6 @@ static inline void invert(double a[2][2])
     a[1][1] = first / determinant;
     a[0][1] /= -determinant;
     a[1][0] /= -determinant;
-}
-
-/* out += factor v_I u */
-INLINE void outer(int nc, double factor, const double *v, const double *u, double *out)
-{
-    for (int i = 0; i < nc; i++)
-        for (int k = 0; k < 3; k++)
-            out[3 * i + k] += factor * v[i] * u[k];
-}
-
-INLINE void axpy(int size, double factor, const double *a, double *out)
-{
-    for (int i = 0; i < size; i++)
-        out[i] += factor * a[i];
 }
 
 /* At the end, where d and f fit the points: d(d, f)/dy, as bend (2, size) of d's parts along the dual
@@ -97,7 +52,7 @@ INLINE void end_of(int nc, const Facet *facet, Place *p, double (*dual)[3], doub
             slope[a][b] = metric[a][b] + dot(s[3 + a + b], s[0]);
             curved[a][b] = dot(s[3 + a + b], p->d[1]);
         }
-        memset(away[a], 0, size * sizeof(double));
+        clear(size, away[a]);
         outer(nc, 1.0, n[0][0], s[1 + a], away[a]);
         outer(nc, 1.0, n[1][a], s[0], away[a]);
     }
@@ -116,7 +71,6 @@ INLINE void end_of(int nc, const Facet *facet, Place *p, double (*dual)[3], doub
     }
 }
 
-/* Force and stiffness of a pair whose d[1] is not yet known; t is lambda_T times the facet's size. */
 INLINE void evaluate(int nc, const Rule *rule, Place *p, double normal, const double *t, Pair *out)
 {
     const Facet *facet = &rule->facet;
@@ -124,9 +78,14 @@ INLINE void evaluate(int nc, const Rule *rule, Place *p, double normal, const do
     double dual[2][3], bend[2][WIDTH], dm[3], ym[CONTROL][3];
     Shape shapes[MOST_POINTS];
     Sums ends[MOST_POINTS][2], middle[MOST_POINTS];
-    double mean[CONTROL] = {0.0}, along[2][CONTROL] = {{0.0}}, hold[2][WIDTH] = {{0.0}};
+    double mean[CONTROL], along[2][CONTROL], hold[2][WIDTH];
     double foot[3] = {0.0}, tangent[2][3] = {{0.0}}, lift[2] = {0.0}, turn[2][2] = {{0.0}}, metric[2][2] = {{0.0}};
 
+    clear(nc, mean);
+    for (int a = 0; a < 2; a++) {
+        clear(nc, along[a]);
+        clear(size, hold[a]);
+    }
     end_of(nc, facet, p, dual, bend, out);
     for (int k = 0; k < 3; k++) {
         dm[k] = 0.5 * (p->d[0][k] + p->d[1][k]);
@@ -181,7 +140,7 @@ INLINE void evaluate(int nc, const Rule *rule, Place *p, double normal, const do
     double pressed[CONTROL];
     for (int i = 0; i < nc; i++)
         pressed[i] = unit[0] * along[0][i] + unit[1] * along[1][i] - mean[i];
-    memset(out->by_normal, 0, size * sizeof(double));
+    clear(size, out->by_normal);
     outer(nc, 1.0, pressed, dm, out->by_normal);
     for (int a = 0; a < 2; a++)
         axpy(size, unit[3 + a], hold[a], out->by_normal);
@@ -194,14 +153,21 @@ INLINE void evaluate(int nc, const Rule *rule, Place *p, double normal, const do
         for (int a = 0; a < 2; a++)
             lambda[3 + a] += metric[a][b] * t[b];
     }
-    for (int i = 0; i < size; i++)
-        memset(out->stiffness[i], 0, size * sizeof(double));
-    if (normal == 0.0 && (!rule->tangential || (t[0] == 0.0 && t[1] == 0.0)))
+    if (normal == 0.0 && (!rule->tangential || (t[0] == 0.0 && t[1] == 0.0))) {
+        for (int i = 0; i < size; i++)
+            clear(size, out->stiffness[i]);
         return;
+    }
 
     /* D^2 pi by work, and the columns and rows of f, whose invariants change with it. */
-    double still[CONTROL][CONTROL] = {{0.0}}, column[2][WIDTH] = {{0.0}}, row[2][WIDTH] = {{0.0}};
+    double still[CONTROL][CONTROL], column[2][WIDTH], row[2][WIDTH];
     double by_d[2][3] = {{0.0}}, of_d[2][3] = {{0.0}}, twice[2][2] = {{0.0}};
+    for (int i = 0; i < nc; i++)
+        clear(nc, still[i]);
+    for (int a = 0; a < 2; a++) {
+        clear(size, column[a]);
+        clear(size, row[a]);
+    }
     for (int q = 0; q < points; q++) {
         double tau = rule->tau[q], w = rule->weight[q], wt = w * tau, slope[CONTROL];
         const Sums *e = ends[q];
@@ -257,7 +223,7 @@ INLINE void evaluate(int nc, const Rule *rule, Place *p, double normal, const do
     for (int i = 0; i < nc; i++)
         half[i] = 0.5 * (lambda[0] * along[0][i] + lambda[1] * along[1][i] - normal * mean[i]);
     for (int a = 0; a < 2; a++) {
-        memset(turned[a], 0, size * sizeof(double));
+        clear(size, turned[a]);
         outer(nc, 1.0, half, against[a], turned[a]);
         memcpy(moved[a], row[a], size * sizeof(double));
         for (int b = 0; b < 2; b++) {
@@ -268,7 +234,7 @@ INLINE void evaluate(int nc, const Rule *rule, Place *p, double normal, const do
         }
     }
     for (int a = 0; a < 2; a++) {
-        memset(held[a], 0, size * sizeof(double));
+        clear(size, held[a]);
         for (int b = 0; b < 2; b++) {
             axpy(size, -metric[a][b], moved[b], held[a]);
             for (int c = 0; c < 2; c++)
@@ -277,7 +243,8 @@ INLINE void evaluate(int nc, const Rule *rule, Place *p, double normal, const do
     }
     for (int i = 0; i < nc; i++)
         for (int k = 0; k < 3; k++) {
-            double *to = out->stiffness[3 * i + k];
+            double *restrict to = out->stiffness[3 * i + k];
+            clear(size, to);
             for (int j = 0; j < nc; j++)
                 to[3 * j + k] = still[i][j];
             for (int a = 0; a < 2; a++) {
@@ -289,8 +256,7 @@ INLINE void evaluate(int nc, const Rule *rule, Place *p, double normal, const do
         }
 }
 
-static void place_of(int nc, const double *x0, const double *x1, const double *d0, const double *f0,
-                     const double *f1, Place *p)
+void place_of(int nc, const double *x0, const double *x1, const double *d0, const double *f0, const double *f1, Place *p)
 {
     for (int k = 0; k < 3; k++) {
         for (int i = 0; i < nc; i++) {
@@ -332,7 +298,7 @@ static void of_any(const Rule *rule, Place *p, double normal, const double *t, P
     evaluate(rule->facet.nc, rule, p, normal, t, out);
 }
 
-static void pair_of(const Rule *rule, Place *p, double normal, const double *t, Pair *out)
+void pair_of(const Rule *rule, Place *p, double normal, const double *t, Pair *out)
 {
     (rule->facet.nc == 3 ? of_three : rule->facet.nc == 4 ? of_four : of_any)(rule, p, normal, t, out);
 }
