@@ -21,7 +21,7 @@ import numpy as np
 
 _NAMES = (
     *("facets.h", "nts_element.h", "facets.c", "nts_element.c", "surface_points.c"),
-    *("contact_law.c", "edges.c"),
+    *("segments.c", "contact_law.c", "edges.c"),
 )
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 _FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
@@ -81,6 +81,12 @@ class EdgeLimits(ctypes.Structure):
     ]
 
 
+class Cuts(ctypes.Structure):
+    """Where pieces of facets end; see `segments.c`."""
+
+    _fields_ = [(name, _REAL) for name in ("facing", "on", "nothing")]  # noqa: RUF012
+
+
 class FieldTable(ctypes.Structure):
     """A Function in a form; see `cell_batches.c`."""
 
@@ -114,6 +120,10 @@ _KERNELS = {
     ),
     "tilted": (_INT, *(_ARRAY,) * 5, _REAL, _LONG, *(_ARRAY,) * 3),
     "condensed": (_FACET, _INT, _ARRAY, _ARRAY, _INT, _LONG, *(_ARRAY,) * 13),
+    "segments": (
+        *(ctypes.POINTER(Cuts), _INT, _INT, _LONG, *(_ARRAY,) * 4),
+        *(_LONG, _ARRAY, _ARRAY, _ARRAY),
+    ),
     "points_of": (_INT, _INT, _LONG, *(_ARRAY,) * 4),
     "over_surface": (
         *(_FACET, _INT, _ARRAY, _ARRAY, _INT, _REAL, _INT, _LONG),
@@ -245,6 +255,7 @@ def load() -> Any:
     for name, arguments in _KERNELS.items():
         kernel = getattr(library, name)
         kernel.argtypes = arguments
+    library.segments.restype = _LONG
     return library
 
 
