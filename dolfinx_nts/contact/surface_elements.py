@@ -119,10 +119,9 @@ class SurfaceElements(ContactElements):
 
     @cached_property
     def _elements_of(self) -> IntArray:
-        """How many elements the slaves at the corners have, shape (n, corners)."""
+        """How many elements each slave has, shape (slaves,)."""
         # Each has a part of a slave's equations, or it would say nothing of its own multiplier.
-        slot = self._slot
-        return np.append(np.bincount(slot[slot >= 0]), 1)[slot]
+        return np.bincount(self._slot[self._slot >= 0], minlength=len(self.frame))
 
     @property
     def immovable(self) -> BoolArray:
@@ -275,21 +274,12 @@ class SurfaceElements(ContactElements):
             residual: Of elements, shape (n, r).
             tangent: Shape (n, r, r).
             rows: Of the slaves [kg m], shape (slaves, constraints).
-            slopes: Derivatives of these by gap, slips, nothing if there are none, and multipliers.
+            slopes: Derivatives of these by gap, two slips and multipliers.
         """
-        width, size, slot = rows.shape[1], self.num_coordinates, self._slot
-        padded = np.concatenate([slopes, np.zeros((1, *slopes.shape[1:]))])[slot]
-        scale = np.append(self.law.scale, 0.0)[slot].repeat(width, axis=1)
-        shape, widths = (*slot.shape, width, size), slot.shape[1] * width
-        of_sums = padded[..., :width] @ tangent[:, size:, :size].reshape(shape)
-        tangent[:, size:, :size] = of_sums.reshape(len(slot), widths, size)
-        tangent[:, :size, size:] *= scale[:, None]
+        width, size = rows.shape[1], self.num_coordinates
+        compiled.law_of_sums(self._slot, self.law.scale, slopes, self._elements_of, tangent)
         element, corner = self._first
-        at = size + corner[:, None] * width + np.arange(width)
-        residual[element[:, None], at] = rows
-        for k in range(slot.shape[1]):
-            here = slice(size + k * width, size + (k + 1) * width)
-            tangent[:, here, here] = padded[:, k, :, 3:] / self._elements_of[:, k, None, None]
+        residual[element[:, None], size + corner[:, None] * width + np.arange(width)] = rows
 
     # ---- a solution
     def _pushed(self, part: Contribution) -> tuple[FloatArray, FloatArray]:

@@ -123,14 +123,18 @@ class Sums(Batch):
             attachment: Facets of the elements.
             foot: Weights of the corners of the master's facets in the points' feet.
         """
-        found, on = [], self.slot >= 0
+        # Corners without a slave have one beyond the last.
+        slave = np.where(self.slot < 0, self.slaves, self.slot)
+        of_slaves = _sparse(self.share, slave, self.slaves + 1).T.tocsr()[: self.slaves]
         both = zip(attachment.surfaces, attachment.numbers, (self.shape, -foot), strict=True)
-        for surface, numbers, weights in both:
-            values = self.share[:, :, None] * weights[:, None]
-            row, column = np.broadcast_arrays(
-                self.slot[:, :, None], numbers[self.element][:, None]
-            )
-            entries = values[on].ravel(), (row[on].ravel(), column[on].ravel())
-            shape = self.slaves, len(surface.points)
-            found.append(scipy.sparse.coo_array(entries, shape=shape).tocsr())
-        return found
+        return [
+            of_slaves @ _sparse(weights, numbers[self.element], len(surface.points))
+            for surface, numbers, weights in both
+        ]
+
+
+def _sparse(values: FloatArray, column: IntArray, number: int) -> Any:
+    """Rows of so many columns with the same number of entries each, at given columns (n, k)."""
+    n, k = values.shape
+    start = np.arange(0, n * k + 1, k)
+    return scipy.sparse.csr_array((values.ravel(), column.ravel(), start), shape=(n, number))

@@ -264,3 +264,22 @@ def over_surface(
     kernel = library.load().over_surface
     library.run(kernel, _facet(nc)[0], *rule, *of_points, multiplier, directions, *own, *out)
     return out
+
+
+def law_of_sums(
+    slot: IntArray, scale: FloatArray, slopes: FloatArray, elements: IntArray, tangent: FloatArray
+) -> None:
+    """Write laws of slaves into elements whose rows of multipliers are the slaves' gap and slips.
+
+    Args:
+        slot: Slaves at the elements' corners, or -1, shape (n, corners).
+        scale: What the slaves' multipliers are over, shape (slaves,).
+        slopes: By gap, two slips and multipliers, of the slaves' rows, (slaves, m, 3 + m).
+        elements: How many of them each slave has, which have equal parts of its own derivatives.
+        tangent: Of the elements, contiguous, shape (n, r, r).
+    """
+    (n, corners), each = slot.shape, slopes.shape[1]
+    size = tangent.shape[1] - corners * each
+    slots, number = (a.astype(np.int64, copy=False) for a in (slot, elements))
+    kernel = library.load().law_of_sums
+    library.run(kernel, corners, each, size, n, slots, scale, slopes, number, tangent)

@@ -6,6 +6,10 @@
 
 enum { CONTROL = 16, DEGREE = 4 };
 
+/* Loops of a length that is known when this is compiled take half the time: what has it as an argument is
+   compiled where that is a number. */
+#define INLINE static inline __attribute__((always_inline))
+
 /* nc control points; polynomials of this degree in each coordinate, or in both together on triangles;
    coefficients [order][derivatives by the second coordinate][power of the first][power of the
    second][control point]. */

@@ -129,6 +129,7 @@ _KERNELS = {
         *(_FACET, _INT, _ARRAY, _ARRAY, _INT, _REAL, _INT, _LONG),
         *(_ARRAY,) * 21,
     ),
+    "law_of_sums": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 5),
     "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 16),
     "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),

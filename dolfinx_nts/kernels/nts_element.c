@@ -282,7 +282,6 @@ static void close(int nc, double factor, const double *y, double *out)
         }
 }
 
-/* Loops of a length that is known when this is compiled take half the time. */
 static void of_three(const Rule *rule, Place *p, double normal, const double *t, Pair *out)
 {
     evaluate(3, rule, p, normal, t, out);

@@ -5,8 +5,6 @@
 /* Gauss points: as many as kernels/nts_element.py, GAUSS_POINTS, has at most. */
 enum { WIDTH = 3 * CONTROL, SUMS = 6, MOST_POINTS = 6 };
 
-#define INLINE static inline __attribute__((always_inline))
-
 typedef struct {
     Facet facet;
     int points, tangential;

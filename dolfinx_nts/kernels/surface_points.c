@@ -223,3 +223,34 @@ void over_surface(const Facet *facet, int points, const double *tau, const doubl
         }
     }
 }
+
+/* Write the laws of slaves, derivatives (slaves, each, 3 + each) of their rows by gap, two slips and own
+   multipliers, into elements whose rows of multipliers are gap and slips; multipliers are over scale. Each
+   of so many elements of a slave has a part of its own. */
+void law_of_sums(int corners, int each, int size, long n, const long *slot, const double *scale,
+                 const double *slopes, const long *elements, double *tangent)
+{
+    int width = size + corners * each, wide = 3 + each;
+    for (long i = 0; i < n; i++, slot += corners, tangent += width * width)
+        for (int c = 0; c < corners; c++) {
+            int at = size + c * each;
+            if (slot[c] < 0)
+                continue;
+            const double *by = slopes + slot[c] * each * wide;
+            for (int j = 0; j < size; j++) {
+                double was[3], *column = tangent + at * width + j, *row = tangent + j * width + at;
+                for (int m = 0; m < each; m++) {
+                    was[m] = column[m * width];
+                    row[m] *= scale[slot[c]];
+                }
+                for (int m = 0; m < each; m++) {
+                    column[m * width] = 0.0;
+                    for (int k = 0; k < each; k++)
+                        column[m * width] += by[m * wide + k] * was[k];
+                }
+            }
+            for (int m = 0; m < each; m++)
+                for (int k = 0; k < each; k++)
+                    tangent[(at + m) * width + at + k] = by[m * wide + 3 + k] / elements[slot[c]];
+        }
+}

@@ -202,6 +202,18 @@ def test_points_of_a_surface_are_summed_up(corners, nc, friction, rule):
         assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
 
 
+@pytest.mark.parametrize("each", [1, 3])
+def test_laws_of_sums_are_those_of_numpy(each):
+    rng, size, slaves = np.random.default_rng(13), 21, 5
+    slot, scale = rng.integers(-1, slaves, (N, 3)), rng.uniform(1, 2, slaves)
+    slopes = rng.normal(size=(slaves, each, 3 + each))
+    elements = rng.integers(1, 5, slaves)
+    tangent = rng.normal(size=(N, size + 3 * each, size + 3 * each))
+    expected = surface.law_of_sums(slot, scale, slopes, elements, tangent)
+    compiled.law_of_sums(slot, scale, slopes, elements, tangent)
+    assert np.abs(tangent - expected).max() < 1e-13
+
+
 @pytest.mark.parametrize("number", [1, 5])
 def test_forces_of_points_are_those_of_nodes(number):
     rng, nodes, rest = np.random.default_rng(10), 6, 3

@@ -74,3 +74,15 @@ def over_surface(measure, x, element, slot, shape, share, multiplier, directions
     sums = (to_slaves(share[..., None] * v[:, None]) for v in (found.gap[:, None], slips))
     gap, slip = sums
     return (*out, found.residual[:, :size].reshape(x.shape), gap[:, 0], slip, to_slaves(pulls))
+
+
+def law_of_sums(slot, scale, slopes, elements, tangent):
+    """Laws of slaves in elements whose rows of multipliers are the slaves' gap and slips."""
+    (n, corners), each = slot.shape, slopes.shape[1]
+    size, out = tangent.shape[1] - corners * each, tangent.copy()
+    for i, c in zip(*np.nonzero(slot >= 0), strict=True):
+        k, here = slot[i, c], slice(size + c * each, size + (c + 1) * each)
+        out[i, here, :size] = slopes[k, :, :each] @ tangent[i, here, :size]
+        out[i, :size, here] *= scale[k]
+        out[i, here, here] = slopes[k, :, 3:] / elements[k]
+    return out
