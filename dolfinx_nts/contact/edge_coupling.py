@@ -172,8 +172,11 @@ class EdgeCoupling:
         chosen = found.touch | ((carries | follows) & found.meet[:, :2].any(axis=1))
         # What held in an attempt at the step passes nothing in that one's solution.
         chosen |= np.isin(self._key(pairs), self._tried) & np.isfinite(gap)
-        chosen &= (found.node == 0) | (found.node >= _ASKED) | (carries & (found.node == 1))
-        self._leave_to_nodes(found, chosen)
+        if self.contact.pair.holds_nodes:
+            chosen &= (found.node == 0) | (found.node >= _ASKED) | (carries & (found.node == 1))
+            self._leave_to_nodes(found, chosen)
+        else:
+            self._pass_on(found, chosen)
         self._take_once(found, chosen, carries)
         self._tried = self._key(pairs[chosen])
         return chosen
@@ -202,6 +205,28 @@ class EdgeCoupling:
         rise = np.abs(np.einsum("ni,ni->n", normal, end - start))
         level = rise < LEVEL * np.linalg.norm(end - start, axis=1)
         chosen[some[level & normal.any(axis=1)]] = False
+
+    def _pass_on(self, found: Near, chosen: BoolArray) -> None:
+        """Take from chosen pairs that meet at a node of the slave which another one holds there.
+
+        One that meets at the end of the step stays: where no node is held, edges hold it as they
+        pass over the rim, one after the other.
+
+        Args:
+            found: Where they meet.
+            chosen: Pairs, shape (n,).
+        """
+        some = np.flatnonzero(chosen & (found.node > 0))
+        if some.size < 2:
+            return
+        assert self._pairs is not None
+        some = some[np.argsort(~found.meet[some, 1], kind="stable")]
+        own, other = self._pairs.numbers[some].T
+        ends = self.contact.edges[0].ends[own]
+        shared = (ends[:, None, :, None] == ends[None, :, None, :]).any(axis=(2, 3))
+        shared &= other[:, None] == other
+        for i in range(1, len(some)):
+            chosen[some[i]] = not (shared[i, :i] & chosen[some[:i]]).any()
 
     def _take_once(self, found: Near, chosen: BoolArray, carries: BoolArray) -> None:
         """Take from chosen pairs that meet at a node of the master all but one of each edge there.
@@ -304,8 +329,10 @@ class EdgeCoupling:
         # So far the same on all ranks.
         if not found.some[1]:
             return False
-        through = found.through & ((found.node == 0) | (found.node >= _ASKED))
-        self._leave_to_nodes(found, through)
+        through = found.through
+        if self.contact.pair.holds_nodes:
+            through = through & ((found.node == 0) | (found.node >= _ASKED))
+            self._leave_to_nodes(found, through)
         pairs = self._pairs.numbers
         through &= self.contact.mine[pairs[:, 0]]
         through &= ~np.isin(self._key(pairs), self._key(self._chosen))

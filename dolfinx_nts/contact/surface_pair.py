@@ -91,6 +91,8 @@ class OverMaster(NamedTuple):
 class SurfacePair(FacetPair, master=Surface, integration="surface"):
     """A `FacetPair` that keeps the slave's surface out in the mean around each node."""
 
+    holds_nodes = False
+
     def _set_up(self) -> None:
         super()._set_up()
         if not len(self.slave.facets):
