@@ -144,7 +144,8 @@ class EdgeCoupling:
         ways = [edges.surface.gather(step.ahead[b]) for edges, b in both]
         found = self._pairs.closest(self._x, ways, reach + near, near, limit)
         old = gather_rows(self._comm, self._history.pair)
-        if not (len(old) or len(self._tried) or found.some[0]):
+        some = len(old) or len(self._tried) or found.some[0]
+        if not some and self.contact.pair.holds_nodes:
             return _NONE[:, 0]
         pairs, chosen = self._pairs.numbers, self._choose(found, old, reach, limit)
         out = np.flatnonzero(chosen & (found.beyond > 0))
@@ -159,24 +160,30 @@ class EdgeCoupling:
 
         Args:
             found: Where they meet.
-            old: Pairs that pressed in the last step, on all ranks, shape (k, 2).
+            old: Pairs that pressed in the last step, or were followed, on all ranks, (k, 2).
             reach: Bound on the step's motion [m].
             limit: As of `Pairs.closest` [m].
         """
         assert self._pairs is not None
-        pairs, gap = self._pairs.numbers, found.gap[:, 0]
-        carries = np.isin(self._key(pairs), self._key(old))
+        pairs, gap, holds = self._pairs.numbers, found.gap[:, 0], self.contact.pair.holds_nodes
+        carries = np.isin(self._key(pairs), self._key(old)) & (holds | (gap < reach))
         # Contact may pass along an edge.
         follows = np.isin(pairs[:, 0], old[:, 0]) | np.isin(pairs[:, 1], old[:, 1])
-        follows &= (gap > -_OVERSHOT * reach) & (gap < limit)
-        chosen = found.touch | ((carries | follows) & found.meet[:, :2].any(axis=1))
+        near, meet = gap > -_OVERSHOT * reach, found.meet[:, :2].any(axis=1)
+        follows &= near & (gap < (limit if holds else reach))
+        chosen = found.touch | ((carries | follows) & meet)
+        if not holds:
+            # A rim enters a little what is kept out of it in the mean.
+            chosen |= near & (gap < limit) & meet & (found.node == 0)
         # What held in an attempt at the step passes nothing in that one's solution.
         chosen |= np.isin(self._key(pairs), self._tried) & np.isfinite(gap)
-        if self.contact.pair.holds_nodes:
-            chosen &= (found.node == 0) | (found.node >= _ASKED) | (carries & (found.node == 1))
-            self._leave_to_nodes(found, chosen)
-        else:
-            self._pass_on(found, chosen)
+        # Where no node is held, edges that press pass a rim on, one after the other.
+        passed = (carries & (found.node == 1)) if holds else chosen & (carries | follows)
+        left = chosen & ((found.node == 0) | (found.node >= _ASKED)) & ~(passed & (not holds))
+        self._leave_to_nodes(found, left)
+        chosen &= left | passed
+        if not holds:
+            self._take_one_at_nodes(found, chosen)
         self._take_once(found, chosen, carries)
         self._tried = self._key(pairs[chosen])
         return chosen
@@ -206,11 +213,10 @@ class EdgeCoupling:
         level = rise < LEVEL * np.linalg.norm(end - start, axis=1)
         chosen[some[level & normal.any(axis=1)]] = False
 
-    def _pass_on(self, found: Near, chosen: BoolArray) -> None:
-        """Take from chosen pairs that meet at a node of the slave which another one holds there.
+    def _take_one_at_nodes(self, found: Near, chosen: BoolArray) -> None:
+        """Take from chosen pairs that meet at a node of the slave all but one of each rim there.
 
-        One that meets at the end of the step stays: where no node is held, edges hold it as they
-        pass over the rim, one after the other.
+        One that meets at the end of the step stays.
 
         Args:
             found: Where they meet.
@@ -301,7 +307,8 @@ class EdgeCoupling:
     @property
     def pressed(self) -> BoolArray:
         """Which of the elements pressed at t_n."""
-        return np.isin(self._key(self._chosen), self._key(self._history.pair))
+        old = self._history
+        return np.isin(self._key(self._chosen), self._key(old.pair[old.force > 0.0]))
 
     # ---- a solution
     def wake(self, e: Evaluation, parts: Sequence[Any]) -> bool:
@@ -329,10 +336,8 @@ class EdgeCoupling:
         # So far the same on all ranks.
         if not found.some[1]:
             return False
-        through = found.through
-        if self.contact.pair.holds_nodes:
-            through = through & ((found.node == 0) | (found.node >= _ASKED))
-            self._leave_to_nodes(found, through)
+        through = found.through & ((found.node == 0) | (found.node >= _ASKED))
+        self._leave_to_nodes(found, through)
         pairs = self._pairs.numbers
         through &= self.contact.mine[pairs[:, 0]]
         through &= ~np.isin(self._key(pairs), self._key(self._chosen))
@@ -363,10 +368,12 @@ class EdgeCoupling:
         return []
 
     def history(self, parts: Sequence[Any]) -> EdgeHistory:
-        """The pairs that carry, and their forces."""
+        """The pairs that carry, or are followed, and their forces."""
         if not parts:
             return EdgeHistory.of_start()
         (part,), factor = parts, self._step.factor
-        on = part.active
+        # Where no node is held, what a rim passes is followed also while it does not press.
+        on = part.active | (not self.contact.pair.holds_nodes)
         force, tangential = -part.multiplier[:, 0] / factor, part.tangential / factor
+        force = np.where(part.active, force, 0.0)
         return EdgeHistory(self._chosen[on], force[on], tangential[on])

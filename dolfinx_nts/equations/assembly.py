@@ -250,10 +250,11 @@ class StepMatrix:
             blocks.fill(self.corner)
         here = []
         for (columns, _), tangent in zip(self._corner_numbers, tangents, strict=True):
-            first, number = (int(columns[0]), len(columns)) if len(columns) else (0, 0)
-            if np.array_equal(columns, np.arange(first, first + number)):
-                columns = slice(first, first + number)
-            here.append(tangent[:, columns][:, :, columns])
+            first, count = int(columns[0]) if len(columns) else 0, len(columns)
+            # Most often they are a row, and need no copy.
+            row = np.array_equal(columns, np.arange(first, first + count))
+            some: Any = slice(first, first + count) if row else columns
+            here.append(tangent[:, some][:, :, some])
         for k, ((_, numbers), block) in enumerate(zip(self._corner_numbers, here, strict=True)):
             change = block if fresh else block - self._in_operator[k]
             node_blocks.add(self.corner, numbers, change)

@@ -78,7 +78,7 @@ def over_surface(measure, x, element, slot, shape, share, multiplier, directions
 
 def law_of_sums(slot, scale, slopes, elements, tangent):
     """Laws of slaves in elements whose rows of multipliers are the slaves' gap and slips."""
-    (n, corners), each = slot.shape, slopes.shape[1]
+    corners, each = slot.shape[1], slopes.shape[1]
     size, out = tangent.shape[1] - corners * each, tangent.copy()
     for i, c in zip(*np.nonzero(slot >= 0), strict=True):
         k, here = slot[i, c], slice(size + c * each, size + (c + 1) * each)
