@@ -49,11 +49,14 @@ def near(own: FloatArray, other: FloatArray, reach: float) -> tuple[IntArray, In
         other: Those of others.
         reach: Distance of the boxes along each axis [m].
     """
+    none = np.empty(0, dtype=np.int64)
     if not (len(own) and len(other)):
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        return none, none
     low, high = other.min(axis=1) - reach, other.max(axis=1) + reach
-    middle, half = 0.5 * (low + high), 0.5 * (high - low).max()
     start, stop = own.min(axis=1), own.max(axis=1)
+    if (low.min(axis=0) > stop.max(axis=0)).any() or (high.max(axis=0) < start.min(axis=0)).any():
+        return none, none
+    middle, half = 0.5 * (low + high), 0.5 * (high - low).max()
     radius = half + 0.5 * (stop - start).max(axis=1)
     found = cKDTree(middle).query_ball_point(0.5 * (start + stop), radius, p=np.inf)
     one = np.repeat(np.arange(len(own)), [len(each) for each in found])

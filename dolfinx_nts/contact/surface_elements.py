@@ -198,7 +198,9 @@ class SurfaceElements(ContactElements):
         points = self._at_points(y, multiplier)
         found = self._of_slaves(points, y, multiplier)
         together = self._together(found.gap, found.slip, multiplier)
-        obeyed = self.law.obey(self._motion(y), found, multiplier, together)
+        # What moves as prescribed is asked for with friction alone.
+        motion = self._motion(y) if self.law.prescribed else np.empty((len(multiplier), 1, 3))
+        obeyed = self.law.obey(motion, found, multiplier, together)
         residual, tangent = points.residual, points.tangent
         if self.attachment.weights is not None:
             residual, tangent = compiled_law.to_nodes(self.attachment.weights, residual, tangent)

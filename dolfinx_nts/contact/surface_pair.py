@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -161,7 +162,10 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         """
         slaves, master = positions
         own, other = slaves[self.slave.facets[self._facets]], master[self.master.facets]
-        found = segments(own, other, near(own, other, radius))
+        pairs = near(own, other, radius)
+        if not len(pairs[0]):
+            return self._none
+        found = segments(own, other, pairs)
         facet, over = self._facets[found.own], found.other
         corners = self.slave.facets[facet]
         shape, slopes, _ = facets.shape(found.xi, corners.shape[1])
@@ -176,6 +180,16 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         slot, part = self._position[corners], area[:, None] * shape
         points = OverMaster(facet, over, shape, xi, normal, gap, length, xi, slot, part)
         return points.select(legal)
+
+    @cached_property
+    def _none(self) -> OverMaster:
+        """No points."""
+        number, flat = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        shape = np.empty((0, self.slave.facets.shape[1]))
+        return OverMaster(
+            number, number, shape, flat, np.empty((0, 3)), np.empty(0), np.empty(0), flat,
+            shape.astype(np.int64), shape,
+        )  # fmt: skip
 
     def _seen_from(self, points: OverMaster, positions: Sequence[FloatArray]) -> OverMaster:
         """The same points and facets where they were at other positions."""
