@@ -170,12 +170,13 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         corners = self.slave.facets[facet]
         shape, slopes, _ = facets.shape(found.xi, corners.shape[1])
         x = np.einsum("nc,nci->ni", shape, slaves[corners])
-        xi, converged, normal, gap, length = _measured(x, other[over])
+        xi, converged, normal, gap = _measured(x, other[over])
+        length = facets.size(other)[over]
         excess = facets.edge_excess(xi, other.shape[1])
         rim = self._free_edges[over]
         legal = converged & (excess <= np.where(rim, OVERHANG, _BEYOND)).all(axis=1)
         legal &= (gap > -MARGIN * length) & (gap < reach + MARGIN * length)
-        sides = np.einsum("nca,nci->nai", slopes, self.slave.reference[corners])
+        sides = np.matmul(slopes.transpose(0, 2, 1), self.slave.reference[corners])
         area = found.weight * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
         slot, part = self._position[corners], area[:, None] * shape
         points = OverMaster(facet, over, shape, xi, normal, gap, length, xi, slot, part)
@@ -195,7 +196,9 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         """The same points and facets where they were at other positions."""
         slaves, master = positions
         x = np.einsum("nc,nci->ni", points.shape, slaves[self.slave.facets[points.own]])
-        xi, converged, normal, gap, length = _measured(x, master[self.master.facets[points.other]])
+        other = master[self.master.facets]
+        xi, converged, normal, gap = _measured(x, other[points.other])
+        length = facets.size(other)[points.other]
         found = points._replace(xi=xi, normal=normal, gap=gap, length=length)
         return found.select(converged)
 
@@ -288,10 +291,10 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
 
 def _measured(
     x: FloatArray, corners: FloatArray
-) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray, FloatArray]:
-    """Feet of points (n, 3) on facets (n, nc, 3), which were found, normals, gaps and sizes [m]."""
+) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
+    """Feet of points (n, 3) on facets (n, nc, 3), which were found, normals and gaps [m]."""
     start, _ = compiled.closest_point(x, corners)
     xi, converged = compiled.project(x, corners, start)
     foot, _, normal = facets.frame(corners, xi)
     gap: FloatArray = np.einsum("ni,ni->n", normal, x - foot)
-    return xi, converged, normal, gap, facets.size(corners)
+    return xi, converged, normal, gap
