@@ -327,13 +327,15 @@ class DirectorBody(Body):
         if self._matrix is None:
             self._matrix = DirectorMatrix(self._values, self._moments, self.fixed)
         n, k = len(self._cells), self._values.num_vectors
-        values = np.zeros((n, 3 * k, 3 * k))
         if stiffness:
             y1 = self._vectors(u1)
-            values += stiffness * kernel.tangent(self._elements, self._y0, y1, self._theta)
+            values = kernel.tangent(self._elements, self._y0, y1, self._theta)
+            values *= stiffness
             if self._pressures:
                 pushed = self._pressures.tangent(self._y0[:, ::2], y1[:, ::2], self._theta)
                 values.reshape(n, k, 3, k, 3)[:, ::2, :, ::2] -= stiffness * pushed
+        else:
+            values = np.zeros((n, 3 * k, 3 * k))
         if mass:
             of_vectors = mass * self._inertia
             for i in range(3):
