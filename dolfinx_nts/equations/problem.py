@@ -234,6 +234,9 @@ class StepProblem:
             return {}
         chosen = sorted(set(np.flatnonzero(rest).tolist()) - self.couplings.touched())
         u, gravity = self.state.u, self.loads.gravity
+        for k in chosen:
+            if self.batches.batch_of(k) < len(self.batches.several):
+                self.loads.tell(k)
         found = self._sleepers.find(chosen, u, gravity, self.rounding.at_rest)
         self.couplings.rest(found)
         return found
@@ -296,7 +299,8 @@ class StepProblem:
             if j in laid.awake:
                 u1, du, internal, external, total = self._evaluated[j]
             else:
-                internal, external = (self.factor * own for own in self._asleep[of[0]])
+                both = zip(*(self._asleep[k] for k in of), strict=True)
+                internal, external = (self.factor * np.concatenate(own) for own in both)
                 u1, du, total = self._u0[j], none[j], internal - external
             pull = coupling[j]
             terms.append(BodyTerms(u1, du, internal, external, pull, total + pull))

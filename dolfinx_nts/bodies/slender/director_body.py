@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -138,7 +138,10 @@ class DirectorBody(Body):
         owned = topology.index_map(topology.dim).size_local
         start = self.comm.exscan(owned) or 0
         self._cells = self._director_mesh.cells[start : start + owned]
-        self._values = ElementValues(self.comm, index_map, self._cells, self._width)
+        ghosts = np.asarray(index_map.ghosts, dtype=np.int64)
+        self._values = ElementValues(
+            self.comm, index_map.size_local, ghosts, self._cells, self._width
+        )
         self._here, self.num_owned = self._values.here, self._values.num_owned
         here = np.arange(self._here.start, self._here.stop)
         self.reference: FloatArray = self._vectors_at(here).ravel()
@@ -281,6 +284,13 @@ class DirectorBody(Body):
         self._load, moments = self._conditions.loads(moment.time, moment.ramp)
         self._moments.begin(moments)
         self._pressures.begin(moment.time, moment.ramp)
+
+    @property
+    def alike(self) -> Hashable | None:
+        """What those have in common that a step evaluates together; None: it does so alone."""
+        if not self._conditions.none:
+            return None
+        return self._cells.shape[1], self.length, *self._masses.tolist()
 
     @property
     def settings(self) -> Settings:
