@@ -3,8 +3,8 @@
     python benchmarks/thin_growth.py --beam 1000 8300 --shell 25 50 100 128 --continuum 15 26 31
     python benchmarks/thin_growth.py --copies 20 --beam 20 --shell 4 --continuum
 
-A beam has as many elements as is said, a shell and a continuum as many along a side. With `--copies` there are as many of
-each, beside each other; `--alone` evaluates them one by one.
+A beam has as many elements as is said, a shell and a continuum as many along a side. With
+`--copies` there are as many of each, beside each other; `--alone` evaluates them one by one.
 """
 
 import argparse

@@ -382,7 +382,7 @@ class Stepper:
         """Name in the ledger what changed parameters of materials do to the energy."""
         names = self._materials.changed()
         if names:
-            self.problem.forget_forces()
+            self.problem.sleepers.forget()
             what = f"a changed parameter of the material of {', '.join(map(repr, names))}"
             self._ledger.restate(self.state, what, beyond=0.0)
 

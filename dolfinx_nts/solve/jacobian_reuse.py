@@ -56,11 +56,11 @@ class KeptTangents:
         changed = any(a.stateGet() != self._states[k] for k, a in self._matrices.items())
         fresh = anywhere(problem.system.comm, self.due or changed)
         if fresh:
-            self._matrices = dict(zip(awake, problem.body_tangents(e), strict=True))
+            self._matrices = dict(zip(awake, problem.tangents.at(e), strict=True))
             self.due = not self._reuse()
         for j in awake:
             if j not in self._matrices:
-                self._matrices[j] = problem.body_tangent(j, e.terms[j].u1)
+                self._matrices[j] = problem.tangents.of(j, e.terms[j].u1)
         return [self._matrices[j] for j in awake], fresh
 
     def remember(self) -> None:
