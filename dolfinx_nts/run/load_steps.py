@@ -12,10 +12,9 @@ from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.parallel import anywhere, global_max
+from dolfinx_nts.run import step_warnings
 from dolfinx_nts.run.ledger_check import NOT_FINITE
-from dolfinx_nts.run.load_step_warnings import tell_at_rest, tell_cut_off, tell_part_of_loads
 from dolfinx_nts.run.solution import Equilibrium
-from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.trial import solved, state_after
 from dolfinx_nts.solve.convergence import unrest
@@ -113,7 +112,7 @@ class LoadStepper(Stepper):
         self._call_before(dt)
         self._materials.changed()
         self._ledger.open(self.state, self._start)
-        tell_cut_off(self.solution, self.state)
+        step_warnings.tell_cut_off(self.solution, self.state)
         self._started = True
 
     def _step(self, dt: float, time: float) -> None:
@@ -168,8 +167,8 @@ class LoadStepper(Stepper):
             text = NOT_FINITE if endless else text
             self.solution.warn("ledger", time, missing, text, grave=endless)
         self._accept(state)
-        tell_inversion(self.solution, self.problem, step, state)
-        tell_couplings(self.solution, self.problem, step, state)
+        step_warnings.tell_inversion(self.solution, self.problem, step, state)
+        step_warnings.tell_couplings(self.solution, self.problem, step, state)
         self._solved = step
         self.look()
 
@@ -225,9 +224,9 @@ class LoadStepper(Stepper):
         """Look as `Stepper` does, and at the end for motions that nothing resists and for loads."""
         super().look(last=last)
         if last and not self._stabilization and self._solved is not None:
-            tell_at_rest(self.solution, self.solver, self._solved, self.state)
+            step_warnings.tell_at_rest(self.solution, self.solver, self._solved, self.state)
         if last:
-            tell_part_of_loads(self.solution, self.problem, self.state, self._end)
+            step_warnings.tell_part_of_loads(self.solution, self.problem, self.state, self._end)
 
     def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, _Relaxed]:
         """Solution of a load step, its state, Newton iterations, what the relaxations took.
