@@ -304,7 +304,7 @@ def require_directions(ends: Sequence[Any], name: str, *, at_nodes: bool) -> Non
             )
 
 
-def points_of(argument: str, body: Any, x: FloatArray) -> Any:
+def points_of(argument: str, body: Body, x: FloatArray) -> Any:
     """A body's material points for a joint or spring, whose argument an error names."""
     try:
         return body.points(x)

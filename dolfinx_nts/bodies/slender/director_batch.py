@@ -9,6 +9,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from dolfinx_nts.bodies.batch import Batch
+from dolfinx_nts.bodies.slender.director_body import DirectorBody
 from dolfinx_nts.bodies.slender.director_elements import DirectorElements
 from dolfinx_nts.bodies.slender.director_matrix import DirectorMatrix
 from dolfinx_nts.bodies.slender.element_values import ElementValues
@@ -26,7 +27,7 @@ class DirectorBatch(Batch):
         numbers: Their numbers in the system, shape (members,).
     """
 
-    def __init__(self, bodies: Sequence[Any], numbers: IntArray) -> None:
+    def __init__(self, bodies: Sequence[DirectorBody], numbers: IntArray) -> None:
         each = [body.elements for body in bodies]
         directors = len(each[0].masses) - 1
         super().__init__(bodies, numbers, directors, f"{bodies[0].kind}s")
