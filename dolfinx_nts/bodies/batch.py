@@ -16,7 +16,7 @@ from dolfinx_nts.types import FloatArray, IntArray
 _REMEMBERED = 6
 
 
-class Batch(Body):
+class BodyBatch(Body):
     """Bodies that are `alike`, under no load but gravity, with nothing prescribed.
 
     Its coordinates are those of its members, rank by rank, on each rank in their order.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.bodies.batch import Batch
+from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.bodies.rigid.rigid_batch import RigidBatch
 from dolfinx_nts.bodies.slender.beam import Beam
@@ -32,7 +32,7 @@ class Batches:
     Attributes:
         comm: MPI communicator.
         count: Number of bodies of the system.
-        bodies: Of each batch what evaluates it: a `Batch`, which come first, or the one body.
+        bodies: Of each batch what evaluates it: a `BodyBatch`, which come first, or the one body.
         numbers: Of each batch the numbers of its bodies in the system.
     """
 
@@ -55,9 +55,9 @@ class Batches:
             self._batch[[*of, self.count + j]] = j
 
     @property
-    def several(self) -> list[Batch]:
+    def several(self) -> list[BodyBatch]:
         """Those of more than one body, the first of `bodies`."""
-        return [body for body in self.bodies if isinstance(body, Batch)]
+        return [body for body in self.bodies if isinstance(body, BodyBatch)]
 
     def batch_of(self, k: int) -> int:
         """Number of a body's batch; `count` + j, for a side of all of batch j, stands for j."""
@@ -66,7 +66,7 @@ class Batches:
     def in_batch(self, k: int, numbers: IntArray) -> IntArray:
         """A body's coordinates -> those of its batch; negative numbers stay."""
         batch = self.bodies[self._batch[k]]
-        if k >= self.count or not isinstance(batch, Batch):
+        if k >= self.count or not isinstance(batch, BodyBatch):
             return numbers
         return np.where(numbers < 0, numbers, batch.numbered(k, numbers))
 
@@ -75,14 +75,14 @@ class Batches:
         if k < self.count:
             return np.full(numbers.shape, k)
         batch = self.bodies[self._batch[k]]
-        assert isinstance(batch, Batch)
+        assert isinstance(batch, BodyBatch)
         return batch.number_of[numbers]
 
     # ---- from bodies to batches and back
     def join(self, values: Sequence[FloatArray]) -> list[FloatArray]:
         """Owned coordinates of each batch from those of each body."""
         return [
-            body.joined(values) if isinstance(body, Batch) else values[of[0]]
+            body.joined(values) if isinstance(body, BodyBatch) else values[of[0]]
             for body, of in zip(self.bodies, self.numbers, strict=True)
         ]
 
@@ -90,7 +90,7 @@ class Batches:
         """Owned coordinates of each body from those of each batch: views."""
         out = [np.empty(0)] * self.count
         for body, of, own in zip(self.bodies, self.numbers, values, strict=True):
-            if isinstance(body, Batch):
+            if isinstance(body, BodyBatch):
                 for k, part in body.parts(own):
                     out[k] = part
             else:
@@ -112,7 +112,7 @@ class Batches:
     def _reduced(self, how: Any, values: Sequence[FloatArray]) -> FloatArray:
         out = np.zeros((*values[0].shape[:-1], self.count))
         for body, of, own in zip(self.bodies, self.numbers, values, strict=True):
-            if isinstance(body, Batch):
+            if isinstance(body, BodyBatch):
                 out[..., body.own] = body.reduced(how, own)
             else:
                 out[..., of[0]] = how.reduce(own, axis=-1, initial=0.0)
@@ -122,7 +122,7 @@ class Batches:
         """`Body.motion_of_points` of each body on this rank [m], shape (bodies,)."""
         out = np.zeros(self.count)
         for body, of, own in zip(self.bodies, self.numbers, du, strict=True):
-            if isinstance(body, Batch):
+            if isinstance(body, BodyBatch):
                 out[body.own] = body.motions(own)
             else:
                 out[of[0]] = body.motion_of_points(own)

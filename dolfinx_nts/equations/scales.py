@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.bodies.batch import Batch
+from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.unknowns import Unknowns
@@ -208,7 +208,7 @@ class Rounding:
             each = diagonal.array_r.copy()
             diagonal.destroy()
             if body.oriented and not body.rigid:
-                here = body.number_here[::3] if isinstance(body, Batch) else of
+                here = body.number_here[::3] if isinstance(body, BodyBatch) else of
                 each = self._as_rounded(body, each.reshape(-1, 3), self._extent[here])
             squares = [np.zeros(other.num_owned) for other in self._batches.bodies]
             squares[j] = np.square(each)

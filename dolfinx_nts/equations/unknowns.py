@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.batch import Batch
+from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
 from dolfinx_nts.interaction.combination import num_multipliers, of_multipliers
@@ -135,7 +135,7 @@ class Unknowns:
         """Where a body's coordinates stand among this rank's unknowns."""
         j = self._batches.batch_of(k)
         place, batch = self._places[j], self._batches.bodies[j]
-        if not isinstance(batch, Batch):
+        if not isinstance(batch, BodyBatch):
             return place
         of = batch.number_here
         found = np.flatnonzero((of[self._awake[j].here] if j in self._awake else of) == k)

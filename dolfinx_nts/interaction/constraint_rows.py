@@ -78,7 +78,7 @@ def joined(
     Args:
         each: Those of the joints.
         of: Numbers of their bodies.
-        batch: A `Batch`.
+        batch: A `BodyBatch`.
     """
     sides = []
     for k, body in enumerate(each[0].sides):

@@ -108,7 +108,7 @@ class Constraints(EveryStep):
 
         Args:
             joints: The joints.
-            batch: A `Batch`.
+            batch: A `BodyBatch`.
             number: For which the batch stands as the body of a side, see `Batches`.
         """
         rows = joined([joint._all for joint in joints], [joint._of for joint in joints], batch)

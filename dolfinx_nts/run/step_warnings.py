@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinx_nts.bodies.batch import Batch
+from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.motion import motion_of
 from dolfinx_nts.bodies.solid.inversion import describe, smallest_dets
 from dolfinx_nts.contact.hidden_facets import hidden_facets
@@ -191,7 +191,7 @@ def _tell_turns(solution: Solution, problem: StepProblem, new: State) -> None:
     batches = problem.batches
     ends = (batches.join(state.u) for state in (old, new))
     for body, (k, *_), u0, u1 in zip(batches.bodies, batches.numbers, *ends, strict=True):
-        if isinstance(body, Batch):
+        if isinstance(body, BodyBatch):
             seen[body.own] = body.turns(u0, u1)
         elif body.oriented:
             driven[k] = body.prescribed_turn(old.time, new.time)

@@ -9,7 +9,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from dolfinx_nts import petsc_compat
-from dolfinx_nts.bodies.batch import Batch
+from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.rigid.rigid import RigidBody
 from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
@@ -17,7 +17,7 @@ from dolfinx_nts.parallel import gather_rows
 from dolfinx_nts.types import FloatArray, IntArray
 
 
-class RigidBatch(Batch):
+class RigidBatch(BodyBatch):
     """Rigid bodies: inertia and weight, see `RigidBody.alike`.
 
     Args:
@@ -37,7 +37,7 @@ class RigidBatch(Batch):
         self._holds: tuple[float, int] | None = None
 
     def motions(self, du: FloatArray) -> FloatArray:
-        """As of `Batch`, all at once."""
+        """As of `BodyBatch`, all at once."""
         moved = np.abs(du).reshape(-1, 4, 3)
         return np.einsum("bk,bki->bi", self._reach, moved).max(axis=1, initial=0.0)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinx_nts.bodies.batch import Batch
+from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.slender.director_body import DirectorBody
 from dolfinx_nts.bodies.slender.director_elements import DirectorElements
 from dolfinx_nts.bodies.slender.director_matrix import DirectorMatrix
@@ -19,7 +19,7 @@ from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.types import FloatArray, IntArray
 
 
-class DirectorBatch(Batch):
+class DirectorBatch(BodyBatch):
     """Beams or shells with directors and masses in common, see `DirectorBody.alike`.
 
     Args:
