@@ -1,4 +1,4 @@
-"""The bodies of a scene as a step sees them: plain rigid ones together, all others one by one."""
+"""The bodies of a scene as a step sees them: those that are alike together, others one by one."""
 
 from __future__ import annotations
 
@@ -7,9 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH, RigidBatch
+from dolfinx_nts.bodies.batch import BodyBatch
+from dolfinx_nts.bodies.rigid.rigid import RigidBody
+from dolfinx_nts.bodies.rigid.rigid_batch import RigidBatch
+from dolfinx_nts.bodies.slender.beam import Beam
+from dolfinx_nts.bodies.slender.director_batch import DirectorBatch
+from dolfinx_nts.bodies.slender.shell import Shell
 from dolfinx_nts.state import State
 from dolfinx_nts.types import FloatArray, IntArray
+
+#: What evaluates several bodies of a class that are alike.
+_TOGETHER: dict[type, Any] = {RigidBody: RigidBatch, Beam: DirectorBatch, Shell: DirectorBatch}
 
 
 class Batches:
@@ -19,33 +27,37 @@ class Batches:
 
     Args:
         bodies: Of the system.
-        together: Whether plain rigid bodies make one batch; else each body is one.
+        together: Whether bodies that are alike make one batch; else each body is one.
 
     Attributes:
         comm: MPI communicator.
         count: Number of bodies of the system.
-        bodies: Of each batch what evaluates it: a `RigidBatch`, or the one body itself.
+        bodies: Of each batch what evaluates it: a `BodyBatch`, which come first, or the one body.
         numbers: Of each batch the numbers of its bodies in the system.
-        rigid: The batch of several, if there is one; the first of `bodies` then.
     """
 
     def __init__(self, bodies: Sequence[Any], *, together: bool = True) -> None:
         self.comm, self.count = bodies[0].comm, len(bodies)
-        plain = [k for k, body in enumerate(bodies) if together and getattr(body, "plain", False)]
-        plain = plain if len(plain) > 1 else []
-        alone = [k for k in range(len(bodies)) if k not in set(plain)]
-        self.rigid = RigidBatch([bodies[k] for k in plain], np.array(plain)) if plain else None
-        several: list[Any] = [self.rigid] if self.rigid else []
-        self.bodies = several + [bodies[k] for k in alone]
-        self.numbers = [plain] * len(several) + [[k] for k in alone]
-        #: Batch of each body, then of each batch that stands for itself as a side of elements ...
+        found: dict[Any, list[int]] = {}
+        for k, body in enumerate(bodies):
+            # A class of the user's own may override anything.
+            alike = body.alike if together and type(body) in _TOGETHER else None
+            found.setdefault(k if alike is None else (type(body), alike), []).append(k)
+        self.numbers = sorted(found.values(), key=lambda of: len(of) == 1)
+        self.bodies: list[Any] = [
+            bodies[k] if len(of) == 1
+            else _TOGETHER[type(bodies[k])]([bodies[i] for i in of], np.array(of))
+            for of in self.numbers for k in of[:1]
+        ]  # fmt: skip
+        #: Batch of each body, then of each one that stands for itself as a side of elements.
         self._batch = np.zeros(self.count + len(self.bodies), dtype=np.int64)
-        #: ... and where the body's coordinates begin in the numbering of its batch.
-        self._first = np.zeros_like(self._batch)
         for j, of in enumerate(self.numbers):
             self._batch[[*of, self.count + j]] = j
-        if self.rigid:
-            self._first[plain] = self.rigid.first
+
+    @property
+    def several(self) -> list[BodyBatch]:
+        """Those of more than one body, the first of `bodies`."""
+        return [body for body in self.bodies if isinstance(body, BodyBatch)]
 
     def batch_of(self, k: int) -> int:
         """Number of a body's batch; `count` + j, for a side of all of batch j, stands for j."""
@@ -53,23 +65,24 @@ class Batches:
 
     def in_batch(self, k: int, numbers: IntArray) -> IntArray:
         """A body's coordinates -> those of its batch; negative numbers stay."""
-        first = self._first[k]
-        return np.where(numbers < 0, numbers, numbers + first) if first else numbers
+        batch = self.bodies[self._batch[k]]
+        if k >= self.count or not isinstance(batch, BodyBatch):
+            return numbers
+        return np.where(numbers < 0, numbers, batch.numbered(k, numbers))
 
     def body_of(self, k: int, numbers: IntArray) -> IntArray:
         """Numbers of the bodies that coordinates of a body, or of a side of a batch, are of."""
         if k < self.count:
             return np.full(numbers.shape, k)
-        j = k - self.count
-        if self.rigid is None or j:
-            return np.full(numbers.shape, self.numbers[j][0])
-        return self.rigid.number_of[numbers]
+        batch = self.bodies[self._batch[k]]
+        assert isinstance(batch, BodyBatch)
+        return batch.number_of[numbers]
 
     # ---- from bodies to batches and back
     def join(self, values: Sequence[FloatArray]) -> list[FloatArray]:
         """Owned coordinates of each batch from those of each body."""
         return [
-            body.joined(values) if body is self.rigid else values[of[0]]
+            body.joined(values) if isinstance(body, BodyBatch) else values[of[0]]
             for body, of in zip(self.bodies, self.numbers, strict=True)
         ]
 
@@ -77,9 +90,9 @@ class Batches:
         """Owned coordinates of each body from those of each batch: views."""
         out = [np.empty(0)] * self.count
         for body, of, own in zip(self.bodies, self.numbers, values, strict=True):
-            if body is self.rigid:
-                for k, row in zip(body.own.tolist(), own.reshape(-1, WIDTH), strict=True):
-                    out[k] = row
+            if isinstance(body, BodyBatch):
+                for k, part in body.parts(own):
+                    out[k] = part
             else:
                 out[of[0]] = own
         return tuple(out)
@@ -96,12 +109,11 @@ class Batches:
         """Largest absolute value at the owned coordinates of each body, shape (bodies,)."""
         return self._reduced(np.maximum, [np.abs(own) for own in values])
 
-    def _reduced(self, how: np.ufunc, values: Sequence[FloatArray]) -> FloatArray:
+    def _reduced(self, how: Any, values: Sequence[FloatArray]) -> FloatArray:
         out = np.zeros((*values[0].shape[:-1], self.count))
         for body, of, own in zip(self.bodies, self.numbers, values, strict=True):
-            if body is self.rigid:
-                each = own.reshape(*own.shape[:-1], len(body.own), WIDTH)
-                out[..., body.own] = how.reduce(each, axis=-1)
+            if isinstance(body, BodyBatch):
+                out[..., body.own] = body.reduced(how, own)
             else:
                 out[..., of[0]] = how.reduce(own, axis=-1, initial=0.0)
         return out
@@ -110,7 +122,7 @@ class Batches:
         """`Body.motion_of_points` of each body on this rank [m], shape (bodies,)."""
         out = np.zeros(self.count)
         for body, of, own in zip(self.bodies, self.numbers, du, strict=True):
-            if body is self.rigid:
+            if isinstance(body, BodyBatch):
                 out[body.own] = body.motions(own)
             else:
                 out[of[0]] = body.motion_of_points(own)
@@ -118,5 +130,5 @@ class Batches:
 
     def destroy(self) -> None:
         """Free the PETSc objects of batches of several; those of bodies are theirs."""
-        if self.rigid:
-            self.rigid.destroy()
+        for batch in self.several:
+            batch.destroy()

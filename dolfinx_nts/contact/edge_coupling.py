@@ -144,7 +144,8 @@ class EdgeCoupling:
         ways = [edges.surface.gather(step.ahead[b]) for edges, b in both]
         found = self._pairs.closest(self._x, ways, reach + near, near, limit)
         old = gather_rows(self._comm, self._history.pair)
-        if not (len(old) or len(self._tried) or found.some[0]):
+        some = len(old) or len(self._tried) or found.some[0]
+        if not some and self.contact.pair.holds_nodes:
             return _NONE[:, 0]
         pairs, chosen = self._pairs.numbers, self._choose(found, old, reach, limit)
         out = np.flatnonzero(chosen & (found.beyond > 0))
@@ -159,21 +160,30 @@ class EdgeCoupling:
 
         Args:
             found: Where they meet.
-            old: Pairs that pressed in the last step, on all ranks, shape (k, 2).
+            old: Pairs that pressed in the last step, or were followed, on all ranks, (k, 2).
             reach: Bound on the step's motion [m].
             limit: As of `Pairs.closest` [m].
         """
         assert self._pairs is not None
-        pairs, gap = self._pairs.numbers, found.gap[:, 0]
-        carries = np.isin(self._key(pairs), self._key(old))
+        pairs, gap, holds = self._pairs.numbers, found.gap[:, 0], self.contact.pair.holds_nodes
+        carries = np.isin(self._key(pairs), self._key(old)) & (holds | (gap < reach))
         # Contact may pass along an edge.
         follows = np.isin(pairs[:, 0], old[:, 0]) | np.isin(pairs[:, 1], old[:, 1])
-        follows &= (gap > -_OVERSHOT * reach) & (gap < limit)
-        chosen = found.touch | ((carries | follows) & found.meet[:, :2].any(axis=1))
+        near, meet = gap > -_OVERSHOT * reach, found.meet[:, :2].any(axis=1)
+        follows &= near & (gap < (limit if holds else reach))
+        chosen = found.touch | ((carries | follows) & meet)
+        if not holds:
+            # A rim enters a little what is kept out of it in the mean.
+            chosen |= near & (gap < limit) & meet & (found.node == 0)
         # What held in an attempt at the step passes nothing in that one's solution.
         chosen |= np.isin(self._key(pairs), self._tried) & np.isfinite(gap)
-        chosen &= (found.node == 0) | (found.node >= _ASKED) | (carries & (found.node == 1))
-        self._leave_to_nodes(found, chosen)
+        # Where no node is held, edges that press pass a rim on, one after the other.
+        passed = (carries & (found.node == 1)) if holds else chosen & (carries | follows)
+        left = chosen & ((found.node == 0) | (found.node >= _ASKED)) & ~(passed & (not holds))
+        self._leave_to_nodes(found, left)
+        chosen &= left | passed
+        if not holds:
+            self._take_one_at_nodes(found, chosen)
         self._take_once(found, chosen, carries)
         self._tried = self._key(pairs[chosen])
         return chosen
@@ -202,6 +212,27 @@ class EdgeCoupling:
         rise = np.abs(np.einsum("ni,ni->n", normal, end - start))
         level = rise < LEVEL * np.linalg.norm(end - start, axis=1)
         chosen[some[level & normal.any(axis=1)]] = False
+
+    def _take_one_at_nodes(self, found: Near, chosen: BoolArray) -> None:
+        """Take from chosen pairs that meet at a node of the slave all but one of each rim there.
+
+        One that meets at the end of the step stays.
+
+        Args:
+            found: Where they meet.
+            chosen: Pairs, shape (n,).
+        """
+        some = np.flatnonzero(chosen & (found.node > 0))
+        if some.size < 2:
+            return
+        assert self._pairs is not None
+        some = some[np.argsort(~found.meet[some, 1], kind="stable")]
+        own, other = self._pairs.numbers[some].T
+        ends = self.contact.edges[0].ends[own]
+        shared = (ends[:, None, :, None] == ends[None, :, None, :]).any(axis=(2, 3))
+        shared &= other[:, None] == other
+        for i in range(1, len(some)):
+            chosen[some[i]] = not (shared[i, :i] & chosen[some[:i]]).any()
 
     def _take_once(self, found: Near, chosen: BoolArray, carries: BoolArray) -> None:
         """Take from chosen pairs that meet at a node of the master all but one of each edge there.
@@ -276,7 +307,8 @@ class EdgeCoupling:
     @property
     def pressed(self) -> BoolArray:
         """Which of the elements pressed at t_n."""
-        return np.isin(self._key(self._chosen), self._key(self._history.pair))
+        old = self._history
+        return np.isin(self._key(self._chosen), self._key(old.pair[old.force > 0.0]))
 
     # ---- a solution
     def wake(self, e: Evaluation, parts: Sequence[Any]) -> bool:
@@ -336,10 +368,12 @@ class EdgeCoupling:
         return []
 
     def history(self, parts: Sequence[Any]) -> EdgeHistory:
-        """The pairs that carry, and their forces."""
+        """The pairs that carry, or are followed, and their forces."""
         if not parts:
             return EdgeHistory.of_start()
         (part,), factor = parts, self._step.factor
-        on = part.active
+        # Where no node is held, what a rim passes is followed also while it does not press.
+        on = part.active | (not self.contact.pair.holds_nodes)
         force, tangential = -part.multiplier[:, 0] / factor, part.tangential / factor
+        force = np.where(part.active, force, 0.0)
         return EdgeHistory(self._chosen[on], force[on], tangential[on])

@@ -8,40 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from dolfinx_nts.contact.contact_measure import Batch, Measured, Slip
 from dolfinx_nts.kernels import compiled, facets, nts_element
 from dolfinx_nts.types import FloatArray
-
-
-class MiddleTangents(NamedTuple):
-    """Tangents a_a over the facet's size, where between t_n and t_{n+1} forces act.
-
-    Attributes:
-        value: [-], shape (n, 2, 3).
-        by_control: Their derivatives by the control points at t_{n+1} [1/m], (n, nc, 2).
-        by_slip: By the slip that `Measured` has [1/m], shape (n, 2, 2, 3), the last axis theirs.
-    """
-
-    value: FloatArray
-    by_control: FloatArray
-    by_slip: FloatArray
-
-    def turns(self, slip: Slip, size: int) -> FloatArray:
-        """Derivatives by the points [1/m], shape (n, 2, size, 3), the last axis the tangents'.
-
-        Args:
-            slip: What `Measured` has.
-            size: Coordinates of the points.
-        """
-        slope = slip.gradient[:, None, :, :size].swapaxes(2, 3)
-        turns: FloatArray = np.matmul(slope, self.by_slip)
-        for i in range(3):
-            turns[:, :, 3 + i :: 3, i] += self.by_control.transpose(0, 2, 1)
-        return turns
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,20 +101,26 @@ class FacetGap(Batch):
             found = self._condensed(x, multiplier)
         if found.slip is None:
             return found
-        middle = self.start + self.theta * (x - self.start)
-        return found._replace(normal=self.normal_at(middle))
+        return found._replace(normal=self.normal_between(x))
 
-    def middle_tangents(self, x: FloatArray) -> MiddleTangents:
-        """Tangents halfway between the foot of t_n and that of points at t_{n+1}."""
-        theta = self.theta
-        control = (self.start + theta * (x - self.start))[:, 1:]
-        xi = self.xi + theta * (self.projection(x) - self.xi)
-        _, first, second = facets.shape(xi, control.shape[1])
-        length = self.length[:, None, None]
+    def middle_tangents(self, x: FloatArray, xi: FloatArray) -> FloatArray:
+        """Tangents a_a over the facet's size, where between t_n and t_{n+1} friction acts [-].
+
+        Args:
+            x: Points at t_{n+1} [m].
+            xi: Their projection.
+
+        Returns:
+            Shape (n, 2, 3).
+        """
+        control = (self.start + self.theta * (x - self.start))[:, 1:]
+        _, first, _ = facets.shape(self.xi + self.theta * (xi - self.xi), control.shape[1])
         tangents = np.einsum("nia,nij->naj", first, control)
-        bends = np.einsum("niab,nij->nabj", second, control)
-        return MiddleTangents(tangents / length, theta * first / length,
-                              theta * bends / length[..., None] ** 2)  # fmt: skip
+        return np.asarray(tangents / self.length[:, None, None])
+
+    def normal_between(self, x: FloatArray) -> FloatArray:
+        """Unit normals where between t_n and t_{n+1} the contact force acts, shape (n, 3)."""
+        return self.normal_at(self.start + self.theta * (x - self.start))
 
     def _has_friction(self, multiplier: FloatArray) -> bool:
         return multiplier.shape[1] > self.num_normal

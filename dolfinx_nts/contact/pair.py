@@ -141,6 +141,8 @@ class ContactPair:
             `adjust`.
     """
 
+    #: Whether it keeps nodes out where they are; else what is around them, in the mean.
+    holds_nodes: ClassVar[bool] = True
     #: Class of pairs for each class of masters.
     _kinds: ClassVar[dict[tuple[type, str], type[ContactPair]]] = {}
 

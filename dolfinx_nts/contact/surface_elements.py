@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from dolfinx_nts.contact.prescribed_slip import PrescribedSlip
 from dolfinx_nts.contact.surface_sums import FacetAttachment, Sums
 from dolfinx_nts.interaction.combination import Combination
 from dolfinx_nts.interaction.elements import Step
-from dolfinx_nts.kernels import compiled_law
+from dolfinx_nts.kernels import compiled, compiled_law
 from dolfinx_nts.kernels.vectors import cross, resultant
 from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
@@ -119,10 +119,9 @@ class SurfaceElements(ContactElements):
 
     @cached_property
     def _elements_of(self) -> IntArray:
-        """How many elements the slaves at the corners have, shape (n, corners)."""
+        """How many elements each slave has, shape (slaves,)."""
         # Each has a part of a slave's equations, or it would say nothing of its own multiplier.
-        slot = self._slot
-        return np.append(np.bincount(slot[slot >= 0]), 1)[slot]
+        return np.bincount(self._slot[self._slot >= 0], minlength=len(self.frame))
 
     @property
     def immovable(self) -> BoolArray:
@@ -151,7 +150,9 @@ class SurfaceElements(ContactElements):
     # ---- places
     def _measured(self, y: FloatArray) -> FloatArray:
         """The measure's points (n, points, 3) from the nodes of elements [m]."""
-        return np.matmul(self.sums.weights, y[self.sums.element])
+        weights = self.attachment.weights
+        corners = y if weights is None else np.matmul(weights, y)
+        return compiled.points_of(self.sums.element, self.sums.shape, corners)
 
     def gap(self, x: FloatArray) -> FloatArray:
         """Gaps of the slaves beyond the overlap that is left [m]."""
@@ -195,19 +196,21 @@ class SurfaceElements(ContactElements):
         multiplier = self.law.scale[:, None] * of_corners[self._first]
         y = self._measured(x)
         points = self._at_points(y, multiplier)
-        found = self._of_slaves(points, multiplier)
+        found = self._of_slaves(points, y, multiplier)
         together = self._together(found.gap, found.slip, multiplier)
-        obeyed = self.law.obey(self._motion(y), found, multiplier, together)
-        residual, tangent = compiled_law.to_elements(
-            self.num_elements, self.sums.element, self.sums.weights, points.residual, points.tangent
-        )
+        # What moves as prescribed is asked for with friction alone.
+        motion = self._motion(y) if self.law.prescribed else np.empty((len(multiplier), 1, 3))
+        obeyed = self.law.obey(motion, found, multiplier, together)
+        residual, tangent = points.residual, points.tangent
+        if self.attachment.weights is not None:
+            residual, tangent = compiled_law.to_nodes(self.attachment.weights, residual, tangent)
         self._write_law(residual, tangent, obeyed.residual[:, 3:], obeyed.tangent[:, 3:])
         return Contribution(
             **obeyed._replace(residual=residual, tangent=tangent)._asdict(),
             multiplier=multiplier,
             gap=found.gap,
             slip=found.slip.value if found.slip else np.empty((len(multiplier), 0)),
-            coupling=points.residual[:, : 3 * y.shape[1]].reshape(y.shape),
+            coupling=points.force,
             place=y,
         )
 
@@ -217,67 +220,50 @@ class SurfaceElements(ContactElements):
         foot = np.einsum("nk,nki->ni", self.measure.foot, motion[:, 1:])
         return self.sums.to_slaves(motion[:, 0] - foot)[:, None]
 
-    def _at_points(self, y: FloatArray, multiplier: FloatArray) -> _AtPoints:
-        """Rows and columns of points, with C in those of the slaves' multipliers.
+    def _at_points(self, y: FloatArray, multiplier: FloatArray) -> compiled.OverSurface:
+        """What points contribute at an iterate, before the law, by corners of the facets.
 
         Args:
             y: Points of the measure at t_{n+1} [m].
             multiplier: Of the slaves [kg m], shape (slaves, constraints).
         """
-        sums, (n, corners), width = self.sums, self.sums.slot.shape, multiplier.shape[1]
-        size, at_corners = 3 * y.shape[1], sums.at_corners(multiplier)
-        own, slips = sums.to_points(multiplier), None
-        if width > 1:
-            middle, directions = self.measure.middle_tangents(y), sums.at_corners(self.frame)
-            force = np.einsum("nc,nck,ncki->ni", sums.share, at_corners[..., 1:], directions)
-            own[:, 1:] = np.matmul(middle.value, force[:, :, None])[:, :, 0]
-        found = self.measure.evaluate(y, np.empty((n, 0)), own)
-        residual = np.zeros((n, size + corners * width))
-        tangent = np.zeros((*residual.shape, residual.shape[1]))
-        residual[:, :size] = found.residual[:, :size]
-        tangent[:, :size, :size] = found.tangent[:, :size, :size]
-        columns, rows = np.empty((2, n, corners, width, size))
-        columns[:, :, 0] = found.tangent[:, None, :size, size]
-        rows[:, :, 0] = found.tangent[:, None, size, :size]
-        if found.slip is not None:
-            slope, turns = found.slip.gradient[..., :size], middle.turns(found.slip, size)
-            slips = np.einsum("nai,na->ni", middle.value, found.slip.value)
-            by_friction = found.tangent[:, :size, size + 1 :]
-            # By the slip as a vector in space, and of it, shape (n, size, 3).
-            by_force = np.matmul(by_friction, middle.value)
-            by_points = np.matmul(slope.transpose(0, 2, 1), middle.value)
-            by_points += np.einsum("na,nazi->nzi", found.slip.value, turns)
-            of_force = np.matmul(turns, force[:, None, :, None])[..., 0]
-            tangent[:, :size, :size] += np.matmul(by_friction, of_force)
-            flat = directions.reshape(n, 2 * corners, 3)
-            for out, by in ((columns, by_force), (rows, by_points)):
-                along = np.matmul(flat, by.transpose(0, 2, 1))
-                out[:, :, 1:] = along.reshape(n, corners, 2, size)
-        shape, share = (n, corners * width, size), sums.share[:, :, None, None]
-        columns, rows = share * columns, share * rows
-        tangent[:, size:, :size] = rows.reshape(shape)
-        tangent[:, :size, size:] = columns.reshape(shape).transpose(0, 2, 1)
-        pulls = np.einsum("nckz,nck->ncz", columns[..., :3], at_corners)
-        return _AtPoints(residual, tangent, found.gap, slips, found.normal, pulls)
+        sums, measure, given = self.sums, self.measure, None
+        xi = measure.projection(y)
+        if measure.rule != "mean-value":
+            own = sums.to_points(multiplier)
+            if multiplier.shape[1] > 1:
+                along = np.einsum("nk,nki->ni", multiplier[:, 1:], self.frame)
+                middle = measure.middle_tangents(y, xi)
+                own[:, 1:] = np.einsum("nai,ni->na", middle, sums.to_points(along))
+            found = measure.evaluate(y, np.empty((len(y), 0)), own)
+            slip = found.slip.gradient if found.slip else np.empty(0)
+            given = found.residual, found.tangent, slip
+        start = measure.start, measure.normal, measure.xi, measure.length
+        return compiled.over_surface(
+            start, (y, xi), measure.theta, sums.element, sums.slot, sums.shape, sums.share,
+            multiplier, self.frame, self.num_elements, given,
+        )  # fmt: skip
 
-    def _of_slaves(self, points: _AtPoints, multiplier: FloatArray) -> Measured:
+    def _of_slaves(
+        self, points: compiled.OverSurface, y: FloatArray, multiplier: FloatArray
+    ) -> Measured:
         """What the law takes for elements, whose coordinates are gap and slip of the slaves.
 
         Their rows of coordinates are minus the forces on the slaves.
         """
-        sums, (n, width) = self.sums, multiplier.shape
+        n, width = multiplier.shape
         residual, tangent = np.zeros((n, 3 + width)), np.zeros((n, 3 + width, 3 + width))
-        gap = sums.to_slaves(points.gap) + self.law.overlap
-        residual[:, :3] = sums.by_slave(points.pulls)
+        gap = points.gap + self.law.overlap
+        residual[:, :3] = points.pulls
         residual[:, 3], tangent[:, 3, 0] = gap, 1.0
-        if points.slip is None or points.normal is None:
+        if width == 1:
             return Measured(residual, tangent, gap)
         gradient = np.zeros((n, 2, 3 + width))
         gradient[:, [0, 1], [1, 2]] = 1.0
         metric = np.tile(np.eye(2), (n, 1, 1))
-        value = np.einsum("nki,ni->nk", self.frame, sums.to_slaves(points.slip)) + self.law.slid
+        value = np.einsum("nki,ni->nk", self.frame, points.slip) + self.law.slid
         slip = Slip(value, gradient, metric, np.zeros((n, 2, 2, 3 + width)))
-        normal = sums.to_slaves(points.normal)
+        normal = self.sums.to_slaves(self.measure.normal_between(y))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         return Measured(residual, tangent, gap, slip, normal)
 
@@ -290,21 +276,12 @@ class SurfaceElements(ContactElements):
             residual: Of elements, shape (n, r).
             tangent: Shape (n, r, r).
             rows: Of the slaves [kg m], shape (slaves, constraints).
-            slopes: Derivatives of these by gap, slips, nothing if there are none, and multipliers.
+            slopes: Derivatives of these by gap, two slips and multipliers.
         """
-        width, size, slot = rows.shape[1], self.num_coordinates, self._slot
-        padded = np.concatenate([slopes, np.zeros((1, *slopes.shape[1:]))])[slot]
-        scale = np.append(self.law.scale, 0.0)[slot].repeat(width, axis=1)
-        shape, widths = (*slot.shape, width, size), slot.shape[1] * width
-        of_sums = padded[..., :width] @ tangent[:, size:, :size].reshape(shape)
-        tangent[:, size:, :size] = of_sums.reshape(len(slot), widths, size)
-        tangent[:, :size, size:] *= scale[:, None]
+        width, size = rows.shape[1], self.num_coordinates
+        compiled.law_of_sums(self._slot, self.law.scale, slopes, self._elements_of, tangent)
         element, corner = self._first
-        at = size + corner[:, None] * width + np.arange(width)
-        residual[element[:, None], at] = rows
-        for k in range(slot.shape[1]):
-            here = slice(size + k * width, size + (k + 1) * width)
-            tangent[:, here, here] = padded[:, k, :, 3:] / self._elements_of[:, k, None, None]
+        residual[element[:, None], size + corner[:, None] * width + np.arange(width)] = rows
 
     # ---- a solution
     def _pushed(self, part: Contribution) -> tuple[FloatArray, FloatArray]:
@@ -335,26 +312,6 @@ class SurfaceElements(ContactElements):
         own, master = (number[self.sums.element] for number in self.attachment.numbers)
         of_slave = np.einsum("nc,ni->nci", self.sums.shape, -part.coupling[:, 0])
         return [(own, of_slave), (master, -part.coupling[:, 1:])]
-
-
-class _AtPoints(NamedTuple):
-    """What points contribute at an iterate, before the law; axis 0 = point.
-
-    Attributes:
-        residual: Rows of the measure's points [kg m], and zeros of the multipliers at its corners.
-        tangent: Its derivative; rows of multipliers are C times those of the slaves' gap and slips.
-        gap: [m], shape (n,).
-        slip: As vectors [m], shape (n, 3); None without friction.
-        normal: As of `Measured`.
-        pulls: Minus the forces on the slave of each corner's multipliers, shape (n, corners, 3).
-    """
-
-    residual: FloatArray
-    tangent: FloatArray
-    gap: FloatArray
-    slip: FloatArray | None
-    normal: FloatArray | None
-    pulls: FloatArray
 
 
 def surface_elements(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from dolfinx_nts.contact.facet_gap import FacetGap
 from dolfinx_nts.contact.facet_pair import OVERHANG, FacetPair
-from dolfinx_nts.contact.node_attachment import beside
 from dolfinx_nts.contact.pair import MARGIN, Found, Motion
 from dolfinx_nts.contact.segments import near, segments
 from dolfinx_nts.contact.surface_elements import SurfaceElements, surface_elements
@@ -92,6 +92,8 @@ class OverMaster(NamedTuple):
 class SurfacePair(FacetPair, master=Surface, integration="surface"):
     """A `FacetPair` that keeps the slave's surface out in the mean around each node."""
 
+    holds_nodes = False
+
     def _set_up(self) -> None:
         super()._set_up()
         if not len(self.slave.facets):
@@ -160,27 +162,43 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         """
         slaves, master = positions
         own, other = slaves[self.slave.facets[self._facets]], master[self.master.facets]
-        found = segments(own, other, near(own, other, radius))
+        pairs = near(own, other, radius)
+        if not len(pairs[0]):
+            return self._none
+        found = segments(own, other, pairs)
         facet, over = self._facets[found.own], found.other
         corners = self.slave.facets[facet]
         shape, slopes, _ = facets.shape(found.xi, corners.shape[1])
         x = np.einsum("nc,nci->ni", shape, slaves[corners])
-        xi, converged, normal, gap, length = _measured(x, other[over])
+        xi, converged, normal, gap = _measured(x, other[over])
+        length = facets.size(other)[over]
         excess = facets.edge_excess(xi, other.shape[1])
         rim = self._free_edges[over]
         legal = converged & (excess <= np.where(rim, OVERHANG, _BEYOND)).all(axis=1)
         legal &= (gap > -MARGIN * length) & (gap < reach + MARGIN * length)
-        sides = np.einsum("nca,nci->nai", slopes, self.slave.reference[corners])
+        sides = np.matmul(slopes.transpose(0, 2, 1), self.slave.reference[corners])
         area = found.weight * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
         slot, part = self._position[corners], area[:, None] * shape
         points = OverMaster(facet, over, shape, xi, normal, gap, length, xi, slot, part)
         return points.select(legal)
 
+    @cached_property
+    def _none(self) -> OverMaster:
+        """No points."""
+        number, flat = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        shape = np.empty((0, self.slave.facets.shape[1]))
+        return OverMaster(
+            number, number, shape, flat, np.empty((0, 3)), np.empty(0), np.empty(0), flat,
+            shape.astype(np.int64), shape,
+        )  # fmt: skip
+
     def _seen_from(self, points: OverMaster, positions: Sequence[FloatArray]) -> OverMaster:
         """The same points and facets where they were at other positions."""
         slaves, master = positions
         x = np.einsum("nc,nci->ni", points.shape, slaves[self.slave.facets[points.own]])
-        xi, converged, normal, gap, length = _measured(x, master[self.master.facets[points.other]])
+        other = master[self.master.facets]
+        xi, converged, normal, gap = _measured(x, other[points.other])
+        length = facets.size(other)[points.other]
         found = points._replace(xi=xi, normal=normal, gap=gap, length=length)
         return found.select(converged)
 
@@ -234,23 +252,9 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
         sums = Sums(
             slaves=len(found.node), element=np.cumsum(new) - 1, slot=points.slot,
             share=np.where(points.slot >= 0, points.part, 0.0), shape=points.shape,
-            weights=self._weights(points), cut=points.cut,
+            cut=points.cut,
         )  # fmt: skip
         return surface_elements(self, found, attachment, measure, sums, step)
-
-    def _weights(self, points: OverMaster) -> FloatArray:
-        """Weights of the nodes of elements in points and control points."""
-        material = self.slave.material
-        of_corners = material.weights[self.slave.facets[points.own]]
-        n, corners, nodes = of_corners.shape
-        own = (points.shape[:, :, None] * of_corners).reshape(n, corners * nodes)
-        control = self.master.facet_weights
-        if control is None:
-            width = self.master.facet_nodes.nodes.shape[1]
-            of_master = np.broadcast_to(np.eye(width), (len(own), width, width))
-        else:
-            of_master = control[points.other]
-        return beside(own, of_master)
 
     def strayed(self, positions: Sequence[FloatArray], found: Any, due: FloatArray) -> float:
         """None: where pieces are cut is looked at elsewhere, see `SurfaceElements.is_stale`."""
@@ -287,10 +291,10 @@ class SurfacePair(FacetPair, master=Surface, integration="surface"):
 
 def _measured(
     x: FloatArray, corners: FloatArray
-) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray, FloatArray]:
-    """Feet of points (n, 3) on facets (n, nc, 3), which were found, normals, gaps and sizes [m]."""
+) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
+    """Feet of points (n, 3) on facets (n, nc, 3), which were found, normals and gaps [m]."""
     start, _ = compiled.closest_point(x, corners)
     xi, converged = compiled.project(x, corners, start)
     foot, _, normal = facets.frame(corners, xi)
     gap: FloatArray = np.einsum("ni,ni->n", normal, x - foot)
-    return xi, converged, normal, gap, facets.size(corners)
+    return xi, converged, normal, gap

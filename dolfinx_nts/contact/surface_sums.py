@@ -27,7 +27,6 @@ class FacetAttachment(Batch):
     other: IntArray
     path = _STILL
     shares = None
-    weights = None
 
     @property
     def surfaces(self) -> tuple[Surface, Surface]:
@@ -45,6 +44,25 @@ class FacetAttachment(Batch):
         corners = self.slave.material.joined(self.slave.facets[self.own])
         return corners, self.master.facet_nodes.select(self.other)
 
+    @cached_property
+    def weights(self) -> FloatArray | None:
+        """Weights of these in the corners, (n, corners of both, nodes); None if they are one."""
+        control, material = self.master.facet_weights, self.slave.material
+        if material.are_nodes and control is None:
+            return None
+        of_corners = material.weights[self.slave.facets[self.own]]
+        n, corners, nodes = of_corners.shape
+        if control is None:
+            width = self.master.facet_nodes.nodes.shape[1]
+            of_master = np.broadcast_to(np.eye(width), (n, width, width))
+        else:
+            of_master = control[self.other]
+        own = np.einsum("nca,cd->ncda", of_corners, np.eye(corners))
+        out = np.zeros((n, corners + of_master.shape[1], corners * nodes + of_master.shape[2]))
+        out[:, :corners, : corners * nodes] = own.reshape(n, corners, corners * nodes)
+        out[:, corners:, corners * nodes :] = of_master
+        return out
+
     def place(self, i: int) -> str:
         """The facets' numbers."""
         return f"facets {int(self.own[i])} and {int(self.other[i])}"
@@ -60,7 +78,6 @@ class Sums(Batch):
         slot: Slaves whose gaps it is a part of, one at each corner of its facet; -1: none.
         share: Its parts C_qA in their gaps [-], 0 where there is none, shape (n, corners).
         shape: Weights of the facet's corners in it, shape (n, corners).
-        weights: Those of the element's nodes in the measure's points, shape (n, points, nodes).
         cut: Where on the master's facets they were when they were chosen, shape (n, 2).
     """
 
@@ -69,7 +86,6 @@ class Sums(Batch):
     slot: IntArray
     share: FloatArray
     shape: FloatArray
-    weights: FloatArray
     cut: FloatArray
 
     @cached_property
@@ -107,14 +123,18 @@ class Sums(Batch):
             attachment: Facets of the elements.
             foot: Weights of the corners of the master's facets in the points' feet.
         """
-        found, on = [], self.slot >= 0
+        # Corners without a slave have one beyond the last.
+        slave = np.where(self.slot < 0, self.slaves, self.slot)
+        of_slaves = _sparse(self.share, slave, self.slaves + 1).T.tocsr()[: self.slaves]
         both = zip(attachment.surfaces, attachment.numbers, (self.shape, -foot), strict=True)
-        for surface, numbers, weights in both:
-            values = self.share[:, :, None] * weights[:, None]
-            row, column = np.broadcast_arrays(
-                self.slot[:, :, None], numbers[self.element][:, None]
-            )
-            entries = values[on].ravel(), (row[on].ravel(), column[on].ravel())
-            shape = self.slaves, len(surface.points)
-            found.append(scipy.sparse.coo_array(entries, shape=shape).tocsr())
-        return found
+        return [
+            of_slaves @ _sparse(weights, numbers[self.element], len(surface.points))
+            for surface, numbers, weights in both
+        ]
+
+
+def _sparse(values: FloatArray, column: IntArray, number: int) -> Any:
+    """Rows of so many columns with the same number of entries each, at given columns (n, k)."""
+    n, k = values.shape
+    start = np.arange(0, n * k + 1, k)
+    return scipy.sparse.csr_array((values.ravel(), column.ravel(), start), shape=(n, number))

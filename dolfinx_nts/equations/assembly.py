@@ -246,15 +246,20 @@ class StepMatrix:
         self, blocks: node_blocks.NodeBlocks, tangents: Sequence[FloatArray], fresh: bool
     ) -> None:
         """Bring a corner in blocks up to the bodies' matrices and the elements. Collective."""
-        changes = tangents
         if fresh:
             blocks.fill(self.corner)
-        else:
-            changes = [a - b for a, b in zip(tangents, self._in_operator, strict=True)]
-        for (columns, numbers), change in zip(self._corner_numbers, changes, strict=True):
-            node_blocks.add(self.corner, numbers, change[:, columns][:, :, columns])
+        here = []
+        for (columns, _), tangent in zip(self._corner_numbers, tangents, strict=True):
+            first, count = int(columns[0]) if len(columns) else 0, len(columns)
+            # Most often they are a row, and need no copy.
+            row = np.array_equal(columns, np.arange(first, first + count))
+            some: Any = slice(first, first + count) if row else columns
+            here.append(tangent[:, some][:, :, some])
+        for k, ((_, numbers), block) in enumerate(zip(self._corner_numbers, here, strict=True)):
+            change = block if fresh else block - self._in_operator[k]
+            node_blocks.add(self.corner, numbers, change)
         self.corner.assemble()
-        self._in_operator = list(tangents)
+        self._in_operator = here
 
     def schur(self) -> SchurApproximation:
         """Approximate Schur complements of the constraints, as the operator is. Collective.

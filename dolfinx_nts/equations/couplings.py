@@ -214,7 +214,7 @@ def _together(
     declared: int,
     batches: Batches,
 ) -> list[OfJoints]:
-    """Joints between plain rigid bodies that are alike as one, all others one by one.
+    """Joints between bodies of one batch that are alike as one, all others one by one.
 
     Args:
         each: What makes the elements of each joint.
@@ -223,16 +223,18 @@ def _together(
         batches: Of the bodies.
     """
     groups: dict[Any, list[int]] = {}
-    plain = set(batches.numbers[0]) if batches.rigid else set()
     for k, (coupling, of) in enumerate(zip(each, bodies, strict=True)):
-        alike = coupling.alike if type(coupling) is Constraints and plain.issuperset(of) else None
-        groups.setdefault(k if alike is None else (k < declared, alike), []).append(k)
+        j, *others = {batches.batch_of(b) for b in of}
+        one = j < len(batches.several) and not others
+        alike = coupling.alike if type(coupling) is Constraints and one else None
+        groups.setdefault(k if alike is None else (k < declared, j, alike), []).append(k)
     out = []
     for numbers in groups.values():
         coupling = each[numbers[0]]
         if len(numbers) > 1:
             several: Any = [each[k] for k in numbers]
-            coupling = Constraints.together(several, batches.rigid, batches.count)
+            j = batches.batch_of(bodies[numbers[0]][0])
+            coupling = Constraints.together(several, batches.bodies[j], batches.count + j)
         out.append(OfJoints(coupling, numbers))
     return out
 

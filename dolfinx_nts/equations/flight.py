@@ -50,8 +50,7 @@ class Flight:
         ahead = [integrator.ahead(v, a, dt) for v, a in zip(v0, a0, strict=True)]
         self.ends = [u + du for u, du in zip(u0, ahead, strict=True)]
         for body, u1 in zip(batches.bodies, self.ends, strict=True):
-            if body is not batches.rigid:
-                u1[body.fixed] = body.prescribed(state.time + dt)
+            u1[body.fixed] = body.prescribed(state.time + dt)
         self._supports.begin(state, batches.split(self.ends), dt)
         rates = [v0] + [[dt * a for a in a0 if a is not None]] * bool(state.a)
         speed = self._lengths.begin(u0, rates, self.ends)

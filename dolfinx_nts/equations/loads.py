@@ -39,9 +39,14 @@ class Loads:
         self._state, self._dt = state, dt
         when = state.time + rule.theta * dt
         self.moments = list(self._moments(when) if moments is None else moments)
-        for body, (k, *_) in zip(batches.bodies, batches.numbers, strict=True):
-            body.begin_step(rule, self.moments[k])
+        u0 = batches.join([moment.u0 for moment in self.moments])
+        for body, (k, *_), place in zip(batches.bodies, batches.numbers, u0, strict=True):
+            body.begin_step(rule, self.moments[k]._replace(u0=place))
         self.gravity = rule.ramp(when) * self._system.gravity
+
+    def tell(self, k: int) -> None:
+        """Begin the step of a body that is a member of a batch, to be asked alone. Collective."""
+        self._system.bodies[k].begin_step(self._integrator, self.moments[k])
 
     def _moments(self, when: float) -> list[EvaluationPoint]:
         """What bodies are told of a step whose loads act at a time [s]."""

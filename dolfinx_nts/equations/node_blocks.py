@@ -27,7 +27,7 @@ _PATTERN = "dolfinx_nts_pattern"
 Pattern = list[tuple[IntArray, IntArray]]
 
 
-def patterns(bodies: Sequence[Any]) -> list[Pattern] | None:
+def patterns(bodies: Sequence[PETSc.Mat]) -> list[Pattern] | None:
     """Block rows of the bodies' matrices, None unless all consist of whole blocks. Collective.
 
     Bodies of the user's own may have any coordinates. PETSc has no incomplete
@@ -105,7 +105,7 @@ class NodeBlocks:
 
     def __init__(
         self,
-        bodies: Sequence[Any],
+        bodies: Sequence[PETSc.Mat],
         found: Sequence[Pattern],
         to_whole: Callable[[int, IntArray], IntArray],
         elements: Sequence[IntArray],

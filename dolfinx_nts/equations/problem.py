@@ -10,7 +10,7 @@ pure: nothing here changes a State, and history changes only when a step is acce
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -19,6 +19,7 @@ from petsc4py import PETSc
 
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.contact.contact_elements import ContactElements
+from dolfinx_nts.equations.body_tangents import BodyTangents
 from dolfinx_nts.equations.couplings import Couplings
 from dolfinx_nts.equations.flight import Flight
 from dolfinx_nts.equations.loads import Loads
@@ -33,11 +34,7 @@ from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, Evaluation
 from dolfinx_nts.parallel import everywhere, global_max
 from dolfinx_nts.state import State
 from dolfinx_nts.system import System
-from dolfinx_nts.types import BoolArray, FloatArray
-
-#: Share of the stiffness around them that matrices of a load step lend to directors, which may be
-#: free to spin, as those of a string between hinges: rounding alone would say how far.
-_SPIN = 1e-11
+from dolfinx_nts.types import FloatArray
 
 
 class StepProblem:
@@ -57,17 +54,17 @@ class StepProblem:
         unknowns: Their layout; made anew whenever the elements' coordinates change.
         version: Changes whenever `unknowns` does.
         dives: Whether free flight presses bodies deep into each other, after `begin`.
-        lent: Share of the stiffness around each coordinate that is added to matrices, see
-            `LentStiffness`.
         factor: What the equations multiply forces by, h^2/2 [s^2] or 1.
         rtol: As given.
         rounding: What part of the forces on bodies is rounding.
         stabilization: In statics, what holds each node at t_n.
         lengths: Lengths of the scene, and of the step after `begin`.
         loads: When the step takes which loads.
+        sleepers: Bodies that the step leaves out.
         supports: Prescribed coordinates in the step.
         batches: Which bodies it evaluates together.
         flight: The step without forces, after `begin`.
+        tangents: Matrices of the bodies.
     """
 
     def __init__(
@@ -75,9 +72,7 @@ class StepProblem:
     ) -> None:
         self.system, self.integrator = system, integrator
         self.rtol, self.condense = rtol, condense
-        self._sleepers = Sleepers(system.bodies, system.comm) if sleep else None
         self.batches = system.batches
-        self._asleep: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._evaluated: dict[int, tuple[FloatArray, ...]] = {}
         # What batches contribute that have no element on any rank: nothing, at every iterate.
         self._of_none: tuple[Any, ...] | None = None
@@ -86,10 +81,10 @@ class StepProblem:
         self.couplings = Couplings(system)
         self._shared = SharedWeight(system.comm, system.contacts)
         self.unknowns: Unknowns | None = None
-        self.version, self.dives, self.lent = 0, False, 0.0
-        self._spins = [not integrator.inertia and _may_spin(b) for b in self.batches.bodies]
+        self.version, self.dives = 0, False
         self._again: Evaluation | None = None
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
+        self.sleepers, self._sleep = Sleepers(system, self.couplings, self.loads), sleep
         self.supports = Supports(system, integrator)
         self.flight = Flight(
             self.batches, integrator, self.supports, self.lengths, self._inertial
@@ -99,8 +94,11 @@ class StepProblem:
             system, lengths.radius or lengths.director, lengths.director or lengths.radius,
             self.loads.largest,
         )  # fmt: skip
+        self.tangents = BodyTangents(
+            self.batches, integrator.inertia, self.stabilization, lambda: self.laid
+        )
         self.rounding = Rounding(
-            self.batches, lambda j: self._tangent_of_batch(j, self._u0[j]), self.stiffness_between
+            self.batches, lambda j: self.tangents.of_all(j, self._u0[j]), self.stiffness_between
         )
 
     # ---- set-up of a step
@@ -126,6 +124,7 @@ class StepProblem:
             moments: Where the forces on each body are taken; None: as the integrator's step has it.
         """
         self.state, self.dt, self.factor = state, dt, self.integrator.factor(dt)
+        self.tangents.factor = self.factor
         self._evaluated, self._u0 = {}, self.batches.join(state.u)
         self.loads.begin(state, dt, moments)
         at_rest = self.flight.begin(state, self._u0, dt)
@@ -143,18 +142,15 @@ class StepProblem:
             self.stabilization.stiffness, self.loads.moments, self.rounding.of,
         )  # fmt: skip
         self.couplings.begin(step, again, search)
-        self._asleep = self._find_asleep(at_rest & (lengths.motion == 0.0)) if sleep else {}
+        self.sleepers.forces = {}
+        if self._sleep and sleep:
+            self.sleepers.find(at_rest & (lengths.motion == 0.0), state.u, self.rounding)
         self._lay_out(again)
 
     @property
     def elements(self) -> list[Any]:
         """Batches of elements in the step."""
         return self.couplings.elements
-
-    def forget_forces(self) -> None:
-        """Take no body's forces from an earlier step: parameters of materials have changed."""
-        if self._sleepers is not None:
-            self._sleepers.forget()
 
     def wake(self, e: Evaluation) -> bool:
         """Whether a solved step asks for more elements, and is to be solved again. Collective.
@@ -164,7 +160,7 @@ class StepProblem:
         """
         if not self.couplings.wake(e):
             return False
-        self._rouse(self._asleep.keys() & self.couplings.touched())
+        self.sleepers.rouse(self.sleepers.forces.keys() & self.couplings.touched())
         self._lay_out(e)
         return True
 
@@ -185,10 +181,7 @@ class StepProblem:
             again: Solution of this step with fewer elements, which the next one goes on from.
         """
         system = self.system
-        if len(self._asleep) == len(system.bodies):
-            # SNES needs an unknown; at rest it takes no iteration.
-            self._rouse({0})
-        self.awake = tuple(k for k in range(len(system.bodies)) if k not in self._asleep)
+        self.awake = self.sleepers.awake()
         elements = self.elements
         widths = np.array([list(c.widths.values()) for c in elements])
         combined = [a for c in elements if c.combination is not None for a in c.combination]
@@ -224,25 +217,6 @@ class StepProblem:
         """The layout, after `begin`."""
         assert self.unknowns is not None, "begin comes first"
         return self.unknowns
-
-    def _find_asleep(self, rest: BoolArray) -> dict[int, tuple[FloatArray, FloatArray]]:
-        """Those of the bodies at rest, shape (bodies,), that neither force nor contact may move.
-
-        With their internal and external forces [N].
-        """
-        if self._sleepers is None:
-            return {}
-        chosen = sorted(set(np.flatnonzero(rest).tolist()) - self.couplings.touched())
-        u, gravity = self.state.u, self.loads.gravity
-        found = self._sleepers.find(chosen, u, gravity, self.rounding.at_rest)
-        self.couplings.rest(found)
-        return found
-
-    def _rouse(self, bodies: Set[int]) -> None:
-        """Take bodies into the step that were left out."""
-        for k in bodies:
-            del self._asleep[k]
-        self.couplings.rouse(bodies)
 
     def _inertial(self, body: Body, du: FloatArray) -> FloatArray:
         """M du of a motion [kg m]; in statics the force of the stabilization [N]."""
@@ -296,7 +270,7 @@ class StepProblem:
             if j in laid.awake:
                 u1, du, internal, external, total = self._evaluated[j]
             else:
-                internal, external = (self.factor * own for own in self._asleep[of[0]])
+                internal, external = (self.factor * own for own in self.sleepers.forces_on(of))
                 u1, du, total = self._u0[j], none[j], internal - external
             pull = coupling[j]
             terms.append(BodyTerms(u1, du, internal, external, pull, total + pull))
@@ -359,28 +333,6 @@ class StepProblem:
             out[laid.of_elements(name)] = laid.own_rows(name, self.elements, rows)
         return out
 
-    def body_tangents(self, e: Evaluation) -> list[PETSc.Mat]:
-        """PETSc matrices of the batches that are awake at an iterate, without contact."""
-        return [self.body_tangent(j, e.terms[j].u1) for j in self.laid.awake]
-
-    def body_tangent(self, j: int, u1: FloatArray) -> PETSc.Mat:
-        """PETSc matrix of a batch at a displacement, without contact: its bodies in the step."""
-        a = self._tangent_of_batch(j, u1)
-        body, spins = self.batches.bodies[j], self._spins[j]
-        if self.lent or spins:
-            share = np.where(np.repeat(body.places, 3), 0.0, _SPIN if spins else 0.0)
-            share = np.maximum(self.lent, share)
-            _add_to_diagonal(a, share * self.stabilization.stiffness(body))
-        return self.laid.part(j, a)
-
-    def _tangent_of_batch(self, j: int, u1: FloatArray) -> PETSc.Mat:
-        """`body_tangent` of all its bodies, with nothing lent."""
-        mass, body = 1.0 if self.integrator.inertia else 0.0, self.batches.bodies[j]
-        a = body.tangent(u1, mass, self.factor)
-        if self.stabilization.share:
-            _add_to_diagonal(a, self.stabilization.of(body))
-        return a
-
     @property
     def rounding_is_known(self) -> bool:
         """Whether the rounding of all forces has been measured, of springs in this step."""
@@ -419,23 +371,6 @@ class StepProblem:
         if self.unknowns is not None:
             self.unknowns.destroy()
         self.unknowns, self._numbers = None, None
-
-
-def _may_spin(body: Body) -> bool:
-    """Whether none of a body's directors is prescribed. Collective."""
-    if body.rigid:
-        return False
-    directors = ~np.repeat(body.places, 3)
-    local = np.array([directors.any(), directors[body.fixed].any()], dtype=float)
-    some, clamped = global_max(body.comm, local)
-    return bool(some and not clamped)
-
-
-def _add_to_diagonal(a: Any, values: FloatArray) -> None:
-    held = a.createVecLeft()
-    held.array_w[:] = values
-    a.setDiagonal(held, addv=PETSc.InsertMode.ADD_VALUES)
-    held.destroy()
 
 
 def _equal(a: tuple[Any, ...], b: tuple[Any, ...] | None) -> bool:

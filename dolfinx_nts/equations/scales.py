@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.unknowns import Unknowns
@@ -207,19 +208,21 @@ class Rounding:
             each = diagonal.array_r.copy()
             diagonal.destroy()
             if body.oriented and not body.rigid:
-                each = self._as_rounded(body, each.reshape(-1, 3), self._extent[of[0]])
+                here = body.number_here[::3] if isinstance(body, BodyBatch) else of
+                each = self._as_rounded(body, each.reshape(-1, 3), self._extent[here])
             squares = [np.zeros(other.num_owned) for other in self._batches.bodies]
             squares[j] = np.square(each)
             norms = np.sqrt(global_sum(self._batches.comm, self._batches.sums(squares)))
             self._diagonal[chosen], self._of_factor[chosen] = norms[chosen], self._factor
 
     @staticmethod
-    def _as_rounded(body: Body, each: FloatArray, extent: float) -> FloatArray:
+    def _as_rounded(body: Body, each: FloatArray, extent: FloatArray) -> FloatArray:
         """Stiffness of a beam's or shell's nodal vectors against rounding [kg], (num_owned,)."""
         # A node's place comes before its directors.
         place = each[body.places].max(axis=1)[np.cumsum(body.places) - 1, None]
         turns, out = ~body.places, each.copy()
-        out[turns] *= body.length / extent
+        shares = np.broadcast_to(body.length / extent, turns.shape)
+        out[turns] *= shares[turns, None]
         out[turns] += np.sqrt(np.abs(each[turns] * place[turns]))
         return out.ravel()
 

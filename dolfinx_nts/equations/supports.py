@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.interaction.evaluation import BodyTerms
 from dolfinx_nts.interaction.prescribed import times, told
 from dolfinx_nts.parallel import global_max
@@ -31,7 +32,7 @@ class Rates(NamedTuple):
     acceleration: FloatArray
 
 
-def rates_at_start(body: Any, time: float, dt: float) -> Rates:
+def rates_at_start(body: Body, time: float, dt: float) -> Rates:
     """Rates of what is prescribed at the start of a step. Collective.
 
     Args:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
+from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.batches import Batches
-from dolfinx_nts.bodies.rigid.rigid_batch import WIDTH
 from dolfinx_nts.equations.layout import ElementBlocks, Layout
 from dolfinx_nts.interaction.combination import num_multipliers, of_multipliers
-from dolfinx_nts.types import FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Fields of the elements' own unknowns; the first is left out where nobody has any.
 _OWN = ("augmented", "constraints")
@@ -49,9 +48,9 @@ class Unknowns:
         self._batches = batches
         self.awake = sorted({batches.batch_of(k) for k in awake})
         self._field = {j: f for f, j in enumerate(self.awake)}
-        self._renumbered, self._chosen = _of_awake(batches, awake)
+        self._awake = _of_awake(batches, awake)
         counts = [
-            batches.bodies[j].num_owned if self._chosen is None or j else int(self._chosen.sum())
+            int(self._awake[j].here.sum()) if j in self._awake else batches.bodies[j].num_owned
             for j in self.awake
         ]
         local = [sum(_size(c, name) for c in elements) for name in _OWN]
@@ -67,7 +66,7 @@ class Unknowns:
             [np.empty(0, np.int64)]
             + [place.start + batches.bodies[j].fixed for j, place in self._places.items()]
         )
-        self._part: Any = None
+        self._parts: dict[int, Any] = {}
         self.blocks = self._blocks(elements, bodies) if there[-1] else []
         index, owners = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for c, numbers in zip(elements, bodies, strict=True):
@@ -89,8 +88,8 @@ class Unknowns:
     def _in_field(self, k: int, numbers: IntArray) -> tuple[int, IntArray]:
         """Field of a body, and its coordinates' numbers there; negative numbers stay."""
         j, found = self._batches.batch_of(k), self._batches.in_batch(k, numbers)
-        if self._renumbered is not None and j == 0:
-            found = np.where(found < 0, found, self._renumbered[found])
+        if j in self._awake:
+            found = np.where(found < 0, found, self._awake[j].numbers[found])
         return self._field[j], found
 
     def numbers_of(self, k: int, numbers: IntArray) -> IntArray:
@@ -134,27 +133,27 @@ class Unknowns:
     # ---- bodies
     def of_body(self, k: int) -> slice:
         """Where a body's coordinates stand among this rank's unknowns."""
-        place, rigid = self._places[self._batches.batch_of(k)], self._batches.rigid
-        if rigid is None or k not in self._batches.numbers[0]:
+        j = self._batches.batch_of(k)
+        place, batch = self._places[j], self._batches.bodies[j]
+        if not isinstance(batch, BodyBatch):
             return place
-        if k not in rigid.own:
-            return slice(place.start, place.start)
-        number = WIDTH * int(np.flatnonzero(rigid.own == k)[0])
-        if self._chosen is not None:
-            number = int(self._chosen[:number].sum())
-        return slice(place.start + number, place.start + number + WIDTH)
+        of = batch.number_here
+        found = np.flatnonzero((of[self._awake[j].here] if j in self._awake else of) == k)
+        start = place.start + (int(found[0]) if found.size else 0)
+        return slice(start, start + len(found))
 
     def part(self, j: int, matrix: PETSc.Mat) -> Any:
         """The part of a batch's PETSc matrix that is in the step. Collective."""
-        if j or self._chosen is None:
+        if j not in self._awake:
             return matrix
         start, _ = matrix.getOwnershipRange()
-        numbers = (start + np.flatnonzero(self._chosen)).astype(PETSc.IntType)
+        numbers = (start + np.flatnonzero(self._awake[j].here)).astype(PETSc.IntType)
         chosen = PETSc.IS().createGeneral(numbers, comm=self._batches.comm)
         chosen.setBlockSize(3)
-        self._part = matrix.createSubMatrix(chosen, chosen, self._part)
+        found = matrix.createSubMatrix(chosen, chosen, self._parts.get(j))
         chosen.destroy()
-        return self._part
+        self._parts[j] = found
+        return found
 
     def read(self, values: FloatArray, base: Sequence[FloatArray]) -> list[FloatArray]:
         """Owned coordinates of each batch, from this rank's unknowns.
@@ -165,9 +164,9 @@ class Unknowns:
         """
         out = list(base)
         for j, place in self._places.items():
-            if j == 0 and self._chosen is not None:
+            if j in self._awake:
                 out[j] = base[j].copy()
-                out[j][self._chosen] = values[place]
+                out[j][self._awake[j].here] = values[place]
             else:
                 out[j] = values[place]
         return out
@@ -177,7 +176,7 @@ class Unknowns:
         for j, place in self._places.items():
             own = values[j]
             assert own is not None
-            out[place] = own[self._chosen] if j == 0 and self._chosen is not None else own
+            out[place] = own[self._awake[j].here] if j in self._awake else own
 
     def of_elements(self, name: str) -> slice:
         """Where a field of the elements' own unknowns stands among this rank's unknowns."""
@@ -282,25 +281,30 @@ class Unknowns:
 
     def destroy(self) -> None:
         """Free the PETSc objects, which Python's collector does not."""
-        for a in (self.x, self._forces, self._local, self._scatter, self._part):
-            if a is not None:
-                a.destroy()
+        for a in (self.x, self._forces, self._local, self._scatter, *self._parts.values()):
+            a.destroy()
 
 
-def _of_awake(
-    batches: Batches, awake: Collection[int]
-) -> tuple[IntArray | None, npt.NDArray[np.bool_] | None]:
-    """Numbers of the rigid batch's coordinates among those in the step, and which here are.
+class _Awake(NamedTuple):
+    """Which coordinates of a batch are in the step, where not all are.
 
-    None where all are, or none is.
+    Attributes:
+        numbers: Of all coordinates of the batch among those in the step.
+        here: Which of those on this rank are.
     """
-    rigid = batches.rigid
-    if rigid is None:
-        return None, None
-    there = np.isin(rigid.number_of, list(awake))
-    if there.all() or not there.any():
-        return None, None
-    return np.cumsum(there) - 1, np.repeat(np.isin(rigid.own, list(awake)), WIDTH)
+
+    numbers: IntArray
+    here: BoolArray
+
+
+def _of_awake(batches: Batches, awake: Collection[int]) -> dict[int, _Awake]:
+    """Of batches by their number, where some of their bodies are in the step and some are not."""
+    found = {}
+    for j, batch in enumerate(batches.several):
+        there = np.isin(batch.number_of, list(awake))
+        if there.any() and not there.all():
+            found[j] = _Awake(np.cumsum(there) - 1, np.isin(batch.number_here, list(awake)))
+    return found
 
 
 def _size(batch: Any, name: str) -> int:

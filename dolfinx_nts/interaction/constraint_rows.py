@@ -78,14 +78,13 @@ def joined(
     Args:
         each: Those of the joints.
         of: Numbers of their bodies.
-        batch: A `RigidBatch`.
+        batch: A `BodyBatch`.
     """
-    starts = (batch.first // 3).tolist()
-    first = dict(zip(batch.members.tolist(), starts, strict=True))
     sides = []
     for k, body in enumerate(each[0].sides):
         here = [rows.sides[k] for rows in each]
-        nodes = [s.nodes + first[bodies[k]] for s, bodies in zip(here, of, strict=True)]
+        both_of = zip(here, of, strict=True)
+        nodes = [batch.numbered(bodies[k], 3 * s.nodes) // 3 for s, bodies in both_of]
         values = [
             np.concatenate([getattr(s, name) for s in here])
             for name in ("weights", "reference", "fixed", "places")

@@ -94,7 +94,7 @@ class Constraints(EveryStep):
     # ---- many joints as one
     @property
     def alike(self) -> Hashable | None:
-        """What joints of rigid bodies have in common that `together` takes; None: none does."""
+        """What joints within a batch have in common that `together` takes; None: none does."""
         rows, upright = self._all, self._all.upright
         if self._driven is not None:
             return None
@@ -108,7 +108,7 @@ class Constraints(EveryStep):
 
         Args:
             joints: The joints.
-            batch: A `RigidBatch`.
+            batch: A `BodyBatch`.
             number: For which the batch stands as the body of a side, see `Batches`.
         """
         rows = joined([joint._all for joint in joints], [joint._of for joint in joints], batch)

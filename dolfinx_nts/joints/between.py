@@ -76,19 +76,42 @@ def assemble(products: Sequence[Product], times: int) -> tuple[Equations, FloatA
     return Equations(weights, constants, prescribed[0]), prescribed
 
 
-class Between(Joint, ABC):
-    """A joint between two bodies, or a body and the ground; one element on one rank.
+class OfTwo(Joint):
+    """What is between two bodies, or a body and the ground; one element on one rank.
+
+    Args:
+        ends: Its bodies; None is the ground.
+        name: In messages and files; None: made of its kind and the bodies' names.
+
+    Attributes:
+        name: As given or made.
+        ends: As given.
+        bodies: Its bodies without the ground.
+    """
+
+    def __init__(self, ends: tuple[Body | None, Body | None], name: str | None) -> None:
+        self.name, self.ends = named(type(self).__name__, ends, name), ends
+        self.bodies = tuple(body for body in ends if body is not None)
+        self.comm = self.bodies[0].comm
+        self._here = int(self.comm.rank == rank_of(self.name, self.comm))
+        self.numbers = np.arange(self._here)
+
+    @property
+    def _names(self) -> list[str]:
+        """Of both ends."""
+        return ["ground" if body is None else body.name for body in self.ends]
+
+
+class Between(OfTwo, ABC):
+    """A joint between two bodies, see `OfTwo`.
 
     Args:
         a: A body.
         b: Another one. None, of either, is the ground.
         points: Where it holds them at the start [m], two of shape (3,), and the argument's name.
-        name: In messages and files; None: made of its kind and the bodies' names.
+        name: As of `OfTwo`.
 
     Attributes:
-        name: As given or made.
-        ends: A and B, None for the ground.
-        bodies: Its bodies without the ground.
         sides: Nodes of both, on which its vectors depend.
         p_a: Its point of A, or of the ground; p_b alike.
         length: What makes a length of a product of two directions [m].
@@ -104,18 +127,12 @@ class Between(Joint, ABC):
         points: tuple[str, Any, Any],
         name: str | None,
     ) -> None:
-        self.ends = a, b
-        kind = type(self).__name__
-        self.name = named(kind, self.ends, name)
+        super().__init__((a, b), name)
         if a is not None and a is b:
             raise ValueError(
-                f"a=b={a.name!r}: a {kind} joins two bodies; pass another one, or None for the "
-                "ground"
+                f"a=b={a.name!r}: a {type(self).__name__} joins two bodies; pass another one, or "
+                "None for the ground"
             )
-        self.bodies = tuple(body for body in (a, b) if body is not None)
-        self.comm = self.bodies[0].comm
-        self._here = int(self.comm.rank == rank_of(self.name, self.comm))
-        self.numbers = np.arange(self._here)
         argument, *given = points
         require_same(self.comm, **{argument: given, "name": name})
         places = [vector(argument, x, "m") for x in given]
@@ -230,7 +247,7 @@ class Between(Joint, ABC):
     def settings(self) -> dict[str, Any]:
         """What a restart compares; of a motion only whether there is one."""
         return {
-            "bodies": ["ground" if body is None else body.name for body in self.ends],
+            "bodies": self._names,
             "points": [place.tolist() for place in self._places],
             "driven": self.driven,
         }
@@ -287,7 +304,7 @@ def require_directions(ends: Sequence[Any], name: str, *, at_nodes: bool) -> Non
             )
 
 
-def points_of(argument: str, body: Any, x: FloatArray) -> Any:
+def points_of(argument: str, body: Body, x: FloatArray) -> Any:
     """A body's material points for a joint or spring, whose argument an error names."""
     try:
         return body.points(x)

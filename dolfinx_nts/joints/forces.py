@@ -13,13 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dolfinx_nts.interaction.coupling import Joint, Slopes
+from dolfinx_nts.interaction.coupling import Slopes
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.measured import Measure, Measured, Move, holds
 from dolfinx_nts.interaction.points import Points
-from dolfinx_nts.joints.between import named, points_of, require_directions, triad
+from dolfinx_nts.joints.between import OfTwo, points_of, require_directions, triad
 from dolfinx_nts.kernels import measures as kernel
-from dolfinx_nts.parallel import rank_of
 from dolfinx_nts.types import FloatArray, Vector, Vectors
 from dolfinx_nts.validation import StepFailedError, direction, require_same, vector
 
@@ -27,14 +26,14 @@ from dolfinx_nts.validation import StepFailedError, direction, require_same, vec
 _ROUNDED = 1e-9
 
 
-class Between(Joint):
-    """What acts along one measure between two bodies, see `Joint`; its class sets `law`.
+class AlongMeasure(OfTwo):
+    """What acts along one measure between two bodies; its class sets `law`.
 
     It stores what its law's `stored` says, if that has one.
 
     Args:
-        ends: Its bodies; None is the ground.
-        name: In messages and files; None: made of its kind and the bodies' names.
+        ends: As of `OfTwo`.
+        name: Likewise.
 
     Attributes:
         measure: What it acts along.
@@ -48,18 +47,13 @@ class Between(Joint):
     entry: tuple[str, float] = ("", 1.0)
 
     def __init__(self, ends: tuple[Any, Any], name: str | None) -> None:
-        self.name = named(type(self).__name__, ends, name)
-        self.bodies = tuple(body for body in ends if body is not None)
-        both = ["ground" if body is None else body.name for body in ends]
-        self._given: dict[str, Any] = {"bodies": both}
+        super().__init__(ends, name)
+        self._given: dict[str, Any] = {"bodies": self._names}
         if ends[0] is ends[1] and ends[0].rigid:
             raise ValueError(
                 f"a=b={ends[0].name!r}: a rigid body does not change its size, so {self.name!r} "
                 "does nothing; pass another body, or None for the ground"
             )
-        self.comm = self.bodies[0].comm
-        self._here = int(self.comm.rank == rank_of(self.name, self.comm))
-        self.numbers = np.arange(self._here)
 
     def _lay(
         self, kind: Any, sides: list[Points], rows: list[tuple[FloatArray, FloatArray]],
@@ -123,14 +117,14 @@ class Between(Joint):
         return Measured(bodies, self)
 
 
-class BetweenPoints(Between):
+class BetweenPoints(AlongMeasure):
     """What acts along the line between two points, whose length is the measure [m].
 
     Args:
         a: A body, or None: the ground.
         b: A body, or None: the ground.
         points: In the reference [m], one of a and one of b, shape (3,) each.
-        name: As of `Between`.
+        name: As of `OfTwo`.
 
     Attributes:
         distance: Of the points in the reference [m], exactly 0 where they coincide.
@@ -166,14 +160,14 @@ class BetweenPoints(Between):
         )
 
 
-class AboutAxis(Between):
+class AboutAxis(AlongMeasure):
     """What acts about an axis, by the angle by which a turns relative to b since the reference.
 
     Args:
         a: A rigid body, or None: the ground.
         b: A rigid body, or None: the ground.
         axis: In the reference, of any length.
-        name: As of `Between`.
+        name: As of `OfTwo`.
 
     Raises:
         TypeError: An argument is of another kind.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.interaction.measured import Move, Row
-from dolfinx_nts.joints.forces import Between
+from dolfinx_nts.joints.forces import AlongMeasure
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import (
@@ -125,14 +125,14 @@ class Driven:
         return 0.0, 0.0
 
 
-class OnJoint(Between):
+class OnJoint(AlongMeasure):
     """A law on the angle by which A turns relative to B about a joint's axis, or on its way along.
 
     Args:
         joint: A joint with an axis.
         word: What it is, for its name.
         law: The law, from what makes a length of the measure [m].
-        entry: As of `Between`.
+        entry: As of `AlongMeasure`.
         turns: Whether on the angle.
     """
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dolfinx_nts.bodies.body import Body
-from dolfinx_nts.joints.forces import AboutAxis, Between, BetweenPoints, Stiff, Viscous
+from dolfinx_nts.joints.forces import AboutAxis, AlongMeasure, BetweenPoints, Stiff, Viscous
 from dolfinx_nts.kernels import measures as kernel
 from dolfinx_nts.parallel import raise_together
 from dolfinx_nts.types import Vector, Vectors
@@ -26,7 +26,7 @@ Function = Callable[[Any], Any]
 _COMPARED, _ALIKE = 1e-2, 0.1
 
 
-class _Stores(Between):
+class _Stores(AlongMeasure):
     """What stores energy."""
 
     def _by_stiffness(self, stiffness: Any, rest: float, unit: str) -> None:

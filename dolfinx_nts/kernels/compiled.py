@@ -1,4 +1,4 @@
-"""The kernels of `facets.c` and `nts_element.c`.
+"""The kernels of `facets.c`, `nts_element.c` and `surface_points.c`.
 
 For the few pairs of a small scene the calls of NumPy cost more than what they compute, for many
 pairs its arrays go through memory again and again.
@@ -182,3 +182,104 @@ def condensed(
     pairs = x0, x1, normal0, xi0, xi1, length, multiplier
     library.run(library.load().condensed, _facet(nc)[0], *rule, tangential, n, *pairs, *out)
     return out
+
+
+class OverSurface(NamedTuple):
+    """What points of a slave's facets give; axis 0 = element, a pair of facets, or slave.
+
+    Attributes:
+        residual: Rows of corners of slave and master, and zeros of the multipliers at the slave's
+            corners, shape (elements, r).
+        tangent: Its derivative; rows of multipliers are those of the slaves' gap and slips.
+        force: Rows of the points and of the master's corners, shape (n, nc + 1, 3).
+        gap: Of the slaves [m], shape (slaves,).
+        slip: As vectors [m], shape (slaves, 3).
+        pulls: Minus the forces on them, shape (slaves, 3).
+    """
+
+    residual: FloatArray
+    tangent: FloatArray
+    force: FloatArray
+    gap: FloatArray
+    slip: FloatArray
+    pulls: FloatArray
+
+
+def points_of(element: IntArray, shape: FloatArray, y: FloatArray) -> FloatArray:
+    """Points on slaves' facets and the corners of masters' facets, shape (n, nc + 1, 3).
+
+    Args:
+        element: That of each point, shape (n,).
+        shape: Weights of the corners of the slave's facet, shape (n, corners).
+        y: Corners of slave and master of elements, shape (elements, corners + nc, 3).
+    """
+    n, corners = shape.shape
+    nc = y.shape[1] - corners
+    out = np.empty((n, nc + 1, 3))
+    given = element.astype(np.int64, copy=False), shape, y
+    library.run(library.load().points_of, corners, nc, n, *given, out)
+    return out
+
+
+def over_surface(
+    start: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    end: tuple[FloatArray, FloatArray],
+    theta: float,
+    element: IntArray,
+    slot: IntArray,
+    shape: FloatArray,
+    share: FloatArray,
+    multiplier: FloatArray,
+    directions: FloatArray,
+    number: int,
+    given: tuple[FloatArray, FloatArray, FloatArray] | None = None,
+) -> OverSurface:
+    """Elements of points of a slave's facets, summed up in pairs of facets and in slaves.
+
+    Args:
+        start: x0, normal0, xi0 and length as of `condensed`.
+        end: x1 and xi1 as of `condensed`.
+        theta: Where between t_n and t_{n+1} friction acts.
+        element: That of each point, in ascending order, shape (n,).
+        slot: Slaves at the corners of its facet, or -1, shape (n, corners).
+        shape: Weights of the corners in the point, shape (n, corners).
+        share: Its parts in these slaves' gaps, shape (n, corners).
+        multiplier: Of the slaves, lambda_N, with friction forces along two directions, (slaves, m).
+        directions: These, shape (slaves, 2, 3).
+        number: Of elements.
+        given: Residual, tangent and gradient of the slip of each point, where its rule is not the
+            mean value.
+    """
+    (slaves, width), (n, corners) = multiplier.shape, slot.shape
+    nc = end[0].shape[1] - 1
+    size = 3 * (corners + nc) + corners * width
+    shapes = (number, size), (number, size, size), (n, nc + 1, 3), (slaves,), (slaves, 3)
+    out = OverSurface(*map(np.zeros, (*shapes, (slaves, 3))))
+    points = nts_element.GAUSS_POINTS[nc]
+    rule = points, *discrete_gradient.gauss(points), width - 1, theta, corners, n
+    x0, normal0, xi0, length = start
+    numbers = (a.astype(np.int64, copy=False) for a in (element, slot))
+    of_points = *numbers, shape, share, x0, end[0], normal0, xi0, end[1], length
+    own = given or (None,) * 3
+    kernel = library.load().over_surface
+    library.run(kernel, _facet(nc)[0], *rule, *of_points, multiplier, directions, *own, *out)
+    return out
+
+
+def law_of_sums(
+    slot: IntArray, scale: FloatArray, slopes: FloatArray, elements: IntArray, tangent: FloatArray
+) -> None:
+    """Write laws of slaves into elements whose rows of multipliers are the slaves' gap and slips.
+
+    Args:
+        slot: Slaves at the elements' corners, or -1, shape (n, corners).
+        scale: What the slaves' multipliers are over, shape (slaves,).
+        slopes: By gap, two slips and multipliers, of the slaves' rows, (slaves, m, 3 + m).
+        elements: How many of them each slave has, which have equal parts of its own derivatives.
+        tangent: Of the elements, contiguous, shape (n, r, r).
+    """
+    (n, corners), each = slot.shape, slopes.shape[1]
+    size = tangent.shape[1] - corners * each
+    slots, number = (a.astype(np.int64, copy=False) for a in (slot, elements))
+    kernel = library.load().law_of_sums
+    library.run(kernel, corners, each, size, n, slots, scale, slopes, number, tangent)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dolfinx_nts.kernels import library
-from dolfinx_nts.types import BoolArray, FloatArray, IntArray
+from dolfinx_nts.types import BoolArray, FloatArray
 
 
 class Law(NamedTuple):
@@ -180,31 +180,6 @@ def to_nodes(
     out = np.empty((n, width)), np.empty((n, width, width))
     given = weights, residual, tangent, np.empty((residual.shape[1], width))
     library.run(library.load().to_nodes, points, nodes, rest, n, *given, *out)
-    return out
-
-
-def to_elements(
-    number: int, element: IntArray, weights: FloatArray, residual: FloatArray, tangent: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """`to_nodes` of points that are parts of elements, summed up.
-
-    Args:
-        number: Of elements.
-        element: That of each point, shape (n,).
-        weights: Of the nodes in the points, shape (n, points, nodes).
-        residual: As of `to_nodes`, and so is tangent.
-        tangent: Its derivative.
-
-    Returns:
-        Those of the elements.
-    """
-    n, points, nodes = weights.shape
-    rest = residual.shape[1] - 3 * points
-    width = 3 * nodes + rest
-    out = np.zeros((number, width)), np.zeros((number, width, width))
-    work = np.empty((residual.shape[1], width)), np.empty(width), np.empty((width, width))
-    given = element.astype(np.int64), weights, residual, tangent
-    library.run(library.load().to_elements, points, nodes, rest, n, *given, *work, *out)
     return out
 
 

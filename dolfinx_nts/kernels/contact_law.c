@@ -367,24 +367,6 @@ void to_nodes(int points, int nodes, int rest, long n, const double *weights, co
     }
 }
 
-/* `to_nodes` of points that belong to elements, summed up there: element (n,), and zeros in what is
-   written, of elements. */
-void to_elements(int points, int nodes, int rest, long n, const long *element, const double *weights,
-                 const double *residual, const double *tangent, double *work, double *one_residual,
-                 double *one_tangent, double *out_residual, double *out_tangent)
-{
-    int size = 3 * points + rest, width = 3 * nodes + rest;
-    for (long i = 0; i < n; i++) {
-        double *r = out_residual + element[i] * width, *k = out_tangent + element[i] * width * width;
-        to_nodes(points, nodes, rest, 1, weights + i * points * nodes, residual + i * size,
-                 tangent + i * size * size, work, one_residual, one_tangent);
-        for (int j = 0; j < width; j++)
-            r[j] += one_residual[j];
-        for (int j = 0; j < width * width; j++)
-            k[j] += one_tangent[j];
-    }
-}
-
 /* ---- what forces on nodes do to a body */
 
 /* Force and moment about the middle of the places of forces on nodes at y, both (n, nodes, 3), where

@@ -59,10 +59,9 @@ static void offset_at(const double *start, int nc, const double (*spans)[3], con
 
 /* ---- orthogonal projection by plain steps of Newton's method, which must come nearer; xi is start
    and result, or as it was where 0 is returned */
-static int newton(const Facet *facet, const Limits *limits, const double *start, const double (*spans)[3],
-                  double *xi)
+INLINE int newton_of(int nc, const Facet *facet, const Limits *limits, const double *start,
+                     const double (*spans)[3], double *xi)
 {
-    int nc = facet->nc;
     double offset[3], step[2], at[2] = {xi[0], xi[1]};
     double extent = 0.0, far = 0.0, slope = 0.0, before = 0.0, largest = 0.0;
     for (int k = 0; k < 3; k++) {
@@ -105,6 +104,14 @@ static int newton(const Facet *facet, const Limits *limits, const double *start,
         }
     }
     return 0;
+}
+
+static int newton(const Facet *facet, const Limits *limits, const double *start, const double (*spans)[3],
+                  double *xi)
+{
+    if (facet->nc == 4)
+        return newton_of(4, facet, limits, start, spans, xi);
+    return newton_of(facet->nc, facet, limits, start, spans, xi);
 }
 
 /* Points (n, 3), corners (n, nc, 3); xi (n, 2) is start and result; which are done (n,). */

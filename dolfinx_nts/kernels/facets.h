@@ -6,6 +6,10 @@
 
 enum { CONTROL = 16, DEGREE = 4 };
 
+/* Loops of a length that is known when this is compiled take half the time: what has it as an argument is
+   compiled where that is a number. */
+#define INLINE static inline __attribute__((always_inline))
+
 /* nc control points; polynomials of this degree in each coordinate, or in both together on triangles;
    coefficients [order][derivatives by the second coordinate][power of the first][power of the
    second][control point]. */
@@ -27,7 +31,7 @@ static inline double larger(double a, double b) { return a > b ? a : b; }
 static inline double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 /* sum n_i v_i */
-static inline void combine(int nc, const double *n, const double (*v)[3], double *out)
+static inline void combine(int nc, const double *restrict n, const double (*restrict v)[3], double *restrict out)
 {
     out[0] = out[1] = out[2] = 0.0;
     for (int i = 0; i < nc; i++)

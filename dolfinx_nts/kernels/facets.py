@@ -100,7 +100,7 @@ def frame(corners: FloatArray, xi: FloatArray) -> tuple[FloatArray, FloatArray, 
     """
     values, first, _ = shape(xi, corners.shape[1])
     point = np.einsum("ni,nij->nj", values, corners)
-    tangents = np.einsum("nia,nij->naj", first, corners)
+    tangents = np.matmul(first.transpose(0, 2, 1), corners)
     normal = cross(tangents[:, 0], tangents[:, 1])
     with np.errstate(invalid="ignore"):
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -19,7 +19,10 @@ from typing import Any
 
 import numpy as np
 
-_NAMES = "facets.h", "facets.c", "nts_element.c", "contact_law.c", "edges.c"
+_NAMES = (
+    *("facets.h", "nts_element.h", "facets.c", "nts_element.c", "surface_points.c"),
+    *("segments.c", "contact_law.c", "edges.c"),
+)
 _SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 _FLAGS = ["-std=c99", "-O2", "-ftree-vectorize", "-fno-math-errno", "-fno-trapping-math"]
 
@@ -78,6 +81,12 @@ class EdgeLimits(ctypes.Structure):
     ]
 
 
+class Cuts(ctypes.Structure):
+    """Where pieces of facets end; see `segments.c`."""
+
+    _fields_ = [(name, _REAL) for name in ("facing", "on", "nothing")]  # noqa: RUF012
+
+
 class FieldTable(ctypes.Structure):
     """A Function in a form; see `cell_batches.c`."""
 
@@ -111,10 +120,19 @@ _KERNELS = {
     ),
     "tilted": (_INT, *(_ARRAY,) * 5, _REAL, _LONG, *(_ARRAY,) * 3),
     "condensed": (_FACET, _INT, _ARRAY, _ARRAY, _INT, _LONG, *(_ARRAY,) * 13),
+    "segments": (
+        *(ctypes.POINTER(Cuts), _INT, _INT, _LONG, *(_ARRAY,) * 4),
+        *(_LONG, _ARRAY, _ARRAY, _ARRAY),
+    ),
+    "points_of": (_INT, _INT, _LONG, *(_ARRAY,) * 4),
+    "over_surface": (
+        *(_FACET, _INT, _ARRAY, _ARRAY, _INT, _REAL, _INT, _LONG),
+        *(_ARRAY,) * 21,
+    ),
+    "law_of_sums": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 5),
     "laws": (ctypes.POINTER(Law), ctypes.POINTER(Together), _LONG, *(_ARRAY,) * 16),
     "obstacle": (_INT, _REAL, _LONG, *(_ARRAY,) * 16),
     "to_nodes": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 6),
-    "to_elements": (_INT, _INT, _INT, _LONG, *(_ARRAY,) * 9),
     "wrenches": (_INT, _LONG, *(_ARRAY,) * 5),
 }
 
@@ -231,12 +249,14 @@ def load() -> Any:
     """
     of = key(" ".join(_FLAGS), *(source.read_text() for source in _SOURCES))
     try:
-        library = made(of, lambda _: [*_FLAGS, *map(str, _SOURCES[1:])])
+        compiled = [str(source) for source in _SOURCES if source.suffix == ".c"]
+        library = made(of, lambda _: [*_FLAGS, *compiled])
     except NotMadeError as error:
         raise NotMadeError(f"the kernels of contact cannot be compiled ({error})") from error
     for name, arguments in _KERNELS.items():
         kernel = getattr(library, name)
         kernel.argtypes = arguments
+    library.segments.restype = _LONG
     return library
 
 

@@ -60,8 +60,8 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     batches, contacts = problem.batches, problem.couplings.touching(step)
     joints = problem.system.declared_joints
     # Nothing holds bodies that are evaluated together.
-    each = zip(batches.bodies, step.terms, strict=True)
-    held = {body: terms for body, terms in each if body is not batches.rigid}
+    alone = slice(len(batches.several), None)
+    held = dict(zip(batches.bodies[alone], step.terms[alone], strict=True))
     parts = [body.reactions(terms.residual, terms.u1) for body, terms in held.items()]
     forces = [part.force.sum(axis=0) for _, part, _ in contacts]
     moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
@@ -107,7 +107,7 @@ def _of_joints(
     problem: StepProblem, parts: Mapping[int, Any], u: Sequence[FloatArray]
 ) -> FloatArray:
     """Of each declared joint on its first body, as of `Elements.resultant`, on this rank."""
-    system, rigid = problem.system, problem.batches.rigid
+    system, batches = problem.system, problem.batches
     declared = len(system.declared_joints)
     out = np.zeros((declared, 4, 3))
     for coupling, numbers in problem.couplings.joints:
@@ -117,8 +117,7 @@ def _of_joints(
         for batch, of in zip(coupling.elements, coupling.bodies, strict=True):
             part = parts.get(id(batch))
             if part is not None and len(numbers) > 1:
-                assert rigid is not None
-                found = batch.resultants(part, 0, rigid.joined(u))
+                found = batch.resultants(part, 0, batches.bodies[batches.batch_of(first)].joined(u))
                 np.add.at(out, np.array(numbers)[batch.joint], found)
             elif part is not None and first in of:
                 out[k] += batch.resultant(part, of.index(first), u[first])

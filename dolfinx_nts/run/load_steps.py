@@ -7,27 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from dolfinx_nts.contact.pair import INITIAL_PENETRATION
 from dolfinx_nts.integrators import Static
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.ledger import balance, resultants
 from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.parallel import anywhere, global_max
+from dolfinx_nts.run import step_warnings
 from dolfinx_nts.run.ledger_check import NOT_FINITE
 from dolfinx_nts.run.solution import Equilibrium
-from dolfinx_nts.run.step_warnings import tell_couplings, tell_inversion
 from dolfinx_nts.run.stepper import Stepper
 from dolfinx_nts.run.trial import solved, state_after
 from dolfinx_nts.solve.convergence import unrest
-from dolfinx_nts.solve.instability import releasing_motions
 from dolfinx_nts.start.free_motion import free_motion
 from dolfinx_nts.state import State
-from dolfinx_nts.system import System, cut_off
+from dolfinx_nts.system import System
 from dolfinx_nts.types import FloatArray
-from dolfinx_nts.validation import (
-    StepFailedError,
-    UserFunctionError,
-)
+from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 #: A load step is dropped if a slave ends this part of a facet behind one of which it was no
 #: candidate.
@@ -56,11 +51,6 @@ _STRAYS = 1e-3, 1e-2, 1e-1
 _OPEN = 0.1
 #: Rounding of work over that of forces times the size of the scene.
 _ROUNDING = 16 * float(np.finfo(float).eps)
-#: Part of an overlap from which on what flat facets cut off a curve is told.
-_SAG_TOLD = 0.05
-#: Part of that which an overlap has to be, not to be rounding.
-_SAG_LEAST = 1e-3
-
 
 class _Relaxed:
     """What the relaxations of a load step took.
@@ -122,7 +112,7 @@ class LoadStepper(Stepper):
         self._call_before(dt)
         self._materials.changed()
         self._ledger.open(self.state, self._start)
-        self._tell_cut_off()
+        step_warnings.tell_cut_off(self.solution, self.state)
         self._started = True
 
     def _step(self, dt: float, time: float) -> None:
@@ -177,8 +167,8 @@ class LoadStepper(Stepper):
             text = NOT_FINITE if endless else text
             self.solution.warn("ledger", time, missing, text, grave=endless)
         self._accept(state)
-        tell_inversion(self.solution, self.problem, step, state)
-        tell_couplings(self.solution, self.problem, step, state)
+        step_warnings.tell_inversion(self.solution, self.problem, step, state)
+        step_warnings.tell_couplings(self.solution, self.problem, step, state)
         self._solved = step
         self.look()
 
@@ -233,86 +223,10 @@ class LoadStepper(Stepper):
     def look(self, *, last: bool = False) -> None:
         """Look as `Stepper` does, and at the end for motions that nothing resists and for loads."""
         super().look(last=last)
+        if last and not self._stabilization and self._solved is not None:
+            step_warnings.tell_at_rest(self.solution, self.solver, self._solved, self.state)
         if last:
-            self._tell_free_motion()
-            self._tell_unstable()
-            self._tell_part_of_loads()
-
-    def _tell_free_motion(self) -> None:
-        """Warn of motions that nothing resists; stabilization would leave them at rest."""
-        if self._stabilization or self._solved is None:
-            return
-        found = free_motion(self.problem, self.solver, self._solved)
-        if found:
-            self.solution.warn(
-                "free motion", self.state.time, 1.0,
-                f"{found}: how far it has moved so is chance; hold it by a Dirichlet condition, "
-                "a joint or prescribed motion, or pass "
-                "stabilization=0.1, which leaves it where it is",
-                grave=True,
-            )  # fmt: skip
-
-    def _tell_unstable(self) -> None:
-        """Warn of a state that a small disturbance leads away from, as a buckled one."""
-        if self._stabilization or self._solved is None or self._slips():
-            return
-        number = releasing_motions(self.problem, self._solved)
-        if number:
-            self.solution.warn(
-                "unstable equilibrium", self.state.time, float(number),
-                f"{number} independent motion{'s' if number > 1 else ''} away from this state "
-                f"release{'' if number > 1 else 's'} energy: it is an equilibrium, but not a "
-                "stable one, and a small disturbance leads elsewhere, as in buckling or tipping; "
-                "to find where, begin with a small displacement= in that direction, or disturb the "
-                "loads",
-            )  # fmt: skip
-
-    def _slips(self) -> bool:
-        """Whether nodes slip with friction, whose forces have no potential. Collective."""
-        both = zip(self.system.contacts, self.state.contacts, strict=True)
-        slip = any(p.friction and bool(((c.force > 0.0) & ~c.stick).any()) for p, c in both)
-        return anywhere(self.system.comm, slip)
-
-    def _tell_cut_off(self) -> None:
-        """Warn if an overlap that load steps press out may be that of flat facets, or is partly."""
-        for pair, depth in zip(
-            self.system.contacts, self.system.penetration(self.state), strict=True
-        ):
-            deep, text = float(depth.max(initial=0.0)), cut_off(pair, depth)
-            sag = pair.sag(depth > 0.0)
-            if not text and sag > _SAG_TOLD * deep > 0.0:
-                part = 100.0 * sag / deep
-                text = (
-                    f"flat facets cut {part:.2g} % of that off a curve, by which the pressure may "
-                    "be wrong: take a finer mesh, or smoothing=True for the master"
-                )
-            if text and deep > _SAG_LEAST * sag:
-                self.solution.warn(
-                    "flat facets", self.state.time, deep,
-                    f"contact {pair.name!r}: nodes start inside by up to {deep:.3g} of a facet; "
-                    + text,
-                    about=(pair.name,),
-                )  # fmt: skip
-
-    def _tell_part_of_loads(self) -> None:
-        """Warn if the load steps were asked to end before all of the constant loads act."""
-        now = self.state.time
-        if not now == self._end < 1.0:
-            return
-        if self.problem.loads.grow():
-            self.solution.warn(
-                "part of the loads", now, 1.0 - now,
-                f"load_steps end at t={now:.6g}, with {100 * now:.3g} % of the constant loads "
-                "(gravity and loads that are no functions of time); all of them act at t=1",
-            )  # fmt: skip
-        depths = self.system.penetration(self.state)
-        deep = max((float(d.max(initial=0.0)) for d in depths), default=0.0)
-        if deep > INITIAL_PENETRATION:
-            self.solution.warn(
-                "part of the interference", now, deep,
-                f"load_steps end at t={now:.6g}, where {100 * (1.0 - now):.3g} % of the overlap "
-                f"at the start is left, up to {deep:.3g} of a facet; none is at t=1",
-            )  # fmt: skip
+            step_warnings.tell_part_of_loads(self.solution, self.problem, self.state, self._end)
 
     def _relax(self, dt: float, time: float) -> tuple[Evaluation, State, int, _Relaxed]:
         """Solution of a load step, its state, Newton iterations, what the relaxations took.

@@ -16,6 +16,7 @@ from dolfinx_nts.ledger.contact_fields import ContactLoads
 from dolfinx_nts.ledger.guards import check_momentum
 from dolfinx_nts.ledger.impact import restored
 from dolfinx_nts.petsc_compat import close_at_exit
+from dolfinx_nts.run import step_warnings
 from dolfinx_nts.run.arguments import check_impact, check_run, check_scheme, same_run
 from dolfinx_nts.run.balance_table import Ledger
 from dolfinx_nts.run.ledger_check import LedgerCheck
@@ -34,8 +35,6 @@ from dolfinx_nts.run.start import (
     refuse_overwritten,
     refuse_written,
 )
-from dolfinx_nts.run.start_warnings import tell_start
-from dolfinx_nts.run.step_warnings import tell_frictionless, tell_pieces, tell_step, tell_stressed
 from dolfinx_nts.run.trial import LastSteps, Trial, solved, state_after
 from dolfinx_nts.solve.accuracy import Newton
 from dolfinx_nts.solve.newton import StepSolver
@@ -168,7 +167,7 @@ class Stepper:
         self._started = False
         if self.restart is None:
             self._ledger.open(state, start)
-            tell_pieces(self.solution, state.time)
+            step_warnings.tell_pieces(self.solution, state.time)
 
     @property
     def memory(self) -> dict[str, Any]:
@@ -302,7 +301,7 @@ class Stepper:
                 logger.info("%s; starting with dt=%.3g", failure, dt)
         self._accept(state)
         self._started = True
-        tell_start(self.solution, self.problem, state, dt, self._start, moved)
+        step_warnings.tell_start(self.solution, self.problem, state, dt, self._start, moved)
         self._ledger.open(state, self._start)
         # Where bodies were before the first step, for one that carries them through each other.
         self.look()
@@ -328,7 +327,7 @@ class Stepper:
         Args:
             last: Look wherever anything has moved since the last look.
         """
-        tell_stressed(self.solution, self.state.time)
+        step_warnings.tell_stressed(self.solution, self.state.time)
         self._look_inside(last)
         self._locking.look(last=last)
         if last:
@@ -386,7 +385,7 @@ class Stepper:
         """Name in the ledger what changed parameters of materials do to the energy."""
         names = self._materials.changed()
         if names:
-            self.problem.forget_forces()
+            self.problem.sleepers.forget()
             what = f"a changed parameter of the material of {', '.join(map(repr, names))}"
             self._ledger.restate(self.state, what, beyond=0.0)
 
@@ -420,12 +419,12 @@ class Stepper:
         self.solution.contact_loads = ContactLoads.of_step(self.problem, step)
         self._last_steps.take(self.state, self.problem.dt, state)
         self._accept(state)
-        tell_step(self.solution, self.problem, step, state)
+        step_warnings.tell_step(self.solution, self.problem, step, state)
         alternates = self._dampers.look(state)
         if alternates:
             self.solution.warn("unresolved", state.time, *alternates)
         if impact is not None:
-            tell_frictionless(self.solution, impact.impulses[0], state.time)
+            step_warnings.tell_frictionless(self.solution, impact.impulses[0], state.time)
         self.look()
 
     def mean_force(self, k: int) -> FloatArray:

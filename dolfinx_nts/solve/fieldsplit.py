@@ -8,6 +8,7 @@ from typing import Any
 from petsc4py import PETSc
 
 from dolfinx_nts.equations.schur import SchurApproximation
+from dolfinx_nts.types import IntArray
 
 BODIES = "fieldsplit_bodies_"
 CONSTRAINTS = "fieldsplit_constraints_"
@@ -84,7 +85,9 @@ def set_schur(snes: PETSc.SNES, approximation: SchurApproximation) -> None:
     snes.getKSP().getPC().setFieldSplitSchurPreType(user, approximation.first)
 
 
-def take_bodies(snes: PETSc.SNES, operator: PETSc.Mat, bodies: Sequence[Any], split: bool) -> None:
+def take_bodies(
+    snes: PETSc.SNES, operator: PETSc.Mat, bodies: Sequence[IntArray], split: bool
+) -> None:
     """Let this rank's preconditioner take whole bodies. Collective, before the first solve.
 
     Args:

@@ -51,7 +51,7 @@ def releasing_motions(problem: StepProblem, step: Evaluation) -> int:
     """
     if problem.system.size > _MOST:
         return 0
-    stabilization, tangents = problem.stabilization, problem.body_tangents(step)
+    stabilization, tangents = problem.stabilization, problem.tangents.at(step)
     if not all(map(_is_symmetric, tangents)):
         return 0
     augmented = AugmentedMatrix(

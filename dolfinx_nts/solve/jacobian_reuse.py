@@ -32,6 +32,7 @@ class KeptTangents:
         self.due, self._factor = True, 0.0
         self._matrices: dict[int, Any] = {}
         self._states: dict[int, int] = {}
+        self._version = -1
 
     def begin(self) -> None:
         """Begin a step: matrices of another step size are of no use."""
@@ -47,17 +48,19 @@ class KeptTangents:
         """
         problem = self._problem
         awake = problem.laid.awake
-        if problem.batches.rigid:
-            # Which of these are awake may have changed; their matrix costs nothing.
-            self._matrices.pop(0, None)
+        if self._version != problem.version:
+            # Which bodies of a batch are awake may have changed.
+            for j in range(len(problem.batches.several)):
+                self._matrices.pop(j, None)
+            self._version = problem.version
         changed = any(a.stateGet() != self._states[k] for k, a in self._matrices.items())
         fresh = anywhere(problem.system.comm, self.due or changed)
         if fresh:
-            self._matrices = dict(zip(awake, problem.body_tangents(e), strict=True))
+            self._matrices = dict(zip(awake, problem.tangents.at(e), strict=True))
             self.due = not self._reuse()
         for j in awake:
             if j not in self._matrices:
-                self._matrices[j] = problem.body_tangent(j, e.terms[j].u1)
+                self._matrices[j] = problem.tangents.of(j, e.terms[j].u1)
         return [self._matrices[j] for j in awake], fresh
 
     def remember(self) -> None:

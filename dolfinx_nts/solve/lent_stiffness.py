@@ -29,7 +29,7 @@ class LentStiffness:
 
     def begin(self) -> None:
         """Lend nothing, as a step begins or ends."""
-        self._problem.lent = 0.0
+        self._problem.tangents.lent = 0.0
 
     def at(self, e: Evaluation, *, wanders: bool) -> bool:
         """Lend what the matrix at an iterate needs; return whether that has changed. Collective.
@@ -40,17 +40,17 @@ class LentStiffness:
                 neither happens, nothing is looked for, as that takes a factorisation.
         """
         problem = self._problem
-        before = problem.lent
+        before = problem.tangents.lent
         if problem.integrator.inertia or not (wanders or before):
             return False
-        problem.lent = before / _RATIO if before > _RATIO * _NONE else 0.0
+        problem.tangents.lent = before / _RATIO if before > _RATIO * _NONE else 0.0
         if wanders and not self._slips(e):
             while releasing_motions(problem, e):
-                problem.lent = max(_RATIO * problem.lent, _FIRST)
-                if problem.lent > _LARGEST:
-                    problem.lent = 0.0
+                problem.tangents.lent = max(_RATIO * problem.tangents.lent, _FIRST)
+                if problem.tangents.lent > _LARGEST:
+                    problem.tangents.lent = 0.0
                     break
-        return problem.lent != before
+        return problem.tangents.lent != before
 
     def _slips(self, e: Evaluation) -> bool:
         """Whether nodes slip with friction, whose forces have no potential. Collective."""

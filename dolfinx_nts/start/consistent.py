@@ -115,10 +115,12 @@ def accelerating_forces(
     problem.begin(replace(state, a=still), dt, moments=moments)
     problem.guess(flight=False, forces=True, carried=True)
     contact = [terms.coupling / problem.factor for terms in problem.evaluate(problem.x).bodies]
-    gravity = ramp * problem.system.gravity
+    gravity, batches = ramp * problem.system.gravity, problem.batches
+    each = zip(batches.bodies, batches.join(state.u), strict=True)
+    pushes = batches.split([body.external(u, gravity) - body.internal(u) for body, u in each])
     out = []
-    for body, u, force in zip(problem.system.bodies, state.u, contact, strict=True):
-        right = body.external(u, gravity) - body.internal(u) - force
+    for body, u, push, force in zip(problem.system.bodies, state.u, pushes, contact, strict=True):
+        right = push - force
         a = np.zeros_like(u)
         a[body.fixed] = rates_at_start(body, state.time, dt).acceleration
         right -= body.inertia(a)

@@ -139,6 +139,23 @@ def beam(frame):
     return nts.System([rod, weight, second], joints=joints, gravity=_gravity(frame))
 
 
+def ropes(frame):
+    """Three ropes of one kind, which a step evaluates together: two hang from hooks, one flies."""
+    a, b, c = (
+        _beam(
+            frame, (0, k, 0), (1 + 0.5 * k, k, 0), 2 + k, name=f"rope {k}",
+            velocity=frame.place(0.1 * (k == 2), 0, 0),
+        )
+        for k in range(3)
+    )  # fmt: skip
+    joints = [
+        nts.Spherical(a, None, point=frame.place(0, 0, 0), name="hook"),
+        nts.Spherical(b, None, point=frame.place(0, 1, 0), name="other hook"),
+        nts.Distance(a, b, points=[frame.place(1, 0, 0), frame.place(1.5, 1, 0)], name="rod"),
+    ]
+    return nts.System([a, b, c], joints=joints, gravity=_gravity(frame))
+
+
 def shell(frame):
     """A plate that falls on a sphere with friction."""
     mesh = frame.grid("quadrilateral", (0, 0, 0), (1, 1, 0), (4, 4))
@@ -244,5 +261,6 @@ def fold(frame):
 #: Step [s] of each scene.
 SCENES = {
     two_blocks: 2e-3, block_on_a_plane: 4e-3, rigid_on_rubber: 4e-3, mechanism: 1e-2, tied: 1e-2,
-    beam: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3, fold: 2e-3,
+    beam: 5e-3, ropes: 5e-3, shell: 2e-3, more_joints: 1e-2, sewn: 2e-3, in_a_bore: 1e-3,
+    fold: 2e-3,
 }  # fmt: skip

@@ -208,19 +208,6 @@ def test_units_do_not_matter(flown):
     assert np.abs(ratio - 1.0).max() < 1e-9
 
 
-@pytest.mark.mpi
-def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path, flown):
-    rule, path = nts.EnergyMomentum(), mpi_tmp_path / "run.h5"
-    saves = nts.Checkpoint(path, every=12)
-    first = nts.simulate(thrown(), rule, dt=4e-3, t_end=0.048, checkpoint=saves)
-    assert first.balance["active"][-1] > 0
-    system = thrown()
-    run = nts.simulate(system, rule, dt=4e-3, t_end=0.064, start=nts.restart(path, system))
-    row = int(np.argmin(np.abs(flown["time"] - 0.064)))
-    for name in ("energy", "friction_dissipation", "contact_defect"):
-        assert run.balance[name][-1] == pytest.approx(flown[name][row], rel=1e-9), name
-
-
 # ---- what nothing holds is told
 @pytest.mark.mpi
 @pytest.mark.parametrize("where", [inner, everywhere])

@@ -5,6 +5,8 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_box
+from lines import interval_mesh
+from shells import grid, plate_nodes, surface_mesh
 
 import dolfinx_nts as nts
 from dolfinx_nts.equations.problem import StepProblem
@@ -43,15 +45,55 @@ def scene():
     return nts.System([a, turned, b, driven, c, d], joints=joints, gravity=GRAVITY)
 
 
+def moving(k):
+    rng = np.random.default_rng(k)
+    return {"velocity": rng.normal(size=3), "angular_velocity": rng.normal(size=3)}
+
+
+def rope(k, cells, section, **options):
+    """A rope of its own length, place and motion, a metre beside the one before it."""
+    mesh = interval_mesh(np.linspace([0, k, 0], [1.0 + k, k, 0.1 * k], cells + 1))
+    return nts.Beam(mesh, section, name=f"rope {k}", **moving(k) | options)
+
+
+def plate(place, cells, name, side=1.0, **options):
+    mesh = surface_mesh(plate_nodes(*cells, side, 1.0) + place, grid(*cells))
+    given = {"young": 1e6, "poisson": 0.3, "thickness": 0.02, "density": 1e3} | options
+    return nts.Shell(mesh, name=name, **given)
+
+
+def thin_scene():
+    """Ropes of one kind and one that is clamped, plates of two kinds; two ropes hang together."""
+    rubber = {"young": 1e6, "poisson": 0.3, "density": 1e3}
+    section = nts.Circle(0.02).section(**rubber)
+    stiffer = nts.Circle(0.02).section(**rubber | {"young": 2e6})
+    clamp = nts.Clamp(lambda x: x[0] < 1e-9)
+    still = {"velocity": (0, 0, 0), "angular_velocity": (0, 0, 0)}
+    a, b, c = rope(0, 3, section), rope(1, 4, section), rope(2, 2, stiffer)
+    held = rope(3, 2, section, bcs=[clamp], **still)
+    thick = plate((0, 9, 0), (2, 1), "thick", thickness=0.03)
+    plates = [
+        plate((0, 5 + 2 * k, 0), (2, 2 + k), f"plate {k}", 1.0 + k, **moving(k)) for k in range(2)
+    ]
+    joints = [
+        nts.Spherical(a, None, point=(0, 0, 0), name="hook"),
+        nts.Spherical(b, None, point=(0, 1, 0), name="other hook"),
+        nts.Spring(a, b, ((1, 0, 0), (2, 1, 0.1)), stiffness=3.0, name="spring"),
+    ]
+    bodies = [a, plates[0], held, b, thick, c, plates[1]]
+    return nts.System(bodies, joints=joints, gravity=GRAVITY)
+
+
 @pytest.fixture
 def alone(monkeypatch):
     """Makes systems whose bodies are evaluated one by one."""
 
     def make(make_scene=scene):
         with monkeypatch.context() as patch:
-            patch.setattr(nts.RigidBody, "plain", False)
+            for kind in (nts.RigidBody, nts.Beam, nts.Shell):
+                patch.setattr(kind, "alike", None)
             system = make_scene()
-            assert system.batches.rigid is None
+            assert not system.batches.several
         return system
 
     return make
@@ -68,8 +110,8 @@ def begun(system, integrator, seed=3):
     state, rng = system.initial_state(), np.random.default_rng(seed)
 
     def noise(size):
-        # The same whatever rank a body lives on.
-        each = [size * rng.normal(size=12) for _ in system.bodies]
+        # The same whatever rank a body lives on; systems that are compared divide alike.
+        each = [size * rng.normal(size=max(12, b.num_owned)) for b in system.bodies]
         return tuple(a[: b.num_owned] for a, b in zip(each, system.bodies, strict=True))
 
     v = tuple(a + b for a, b in zip(state.v, noise(0.1), strict=True))
@@ -82,6 +124,20 @@ def begun(system, integrator, seed=3):
     return problem, problem.evaluate(problem.x)
 
 
+def compare(problem, e, other, expected):
+    """Terms of each body and norms of rounding, of all bodies together and one by one."""
+    assert len(problem.elements) < len(other.elements)
+    for k, (one, two) in enumerate(zip(e.bodies, expected.bodies, strict=True)):
+        for name in ("u1", "du", "internal", "external", "coupling", "residual"):
+            found, right = (gathered(getattr(terms, name)) for terms in (one, two))
+            size = max(np.abs(right).max(), 1e-12)
+            assert found.shape == right.shape
+            assert np.abs(found - right).max() <= 1e-13 * size, (k, name)
+    for p in (problem, other):
+        p.rounding.measure(p.awake)
+    assert problem.rounding.forces == pytest.approx(other.rounding.forces, rel=1e-12)
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.GeneralizedAlpha()])
 def test_terms_are_those_of_members(integrator, alone):
@@ -90,18 +146,23 @@ def test_terms_are_those_of_members(integrator, alone):
     (problem, e), (other, expected) = (begun(s, integrator) for s in (system, single))
     # Hinges together, others by themselves; of what holds bodies together all in one but of two.
     assert [len(of) for _, of in problem.couplings.joints].count(2) == 1
-    assert len(problem.elements) < len(other.elements)
-    for k, (one, two) in enumerate(zip(e.bodies, expected.bodies, strict=True)):
-        for name in ("u1", "du", "internal", "external", "coupling", "residual"):
-            found, right = (gathered(getattr(terms, name)) for terms in (one, two))
-            size = max(np.abs(right).max(), 1e-12)
-            assert found.shape == (12,)
-            assert np.abs(found - right).max() <= 1e-13 * size, (k, name)
+    compare(problem, e, other, expected)
     # By hand: h^2/2 times the weight at the centre of mass, nothing on the directors.
     heavy = gathered(e.bodies[4].external)
     factor = integrator.factor(H)
     assert heavy[:3] == pytest.approx(factor * 3.0 * GRAVITY, rel=1e-14)
     assert not heavy[3:].any()
+    for p in (problem, other):
+        p.destroy()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Newmark()])
+def test_terms_of_beams_and_shells_are_those_of_members(integrator, alone):
+    system, single = thin_scene(), alone(thin_scene)
+    assert system.batches.numbers == [[0, 3, 5], [1, 6], [2], [4]]
+    (problem, e), (other, expected) = (begun(s, integrator) for s in (system, single))
+    compare(problem, e, other, expected)
     for p in (problem, other):
         p.destroy()
 
@@ -117,9 +178,10 @@ def test_energies_and_momenta_are_those_of_members(alone):
 
 
 @pytest.mark.mpi
-def test_matrix_is_the_derivative_of_the_residual():
+@pytest.mark.parametrize("make", [scene, thin_scene])
+def test_matrix_is_the_derivative_of_the_residual(make):
     integrator = nts.EnergyMomentum()
-    stepper = nts.Stepper(scene(), integrator, project_start=True)
+    stepper = nts.Stepper(make(), integrator, project_start=True)
     stepper.advance(H)
     problem = stepper.problem
     matrix = stepper.solver.assemble(problem.evaluate(problem.x)).operator
@@ -144,12 +206,13 @@ def test_matrix_is_the_derivative_of_the_residual():
 
 
 @pytest.mark.mpi
+@pytest.mark.parametrize("make", [scene, thin_scene])
 @pytest.mark.parametrize("integrator", [nts.EnergyMomentum(), nts.Newmark()])
-def test_runs_are_the_same(integrator, alone):
+def test_runs_are_the_same(integrator, make, alone):
     """Reactions, ledger and what joints remember, too."""
     runs = [
         nts.simulate(system, integrator, dt=H, t_end=5 * H, project_start=True)
-        for system in (scene(), alone())
+        for system in (make(), alone(make))
     ]
     one, two = (run.balance for run in runs)
     assert one.keys() == two.keys()
@@ -183,6 +246,42 @@ def blocks():
         for k, (a, b) in enumerate(zip(cubes, cubes[1:], strict=False), start=1)
     ]
     return nts.System(cubes, contacts=contacts)
+
+
+def plates():
+    """A stack of small plates without gravity, the first of which flies at the others."""
+
+    stack = [
+        plate(
+            (0, 0, 0.1 * k), (2, 2), f"plate {k}", thickness=0.05, density=20.0,
+            velocity=(0, 0, 4.0 * (k == 0)),
+        )
+        for k in range(4)
+    ]  # fmt: skip
+    contacts = [
+        nts.ContactPair(slave=b.surface(side="bottom"), master=a.surface(side="top"))
+        for a, b in zip(stack, stack[1:], strict=False)
+    ]
+    return nts.System(stack, contacts=contacts)
+
+
+@pytest.mark.mpi
+def test_plates_sleep_one_by_one(alone):
+    seen = []
+    for system in (plates(), alone(plates)):
+        stepper = nts.Stepper(system, nts.EnergyMomentum(), sleep=True)
+        awake = []
+        for _ in range(12):
+            stepper.advance(0.002)
+            awake.append(stepper.problem.awake)
+        seen.append((awake, [gathered(u) for u in stepper.state.u], stepper.solution.balance))
+        stepper.close()
+    (awake, u, table), (expected, right, _) = seen
+    assert awake == expected and awake[0] == (0,) and 1 in awake[-1]
+    assert all((a.any() == b.any()) for a, b in zip(u, right, strict=True))
+    top = max(np.abs(b).max() for b in right)
+    assert max(np.abs(a - b).max() for a, b in zip(u, right, strict=True)) < 1e-9 * top
+    assert np.abs(table["ledger_residual"]).max() < 1e-10 * table["energy"][0]
 
 
 @pytest.mark.mpi

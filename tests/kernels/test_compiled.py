@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from facet_kinds import CENTRE, FLAT, KINDS
 from measures import relative
-from twins import closest, laws, obstacle, points
+from twins import closest, laws, obstacle, points, surface
 
 import dolfinx_nts as nts
 from dolfinx_nts.contact.contact_law import ContactLaw, Rub, Together
@@ -170,6 +170,50 @@ class Table(nts.Obstacle):
         return Gap(x[:, 2].astype(np.float32), np.tile(up, (n, 1, 1)), np.zeros((n, 3, 3), int))
 
 
+@pytest.mark.parametrize("rule", ["mean-value", "gonzalez", "direct"])
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize(("corners", "nc"), [(4, 4), (3, 4), (4, 3), (3, 3)])
+def test_points_of_a_surface_are_summed_up(corners, nc, friction, rule):
+    measure, x, multiplier = pairs(nc, friction, rule)
+    rng, slaves, number = np.random.default_rng(12), 9, 7
+    shape, share = rng.uniform(size=(2, N, corners))
+    shape /= shape.sum(axis=1, keepdims=True)
+    element, slot = np.sort(rng.integers(0, number, N)), rng.integers(-1, slaves, (N, corners))
+    # Some points carry nothing.
+    multiplier = multiplier[:slaves]
+    multiplier[:4] = 0.0
+    directions = np.linalg.qr(rng.normal(size=(slaves, 3, 2)))[0].transpose(0, 2, 1)
+    given = element, slot, shape, share, multiplier, directions, number
+    there = surface.over_surface(measure, x, *given)
+    xi, own = measure.projection(x), None
+    if rule != "mean-value":
+        along, _, _ = surface.middle(measure, x, xi)
+        every = np.concatenate([multiplier, np.zeros((1, multiplier.shape[1]))])[slot]
+        frames = np.concatenate([directions, np.zeros((1, 2, 3))])[slot, : every.shape[2] - 1]
+        pull = np.einsum("nc,nck,ncki->ni", share, every[..., 1:], frames)
+        of_points = np.einsum("nc,nck->nk", share, every)
+        if friction:
+            of_points[:, 1:] = np.einsum("nai,ni->na", along, pull)
+        found = measure.evaluate(x, np.empty((N, 0)), of_points)
+        own = found.residual, found.tangent, found.slip.gradient if friction else np.empty(0)
+    start = measure.start, measure.normal, measure.xi, measure.length
+    here = compiled.over_surface(start, (x, xi), measure.theta, *given, own)
+    for found, expected in zip(here, there, strict=True):
+        assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("each", [1, 3])
+def test_laws_of_sums_are_those_of_numpy(each):
+    rng, size, slaves = np.random.default_rng(13), 21, 5
+    slot, scale = rng.integers(-1, slaves, (N, 3)), rng.uniform(1, 2, slaves)
+    slopes = rng.normal(size=(slaves, each, 3 + each))
+    elements = rng.integers(1, 5, slaves)
+    tangent = rng.normal(size=(N, size + 3 * each, size + 3 * each))
+    expected = surface.law_of_sums(slot, scale, slopes, elements, tangent)
+    compiled.law_of_sums(slot, scale, slopes, elements, tangent)
+    assert np.abs(tangent - expected).max() < 1e-13
+
+
 @pytest.mark.parametrize("number", [1, 5])
 def test_forces_of_points_are_those_of_nodes(number):
     rng, nodes, rest = np.random.default_rng(10), 6, 3
@@ -177,15 +221,10 @@ def test_forces_of_points_are_those_of_nodes(number):
     weights[rng.uniform(size=weights.shape) < 0.3] = 0.0
     residual = rng.normal(size=(N, 3 * number + rest))
     tangent = rng.normal(size=(N, *residual.shape[1:] * 2))
-    element, count = rng.integers(0, 4, N), 5
     here = compiled_law.to_nodes(weights, residual, tangent)
-    sums = compiled_law.to_elements(count, element, weights, residual, tangent)
     there = points.to_nodes(weights, residual, tangent)
-    for found, summed, expected in zip(here, sums, there, strict=True):
+    for found, expected in zip(here, there, strict=True):
         assert np.abs(found - expected).max() < 1e-13
-        total = np.zeros((count, *expected.shape[1:]))
-        np.add.at(total, element, expected)
-        assert np.abs(summed - total).max() < 1e-12
 
 
 def test_wrenches_are_those_of_numpy():

@@ -200,7 +200,7 @@ def test_operator_is_the_sum_of_bodies_and_elements(rule):
         at.solver.assemble(e)
         found = dense(at.solver.matrix.operator)
         expected = np.zeros_like(found)
-        for rows, body in zip(at.blocks(), at.problem.body_tangents(e), strict=False):
+        for rows, body in zip(at.blocks(), at.problem.tangents.at(e), strict=False):
             expected[rows, rows] = dense(body)
         for block, part in zip(laid.blocks, e.parts, strict=True):
             fields = zip(block.fields, block.numbers, strict=True)
@@ -235,7 +235,7 @@ def test_contact_changes_beside_matrices_that_are_kept(rule, solver):
     vectors[0].array_w[:] = rng.uniform(-1, 1, len(problem.x.array_r))
     solver.assemble(other)
     matrix.operator.mult(vectors[0], vectors[1])
-    problem.body_tangents(first)
+    problem.tangents.at(first)
     matrix.assemble([part.tangent for part in other.parts])
     matrix.operator.mult(vectors[0], vectors[2])
     kept, fresh = vectors[1].array_r, vectors[2].array_r

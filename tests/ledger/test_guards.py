@@ -122,7 +122,7 @@ def test_no_tolerance_comes_from_an_iterate():
     far = problem.x.duplicate()
     far.array_w[:] = 1e3 * (1 + np.arange(len(far.array_r)))
     with np.errstate(all="ignore"):
-        problem.body_tangents(problem.evaluate(far))
+        problem.tangents.at(problem.evaluate(far))
     assert problem.momentum_rounding == before
     far.destroy()
     stepper.close()

@@ -152,7 +152,7 @@ def test_schur_complements_are_those_of_the_operator(blocked, condense):
 
     assert matrix.operator.getNestSubMatrix(0, 0).getType() == ("seqbaij" if blocked else "seqaij")
     for _ in range(2):
-        problem.body_tangents(e)
+        problem.tangents.at(e)
         matrix.assemble(tangents, fresh=True)
         a = parts()[0][np.ix_(rows, rows)]
         w = 1.0 / np.abs(a).sum(axis=1)
@@ -311,7 +311,7 @@ def test_matrix_in_blocks_of_nodes(cells, masters):
     problem = stepper.problem
     e = problem.evaluate(problem.x)
     other = StepMatrix(
-        problem.unknowns.layout, problem.body_tangents(e), problem.unknowns.blocks, split=True
+        problem.unknowns.layout, problem.tangents.at(e), problem.unknowns.blocks, split=True
     )
     tangents = [part.tangent for part in e.parts] if problem.unknowns.blocks else []
     matrix.assemble(tangents, fresh=True)

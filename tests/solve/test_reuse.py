@@ -21,8 +21,8 @@ def run(integrator, dt=2e-3, steps=30, system=None, **newton):
         system or rubbing_blocks(0.3), MID_STEP[integrator], newton=nts.Newton(**newton)
     )
     assembled, problem = [], stepper.problem
-    body_tangents = problem.body_tangents
-    problem.body_tangents = lambda e: assembled.append(1) or body_tangents(e)
+    at = problem.tangents.at
+    problem.tangents.at = lambda e: assembled.append(1) or at(e)
     for k in range(steps):
         stepper.advance((k + 1) * dt - stepper.state.time)
     stepper.close()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 from mpi4py import MPI
@@ -310,10 +310,10 @@ class RigidBody(MeshBody):
 
     # ---- as of Body
     @property
-    def plain(self) -> bool:
-        """Whether inertia and gravity are all there is to it, so that many are evaluated as one."""
-        overridden = type(self) is not RigidBody
-        return self._loads.none and not (overridden or self._drive.moves or self._drive.turns)
+    def alike(self) -> Hashable | None:
+        """Not None if inertia and gravity are all there is to it: a step takes many as one."""
+        held = self._drive.moves or self._drive.turns
+        return () if self._loads.none and not held else None
 
     @property
     def settings(self) -> Settings:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from petsc4py import PETSc
 
@@ -21,7 +23,7 @@ class RigidMatrix:
         total: Mass [kg].
     """
 
-    def __init__(self, comm: Any, masses: FloatArray, fixed: IntArray, total: float) -> None:
+    def __init__(self, comm: MPI.Comm, masses: FloatArray, fixed: IntArray, total: float) -> None:
         self._comm, self._mass, self._fixed, self._total = comm, masses, fixed, total
         self._matrix: Any = None
         # Mass factor that it holds, and PETSc's count of changes since.

@@ -163,8 +163,9 @@ class Beam(DirectorBody):
 
         They act on what lies before a section from what lies behind it.
         """
-        strain = kernel.strains(self._elements, y)
-        return kernel.resultants(strain * self.section.stiffness, y, self._rest, self.length)
+        strained, rest = self.elements.strained, self.elements.rest
+        stress = kernel.strains(strained, y) * self.section.stiffness
+        return kernel.resultants(stress, y, rest, self.length)
 
     def directions_at(self, direction: FloatArray, x: Places) -> Points:
         """As of `Body`, at a node. Collective."""

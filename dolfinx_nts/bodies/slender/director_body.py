@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -19,6 +19,7 @@ from dolfinx_nts.bodies.directors import Directors
 from dolfinx_nts.bodies.meshes.mesh_check import places_of
 from dolfinx_nts.bodies.nodal_values import cell_function, motion_on
 from dolfinx_nts.bodies.slender import turns
+from dolfinx_nts.bodies.slender.director_elements import DirectorElements
 from dolfinx_nts.bodies.slender.director_matrix import DirectorMatrix
 from dolfinx_nts.bodies.slender.director_mesh import DirectorMesh, WholeSkin
 from dolfinx_nts.bodies.slender.director_skin import DirectorSkin
@@ -137,7 +138,10 @@ class DirectorBody(Body):
         owned = topology.index_map(topology.dim).size_local
         start = self.comm.exscan(owned) or 0
         self._cells = self._director_mesh.cells[start : start + owned]
-        self._values = ElementValues(self.comm, index_map, self._cells, self._width)
+        ghosts = np.asarray(index_map.ghosts, dtype=np.int64)
+        self._values = ElementValues(
+            self.comm, index_map.size_local, ghosts, self._cells, self._width
+        )
         self._here, self.num_owned = self._values.here, self._values.num_owned
         here = np.arange(self._here.start, self._here.stop)
         self.reference: FloatArray = self._vectors_at(here).ravel()
@@ -151,13 +155,11 @@ class DirectorBody(Body):
 
     def _set_up_elements(self) -> None:
         """This rank's elements, and their mass."""
-        n, nodes = self._cells.shape
+        n, _ = self._cells.shape
         y = self._vectors_at(self._cells.ravel()).reshape(n, self._values.num_vectors, 3)
-        self._elements, self._shares = self._elements_of(y)
-        self._rest = y
-        sums = self._shares.sum(axis=2)[:, :, None, None] * self._masses[:, None]
-        of_nodes = np.broadcast_to(sums, (n, nodes, len(self._masses), 3))
-        self.nodal_mass: FloatArray = self._values.sums(of_nodes)
+        strained, shares = self._elements_of(y)
+        self.elements = DirectorElements(self._values, strained, y, shares, self._masses)
+        self.nodal_mass: FloatArray = self.elements.nodal_mass
 
     def _set_up_velocity(self, velocity: Values, spin: FloatArray) -> None:
         x, d = self._director_mesh.x[self._here], self._director_mesh.directors[self._here]
@@ -179,14 +181,10 @@ class DirectorBody(Body):
         return (k * self._director_mesh.order[:, None] + np.arange(k)).ravel()
 
     # ---- values of this rank's elements
-    def _of_elements(self, owned: FloatArray) -> FloatArray:
-        """Values at the nodes of this rank's elements, shape (n, k, 3). Collective."""
-        self.check_alive()
-        return self._values.of(owned)
-
     def _vectors(self, u: FloatArray) -> FloatArray:
         """Nodal vectors of this rank's elements [m], shape (n, k, 3). Collective."""
-        return self._rest + self._of_elements(u)
+        self.check_alive()
+        return self.elements.vectors(u)
 
     def _in_order(self) -> tuple[FloatArray, FloatArray]:
         """Places in the reference and now [m], shape (n, 3) each, in file order. Collective."""
@@ -280,11 +278,19 @@ class DirectorBody(Body):
     # ---- as of Body
     def begin_step(self, rule: Integrator, moment: EvaluationPoint) -> None:
         """Set the state at t_n and the loads of the step."""
-        self._u0, self._y0 = moment.u0, self._vectors(moment.u0)
-        self._theta, self._held_at = rule.taken_at, rule.theta
+        self.check_alive()
+        self.elements.begin(moment.u0, rule.taken_at)
+        self._u0, self._held_at = moment.u0, rule.theta
         self._load, moments = self._conditions.loads(moment.time, moment.ramp)
         self._moments.begin(moments)
         self._pressures.begin(moment.time, moment.ramp)
+
+    @property
+    def alike(self) -> Hashable | None:
+        """What those have in common that a step evaluates together; None: it does so alone."""
+        if not self._conditions.none:
+            return None
+        return self._cells.shape[1], self.length, *self._masses.tolist()
 
     @property
     def settings(self) -> Settings:
@@ -297,15 +303,11 @@ class DirectorBody(Body):
 
     def inertia(self, v: FloatArray) -> FloatArray:
         """M v [kg m/s for a velocity]. Collective."""
-        n, nodes = self._cells.shape
-        at = self._of_elements(v).reshape(n, nodes, self._width)
-        mass = np.repeat(self._masses, 3)
-        return self._values.sums(np.matmul(self._shares, at) * mass)
+        return self.elements.inertia(v)
 
     def internal(self, u1: FloatArray) -> FloatArray:
         """Internal forces of the step [N]. Collective."""
-        y1 = self._vectors(u1)
-        return self._values.sums(kernel.force(self._elements, self._y0, y1, self._theta))
+        return self.elements.internal(u1)
 
     def external(self, u1: FloatArray, gravity: FloatArray) -> FloatArray:
         """Loads and gravity [N]; a moment acts on directors where the step takes its forces."""
@@ -317,8 +319,8 @@ class DirectorBody(Body):
             f[moments.turned, 3:] += moments.push(y)
         if self._pressures:
             on_cells = np.zeros((len(self._cells), self._values.num_vectors, 3))
-            x0, x1 = self._y0[:, ::2], self._vectors(u1)[:, ::2]
-            on_cells[:, ::2] = self._pressures.forces(x0, x1, self._theta)
+            x0, x1 = self.elements.y0[:, ::2], self._vectors(u1)[:, ::2]
+            on_cells[:, ::2] = self._pressures.forces(x0, x1, self.elements.theta)
             f += self._values.sums(on_cells).reshape(f.shape)
         return f.ravel()
 
@@ -326,49 +328,28 @@ class DirectorBody(Body):
         """Return mass M + stiffness K, the same matrix in each call. Collective."""
         if self._matrix is None:
             self._matrix = DirectorMatrix(self._values, self._moments, self.fixed)
-        n, k = len(self._cells), self._values.num_vectors
-        values = np.zeros((n, 3 * k, 3 * k))
-        if stiffness:
-            y1 = self._vectors(u1)
-            values += stiffness * kernel.tangent(self._elements, self._y0, y1, self._theta)
-            if self._pressures:
-                pushed = self._pressures.tangent(self._y0[:, ::2], y1[:, ::2], self._theta)
-                values.reshape(n, k, 3, k, 3)[:, ::2, :, ::2] -= stiffness * pushed
-        if mass:
-            of_vectors = mass * self._inertia
-            for i in range(3):
-                values[:, i::3, i::3] += of_vectors
+        self.check_alive()
+        elements = self.elements
+        values = elements.tangent(u1, mass, stiffness)
+        if stiffness and self._pressures:
+            (n, k, _), y1 = elements.rest.shape, elements.vectors(u1)
+            pushed = self._pressures.tangent(elements.y0[:, ::2], y1[:, ::2], elements.theta)
+            values.reshape(n, k, 3, k, 3)[:, ::2, :, ::2] -= stiffness * pushed
         slopes = stiffness * self._held_at * self._moments.slopes()
         directors = self._width // 3 - 1
         of_moments = np.repeat(slopes, directors, axis=1)
-        scale = mass * self.nodal_mass if mass else stiffness * self._diagonal
+        scale = mass * self.nodal_mass if mass else stiffness * elements.diagonal
         places = np.repeat(self.places, 3)
         total = self.comm.allreduce(np.array([scale[places].sum(), places.sum()]))
         return self._matrix.assemble(values, of_moments, total[0] / total[1] or 1.0)
 
-    @cached_property
-    def _inertia(self) -> FloatArray:
-        """Mass matrices of the elements, of one component of their vectors, (n, k, k)."""
-        k, (n, nodes) = self._width // 3, self._cells.shape
-        whole = np.zeros((n, nodes, k, nodes, k))
-        each = np.einsum("nab,k->knab", self._shares, self._masses)
-        whole[:, :, range(k), :, range(k)] = each
-        return whole.reshape(n, nodes * k, nodes * k)
-
-    @cached_property
-    def _diagonal(self) -> FloatArray:
-        """Return the diagonal of the stiffness in the reference [N/m]. Collective."""
-        k = kernel.tangent(self._elements, self._rest, self._rest, 1.0)
-        return self._values.sums(np.einsum("nii->ni", k))
-
     def nodal_stiffness(self) -> FloatArray:
         """Mean diagonal of the tangent at each node in the reference [N/m]. Collective."""
-        mean = self._diagonal.reshape(-1, 3).mean(axis=1)
-        return np.repeat(mean, 3)
+        return self.elements.nodal_stiffness()
 
     def potential(self, u: FloatArray) -> float:
         """Strain energy on this rank [J]. Collective."""
-        return float(kernel.energy(self._elements, self._vectors(u)).sum())
+        return self.elements.potential(u)
 
     def reactions(self, residual: FloatArray, u1: FloatArray) -> FloatArray:
         """Resultants on the places of each condition, this rank's part [N], (conditions, 3)."""
@@ -387,7 +368,7 @@ class DirectorBody(Body):
         count = self._width // 3
         directors = y.reshape(len(y), self._cells.shape[1], count, 3)[:, :, 1:]
         least, cell, pair = turns.least_cosine(directors, pairs)
-        return least, self._rest[cell, ::count][pairs[pair]].mean(axis=0)
+        return least, self.elements.rest[cell, ::count][pairs[pair]].mean(axis=0)
 
     def describe_det(self, det: float, place: FloatArray) -> tuple[str, str]:
         """How far neighbouring nodes turn against each other, and what elements are needed."""

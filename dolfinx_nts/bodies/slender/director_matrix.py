@@ -26,7 +26,8 @@ class DirectorMatrix:
         self._fixed, self._size = fixed, values.num_owned
         of_elements = values.of(held).reshape(-1, 3 * values.num_vectors) > 0.5
         at_moments = moments.at(held > 0.5)
-        self._held = [a[..., :, None] | a[..., None, :] for a in (of_elements, at_moments)]
+        both = (a[..., :, None] | a[..., None, :] for a in (of_elements, at_moments))
+        self._held = [np.flatnonzero(held) for held in both]
         self._matrix = values.matrix(moments.at(values.numbers))
 
     def assemble(
@@ -42,7 +43,7 @@ class DirectorMatrix:
         own = np.zeros(self._size)
         own[self._fixed] = diagonal
         for values, held in zip((of_elements, of_moments), self._held, strict=True):
-            values[held] = 0.0
+            values.reshape(-1)[held] = 0.0
         whole = np.concatenate([of_elements.ravel(), of_moments.ravel(), own])
         petsc_compat.set_values_coo(self._matrix, whole)
         return self._matrix

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mpi4py import MPI
 
 import numpy as np
@@ -18,7 +16,8 @@ class ElementValues:
 
     Args:
         comm: MPI communicator.
-        index_map: DOLFINx's of the nodes.
+        size: Number of nodes of this rank.
+        ghosts: Global numbers of other ranks' nodes that it needs.
         cells: Global numbers of the nodes of this rank's elements, shape (n, nodes).
         width: Coordinates of a node.
 
@@ -26,18 +25,21 @@ class ElementValues:
         here: Global numbers of this rank's nodes.
         num_owned: Coordinates of this rank.
         numbers: Their global numbers.
+        cells: As given, and so are `ghosts`.
         nodes: Nodes of the elements on this rank, shape (n, nodes).
         num_vectors: Nodal vectors of an element.
     """
 
-    def __init__(self, comm: MPI.Comm, index_map: Any, cells: IntArray, width: int) -> None:
-        start, stop = index_map.local_range
-        self.here, self._width, self._cells = slice(start, stop), width, cells
-        self.num_owned = width * index_map.size_local
+    def __init__(
+        self, comm: MPI.Comm, size: int, ghosts: IntArray, cells: IntArray, width: int
+    ) -> None:
+        start = comm.exscan(size) or 0
+        stop = start + size
+        self.here, self._width, self.cells = slice(start, stop), width, cells
+        self.num_owned, self.ghosts = width * size, ghosts
         self.numbers = width * start + np.arange(self.num_owned)
-        ghosts = np.asarray(index_map.ghosts, dtype=PETSc.IntType)
         self._shared = PETSc.Vec().createGhost(
-            ghosts, (self.num_owned, None), bsize=width, comm=comm
+            ghosts.astype(PETSc.IntType), (self.num_owned, None), bsize=width, comm=comm
         )
         known = np.concatenate([np.arange(start, stop), ghosts])
         order = np.argsort(known)
@@ -69,7 +71,7 @@ class ElementValues:
             of_nodes: Coordinates of single nodes that have entries of their own, (m, d, 3).
         """
         width, size = self._width, 3 * self.num_vectors
-        numbers = (width * self._cells[:, :, None] + np.arange(width)).reshape(-1, size)
+        numbers = (width * self.cells[:, :, None] + np.arange(width)).reshape(-1, size)
         rows, cols = zip(
             *(np.broadcast_arrays(a[..., :, None], a[..., None, :]) for a in (numbers, of_nodes)),
             strict=True,

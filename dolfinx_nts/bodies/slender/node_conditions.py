@@ -75,6 +75,11 @@ class NodeConditions:
         self.loads(0.0, 1.0)
 
     @property
+    def none(self) -> bool:
+        """Whether nothing is prescribed and nothing loads the body, at any time."""
+        return not self._values and not self._values_of_loads
+
+    @property
     def settings(self) -> Settings:
         """What ranks must have in common, see `Body`."""
         return {"bcs": self._values, "forces": self._values_of_loads}

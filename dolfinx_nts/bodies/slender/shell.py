@@ -171,8 +171,8 @@ class Shell(DirectorBody):
         shear; moments bend and twist.
         """
         middle = np.zeros((1, 2))
-        e = kernel.strains(y, self._rest, self.length, middle)[:, 0]
-        axes = kernel.axes(self._rest[:, ::2], middle)[0][:, 0]
+        e = kernel.strains(y, self.elements.rest, self.length, middle)[:, 0]
+        axes = kernel.axes(self.elements.rest[:, ::2], middle)[0][:, 0]
         c = kernel.stiffness(self.young, self.poisson, self.thickness)
         local = np.zeros((2, len(e), 3, 3))
         for k, stress in enumerate((e[:, :3] @ c.membrane, e[:, 3:6] @ c.bending)):
