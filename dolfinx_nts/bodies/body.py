@@ -284,7 +284,7 @@ class Body:
 
     @property
     def is_thin(self) -> bool:
-        """Whether it has one cell of degree 1 over its thickness. Collective."""
+        """Whether it is long or flat, with one cell of degree 1 over its thickness. Collective."""
         return False
 
     def take_parameters(self) -> None:

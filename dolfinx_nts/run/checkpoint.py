@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 #: Notes that are the stepper's.
-_MEMORY = ("last", "promised", "measured", "recent", "solver")
+_MEMORY = ("last", "promised", "measured", "recent", "stress", "solver")
 
 
 @known_options

@@ -170,6 +170,7 @@ class LoadStepper(Stepper):
         step_warnings.tell_inversion(self.solution, self.problem, step, state)
         step_warnings.tell_couplings(self.solution, self.problem, step, state)
         self._solved = step
+        self._locking.look()
         self.look()
 
     def _rounded_force(self, step: Evaluation) -> float:

@@ -6,6 +6,7 @@ import numpy as np
 
 from dolfinx_nts.run.solution import Solution
 from dolfinx_nts.system import System
+from dolfinx_nts.types import FloatArray
 
 #: Part of the squared stress that jumps between cells from which on a body is called too stiff.
 _LOCKED = 0.1
@@ -25,23 +26,33 @@ class LockingWatch:
         self._bodies, self._steps = system.bodies, 0
         self._sums = np.zeros((len(system.bodies), 2))
 
-    def look(self, *, last: bool = False) -> None:
-        """Look after an accepted step, if it is time for it. Collective.
+    @property
+    def memory(self) -> tuple[int, tuple[float, ...]]:
+        """What a checkpoint keeps: number of steps, and the sums of all bodies."""
+        return self._steps, tuple(self._sums.ravel().tolist())
 
-        Args:
-            last: Whether the run ends here.
-        """
-        if not last:
-            self._steps += 1
-        if last or self._steps & (self._steps - 1) == 0:
-            for k, body in enumerate(self._bodies):
-                found = body.stress_jumps()
-                if found is not None:
-                    self._sums[k] += found
+    def resume(self, memory: tuple[int, tuple[float, ...]]) -> None:
+        """Go on from what another run kept."""
+        self._steps, self._sums[:] = memory[0], np.reshape(memory[1], self._sums.shape)
+
+    def look(self) -> None:
+        """Look after an accepted step, if it is time for it. Collective."""
+        self._steps += 1
+        if self._steps & (self._steps - 1) == 0:
+            self._sums += self._now()
+
+    def _now(self) -> FloatArray:
+        found = np.zeros_like(self._sums)
+        for of_body, body in zip(found, self._bodies, strict=True):
+            jumps = body.stress_jumps()
+            if jumps is not None:
+                of_body[:] = jumps
+        return found
 
     def tell(self, solution: Solution, time: float) -> None:
-        """Warn of what was seen. Collective."""
-        for body, (jumps, whole) in zip(self._bodies, self._sums.tolist(), strict=True):
+        """Warn of what was seen until now, where the run ends. Collective."""
+        sums = (self._sums + self._now()).tolist()
+        for body, (jumps, whole) in zip(self._bodies, sums, strict=True):
             if not whole > 0.0:
                 continue
             share = jumps / whole

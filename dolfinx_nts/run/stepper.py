@@ -174,14 +174,15 @@ class Stepper:
         """What a checkpoint keeps beside state and solution: numbers and tuples of them.
 
         last: start and length of the last step [s], or None; promised: see `LedgerCheck.memory`;
-        measured: see `Rounding`; recent: lengths of the last two steps [s]; solver: see
-        `StepSolver.memory`.
+        measured: see `Rounding`; recent: lengths of the last two steps [s]; stress: see
+        `LockingWatch.memory`; solver: see `StepSolver.memory`.
         """
         return {
             "last": self._last_steps.last,
             "promised": self._promises.memory,
             "measured": self.problem.rounding.measured,
             "recent": self._last_steps.lengths,
+            "stress": self._locking.memory,
             "solver": self.solver.memory,
         }
 
@@ -204,6 +205,7 @@ class Stepper:
         self._promises.resume(memory["promised"])
         self.problem.rounding.measured = memory["measured"]
         self.solver.resume(memory["solver"])
+        self._locking.resume(memory["stress"])
         if self._last_steps.last is not None:
             begin, length = self._last_steps.last
             self._call_before(length, begin)
@@ -329,7 +331,6 @@ class Stepper:
         """
         step_warnings.tell_stressed(self.solution, self.state.time)
         self._look_inside(last)
-        self._locking.look(last=last)
         if last:
             self._locking.tell(self.solution, self.state.time)
 

@@ -25,7 +25,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
-from dolfinx_nts.parallel import anywhere, raise_together
+from dolfinx_nts.parallel import anywhere, global_max, raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
@@ -40,6 +40,8 @@ from dolfinx_nts.validation import (
 _STRESS_FREE = 1e-6
 #: Strain that tells the stiffness: of the size that leaves linear terms and rounding far apart.
 _SMALL_STRAIN = 1e-4
+#: Longest side of the box around a body over the shortest from which on it may bend.
+_THIN = 4.0
 
 
 @known_options
@@ -269,6 +271,11 @@ class Continuum(UflBody):
     def is_thin(self) -> bool:  # type: ignore[override]
         """As of `Body`."""
         if not self._linear:
+            return False
+        x = self.reference.reshape(-1, 3)
+        ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
+        sides = global_max(self.comm, ends).sum(axis=0)
+        if sides.max() < _THIN * sides.min():
             return False
         outside = compat.exterior_facets(self.mesh)
         on_boundary = fem.locate_dofs_topological(self.space, 2, outside)
