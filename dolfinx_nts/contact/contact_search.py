@@ -14,6 +14,8 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
+from dolfinx_nts.contact.convex_edges import OUTSIDE
+from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.left_behind import beside, unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
@@ -65,6 +67,7 @@ class ContactSearch:
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._begun: State | None = None
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
+        self._left = [np.zeros_like(had) for had in self._had]
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
         before = zip(contacts, held_before(contacts), strict=True)
         self._foreign = [held[pair.slave.share] for pair, held in before]
@@ -104,9 +107,28 @@ class ContactSearch:
             self._followed = [old.followed for old in self._old]
             self._found = [self._search(k) for k in range(len(self._pairs))]
             drop_doubles(self._found, [old.force for old in self._old])
+            self._leave_corners()
             had = self.had_unknowns
             self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in enumerate(self._found)]
         self._choose()
+
+    def _leave_corners(self) -> None:
+        """Take from the candidates the corners that something else holds. Collective."""
+        for k, c in enumerate(self._found):
+            if not self._is_of_corners(k) or not anywhere(self._comm, len(c.candidates.node)):
+                continue
+            of, near = self._pairs.index(c.pair.of), np.zeros(len(c.pair.master.share), dtype=bool)
+            near[self._found[of].candidates.node] = True
+            meet = self._edges[of].ends if of in self._edges else np.empty((0, 4), dtype=int)
+            held = c.pair.held_otherwise(
+                c.candidates, self._positions(k), c.pair.master.at_all(near), meet
+            )
+            some = c.candidates.select(held)
+            self._left[k] = np.zeros(len(c.pair.slave.share), dtype=bool)
+            self._left[k][some.node] = True
+            # What they enter meanwhile does not throw them out.
+            self._followed[k][some.node[some.gap < -OUTSIDE * some.length]] = False
+            self._found[k] = c.select(~held)
 
     def _choose(self) -> None:
         """Give unknowns to the candidates that are awake."""
@@ -175,7 +197,7 @@ class ContactSearch:
             path,
             Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k], self._repeats > 0),
             # In statics steps may be of any length, and what they carry inside is looked for.
-            self._old[k].followed if step.integrator.inertia else None,
+            self._old[k].followed if step.integrator.inertia or self._is_of_corners(k) else None,
         )
         beyond = self._edges[k].find(positions, found) if k in self._edges else ()
         found = found.select(~self._foreign[k][found.node])
@@ -212,6 +234,9 @@ class ContactSearch:
             law = replace(law, before=before)
         offset = pair.offset[found.node] if pair.adjust else 0.0
         return replace(elements, law=law, offset=offset)
+
+    def _is_of_corners(self, k: int) -> bool:
+        return isinstance(self._pairs[k], Corners)
 
     def _may_touch(self, k: int, c: ContactElements, had: BoolArray) -> BoolArray:
         """Return which need unknowns: all within reach, and those that had them in the last step.
@@ -305,7 +330,7 @@ class ContactSearch:
             raise StepFailedError(text, advises=failure.advises) from None
         if hit is None:
             return False
-        new = (hit >= 0) & ~self._foreign[k]
+        new = (hit >= 0) & ~self._foreign[k] & ~self._left[k]
         self._aimed[k] = np.where(new, hit, self._aimed[k])
         # What is held at a facet that its path led to is to be so again.
         at = np.where(self._aimed[k] >= 0, held, -1)

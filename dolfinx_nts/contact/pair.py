@@ -17,6 +17,7 @@ from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import is_finite, known_options, require_bool, require_one_of
 
@@ -402,6 +403,10 @@ class ContactPair:
         raise NotImplementedError
 
     # ---- what they share
+    def history_at_start(self) -> ContactHistory:
+        """What it remembers of its slave nodes before the first step."""
+        return ContactHistory.of_start(len(self.slave.share))
+
     @property
     def name(self) -> str:
         """Slave body and master, for messages and files."""

@@ -44,8 +44,9 @@ class Couplings:
     def __init__(self, system: System) -> None:
         self.edges = {k: EdgeCoupling(edges) for k, edges in system.edges.items()}
         self.contacts = ContactSearch(
-            system.contacts, system.contact_bodies, system.comm, self.edges
+            system.pairs, system.pair_bodies, system.comm, self.edges
         )
+        self._contacts = len(system.contacts)
         both = zip(system.joints, system.joint_bodies, strict=True)
         each: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
         _lend_less(system, each)
@@ -148,7 +149,7 @@ class Couplings:
             for k, own in zip(of, found if len(of) > 1 else [found], strict=True):
                 out[k] = own
         contacts = self.contacts.history(e.parts[: len(self.contacts.elements)])
-        edges = [EdgeHistory.of_start() for _ in contacts]
+        edges = [EdgeHistory.of_start() for _ in range(self._contacts)]
         for k, _, part in self.of_edges(e):
             edges[k] = self.edges[k].history([part])
         return contacts, tuple(out), tuple(edges)
@@ -156,7 +157,7 @@ class Couplings:
     def touching(
         self, e: Evaluation
     ) -> list[tuple[ContactElements, Contribution, ContactHistory]]:
-        """Of each contact its elements, their part of an evaluation, and its memory of t_n.
+        """Of each of `System.pairs` its elements, their part of an evaluation, and memory of t_n.
 
         For results that only contacts have: pressures, impacts, changes of facet.
         """

@@ -63,9 +63,9 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     each = zip(batches.bodies, step.terms, strict=True)
     held = {body: terms for body, terms in each if body is not batches.rigid}
     parts = [body.reactions(terms.residual, terms.u1) for body, terms in held.items()]
-    forces = [part.force.sum(axis=0) for _, part, _ in contacts]
-    moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
-    parts += (np.reshape(each, (len(contacts), 3)) for each in (forces, moments))
+    theta, system = problem.integrator.theta, problem.system
+    found = [[part.force.sum(axis=0), c.moment(part, theta)] for c, part, _ in contacts]
+    parts.extend(system.on_slaves(np.reshape(found, (-1, 2, 3))).swapaxes(0, 1))
     both = zip(batches.join(problem.state.u), step.terms, strict=True)
     u = batches.split([u0 + problem.integrator.theta * terms.du for u0, terms in both])
     for k, edges, part in problem.couplings.of_edges(step):

@@ -225,7 +225,7 @@ class LoadStepper(Stepper):
 
     def _look_inside(self, last: bool) -> None:
         """Look, unless overlap is left that a contact is to resolve. Collective."""
-        both = zip(self.system.contacts, self.state.contacts, strict=True)
+        both = zip(self.system.pairs, self.state.contacts, strict=True)
         asked = any(p.interference == "resolve" and bool(c.overlap.any()) for p, c in both)
         if not (self._left(self.state.time) and anywhere(self.system.comm, asked)):
             super()._look_inside(last)
@@ -269,7 +269,7 @@ class LoadStepper(Stepper):
 
     def _slips(self) -> bool:
         """Whether nodes slip with friction, whose forces have no potential. Collective."""
-        both = zip(self.system.contacts, self.state.contacts, strict=True)
+        both = zip(self.system.pairs, self.state.contacts, strict=True)
         slip = any(p.friction and bool(((c.force > 0.0) & ~c.stick).any()) for p, c in both)
         return anywhere(self.system.comm, slip)
 
