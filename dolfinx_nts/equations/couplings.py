@@ -156,14 +156,15 @@ class Couplings:
 
     def touching(
         self, e: Evaluation
-    ) -> list[tuple[ContactElements, Contribution, ContactHistory]]:
-        """Of each of `System.pairs` its elements, their part of an evaluation, and memory of t_n.
+    ) -> list[tuple[int, ContactElements, Contribution, ContactHistory]]:
+        """Of each of `System.pairs` that may act its number, elements, part, and memory of t_n.
 
         For results that only contacts have: pressures, impacts, changes of facet.
         """
-        elements = self.contacts.elements
+        numbers, elements = self.contacts.numbers, self.contacts.elements
         parts: Any = e.parts[: len(elements)]
-        return list(zip(elements, parts, self._remembered, strict=True))
+        remembered = [self._remembered[k] for k in numbers]
+        return list(zip(numbers, elements, parts, remembered, strict=True))
 
     def guess(self, positions: Sequence[FloatArray], *, carried: bool) -> FloatArray:
         """Constraints' unknowns of all elements as in the last step, one after the other.

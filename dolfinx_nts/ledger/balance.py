@@ -230,7 +230,7 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
     if not problem.system.contacts:
         return []
     found = []
-    for contact, part, old in problem.couplings.touching(step):
+    for _, contact, part, old in problem.couplings.touching(step):
         c = contact.candidates
         before, gain = old.facet[c.node], contact.gains(part, problem.factor)
         stayed = (old.force[c.node] > 0.0) & part.active

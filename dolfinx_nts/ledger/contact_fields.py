@@ -40,8 +40,8 @@ class ContactLoads(NamedTuple):
         """Of a solved step; its tangents are not kept."""
         couplings = problem.couplings
         both: list[list[Any]] = [[] for _ in problem.system.contacts]
-        for k, (c, part, _) in zip(problem.system.contact_of, couplings.touching(step), strict=True):
-            both[k].append((c, part))
+        for k, c, part, _ in couplings.touching(step):
+            both[problem.system.contact_of[k]].append((c, part))
         for k, c, part in couplings.of_edges(step):
             both[k].append((c, part))
         elements = tuple(tuple(c for c, _ in of) for of in both)

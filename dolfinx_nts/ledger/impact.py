@@ -164,7 +164,7 @@ def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
     couplings = problem.couplings
     nodes = [
         (k, batch, part, old.force[batch.candidates.node] > 0.0)
-        for k, (batch, part, old) in enumerate(couplings.touching(step))
+        for k, batch, part, old in couplings.touching(step)
     ]
     edges = [(k, c, part, couplings.edges[k].pressed) for k, c, part in couplings.of_edges(step)]
     for k, batch, part, pressed in (*nodes, *edges):
