@@ -58,6 +58,7 @@ class ContactSearch:
     ) -> None:  # fmt: skip
         self._pairs, self._of, self._comm = contacts, list(bodies), comm
         self.numbers: list[int] = []
+        self.bodies: list[tuple[int, ...]] = []
         self.elements: list[ContactElements] = []
         self.idle: list[ContactElements] = []
         self.idle_gaps: list[FloatArray] = []
@@ -65,18 +66,13 @@ class ContactSearch:
         self._declared = sum(not isinstance(pair, Corners) for pair in contacts)
         self._edges = edges
         self._cover, self._repeats = [0.0] * len(contacts), 0
-        self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
+        self._known: dict[int, tuple[list[FloatArray], float, ContactElements | None]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._begun: State | None = None
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
         self._massless = [pair.slave.massless[pair.slave.share] for pair in contacts]
         before = zip(contacts, held_before(contacts), strict=True)
         self._foreign = [held[pair.slave.share] for pair, held in before]
-
-    @property
-    def bodies(self) -> list[tuple[int, ...]]:
-        """Of each of `elements` the numbers of its bodies."""
-        return [self._of[k] for k in self.numbers]
 
     @property
     def had_unknowns(self) -> list[BoolArray]:
@@ -129,6 +125,7 @@ class ContactSearch:
                 numbers.append(k)
                 found.append(near)
         self.numbers, self._found = numbers, found
+        self.bodies = [self._of[k] for k in numbers]
         both = zip(numbers, found, strict=True)
         self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in both]
 

@@ -26,7 +26,7 @@ class ContactLoads(NamedTuple):
     """Contact forces of a step, as its elements have them.
 
     Attributes:
-        elements: Those of each contact: of nodes, of corners, and of edges that are near each other.
+        elements: Those of each contact: of nodes, and of corners and edges that are near.
         parts: Their solution.
         factor: What the step equations multiply forces by [s^2].
     """

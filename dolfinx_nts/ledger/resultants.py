@@ -64,10 +64,10 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     held = {body: terms for body, terms in each if body is not batches.rigid}
     parts = [body.reactions(terms.residual, terms.u1) for body, terms in held.items()]
     theta, system = problem.integrator.theta, problem.system
-    found = np.zeros((len(system.pairs), 2, 3))
+    pushes = np.zeros((len(system.pairs), 2, 3))
     for k, c, part, _ in contacts:
-        found[k] = part.force.sum(axis=0), c.moment(part, theta)
-    parts.extend(system.on_slaves(found).swapaxes(0, 1))
+        pushes[k] = part.force.sum(axis=0), c.moment(part, theta)
+    parts.extend(system.on_slaves(pushes).swapaxes(0, 1))
     both = zip(batches.join(problem.state.u), step.terms, strict=True)
     u = batches.split([u0 + problem.integrator.theta * terms.du for u0, terms in both])
     for k, edges, part in problem.couplings.of_edges(step):
