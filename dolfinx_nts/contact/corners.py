@@ -63,12 +63,9 @@ class Corners(FacetPair):
         """None: what passes by a face is told where bodies are looked at as a whole."""
         return hidden.select(np.zeros(len(hidden.node), dtype=bool))
 
-    def nodal_forces(self, history: ContactHistory) -> FloatArray:
-        """Forces at the points of its master, equal at all of a facet [N], (p,). Collective."""
-        force, on = np.zeros(len(self.master.points)), history.force > 0.0
-        at = self.master.facets[history.facet[on]]
-        np.add.at(force, at, history.force[on, None] / at.shape[1])
-        return global_sum(self.master.body.comm, force)
+    def borne(self, history: ContactHistory) -> float:
+        """Sum of the forces that they bear [N]. Collective."""
+        return float(global_sum(self.slave.body.comm, history.force.sum(keepdims=True))[0])
 
     def leave_to(self, node: IntArray, meet: IntArray) -> None:
         """Note what else holds in a step, before `find`.

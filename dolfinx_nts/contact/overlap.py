@@ -166,9 +166,7 @@ class OverlapWatch:
             if k in self._along:
                 # Edges carry at a rim, where they cross it: between their nodes.
                 carry = carry + self._along[k].nodal_forces(edges[k])
-            for n, corners in self._corners:
-                if corners.of is contact:
-                    carry = carry + corners.nodal_forces(histories[n])
+            borne = sum(c.borne(histories[n]) for n, c in self._corners if c.of is contact)
             if not carry.any():
                 continue
             positions = contact.positions([u[b] for b in bodies])
@@ -176,7 +174,7 @@ class OverlapWatch:
                 self._edges[k] = InnerEdges(contact.master.facets, positions[1])
             held = self._held_otherwise(k, everywhere)
             yield from filter(None, (
-                inside_rim(contact, positions, carry, held),
+                inside_rim(contact, positions, carry, held, borne),
                 in_inner_edge(self._edges[k], contact, positions, everywhere[k]),
             ))  # fmt: skip
 
