@@ -64,6 +64,8 @@ class ContactSearch:
         self.idle_gaps: list[FloatArray] = []
         self.beside = [(0.0, -1)] * len(contacts)
         self._declared = sum(not isinstance(pair, Corners) for pair in contacts)
+        number = {id(pair): k for k, pair in enumerate(contacts)}
+        self._corners = [(c, number[id(c.of)]) for c in contacts if isinstance(c, Corners)]
         self._edges = edges
         self._cover, self._repeats = [0.0] * len(contacts), 0
         self._known: dict[int, tuple[list[FloatArray], float, ContactElements | None]] = {}
@@ -115,9 +117,7 @@ class ContactSearch:
         numbers, had = list(range(self._declared)), self.had_unknowns
         found: list[Any] = [self._search(k) for k in numbers]
         drop_doubles(found, [old.force for old in self._old])
-        for k in range(self._declared, len(self._pairs)):
-            corners: Any = self._pairs[k]
-            of = next(n for n, pair in enumerate(self._pairs) if pair is corners.of)
+        for k, (corners, of) in enumerate(self._corners, self._declared):
             meet = self._edges[of].ends if of in self._edges else np.empty((0, 4), dtype=np.int64)
             corners.leave_to(found[of].candidates.node, meet)
             near = self._search(k)

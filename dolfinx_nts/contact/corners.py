@@ -149,7 +149,8 @@ class Corners(FacetPair):
     ) -> BoolArray:
         """Whether facets around corners lie flat on those that they are over, shape (n,).
 
-        As long as nodes there are candidates of the pair.
+        As long as a node there is a candidate of the pair; of rigid bodies all have to be, as what
+        reaches over a rim tips about it. A body that deforms lies on its nodes before the rim.
 
         Args:
             node: The corners, shape (n,).
@@ -157,7 +158,8 @@ class Corners(FacetPair):
             x: Points of the slave at t_n [m].
             corners: Corners of the master's facets [m].
         """
-        flat: BoolArray = self._near[self.master.facets[facet]].any(axis=1)
+        near = self._near[self.master.facets[facet]]
+        flat: BoolArray = near.any(axis=1) if self.yields else near.all(axis=1)
         some = np.flatnonzero(flat)
         if not some.size:
             return flat

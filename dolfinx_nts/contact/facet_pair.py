@@ -185,12 +185,15 @@ class FacetPair(ContactPair, master=Surface):
         if not (self.is_long(reach) or anywhere(self.slave.body.comm, node.size > 0)):
             return Found(NO_CANDIDATES, ~every, cover)
         found, lost = self.measure(x, master, node, closest.facet[node], closest.xi[node], reach)
+        let_go = lost
         if motion is not None:
+            near = found.node
             found = self.slave_paths.lead(found, slaves, master, motion._replace(reach=reach))
+            let_go = np.concatenate([lost, np.setdiff1d(near, found.node)])
         beside = (found.gap < -OUTSIDE * found.length) & ~known[found.node]
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
-        stays[node], stays[lost] = known[node], False
+        stays[node], stays[let_go] = known[node], False
         hidden, deepest = self._told(found.select(beside), current), (0.0, -1)
         if len(hidden.node):
             depth = -hidden.gap / hidden.length

@@ -253,3 +253,39 @@ def test_a_rigid_cube_rests_on_a_facet_that_is_larger_than_its_face():
     assert run.status == "completed" and not run.warnings
     np.testing.assert_allclose(cube.position, [0.25, 0.25, 0.15], atol=1e-9)
     assert -np.mean(run.contact_forces[1:, 0, 2]) == pytest.approx(270.0, rel=0.06)
+
+
+@pytest.mark.parametrize(("facets", "across"), [(1, 2), (4, 2), (4, 4)])
+def test_a_block_that_is_wider_than_a_table_tips_about_its_rim(facets, across):
+    """No edges cross. By the closed form of small angles, m g x^2 / (2 v (I + m x^2)), I = m/6."""
+    table = nts.RigidBody(box((-3, -0.4, -1), (0, 0.4, 0), (3, 2, 1)), density=1e3, **HELD)
+    block = nts.RigidBody(
+        box((-0.9, -0.5, 0), (0.1, 0.5, 1), (facets, across, 1)), density=1e3, velocity=(2, 0, 0),
+        name="block",
+    )  # fmt: skip
+    faces = [b.surface(lambda x: np.abs(x[2]) < 1e-9) for b in (block, table)]
+    system = nts.System([table, block], contacts=[nts.ContactPair(*faces)], gravity=(0, 0, -9.81))
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=5e-3, t_end=0.45, accuracy="balanced")
+    assert run.status == "completed" and not run.warnings
+    assert np.abs(run.balance["ledger_residual"]).max() < 1e-9 * run.balance["energy"][0]
+    right = 9.81 * 0.25 / (4.0 * (1.0 / 6.0 + 0.25))
+    assert block.angular_velocity[1] == pytest.approx(right, rel=0.03)
+
+
+def test_nodes_that_tilt_beyond_a_rim_are_not_thrown_out_when_they_return():
+    """A soft cube of two cells bends over the rim of one of five: it wins no energy there."""
+    def velocity(x):
+        return np.array([2.0 + 0.5 * (x[2] - 0.5), 0.0 * x[0], -0.5 * (x[0] - 0.5)])
+
+    left = nts.Continuum(
+        box((0, 0, 0), (1, 1, 1), 2), RUBBER, density=1e3, velocity=velocity, name="left"
+    )
+    right = nts.Continuum(box((1.004, 0, 0), (2.004, 1, 1), 5), RUBBER, density=1e3, name="right")
+    pair = nts.ContactPair(
+        left.surface(lambda x: x[0] > 1 - 1e-9), right.surface(lambda x: x[0] < 1.004 + 1e-9)
+    )
+    system = nts.System([left, right], contacts=[pair])
+    run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.03, accuracy="exact")
+    energy = run.balance["energy"]
+    assert run.status == "completed"
+    assert np.diff(energy).max() < 1e-3 * energy[0]
