@@ -160,7 +160,8 @@ class Pace:
         many steps and saves no energy (measured). Every rank must call it.
         """
         comm, state, contacts = problem.system.comm, problem.state, problem.couplings.contacts
-        carrying = np.array([bool((state.contacts[k].force > 0.0).any()) for k in contacts.numbers])
+        forces = [state.contacts[k].force for k in contacts.numbers]
+        carrying = np.array([bool((force > 0.0).any()) for force in forces], dtype=bool)
         comm.Allreduce(MPI.IN_PLACE, carrying, op=MPI.LOR)
         lost, first = 0.0, 1.0
         for c, end, late in zip(contacts.elements, contacts.flight_gaps(), carrying, strict=True):
