@@ -13,6 +13,7 @@ import numpy as np
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body, is_body
 from dolfinx_nts.bodies.conditions import jumps
+from dolfinx_nts.contact.corners import corners_of
 from dolfinx_nts.contact.crossings import point
 from dolfinx_nts.contact.edge_contact import EdgeContact
 from dolfinx_nts.contact.overlap import OverlapWatch
@@ -20,7 +21,7 @@ from dolfinx_nts.contact.pair import INITIAL_PENETRATION, INTERFERENCE, Candidat
 from dolfinx_nts.contact.shared_nodes import areas, check_shared
 from dolfinx_nts.interaction.coupling import Joint, is_joint
 from dolfinx_nts.parallel import need_kernels
-from dolfinx_nts.state import ContactHistory, EdgeHistory, State
+from dolfinx_nts.state import EdgeHistory, State
 from dolfinx_nts.types import FloatArray
 from dolfinx_nts.validation import items, known_options, require_same, vector
 
@@ -49,6 +50,8 @@ class System:
         size: Coordinates of all bodies.
         declared_joints: As given, each followed by its parts.
         joints: These, then those that bodies bring, such as what keeps a rigid body rigid.
+        pairs: Contacts, then the corners of those whose masters have any.
+        contact_of: Number of the contact that each of these belongs to.
         edges: Contact of edges by the number of the contact that has any.
 
     Raises:
@@ -100,6 +103,10 @@ class System:
         index = {id(b): i for i, b in enumerate(self.bodies)}
         self.joint_bodies = [tuple(index[id(b)] for b in j.bodies) for j in self.joints]
         self.contact_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.contacts]
+        corners = [(k, c) for k, pair in enumerate(self.contacts) for c in corners_of(pair)]
+        self.pairs = (*self.contacts, *(c for _, c in corners))
+        self.contact_of = [*range(len(self.contacts)), *(k for k, _ in corners)]
+        self.pair_bodies = [tuple(index[id(b)] for b in c.bodies) for c in self.pairs]
         self.edges: dict[int, EdgeContact] = {}
         for k, (pair, numbers) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
             if pair.has_edges:
@@ -109,7 +116,7 @@ class System:
         if self.contacts:
             need_kernels(self.comm)
         start = self.initial_state()
-        for pair, where in zip(self.contacts, self.contact_bodies, strict=True):
+        for pair, where in zip(self.pairs, self.pair_bodies, strict=True):
             pair.settle([start.u[b] for b in where])
         depths = self.penetration(start)
         for k, (pair, where) in enumerate(zip(self.contacts, self.contact_bodies, strict=True)):
@@ -198,7 +205,7 @@ class System:
             u=tuple(self._at_start(b) for b in self.bodies),
             v=tuple(b.initial_velocity.copy() for b in self.bodies),
             a=(),
-            contacts=tuple(ContactHistory.of_start(len(c.slave.share)) for c in self.contacts),
+            contacts=tuple(c.history_at_start() for c in self.pairs),
             joints=tuple(joint.start() for joint in self.joints),
             edges=tuple(EdgeHistory.of_start() for _ in self.contacts),
         )
@@ -208,6 +215,21 @@ class System:
         u = body.initial_displacement.copy()
         u[body.fixed] = body.prescribed(0.0)
         return u
+
+    def on_slaves(self, values: FloatArray) -> FloatArray:
+        """Forces or moments on the slaves of its contacts from those on the slaves of `pairs`.
+
+        Args:
+            values: Shape (pairs, ...).
+
+        Returns:
+            Shape (contacts, ...).
+        """
+        found = values[: len(self.contacts)].copy()
+        # Corners are those of masters.
+        for k, value in zip(self.contact_of[len(found) :], values[len(found) :], strict=True):
+            found[k] -= value
+        return found
 
     @cached_property
     def slave_areas(self) -> list[FloatArray]:
@@ -226,7 +248,7 @@ class System:
             obstacles, deep inside.
         """
         depths = []
-        both = zip(self.contacts, self._facing(state), state.contacts, strict=True)
+        both = zip(self.contacts, self._facing(state), state.contacts, strict=False)
         for pair, found, history in both:
             deep = np.maximum(-found.gap - left * history.overlap[found.node], 0.0)
             depth = np.zeros(len(pair.slave.points))
@@ -238,7 +260,7 @@ class System:
     def _facing(self, state: State) -> Iterator[Candidates]:
         """What this rank's slaves of each contact lie over, where they are. Collective."""
         for pair, bodies, history in zip(
-            self.contacts, self.contact_bodies, state.contacts, strict=True
+            self.contacts, self.contact_bodies, state.contacts, strict=False
         ):
             positions = pair.positions([state.u[b] for b in bodies])
             yield pair.find(positions, history.facet, pair.path(state.time, state.time)).candidates
@@ -259,12 +281,12 @@ class System:
             self.refuse_overlap(state)
             return state
         contacts = []
-        for found, history in zip(self._facing(state), state.contacts, strict=True):
+        for found, history in zip(self._facing(state), state.contacts, strict=False):
             new, node = np.zeros_like(history.overlap), found.node
             new[node] = np.maximum(-found.gap, 0.0) / left
             known = np.isfinite(history.gap)
             contacts.append(history._replace(overlap=np.where(known, history.overlap, new)))
-        return replace(state, contacts=tuple(contacts))
+        return replace(state, contacts=(*contacts, *state.contacts[len(contacts) :]))
 
     def refuse_overlap(self, state: State) -> None:
         """Raise on every rank if slaves are inside a master where no load steps press them out."""

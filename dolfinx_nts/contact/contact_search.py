@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 from mpi4py import MPI
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from dolfinx_nts.contact.contact_elements import ContactElements
 from dolfinx_nts.contact.contact_law import Contribution, Rub, no_pull
+from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.edge_coupling import EdgeCoupling
 from dolfinx_nts.contact.left_behind import beside, unheld
 from dolfinx_nts.contact.pair import ContactPair, Motion
@@ -23,7 +25,7 @@ from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.interaction.evaluation import Evaluation
 from dolfinx_nts.parallel import anywhere, global_max
 from dolfinx_nts.state import ContactHistory, State
-from dolfinx_nts.types import BoolArray, FloatArray
+from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import StepFailedError, UserFunctionError
 
 _EPS = float(np.finfo(float).eps)
@@ -42,9 +44,10 @@ class ContactSearch:
     """Makes the elements of all contacts of a system, step after step; see `Coupling`.
 
     Attributes:
-        elements: Candidates of each contact that have unknowns in this step.
+        numbers: Of the contacts that may act in this step: all but corners that are near nothing.
+        elements: Candidates of each of these that have unknowns in this step.
         idle: The others, which the step's motion does not bring to their masters.
-        idle_gaps: Gaps [m] of the idle candidates of each contact in the last solution.
+        idle_gaps: Gaps [m] of the idle candidates of each in the last solution.
         beside: Of each contact, how deep in facet sizes the deepest of this rank's nodes that
             passed the surface's edge lies behind it at t_n, and its input number.
     """
@@ -53,15 +56,19 @@ class ContactSearch:
         self, contacts: Sequence[ContactPair], bodies: Sequence[tuple[int, ...]], comm: MPI.Comm,
         edges: Mapping[int, EdgeCoupling] = MappingProxyType({}),
     ) -> None:  # fmt: skip
-        self._pairs, self._comm = contacts, comm
-        self.bodies = list(bodies)
+        self._pairs, self._of, self._comm = contacts, list(bodies), comm
+        self.numbers: list[int] = []
+        self.bodies: list[tuple[int, ...]] = []
         self.elements: list[ContactElements] = []
         self.idle: list[ContactElements] = []
         self.idle_gaps: list[FloatArray] = []
         self.beside = [(0.0, -1)] * len(contacts)
+        self._declared = sum(not isinstance(pair, Corners) for pair in contacts)
+        number = {id(pair): k for k, pair in enumerate(contacts)}
+        self._corners = [(c, number[id(c.of)]) for c in contacts if isinstance(c, Corners)]
         self._edges = edges
         self._cover, self._repeats = [0.0] * len(contacts), 0
-        self._known: dict[int, tuple[list[FloatArray], float, ContactElements]] = {}
+        self._known: dict[int, tuple[list[FloatArray], float, ContactElements | None]] = {}
         self._placed: dict[int, Sequence[FloatArray]] = {}
         self._begun: State | None = None
         self._had = [np.zeros(len(pair.slave.share), dtype=bool) for pair in contacts]
@@ -75,8 +82,8 @@ class ContactSearch:
         if not self.elements:
             return self._had
         found = [np.zeros_like(had) for had in self._had]
-        for has, c in zip(found, self.elements, strict=True):
-            has[c.candidates.node] = True
+        for k, c in zip(self.numbers, self.elements, strict=True):
+            found[k][c.candidates.node] = True
         return found
 
     def resume(self, had: Sequence[BoolArray]) -> None:
@@ -102,11 +109,25 @@ class ContactSearch:
             self._aimed = [np.full(len(pair.slave.share), -1) for pair in self._pairs]
         if search:
             self._followed = [old.followed for old in self._old]
-            self._found = [self._search(k) for k in range(len(self._pairs))]
-            drop_doubles(self._found, [old.force for old in self._old])
-            had = self.had_unknowns
-            self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in enumerate(self._found)]
+            self._seek()
         self._choose()
+
+    def _seek(self) -> None:
+        """Find candidates, and which of them need unknowns. Collective."""
+        numbers, had = list(range(self._declared)), self.had_unknowns
+        found: list[Any] = [self._search(k) for k in numbers]
+        drop_doubles(found, [old.force for old in self._old])
+        for k, (corners, of) in enumerate(self._corners, self._declared):
+            meet = self._edges[of].ends if of in self._edges else np.empty((0, 4), dtype=np.int64)
+            corners.leave_to(found[of].candidates.node, meet)
+            near = self._search(k)
+            if near is not None:
+                numbers.append(k)
+                found.append(near)
+        self.numbers, self._found = numbers, found
+        self.bodies = [self._of[k] for k in numbers]
+        both = zip(numbers, found, strict=True)
+        self._with_unknowns = [self._may_touch(k, c, had[k]) for k, c in both]
 
     def _choose(self) -> None:
         """Give unknowns to the candidates that are awake."""
@@ -123,7 +144,7 @@ class ContactSearch:
         ]
         far = [
             self._reach(k, self._step.motion) > limit.min(initial=np.inf)
-            for k, limit in enumerate(limits)
+            for k, limit in zip(self.numbers, limits, strict=True)
         ]
         if not anywhere(self._comm, any(far)):
             return False
@@ -143,18 +164,21 @@ class ContactSearch:
     def _positions(self, k: int) -> Sequence[FloatArray]:
         """Positions of all points of a contact at t_n [m], see `ContactPair`. Collective."""
         if k not in self._placed:
-            u = [self._step.state.u[b] for b in self.bodies[k]]
+            u = [self._step.state.u[b] for b in self._of[k]]
             self._placed[k] = self._pairs[k].positions(u)
         return self._placed[k]
 
     def _reach(self, k: int, motion: FloatArray) -> float:
         """Bound on the motion of slaves relative to the master [m]."""
-        reach = np.sqrt(3.0) * float(sum(motion[b] for b in self.bodies[k]))
+        reach = np.sqrt(3.0) * float(sum(motion[b] for b in self._of[k]))
         return reach + float(np.linalg.norm(np.diff(self._paths[k], axis=0)))
 
-    def _search(self, k: int) -> ContactElements:
-        """Candidates of a contact, found anew unless all its bodies slept and nothing moves."""
-        u = [self._step.state.u[b] for b in self.bodies[k]]
+    def _search(self, k: int) -> ContactElements | None:
+        """Candidates of a contact, found anew unless all its bodies slept and nothing moves.
+
+        None: it is one of corners, and has none.
+        """
+        u = [self._step.state.u[b] for b in self._of[k]]
         known, reach = self._known.pop(k, None), self._reach(k, self._step.motion)
         if reach > 0.0:
             return self._find(k, reach)
@@ -166,8 +190,8 @@ class ContactSearch:
         self._known[k] = known
         return known[2]
 
-    def _find(self, k: int, reach: float) -> ContactElements:
-        pair, path, bodies, step = self._pairs[k], self._paths[k], self.bodies[k], self._step
+    def _find(self, k: int, reach: float) -> ContactElements | None:
+        pair, path, bodies, step = self._pairs[k], self._paths[k], self._of[k], self._step
         positions = self._positions(k)
         found, self._followed[k], self._cover[k], self.beside[k] = pair.find(
             positions,
@@ -175,8 +199,10 @@ class ContactSearch:
             path,
             Motion(reach, [step.ahead[b] for b in bodies], self._aimed[k], self._repeats > 0),
             # In statics steps may be of any length, and what they carry inside is looked for.
-            self._old[k].followed if step.integrator.inertia else None,
+            self._old[k].followed if step.integrator.inertia or k >= self._declared else None,
         )
+        if k >= self._declared and not anywhere(self._comm, len(found.node) > 0):
+            return None
         beyond = self._edges[k].find(positions, found) if k in self._edges else ()
         found = found.select(~self._foreign[k][found.node])
         if len(beyond):
@@ -238,7 +264,7 @@ class ContactSearch:
         if not self._watching:
             return False
         u1 = [terms.u1 for terms in e.bodies]
-        self.idle_gaps = [self._gap(k, c, u1) for k, c in enumerate(self.idle)]
+        self.idle_gaps = self._gaps(self.idle, u1)
         closed = [
             ~(gap >= -c.law.gap_rounding) for c, gap in zip(self.idle, self.idle_gaps, strict=True)
         ]
@@ -256,11 +282,15 @@ class ContactSearch:
         Raises:
             StepFailedError: A node went through an obstacle and out of it again.
         """
-        missed = False
+        missed, batches = False, dict(zip(self.numbers, range(len(parts)), strict=True))
         for k in range(len(self._pairs)):
             reach = self._reach(k, motion)
             missed |= reach > self._cover[k]
-            missed |= self._passed(k, e, parts[k], reach)
+            held = np.full(len(self._pairs[k].slave.share), -1)
+            if k in batches:
+                c, active = self.elements[batches[k]].candidates, parts[batches[k]].active
+                held[c.node[active]] = c.facet[active]
+            missed |= self._passed(k, e, held, reach)
         stale = not missed and self._are_stale(e, parts)
         self._repeats = self._repeats + 1 if stale else 0
         return missed or stale
@@ -270,8 +300,8 @@ class ContactSearch:
         if self._step.integrator.inertia:
             return False
         stale = False
-        for pair, of, c, part in zip(self._pairs, self.bodies, self.elements, parts, strict=True):
-            end = pair.positions([e.bodies[b].u1 for b in of])
+        for of, c, part in zip(self.bodies, self.elements, parts, strict=True):
+            end = c.pair.positions([e.bodies[b].u1 for b in of])
             stale |= c.is_stale(end, part, self._repeats)
         return stale
 
@@ -281,19 +311,16 @@ class ContactSearch:
         They left their facets in a load step, over edges of a curved surface.
         """
         far = [0.0]
-        for k, c in enumerate(self.elements):
-            on = e.parts[k].active
-            end = self._pairs[k].positions([e.bodies[b].u1 for b in self.bodies[k]])
+        for of, c, part in zip(self.bodies, self.elements, e.parts, strict=False):
+            on = part.active
+            end = c.pair.positions([e.bodies[b].u1 for b in of])
             due = np.broadcast_to(c.offset - c.law.overlap, on.shape)[on]
-            far.append(self._pairs[k].strayed(end, c.candidates.select(on), due))
+            far.append(c.pair.strayed(end, c.candidates.select(on), due))
         return float(global_max(self._comm, np.array(far)).max())
 
-    def _passed(self, k: int, e: Evaluation, part: Contribution, reach: float) -> bool:
+    def _passed(self, k: int, e: Evaluation, held: IntArray, reach: float) -> bool:
         """Return whether nodes have come through facets unseen, which are noted. Collective."""
-        pair, bodies, path = self._pairs[k], self.bodies[k], self._paths[k]
-        held = np.full(len(pair.slave.share), -1)
-        c, active = self.elements[k].candidates, part.active
-        held[c.node[active]] = c.facet[active]
+        pair, bodies, path = self._pairs[k], self._of[k], self._paths[k]
         motions, positions = [e.bodies[b].du for b in bodies], self._positions(k)
         try:
             hit = pair.missed(positions, motions, path, reach, held, self._aimed[k])
@@ -314,13 +341,18 @@ class ContactSearch:
 
     def history(self, parts: Sequence[Contribution]) -> tuple[ContactHistory, ...]:
         """Return what each contact remembers of an accepted step."""
-        histories = []
-        for k, (c, part) in enumerate(zip(self.elements, parts, strict=True)):
-            new = c.history(part, self._step.factor, self._old[k])
-            idle = self.idle[k].candidates
-            new.facet[idle.node], new.gap[idle.node] = idle.facet, self.idle_gaps[k]
-            histories.append(new._replace(followed=self._followed[k]))
-        return tuple(histories)
+        histories = [
+            pair.history_at_start()._replace(slip=old.slip, overlap=old.overlap)
+            for pair, old in zip(self._pairs, self._old, strict=True)
+        ]
+        for k, c, part, idle, gaps in zip(
+            self.numbers, self.elements, parts, self.idle, self.idle_gaps, strict=True
+        ):
+            new, others = c.history(part, self._step.factor, self._old[k]), idle.candidates
+            new.facet[others.node], new.gap[others.node] = others.facet, gaps
+            histories[k] = new
+        both = zip(histories, self._followed, strict=True)
+        return tuple(new._replace(followed=followed) for new, followed in both)
 
     def smallest(self, parts: Sequence[Contribution]) -> dict[str, float]:
         """The smallest gap of an accepted step on this rank, infinite without candidates."""
@@ -350,14 +382,14 @@ class ContactSearch:
         if not self._step.integrator.inertia and self._carried is self._old:
             near = _TOUCHING * c.candidates.length
             touching = c.candidates.gap <= np.maximum(near, c.sag)
-            touching |= self._old[k].force[c.candidates.node] > 0.0
+            touching |= self._old[self.numbers[k]].force[c.candidates.node] > 0.0
             gap = c.gap(x)
             multipliers[:, 0] -= np.where(touching, near + np.maximum(gap, 0.0), 0.0)
         return multipliers
 
     def carried(self, k: int) -> FloatArray:
         """Multipliers of the contact forces of the last step as they were, (n, constraints)."""
-        c, old = self.elements[k], self._carried[k]
+        c, old = self.elements[k], self._carried[self.numbers[k]]
         node = c.candidates.node
         forces = c.multipliers(old.force[node], old.tangential[node])
         return self._step.factor * forces / c.law.scale[:, None]
@@ -395,9 +427,14 @@ class ContactSearch:
 
     def flight_gaps(self) -> list[FloatArray]:
         """Gaps of each contact's candidates after free flight over the step [m]. Collective."""
-        return [self._gap(k, c, self._step.first) for k, c in enumerate(self.elements)]
+        return self._gaps(self.elements, self._step.first)
+
+    def _gaps(
+        self, elements: Sequence[ContactElements], u: Sequence[FloatArray]
+    ) -> list[FloatArray]:
+        return [self._gap(k, c, u) for k, c in zip(self.numbers, elements, strict=True)]
 
     def _gap(self, k: int, c: ContactElements, u: Sequence[FloatArray]) -> FloatArray:
         """Gaps of some candidates of a contact at displacements of all bodies [m]. Collective."""
-        moved = c.pair.positions([u[b] for b in self.bodies[k]])
+        moved = c.pair.positions([u[b] for b in self._of[k]])
         return c.gap_at(moved, self._paths[k][1])

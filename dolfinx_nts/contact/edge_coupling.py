@@ -269,6 +269,18 @@ class EdgeCoupling:
         key: IntArray = pairs[:, 0] * len(self.contact.edges[1].ends) + pairs[:, 1]
         return key
 
+    @property
+    def ends(self) -> IntArray:
+        """Points of the master and of the slave at ends of edges that may meet, all ranks', (n, 4).
+
+        Of the step so far.
+        """
+        if self._pairs is None:
+            return np.empty((0, 4), dtype=np.int64)
+        own, other = np.divmod(self._tried, len(self.contact.edges[1].ends))
+        slave, master = self.contact.ends
+        return np.column_stack([master[other], slave[own]])
+
     # ---- elements of a step
     def make(self) -> None:
         """Make the elements of the pairs that `find` has chosen. Collective."""

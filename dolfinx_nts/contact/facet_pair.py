@@ -29,6 +29,7 @@ from dolfinx_nts.contact.slave_paths import SlavePaths
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.kernels import compiled, facets
+from dolfinx_nts.parallel import anywhere
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: A node may project this far (in convective coordinates) beyond an edge that the master surface
@@ -181,13 +182,18 @@ class FacetPair(ContactPair, master=Surface):
         self.facing.look(slaves, corners)
         closest = self._closest(slaves, corners, radius, current)
         node = np.flatnonzero(closest.facet >= 0)
+        if not (self.is_long(reach) or anywhere(self.slave.body.comm, node.size > 0)):
+            return Found(NO_CANDIDATES, ~every, cover)
         found, lost = self.measure(x, master, node, closest.facet[node], closest.xi[node], reach)
+        let_go = lost
         if motion is not None:
+            near = found.node
             found = self.slave_paths.lead(found, slaves, master, motion._replace(reach=reach))
+            let_go = np.concatenate([lost, np.setdiff1d(near, found.node)])
         beside = (found.gap < -OUTSIDE * found.length) & ~known[found.node]
         # What was followed and is out of reach is sought anew from either side.
         stays = np.zeros_like(every)
-        stays[node], stays[lost] = known[node], False
+        stays[node], stays[let_go] = known[node], False
         hidden, deepest = self._told(found.select(beside), current), (0.0, -1)
         if len(hidden.node):
             depth = -hidden.gap / hidden.length

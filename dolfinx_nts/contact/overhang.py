@@ -46,6 +46,7 @@ def overhang(
     force: FloatArray,
     corners: FloatArray,
     held: BoolArray | None = None,
+    elsewhere: float = 0.0,
 ) -> Overhang | None:
     """Return how far inside the rim of a master contact ends, if all of its force acts there.
 
@@ -60,8 +61,9 @@ def overhang(
         corners: Corners of the master's facets [m], shape (n, nc, 3).
         held: Points that carry in another contact, which hold what reaches over the rim, shape
             (p,); None: there are none.
+        elsewhere: What the master's corners bear [N].
     """
-    total, on = float(force.sum()), (force > 0.0)[facets]
+    total, on = float(force.sum()) + elsewhere, (force > 0.0)[facets]
     part = on.any(axis=1) & ~on.all(axis=1)
     facets, on = facets[part], on[part]
     # A touch without force may have rounding in it, of any sign; most often some carry amid others.
@@ -125,6 +127,7 @@ def inside_rim(
     positions: tuple[FloatArray, ...],
     force: FloatArray,
     held: BoolArray | None = None,
+    elsewhere: float = 0.0,
 ) -> Finding | None:
     """As `overhang`, of a contact, with a sentence and a remedy.
 
@@ -133,11 +136,12 @@ def inside_rim(
         positions: Of all points of both, as of `ContactPair.positions` [m].
         force: Normal force of each point of the slave, also of its edges [N].
         held: As of `overhang`.
+        elsewhere: As of `overhang` [N].
     """
     (x, y), slave, master = positions, contact.slave, contact.master
     if not len(slave.facets):
         return None
-    found = overhang(x, slave.facets, force, y[master.facets], held)
+    found = overhang(x, slave.facets, force, y[master.facets], held, elsewhere)
     if found is None:
         return None
     one, two, node = slave.body.name, master.body.name, int(slave.original[found.node])

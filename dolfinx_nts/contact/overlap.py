@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from dolfinx_nts.contact.corners import Corners
 from dolfinx_nts.contact.crossings import BodyPair, Finding, Pause
 from dolfinx_nts.contact.inner_edge import InnerEdges, in_inner_edge
 from dolfinx_nts.contact.obstacle_crossings import ObstacleContact
@@ -23,7 +24,7 @@ from dolfinx_nts.contact.overhang import inside_rim
 from dolfinx_nts.contact.self_crossings import SelfPair
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.kernels.vectors import range_of, relative_way
-from dolfinx_nts.state import EdgeHistory
+from dolfinx_nts.state import ContactHistory, EdgeHistory
 from dolfinx_nts.types import BoolArray, FloatArray
 
 
@@ -55,6 +56,7 @@ class OverlapWatch:
     def __init__(self, system: Any) -> None:
         self._comm, self._bodies, self._along = system.comm, system.bodies, system.edges
         self._edges: dict[int, InnerEdges] = {}
+        self._corners = [(n, c) for n, c in enumerate(system.pairs) if isinstance(c, Corners)]
 
         def start() -> tuple[FloatArray, ...]:
             return system.initial_state().u
@@ -96,7 +98,7 @@ class OverlapWatch:
         u: Sequence[FloatArray],
         time: float = 0.0,
         *,
-        forces: Sequence[FloatArray] = (),
+        contacts: Sequence[ContactHistory] = (),
         edges: Sequence[EdgeHistory] = (),
         last: bool = False,
     ) -> list[Finding]:
@@ -105,9 +107,9 @@ class OverlapWatch:
         Args:
             u: Owned displacements of all bodies [m]; kept until the next look, not to be changed.
             time: At which they are so [s].
-            forces: Of each contact of the system the normal forces of its share [N]; may be left
-                out, and then contact inside a rim or in an inner edge is not told.
-            edges: What the edges of each contact remember; left out with `forces`.
+            contacts: What each of `System.pairs` remembers; may be left out, and then contact
+                inside a rim or in an inner edge is not told.
+            edges: What the edges of each contact remember; left out with `contacts`.
             last: Look again wherever anything has moved.
         """
         now = [pair.where(u, time) for pair in self._pairs]
@@ -115,15 +117,15 @@ class OverlapWatch:
         due = self._due(now, last)
         # Obstacles have no rim and no inner edge.
         between = [k for k, _ in due if isinstance(self._pairs[k], BodyPair)]
-        everywhere = self._everywhere(forces) if between else []
+        forces = self._everywhere(contacts) if between else []
         for k, way in due:
             before, pair = self._looked.get(k), self._pairs[k]
             found, pause = pair.look(now[k])
             if before and way > before.pause.clear + before.pause.through:
                 found += pair.passed(before.where, now[k], way, before.pause.through)
             findings += [f for f in found if f.depth > self._allowed[k]]
-            if everywhere and isinstance(pair, BodyPair):
-                findings += self._of_contacts(pair, u, everywhere, edges)
+            if forces and isinstance(pair, BodyPair):
+                findings += self._of_contacts(pair, u, forces, contacts, edges)
             self._looked[k] = _Looked(now[k], pause)
         worst: dict[tuple[str, tuple[str, ...]], Finding] = {}
         for f in findings:
@@ -132,18 +134,17 @@ class OverlapWatch:
                 worst[key] = f
         return list(worst.values())
 
-    def _everywhere(self, forces: Sequence[FloatArray]) -> list[FloatArray]:
+    def _everywhere(self, histories: Sequence[ContactHistory]) -> list[FloatArray]:
         """Forces of all points of each contact's slave, none if there are none. Collective."""
-        if not forces:
-            return []
-        both = zip(self._contacts, forces, strict=True)
-        return [contact.slave.at_all(force) for (contact, _), force in both]
+        both = zip(self._contacts, histories, strict=False)
+        return [contact.slave.at_all(history.force) for (contact, _), history in both]
 
     def _of_contacts(
         self,
         pair: BodyPair,
         u: Sequence[FloatArray],
         everywhere: Sequence[FloatArray],
+        histories: Sequence[ContactHistory],
         edges: Sequence[EdgeHistory],
     ) -> Iterator[Finding]:
         """What is told of contacts by their forces. Collective.
@@ -154,6 +155,7 @@ class OverlapWatch:
             pair: The bodies between which they are.
             u: As of `look`.
             everywhere: Normal forces of all points of each contact's slave [N].
+            histories: As `contacts` of `look`.
             edges: As of `look`.
         """
         for k, (contact, bodies) in enumerate(self._contacts):
@@ -164,6 +166,7 @@ class OverlapWatch:
             if k in self._along:
                 # Edges carry at a rim, where they cross it: between their nodes.
                 carry = carry + self._along[k].nodal_forces(edges[k])
+            borne = sum(c.borne(histories[n]) for n, c in self._corners if c.of is contact)
             if not carry.any():
                 continue
             positions = contact.positions([u[b] for b in bodies])
@@ -171,7 +174,7 @@ class OverlapWatch:
                 self._edges[k] = InnerEdges(contact.master.facets, positions[1])
             held = self._held_otherwise(k, everywhere)
             yield from filter(None, (
-                inside_rim(contact, positions, carry, held),
+                inside_rim(contact, positions, carry, held, borne),
                 in_inner_edge(self._edges[k], contact, positions, everywhere[k]),
             ))  # fmt: skip
 

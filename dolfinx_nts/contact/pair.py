@@ -17,6 +17,7 @@ from dolfinx_nts.contact.slave_choice import slave_and_master
 from dolfinx_nts.contact.surfaces import Surface
 from dolfinx_nts.interaction.elements import Step
 from dolfinx_nts.parallel import global_max
+from dolfinx_nts.state import ContactHistory
 from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 from dolfinx_nts.validation import is_finite, known_options, require_bool, require_one_of
 
@@ -122,8 +123,9 @@ class ContactPair:
             miss each other by. The gap that they start with goes on being none; bodies are drawn
             where their meshes are, and may be that deep inside each other without a warning. At
             most half a facet of the master inwards; edges stay as meshed [m].
-        edges: Whether sharp edges of solid and rigid bodies are kept out of each other, too; else
-            they may pass through each other between their nodes, mostly without a word.
+        edges: Whether sharp edges of solid and rigid bodies are kept out of each other, too, and
+            the master's nodes there out of the slave's facets; else they may pass between the
+            slave's nodes, mostly without a word.
         integration: What of the slave is kept out: its "nodes", or the "surface" between them in
             the mean around each node, by points of all facets (theory section 17).
 
@@ -404,6 +406,10 @@ class ContactPair:
         raise NotImplementedError
 
     # ---- what they share
+    def history_at_start(self) -> ContactHistory:
+        """What it remembers of its slave nodes before the first step."""
+        return ContactHistory.of_start(len(self.slave.share))
+
     @property
     def name(self) -> str:
         """Slave body and master, for messages and files."""

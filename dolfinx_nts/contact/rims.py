@@ -16,7 +16,7 @@ from dolfinx_nts.types import BoolArray, FloatArray, IntArray
 
 #: Sine of the angle between the slave and the master from which on nodes of the slave beyond a
 #: sharp rim are not held, of rigid bodies and of others, which bend where they lie on each other.
-_TILTED = 1e-3, 0.1
+TILTED = 1e-3, 0.1
 
 
 class Rims:
@@ -38,7 +38,7 @@ class Rims:
         self._any: BoolArray = self._at.any(axis=1)
         self._around = self._slave.facets, *facets_around(self._slave)
         self._addresses = [a.ctypes.data for a in self._around]
-        self._least = _TILTED[pair.yields]
+        self._least = TILTED[pair.yields]
 
     def without_tilted(
         self,

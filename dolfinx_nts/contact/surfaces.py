@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from copy import copy
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -110,6 +111,13 @@ class Surface:
     def facet_points(self) -> set[tuple[int, ...]]:
         """Of each facet the numbers of its corners in the body, ascending."""
         return {tuple(sorted(corners)) for corners in self.points[self.facets].tolist()}
+
+    def part(self, points: npt.NDArray[np.bool_]) -> Surface:
+        """The same surface, with the contact of some of its points (p,) alone."""
+        found = copy(self)
+        found.share = self.share[points[self.share]]
+        vars(found).pop("_dealt", None)
+        return found
 
     def leave(self) -> None:
         """Forget what contacts use of the body."""
@@ -223,8 +231,8 @@ class Surface:
         return gather_rows(self.body.comm, self.share)
 
     def at_all(self, values: Array) -> Array:
-        """Values at all points from those at the points of `share`. Collective."""
-        table = np.empty((len(self.points), *values.shape[1:]), dtype=values.dtype)
+        """Values at all points from those at the points of `share`, else 0. Collective."""
+        table = np.zeros((len(self.points), *values.shape[1:]), dtype=values.dtype)
         table[self._dealt] = gather_rows(self.body.comm, values)
         return table
 

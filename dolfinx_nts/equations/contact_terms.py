@@ -44,7 +44,7 @@ class ContactTerms:
     def __init__(self, bodies: Sequence[Body], contacts: Sequence[ContactPair]) -> None:
         self._system = System(bodies, contacts=contacts)
         self._search = ContactSearch(
-            self._system.contacts, self._system.contact_bodies, self._system.comm
+            self._system.pairs, self._system.pair_bodies, self._system.comm
         )
         self.state: State = self._system.initial_state()
         self._system.refuse_overlap(self.state)

@@ -44,8 +44,9 @@ class Couplings:
     def __init__(self, system: System) -> None:
         self.edges = {k: EdgeCoupling(edges) for k, edges in system.edges.items()}
         self.contacts = ContactSearch(
-            system.contacts, system.contact_bodies, system.comm, self.edges
+            system.pairs, system.pair_bodies, system.comm, self.edges
         )
+        self._contacts = len(system.contacts)
         both = zip(system.joints, system.joint_bodies, strict=True)
         each: list[JointCoupling] = [joint.coupling(bodies) for joint, bodies in both]
         _lend_less(system, each)
@@ -148,21 +149,22 @@ class Couplings:
             for k, own in zip(of, found if len(of) > 1 else [found], strict=True):
                 out[k] = own
         contacts = self.contacts.history(e.parts[: len(self.contacts.elements)])
-        edges = [EdgeHistory.of_start() for _ in contacts]
+        edges = [EdgeHistory.of_start() for _ in range(self._contacts)]
         for k, _, part in self.of_edges(e):
             edges[k] = self.edges[k].history([part])
         return contacts, tuple(out), tuple(edges)
 
     def touching(
         self, e: Evaluation
-    ) -> list[tuple[ContactElements, Contribution, ContactHistory]]:
-        """Of each contact its elements, their part of an evaluation, and its memory of t_n.
+    ) -> list[tuple[int, ContactElements, Contribution, ContactHistory]]:
+        """Of each of `System.pairs` that may act its number, elements, part, and memory of t_n.
 
         For results that only contacts have: pressures, impacts, changes of facet.
         """
-        elements = self.contacts.elements
+        numbers, elements = self.contacts.numbers, self.contacts.elements
         parts: Any = e.parts[: len(elements)]
-        return list(zip(elements, parts, self._remembered, strict=True))
+        remembered = [self._remembered[k] for k in numbers]
+        return list(zip(numbers, elements, parts, remembered, strict=True))
 
     def guess(self, positions: Sequence[FloatArray], *, carried: bool) -> FloatArray:
         """Constraints' unknowns of all elements as in the last step, one after the other.

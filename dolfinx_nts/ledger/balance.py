@@ -230,7 +230,7 @@ def switches(problem: StepProblem, step: Evaluation, time: float) -> list[Switch
     if not problem.system.contacts:
         return []
     found = []
-    for contact, part, old in problem.couplings.touching(step):
+    for _, contact, part, old in problem.couplings.touching(step):
         c = contact.candidates
         before, gain = old.facet[c.node], contact.gains(part, problem.factor)
         stayed = (old.force[c.node] > 0.0) & part.active
@@ -263,7 +263,7 @@ def first_row(system: System, state: State) -> dict[str, Any]:
     row |= measure(system, state)
     row |= {"time": state.time, "energy": row["kinetic"] + row["potential"]}
     local = np.zeros(len(COUNTS))
-    for pair, old in zip(system.contacts, state.contacts, strict=True):
+    for pair, old in zip(system.pairs, state.contacts, strict=True):
         on = old.force > 0.0
         slips = (on & ~old.stick).sum() if pair.friction else 0
         local += on.sum(), (on & old.stick).sum(), slips

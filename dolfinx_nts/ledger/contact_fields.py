@@ -26,7 +26,7 @@ class ContactLoads(NamedTuple):
     """Contact forces of a step, as its elements have them.
 
     Attributes:
-        elements: Those of each contact: of nodes, and of edges that are near each other.
+        elements: Those of each contact: of nodes, and of corners and edges that are near.
         parts: Their solution.
         factor: What the step equations multiply forces by [s^2].
     """
@@ -39,7 +39,9 @@ class ContactLoads(NamedTuple):
     def of_step(cls, problem: StepProblem, step: Evaluation) -> ContactLoads:
         """Of a solved step; its tangents are not kept."""
         couplings = problem.couplings
-        both = [[(c, part)] for c, part, _ in couplings.touching(step)]
+        both: list[list[Any]] = [[] for _ in problem.system.contacts]
+        for k, c, part, _ in couplings.touching(step):
+            both[problem.system.contact_of[k]].append((c, part))
         for k, c, part in couplings.of_edges(step):
             both[k].append((c, part))
         elements = tuple(tuple(c for c, _ in of) for of in both)
@@ -49,8 +51,13 @@ class ContactLoads(NamedTuple):
     def on(self, k: int) -> list[tuple[Surface, FloatArray]]:
         """Forces of a contact on the points of its surfaces [N], (p, 3) each. Collective."""
         both, found = zip(self.elements[k], self.parts[k], strict=True), []
-        each = zip(*(c.nodal_forces(part) for c, part in both), strict=True)
-        for surface, forces in zip(self.elements[k][0].pair.surfaces, each, strict=True):
+        pair, forces_of = self.elements[k][0].pair, [c.nodal_forces(part) for c, part in both]
+        # Corners are the master's.
+        of = [
+            forces if c.pair is pair else forces[::-1]
+            for c, forces in zip(self.elements[k], forces_of, strict=True)
+        ]
+        for surface, forces in zip(pair.surfaces, zip(*of, strict=True), strict=True):
             force = sum(forces[1:], forces[0])
             surface.body.comm.Allreduce(MPI.IN_PLACE, force, op=MPI.SUM)
             found.append((surface, force / self.factor))

@@ -74,7 +74,7 @@ def restored(
     if not pushes.sum() > 0.0:
         return None
     _refuse_moved(problem, step)
-    bodies_of = [system.contact_bodies[new.contact] for new in contacts]
+    bodies_of = [system.pair_bodies[new.contact] for new in contacts]
     both = zip(bodies_of, pushes, strict=True)
     groups = _groups(problem, [bodies for bodies, push in both if push > 0.0])
     forces = _forces(problem, contacts)
@@ -97,11 +97,12 @@ def restored(
         shares[groups == group] = share
         energy += share * (speed + 0.5 * share * ease)
     v = tuple(a + share * dv for a, share, dv in zip(state.v, shares, change, strict=True))
-    impulses = np.zeros((2, len(system.contacts), 3))
+    impulses = np.zeros((len(system.pairs), 2, 3))
     for new, bodies in zip(contacts, bodies_of, strict=True):
         of = _group(groups, bodies)
         share = float(shares[groups == of].max()) if of >= 0 else 0.0
-        impulses[:, new.contact] += share * new.impulse
+        impulses[new.contact] += share * new.impulse
+    impulses = system.on_slaves(impulses).swapaxes(0, 1).copy()
     comm.Allreduce(MPI.IN_PLACE, impulses, op=MPI.SUM)
     return Impact(replace(state, v=v), energy, impulses)
 
@@ -141,7 +142,7 @@ class _New(NamedTuple):
     """What nodes or edges of a contact do that came to touch in a step.
 
     Attributes:
-        contact: Number of the contact.
+        contact: Number of the contact among `System.pairs`.
         batch: Elements of the contact.
         push: Impulse of the step along the normals [N s], their sum on this rank.
         rows: Of the elements' coordinates [N s], shape (elements, coordinates).
@@ -163,7 +164,7 @@ def _new(problem: StepProblem, step: Evaluation) -> list[_New]:
     couplings = problem.couplings
     nodes = [
         (k, batch, part, old.force[batch.candidates.node] > 0.0)
-        for k, (batch, part, old) in enumerate(couplings.touching(step))
+        for k, batch, part, old in couplings.touching(step)
     ]
     edges = [(k, c, part, couplings.edges[k].pressed) for k, c, part in couplings.of_edges(step)]
     for k, batch, part, pressed in (*nodes, *edges):

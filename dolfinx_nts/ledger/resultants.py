@@ -63,9 +63,11 @@ def of_step(problem: StepProblem, step: Evaluation) -> dict[str, FloatArray]:
     alone = slice(len(batches.several), None)
     held = dict(zip(batches.bodies[alone], step.terms[alone], strict=True))
     parts = [body.reactions(terms.residual, terms.u1) for body, terms in held.items()]
-    forces = [part.force.sum(axis=0) for _, part, _ in contacts]
-    moments = [c.moment(part, problem.integrator.theta) for c, part, _ in contacts]
-    parts += (np.reshape(each, (len(contacts), 3)) for each in (forces, moments))
+    theta, system = problem.integrator.theta, problem.system
+    pushes = np.zeros((len(system.pairs), 2, 3))
+    for k, c, part, _ in contacts:
+        pushes[k] = part.force.sum(axis=0), c.moment(part, theta)
+    parts.extend(system.on_slaves(pushes).swapaxes(0, 1))
     both = zip(batches.join(problem.state.u), step.terms, strict=True)
     u = batches.split([u0 + problem.integrator.theta * terms.du for u0, terms in both])
     for k, edges, part in problem.couplings.of_edges(step):

@@ -2,7 +2,7 @@
 
 Version 8, with h5py's names of types:
 
-- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (8) and
+- attributes `format` ("dolfinx_nts checkpoint" or "dolfinx_nts solution"), `version` (9) and
   `package` (the version that wrote it);
 - `notes`: JSON text. `scene` is what `describe` says of the system, `time` t [s]; the rest belongs
   to the run, see `dolfinx_nts.run.checkpoint`;
@@ -56,7 +56,7 @@ _OTHER = {
     CHECKPOINT: "it is no checkpoint; pass the path that Checkpoint had",
     SOLUTION: "it holds no saved run; pass the path that Solution.save had",
 }
-_VERSION = 8
+_VERSION = 9
 #: What stands between the HDF5 part and its checksum.
 _MARK = b"crc32"
 #: Options of bodies that are loads and supports.
@@ -218,7 +218,7 @@ class Numbering:
             for k, rows in enumerate(self.to_file(values) if values else []):
                 tables[f"bodies/{k}/{name}"] = rows
         tables |= {f"bodies/{k}/reference": rows for k, rows in enumerate(self.reference)}
-        for k, (pair, history) in enumerate(zip(self.system.contacts, state.contacts, strict=True)):
+        for k, (pair, history) in enumerate(zip(self.system.pairs, state.contacts, strict=True)):
             numbers = pair.slave.original[pair.slave.share]
             more = {name: values[k] for name, values in nodal.items()}
             more |= {"number": numbers, **history._asdict()}
@@ -271,7 +271,7 @@ class Numbering:
     def nodal(self, tables: Tables, name: str) -> list[Array]:
         """Return an array of each contact at this rank's slave nodes. Collective."""
         found = []
-        for k, pair in enumerate(self.system.contacts):
+        for k, pair in enumerate(self.system.pairs):
             rows = self._share(tables, f"contacts/{k}", ("number", name))
             numbers = pair.slave.original[pair.slave.share]
             found.append(self._at(rows, name, numbers, pair.name))

@@ -216,7 +216,7 @@ class LoadStepper(Stepper):
 
     def _look_inside(self, last: bool) -> None:
         """Look, unless overlap is left that a contact is to resolve. Collective."""
-        both = zip(self.system.contacts, self.state.contacts, strict=True)
+        both = zip(self.system.pairs, self.state.contacts, strict=True)
         asked = any(p.interference == "resolve" and bool(c.overlap.any()) for p, c in both)
         if not (self._left(self.state.time) and anywhere(self.system.comm, asked)):
             super()._look_inside(last)

@@ -32,7 +32,8 @@ class Saved(Record):
             `reference` X [m], `u` [m], `v` [m/s], and `a` [m/s^2] where the integrator carries any;
             of an equilibrium `rate` [m] and `force` [N], see `Equilibrium`.
         contacts: Of each contact, in their order: `number`, the input numbers of its slave nodes,
-            ascending, and for each of them the fields of `ContactHistory`.
+            ascending, and for each of them the fields of `ContactHistory`. Then the same of the
+            masters' corners, see `System.pairs`.
         joints: Of each joint that remembers something, by its name, `number` and `value`.
         scene: Names, kinds and sizes of bodies, contacts and joints.
         versions: Of the packages that made the run.
@@ -127,9 +128,10 @@ def load(path: StrPath) -> Saved:
     except (OSError, KeyError, RuntimeError) as error:
         raise OSError(f"path={str(path)!r}: cannot be read, it may be damaged ({error})") from error
     scene = notes["scene"]
-    groups: dict[str, Rows] = {
-        kind: [{} for _ in scene[kind]] for kind in ("bodies", "contacts", "joints")
-    }
+    groups: dict[str, Rows] = {kind: [{} for _ in scene[kind]] for kind in ("bodies", "joints")}
+    # Corners of contacts follow these.
+    pairs = {place.split("/")[1] for place in tables if place.startswith("contacts/")}
+    groups["contacts"] = [{} for _ in pairs]
     for place, values in tables.items():
         kind, number, *name = place.split("/")
         if kind in groups:

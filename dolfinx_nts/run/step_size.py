@@ -160,7 +160,8 @@ class Pace:
         many steps and saves no energy (measured). Every rank must call it.
         """
         comm, state, contacts = problem.system.comm, problem.state, problem.couplings.contacts
-        carrying = np.array([bool((c.force > 0.0).any()) for c in state.contacts], dtype=bool)
+        forces = [state.contacts[k].force for k in contacts.numbers]
+        carrying = np.array([bool((force > 0.0).any()) for force in forces], dtype=bool)
         comm.Allreduce(MPI.IN_PLACE, carrying, op=MPI.LOR)
         lost, first = 0.0, 1.0
         for c, end, late in zip(contacts.elements, contacts.flight_gaps(), carrying, strict=True):
@@ -226,7 +227,7 @@ class Pace:
 
     def _expels(self, problem: StepProblem, step: Evaluation) -> bool:
         gain = 0.0
-        for c, part, _ in problem.couplings.touching(step):
+        for _, c, part, _ in problem.couplings.touching(step):
             gain += float(np.maximum(c.gains(part, problem.factor), 0.0).sum())
         total = float(problem.system.comm.allreduce(gain))
         return total > self._tolerance * 0.5 * self._top**2

@@ -293,7 +293,7 @@ def tell_at_rest(
 
 def _slips(solution: Solution, state: State) -> bool:
     """Whether nodes slip with friction, whose forces have no potential. Collective."""
-    both = zip(solution.system.contacts, state.contacts, strict=True)
+    both = zip(solution.system.pairs, state.contacts, strict=True)
     slip = any(p.friction and bool(((c.force > 0.0) & ~c.stick).any()) for p, c in both)
     return anywhere(solution.system.comm, slip)
 

@@ -337,9 +337,9 @@ class Stepper:
     def _look_inside(self, last: bool) -> None:
         """`look` at bodies inside each other."""
         if self._overlap is not None:
-            state, forces = self.state, [c.force for c in self.state.contacts]
+            state = self.state
             for found in self._overlap.look(
-                state.u, state.time, forces=forces, edges=state.edges, last=last
+                state.u, state.time, contacts=state.contacts, edges=state.edges, last=last
             ):
                 self.solution.warn(
                     found.kind, state.time, found.depth, found.text, grave=found.grave,

@@ -78,7 +78,7 @@ def used_up(problem: StepProblem, e: Evaluation) -> str:
         return ""
     local = np.zeros((len(system.bodies), 7))
     both = zip(problem.couplings.touching(e), problem.couplings.bodies, strict=False)
-    for (contact, part, old), of in both:
+    for (k, contact, part, old), of in both:
         bodies = list(of)
         if not contact.law.num_tangential:  # may hold the body against sliding, as a wall does
             local[bodies, 0] += part.active.sum()
@@ -86,7 +86,9 @@ def used_up(problem: StepProblem, e: Evaluation) -> str:
         local[bodies, 1] += part.active.sum()
         local[bodies, 2] += (part.active & contact.law.sticks(part)).sum()
         local[bodies, 3] += contact.law.coefficient * old.force.sum()
-        local[bodies, 4:] += old.tangential.sum(axis=0)
+        # Of corners that of their slaves is opposite to that of the contact's.
+        side = 1.0 if k < len(system.contacts) else -1.0
+        local[bodies, 4:] += side * old.tangential.sum(axis=0)
     local[:, 0] += [len(body.fixed) for body in system.bodies]
     for linked in system.joint_bodies:
         local[list(linked), 0] += 1
@@ -113,7 +115,7 @@ def contact_on(problem: StepProblem, e: Evaluation, flips: Sequence[Any], body: 
     """
     found = []
     both = zip(problem.couplings.touching(e), problem.couplings.bodies, flips, strict=False)
-    for (contact, part, _), bodies, changes in both:
+    for (_, contact, part, _), bodies, changes in both:
         if body not in bodies or not len(part.active):
             continue
         # What flips most, else what carries.

@@ -57,6 +57,6 @@ class LentStiffness:
         contacts = self._problem.couplings.touching(e)
         slip = any(
             c.law.num_tangential and bool((part.active & ~c.law.sticks(part)).any())
-            for c, part, _ in contacts
+            for _, c, part, _ in contacts
         )
         return anywhere(self._problem.system.comm, slip)

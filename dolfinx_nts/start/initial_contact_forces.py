@@ -83,16 +83,16 @@ def with_resting_forces(
 
 def _with_forces(problem: StepProblem, step: Evaluation, state: State) -> State:
     """The state with the forces of a first step at nodes that rest or slide. Collective."""
-    found = []
+    found = list(state.contacts)
     flight = problem.couplings.contacts.flight_gaps()
-    for after, (c, part, old) in zip(flight, problem.couplings.touching(step), strict=True):
+    for after, (k, c, part, old) in zip(flight, problem.couplings.touching(step), strict=True):
         new, node = c.history(part, problem.factor, old), c.candidates.node
         push = problem.factor * new.force[node] / c.law.scale
         rests = np.zeros(len(new.force), dtype=bool)
         rests[node] = _closed(c) & (c.candidates.gap - after <= _RESTS * push)
         force = np.where(rests, new.force, 0.0)
         tangential = np.where(rests[:, None], new.tangential, 0.0)
-        found.append(old._replace(force=force, tangential=tangential))
+        found[k] = old._replace(force=force, tangential=tangential)
     return replace(state, contacts=tuple(found))
 
 

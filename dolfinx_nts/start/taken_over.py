@@ -59,10 +59,11 @@ def state_from(
         _check_start(body, old, now, time)
     found = system.initial_state()
     contacts, edges = list(found.contacts), list(found.edges)
-    for k, pair in enumerate(system.contacts):
-        for j, known in enumerate(other.contacts):
+    for k, pair in enumerate(system.pairs):
+        for j, known in enumerate(other.pairs):
             if pair.is_like(known):
-                contacts[k], edges[k] = state.contacts[j], state.edges[j]
+                contacts[k] = state.contacts[j]
+                edges[k : k + 1] = state.edges[j : j + 1]
                 _check_jump(pair, known, state.time, time)
     joints = list(found.joints)
     for k, joint in enumerate(system.joints):

@@ -466,8 +466,9 @@ def shot(thick):
         bodies.append(nts.Continuum(mesh, rubber, density=1e3, velocity=down, name=name))
     block, plate = bodies
     pair = nts.ContactPair(
-        slave=plate.surface(lambda x: x[2] > -1e-9), master=block.surface(lambda x: x[2] < 0.05001)
-    )
+        slave=plate.surface(lambda x: x[2] > -1e-9), master=block.surface(lambda x: x[2] < 0.05001),
+        edges=False,
+    )  # fmt: skip
     return nts.System(bodies, contacts=[pair])
 
 

@@ -51,6 +51,7 @@ def two_blocks(cell, gap=0.0, speed=0.0, bcs=(), friction=0.0, integration="node
         master=lower.surface(lambda x: x[2] > 1 - 1e-9, smoothing=cell in SMOOTH),
         friction=friction,
         integration=integration,
+        edges=False,
     )
     return nts.System([upper, lower], contacts=[pair])
 
