@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from dolfinx_nts.run.locking_watch import LockingWatch
+
 #: Offsets and weights of differences that are exact for polynomials up to degree 4, whatever the
 #: step.
 STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
@@ -11,6 +13,12 @@ STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 PROMISED, OPEN = {"exact": 1e-11, "balanced": 1e-8, "fast": 1e-5}, 1e-2
 #: Columns of the balance table that say whether two runs are the same.
 COLUMNS = ("kinetic", "potential", "friction_dissipation", "contact_defect", "angular_momentum")
+
+
+# ---- what a run tells
+def kinds(run):
+    """Kinds of a run's warnings but those of cells, which are coarse in scenes of tests."""
+    return [kind for kind in run.warnings if kind not in LockingWatch.KINDS]
 
 
 # ---- derivatives and arrays

@@ -20,7 +20,12 @@ class LockingWatch:
 
     Args:
         system: The scene.
+
+    Attributes:
+        KINDS: Of the warnings.
     """
+
+    KINDS = ("locking", "one cell thick")
 
     def __init__(self, system: System) -> None:
         self._bodies, self._steps = system.bodies, 0
