@@ -10,7 +10,7 @@ import numpy as np
 from dolfinx_nts.bodies.batches import Batches
 from dolfinx_nts.bodies.body import Body
 from dolfinx_nts.equations.scales import Lengths
-from dolfinx_nts.equations.supports import Supports
+from dolfinx_nts.equations.supports import StepSupports
 from dolfinx_nts.state import State
 from dolfinx_nts.types import BoolArray, FloatArray
 
@@ -31,7 +31,7 @@ class Flight:
     """
 
     def __init__(
-        self, batches: Batches, integrator: Any, supports: Supports, lengths: Lengths,
+        self, batches: Batches, integrator: Any, supports: StepSupports, lengths: Lengths,
         inertial: Callable[[Body, FloatArray], FloatArray],
     ) -> None:  # fmt: skip
         self._batches, self._integrator, self._inertial = batches, integrator, inertial

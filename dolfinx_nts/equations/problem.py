@@ -27,7 +27,7 @@ from dolfinx_nts.equations.scales import Lengths, Rounding, stiffness_between
 from dolfinx_nts.equations.shared_weight import SharedWeight
 from dolfinx_nts.equations.sleep import Sleepers
 from dolfinx_nts.equations.stabilization import Stabilization
-from dolfinx_nts.equations.supports import Supports
+from dolfinx_nts.equations.supports import StepSupports
 from dolfinx_nts.equations.unknowns import Unknowns
 from dolfinx_nts.interaction.elements import Step, evaluate_together
 from dolfinx_nts.interaction.evaluation import BodyTerms, Evaluation, EvaluationPoint
@@ -85,7 +85,7 @@ class StepProblem:
         self._again: Evaluation | None = None
         self.lengths, self.loads = Lengths(system), Loads(system, integrator)
         self.sleepers, self._sleep = Sleepers(system, self.couplings, self.loads), sleep
-        self.supports = Supports(system, integrator)
+        self.supports = StepSupports(system, integrator)
         self.flight = Flight(
             self.batches, integrator, self.supports, self.lengths, self._inertial
         )

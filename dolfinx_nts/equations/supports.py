@@ -61,7 +61,7 @@ class _Ends(NamedTuple):
     flown: FloatArray
 
 
-class Supports:
+class StepSupports:
     """Prescribed coordinates of a system in a step; `begin` fixes it.
 
     Attributes:

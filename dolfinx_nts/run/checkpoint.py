@@ -17,6 +17,7 @@ The file is described in `dolfinx_nts.output.state_file`; of its `notes` the run
 - `pace`: what `Adapt` remembers, see `PaceMemory`, but its accelerations, which are
   `bodies/K/acceleration`; or null;
 - `recent`: lengths of the last two steps [s];
+- `stress`: steps, and of each body how much its stress jumped and was, see `LockingWatch.memory`;
 - `solver`: the preset of the linear solver in use, the steps for which it still is, MUMPS's
   workspace by preset where it is not the first, and whether constraints of joints repeat each other
   (null: not known yet), see `StepSolver.memory`.
