@@ -283,6 +283,11 @@ class Body:
         return "use a finer mesh"
 
     @property
+    def keeps_volume(self) -> bool:
+        """Whether its cells are of degree 1 and its material hardly changes its volume."""
+        return False
+
+    @property
     def is_thin(self) -> bool:
         """Whether it is long or flat, with one cell of degree 1 over its thickness. Collective."""
         return False

@@ -10,16 +10,20 @@ from dolfinx_nts.types import FloatArray
 
 #: Part of the squared stress that jumps between cells from which on a body is called too stiff.
 _LOCKED = 0.1
+#: Steps in time after which it looks for the first time.
+_FIRST = 16
 
 
 class LockingWatch:
-    """Looks after 1, 2, 4, 8, ... steps and in the end, for less than 1 % of a run.
+    """Looks after 16, 32, 64, ... steps and in the end; at an equilibrium in the end.
 
-    What counts is the sum over all looks: a front of a wave jumps from cell to cell, too, but holds
-    little of the stress that a body is under in the course of a run.
+    What counts is the sum over all looks: at the front of a wave the stress jumps from cell to
+    cell, too, but that is little of the stress that a body is under in the course of a run. Of runs
+    of fewer steps in time, in which a front may be all there is, nothing is told.
 
     Args:
         system: The scene.
+        in_time: Whether steps are in time, not those of a load.
 
     Attributes:
         KINDS: Of the warnings.
@@ -27,8 +31,8 @@ class LockingWatch:
 
     KINDS = ("locking", "one cell thick")
 
-    def __init__(self, system: System) -> None:
-        self._bodies, self._steps = system.bodies, 0
+    def __init__(self, system: System, *, in_time: bool) -> None:
+        self._bodies, self._steps, self._in_time = system.bodies, 0, in_time
         self._sums = np.zeros((len(system.bodies), 2))
 
     @property
@@ -43,25 +47,40 @@ class LockingWatch:
     def look(self) -> None:
         """Look after an accepted step, if it is time for it. Collective."""
         self._steps += 1
-        if self._steps & (self._steps - 1) == 0:
+        if self._is_due and self._in_time:
             self._sums += self._now()
+
+    @property
+    def _is_due(self) -> bool:
+        return self._steps >= _FIRST and self._steps & (self._steps - 1) == 0
 
     def _now(self) -> FloatArray:
         found = np.zeros_like(self._sums)
         for of_body, body in zip(found, self._bodies, strict=True):
             jumps = body.stress_jumps()
-            if jumps is not None:
+            if jumps is not None and np.isfinite(jumps).all():
                 of_body[:] = jumps
         return found
 
     def tell(self, solution: Solution, time: float) -> None:
         """Warn of what was seen until now, where the run ends. Collective."""
-        sums = (self._sums + self._now()).tolist()
+        if self._in_time and self._steps < _FIRST:
+            return
+        seen = self._is_due and self._in_time
+        sums = (self._sums if seen else self._sums + self._now()).tolist()
         for body, (jumps, whole) in zip(self._bodies, sums, strict=True):
             if not whole > 0.0:
                 continue
             share = jumps / whole
-            if share > _LOCKED:
+            if body.keeps_volume:
+                solution.warn(
+                    "locking", time, max(share, 1.0),
+                    f"cells of body {body.name!r} are of degree 1 and can hardly move, as its "
+                    "material hardly changes its volume: it may be many times too stiff; "
+                    f"{body.remedy_of_locking}",
+                    about=(body.name,),
+                )  # fmt: skip
+            elif share > _LOCKED:
                 solution.warn(
                     "locking", time, share,
                     f"cells of body {body.name!r} may be too stiff for its motion: {share:.2g} of "
@@ -73,6 +92,7 @@ class LockingWatch:
                 solution.warn(
                     "one cell thick", time, 1.0,
                     f"body {body.name!r} has no node inside: where it bends, one cell of degree 1 "
-                    "over its thickness errs by 10 to 40 %; use two or more",
+                    "over its thickness is too stiff by 10 to 70 %, or too soft with "
+                    "volume='projected'; use two or more",
                     about=(body.name,),
                 )  # fmt: skip

@@ -127,7 +127,8 @@ class Stepper:
         self._project_start = project_start
         self._before_step = before_step
         self.newton = newton or Newton()
-        self._materials, self._locking = MaterialWatch(system), LockingWatch(system)
+        self._materials = MaterialWatch(system)
+        self._locking = LockingWatch(system, in_time=integrator.inertia)
         preset = self.newton.preset(system, integrator.inertia, given)
         self.problem = StepProblem(
             system, integrator, rtol=self.newton.rtol, condense=self.newton.condense, sleep=sleep
@@ -426,6 +427,7 @@ class Stepper:
             self.solution.warn("unresolved", state.time, *alternates)
         if impact is not None:
             step_warnings.tell_frictionless(self.solution, impact.impulses[0], state.time)
+        self._locking.look()
         self.look()
 
     def mean_force(self, k: int) -> FloatArray:

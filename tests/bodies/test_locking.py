@@ -2,8 +2,10 @@
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 from dolfinx.mesh import CellType, GhostMode, create_box
+from rotations import rotation
 
 import dolfinx_nts as nts
 
@@ -68,6 +70,8 @@ def test_a_wave_is_no_locking():
         jumps, whole = body.stress_jumps()
         shares.append(jumps / whole if whole else 0.0)
     s.look(last=True)
+    steps, sums = s._locking.memory
+    assert steps == 40 and sums[1] > 0.0  # looked at after 16 and 32
     assert max(shares) > 0.15 and not set(s.solution.warnings) & {"locking", "one cell thick"}
     s.close()
 
@@ -75,3 +79,48 @@ def test_a_wave_is_no_locking():
 def test_degree_2_is_sound():
     _, run = bar((20, 2, 2), 0.3, degree=2)
     assert not set(run.warnings) & {"locking", "one cell thick"}
+
+
+def test_a_bush_that_cannot_change_its_volume_is_told_of():
+    """Held at both faces its stress hardly jumps, while it is 100 times too stiff."""
+    body, run = held_block(0.4999)
+    jumps, whole = body.stress_jumps()
+    assert jumps / whole < 0.5 and "hardly changes its volume" in run.warnings["locking"].text
+    _, run = held_block(0.4999, volume="projected")
+    assert "hardly changes" not in str(run.warnings.get("locking"))
+
+
+def held_block(poisson, **options):
+    """A flat block, one face held and the other one moved aside and down."""
+    mesh = create_box(COMM, ((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), (4, 4, 2), CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=poisson), density=1e3,
+        bcs=[
+            nts.Dirichlet(lambda x: x[2] < 1e-9),
+            nts.Dirichlet(lambda x: x[2] > 1 - 1e-9, value=lambda t: (0.01 * t, 0.0, -0.01 * t)),
+        ],
+        **options,
+    )  # fmt: skip
+    return body, nts.equilibrium(nts.System([body]))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_thin_whatever_way_it_is_turned(angle):
+    mesh = create_box(COMM, ((0.0, 0.0, 0.0), (10.0, 1.0, 1.0)), (20, 1, 1), CellType.hexahedron)
+    mesh.geometry.x[:] = mesh.geometry.x @ rotation(angle, (1.0, 2.0, 3.0)).T
+    assert nts.Continuum(mesh, nts.NeoHookean(young=1.0, poisson=0.3), density=1.0).is_thin
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("volume", ["full", "projected"])
+def test_a_rank_without_a_cell(volume):
+    """One cell: on 2 ranks one of them has none."""
+    mesh = create_box(COMM, ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), (1, 1, 1), CellType.hexahedron)
+    body = nts.Continuum(
+        mesh, nts.NeoHookean(young=1e6, poisson=0.3), density=1e3, volume=volume,
+        velocity=lambda x: np.array([x[1], 0.0 * x[0], 0.0 * x[0]]),
+    )  # fmt: skip
+    run = nts.simulate(nts.System([body]), nts.EnergyMomentum(), dt=1e-3, t_end=0.02)
+    assert run.status == "completed"
+    energy = run.balance["energy"]
+    assert np.abs(energy - energy[0]).max() < 1e-12 * energy[0]

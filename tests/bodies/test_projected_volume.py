@@ -265,8 +265,10 @@ def test_parameters_may_change_between_steps():
     young = fem.Constant(mesh, 2.0)
     body = body_of(mesh, nts.NeoHookean(young=young, poisson=0.4))
     _, u = between(body)
-    stiff = body.potential(u)
+    stiff, of_nodes = body.potential(u), body.nodal_stiffness().copy()
     young.value = 1.0
+    body.take_parameters()
+    assert body.nodal_stiffness() == pytest.approx(0.5 * of_nodes, rel=1e-12)
     assert body.potential(u) == pytest.approx(0.5 * stiff, rel=1e-14)
 
 

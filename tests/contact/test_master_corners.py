@@ -10,6 +10,7 @@ from measures import kinds
 from scenes import RUBBER, UNITS, box, everywhere
 
 import dolfinx_nts as nts
+from dolfinx_nts import dolfinx_compat as compat
 
 COMM = MPI.COMM_WORLD
 #: Turned so that a diagonal of the cube is along z.
@@ -102,7 +103,7 @@ def test_the_vertex_is_in_no_tetrahedron_of_the_slave():
     pair = nts.ContactPair(face, cube.surface(everywhere))
     stepper = nts.Stepper(nts.System([cube, lower], contacts=[pair]), nts.EnergyMomentum())
     tip = cube.mesh.geometry.x[cube.mesh.geometry.x[:, 2].argmin()] - cube.position
-    tets = np.asarray(lower.mesh.geometry.dofmap.array).reshape(-1, 4)
+    tets = compat.geometry_dofmap(lower.mesh)
     deep, low = [], []
     for _ in range(80):
         stepper.advance(1e-3)

@@ -44,7 +44,8 @@ class _OfCells:
         topology = space.mesh.topology
         self.cells, block = topology.index_map(topology.dim).size_local, space.dofmap.bs
         dofs = compat.cell_dofs(space)[: self.cells]
-        self._entries = (block * dofs[:, :, None] + np.arange(block)).reshape(self.cells, -1)
+        shape = self.cells, block * dofs.shape[1]
+        self._entries = (block * dofs[:, :, None] + np.arange(block)).reshape(shape)
         self._size = space.dofmap.index_map.size_local * space.dofmap.index_map_bs
 
     def __call__(self, form: CellForm) -> FloatArray:
@@ -184,7 +185,7 @@ class FormWithMeans:
         self._apart = _OfCells(broken)
         nodes = compat.cell_dofs(space)[: self._apart.cells].astype(PETSc.IntType)
         coordinates = 3 * nodes[:, :, None] + np.arange(3, dtype=PETSc.IntType)
-        self._dofs = coordinates.reshape(self._apart.cells, -1)
+        self._dofs = coordinates.reshape(len(nodes), 3 * nodes.shape[1])
         index_map = space.dofmap.index_map
         self._size = 3 * (index_map.size_local + index_map.num_ghosts)
         work = ufl.replace(form, {w: apart})

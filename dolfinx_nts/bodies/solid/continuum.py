@@ -17,7 +17,7 @@ from dolfinx_nts import dolfinx_compat as compat
 from dolfinx_nts.bodies.conditions import Dirichlet, Traction, VectorInTime, facets_of
 from dolfinx_nts.bodies.meshes.mesh_check import check_mesh
 from dolfinx_nts.bodies.solid.cell_means import CellMeans
-from dolfinx_nts.bodies.solid.materials import misfit, with_constants
+from dolfinx_nts.bodies.solid.materials import bulk_over_shear, misfit, with_constants
 from dolfinx_nts.bodies.solid.parameters import Parameter, require_positive_parameter
 from dolfinx_nts.bodies.solid.stress_jumps import StressJumps
 from dolfinx_nts.bodies.solid.ufl_body import UflBody
@@ -25,7 +25,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
-from dolfinx_nts.parallel import anywhere, global_max, raise_together
+from dolfinx_nts.parallel import anywhere, global_max, global_sum, raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
@@ -40,6 +40,8 @@ from dolfinx_nts.validation import (
 _STRESS_FREE = 1e-6
 #: Strain that tells the stiffness: of the size that leaves linear terms and rounding far apart.
 _SMALL_STRAIN = 1e-4
+#: Bulk over shear modulus from which on cells of degree 1 lock in any motion (nu = 0.499).
+_INCOMPRESSIBLE = 500.0
 #: Longest side of the box around a body over the shortest from which on it may bend.
 _THIN = 4.0
 
@@ -239,6 +241,7 @@ class Continuum(UflBody):
         """What ranks must have in common, see `Body`."""
         loads = {"body_force": self.body_force, "traction": [t.value for t in self._traction]}
         own = {"material": self.material, "density": self.density, "degree": self.degree}
+        own["volume"] = self._volume
         return own | loads | super().settings
 
     def stress_jumps(self) -> FloatArray:
@@ -267,20 +270,31 @@ class Continuum(UflBody):
     def _linear(self) -> bool:
         return self.degree == 1
 
+    @property
+    def keeps_volume(self) -> bool:
+        """As of `Body`."""
+        full = self._linear and self._volume == "full"
+        return full and bulk_over_shear(self.material) > _INCOMPRESSIBLE
+
     @cached_property
     def is_thin(self) -> bool:  # type: ignore[override]
         """As of `Body`."""
         if not self._linear:
             return False
         x = self.reference.reshape(-1, 3)
-        ends = np.array([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
+        count = global_sum(self.comm, np.array([float(len(x))]))
+        off = x - global_sum(self.comm, x.sum(axis=0)) / count
+        # Along the axes of the nodes, whatever way the body is turned.
+        moments: FloatArray = np.dot(off.T, off)
+        _, axes = np.linalg.eigh(global_sum(self.comm, moments))
+        along = off @ axes
+        ends = np.array([along.max(axis=0, initial=-np.inf), (-along).max(axis=0, initial=-np.inf)])
         sides = global_max(self.comm, ends).sum(axis=0)
         if sides.max() < _THIN * sides.min():
             return False
         outside = compat.exterior_facets(self.mesh)
         on_boundary = fem.locate_dofs_topological(self.space, 2, outside)
-        count = self.space.dofmap.index_map.size_local
-        inside = count - np.count_nonzero(np.unique(on_boundary) < count)
+        inside = len(x) - np.count_nonzero(np.unique(on_boundary) < len(x))
         return not anywhere(self.comm, bool(inside))
 
     def destroy(self) -> None:

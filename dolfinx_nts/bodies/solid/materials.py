@@ -21,7 +21,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
 from typing import Any
 
@@ -210,6 +210,20 @@ class MooneyRivlin(Isotropic):
         j, linear = ufl.sqrt(1 + d), a + 2 * b
         first = (linear + c / 2 * j / (1 + j)) * d / (1 + d)
         return first, first - (a + b), first - linear
+
+
+def bulk_over_shear(material: Any) -> float:
+    """Bulk over shear modulus of an undeformed material of this package; of any other one 0."""
+    given = [getattr(material, f.name) for f in fields(material)] if is_dataclass(material) else []
+    if not given or not all(map(is_number, given)):
+        return 0.0
+    if isinstance(material, MooneyRivlin):
+        mu, lam = 2 * (material.a + material.b), material.c + 4 * material.b
+    elif isinstance(material, NeoHookean | StVenantKirchhoff):
+        mu, lam = _lame(material.young, material.poisson)
+    else:
+        return 0.0
+    return float(lam / mu + 2 / 3)
 
 
 def with_constants(material: Any, mesh: Mesh) -> Expr:

@@ -178,9 +178,10 @@ class StepForms:
         self._factors.value, self._rate.value = (0.0, 1.0), 0.0
         # The matrix of the step may be kept from an earlier one.
         matrix = petsc_compat.create_matrix(tangent)
-        petsc_compat.assemble_matrix(matrix, tangent, (), 0.0)
         if means is not None:
             means.evaluate()
+        petsc_compat.assemble_matrix(matrix, tangent, (), 0.0)
+        if means is not None:
             means.add_to(matrix, 1.0, ())
         diagonal = matrix.getDiagonal()
         found: FloatArray = diagonal.array_r.copy()

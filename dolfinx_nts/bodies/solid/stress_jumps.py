@@ -54,7 +54,7 @@ class StressJumps:
     def sums(self) -> FloatArray:
         """Both integrals at the displacements of now [Pa^2 m^3], shape (2,). Collective."""
         assemble_vector(self._vector, self._sums)
-        means = self._vector.array_r.reshape(len(self._weights), -1) / self._weights[:, None]
+        means = self._vector.array_r.reshape(-1, 9) / self._weights[:, None]
         self._smooth.x.array[: means.size] = means.ravel()
         self._smooth.x.scatter_forward()
         return global_sum(self._comm, np.array([form.value() for form in self._squares]))
