@@ -159,7 +159,7 @@ class Corners(FacetPair):
             corners: Corners of the master's facets [m].
         """
         near = self._near[self.master.facets[facet]]
-        flat: BoolArray = near.any(axis=1) if self.yields else near.all(axis=1)
+        flat: BoolArray = near.all(axis=1) if self.slave.body.rigid else near.any(axis=1)
         some = np.flatnonzero(flat)
         if not some.size:
             return flat

@@ -5,7 +5,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from cubes import HALF, ON_EDGE, turned
-from dolfinx.mesh import CellType
+from dolfinx.mesh import CellType, create_box
 from measures import kinds
 from scenes import RUBBER, UNITS, box, everywhere
 
@@ -291,3 +291,26 @@ def test_nodes_that_tilt_beyond_a_rim_are_not_thrown_out_when_they_return():
     energy = run.balance["energy"]
     assert run.status == "completed"
     assert np.diff(energy).max() < 1e-3 * energy[0]
+
+
+@pytest.mark.mpi
+def test_a_rigid_face_that_falls_flat_is_held_at_its_corners():
+    """Its face lies on four facets and one node of the slave; the other declaration is the measure."""
+    found = []
+    for cube_is_slave in (False, True):
+        ends = ((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0))
+        slab = nts.Continuum(
+            create_box(COMM, ends, (4, 4, 2), CellType.hexahedron),
+            nts.NeoHookean(young=1e6, poisson=0.3), density=1e3,
+            bcs=[nts.Dirichlet(lambda x: x[2] < -1 + 1e-9)], name="slab",
+        )  # fmt: skip
+        ends = ((-0.3, -0.3, 0.001), (0.3, 0.3, 0.6))
+        mesh = create_box(COMM, ends, (1, 1, 1), CellType.hexahedron)
+        cube = nts.RigidBody(mesh, density=1e3, velocity=(0.0, 0.0, -1.0), name="cube")
+        sides = [cube.surface(lambda x: x[0] > -9.0), slab.surface(lambda x: x[2] > -1e-9)]
+        slave, master = sides if cube_is_slave else sides[::-1]
+        system = nts.System([cube, slab], contacts=[nts.ContactPair(slave=slave, master=master)])
+        run = nts.simulate(system, nts.EnergyMomentum(), dt=1e-3, t_end=0.03)
+        assert run.status == "completed" and not kinds(run)
+        found.append([*nts.motion_of(cube).velocity, run.balance["energy"][-1]])
+    assert np.abs(found[0][2] - found[1][2]) < 1e-6 and found[0][3] == pytest.approx(found[1][3])
