@@ -295,7 +295,7 @@ def test_nodes_that_tilt_beyond_a_rim_are_not_thrown_out_when_they_return():
 
 @pytest.mark.mpi
 def test_a_rigid_face_that_falls_flat_is_held_at_its_corners():
-    """Its face lies on four facets and one node of the slave; the other declaration is the measure."""
+    """Its face lies on one node of the slave; the other declaration is the measure."""
     found = []
     for cube_is_slave in (False, True):
         ends = ((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0))
