@@ -11,11 +11,11 @@ from dolfinx_nts.types import FloatArray
 #: Part of the squared stress that jumps between cells from which on a body is called too stiff.
 _LOCKED = 0.1
 #: Steps in time after which it looks for the first time.
-_FIRST = 16
+_FIRST = 64
 
 
 class LockingWatch:
-    """Looks after 16, 32, 64, ... steps and in the end; at an equilibrium in the end.
+    """Looks after 64, 128, ... steps and in the end; at an equilibrium in the end.
 
     What counts is the sum over all looks: at the front of a wave the stress jumps from cell to
     cell, too, but that is little of the stress that a body is under in the course of a run. Of runs
