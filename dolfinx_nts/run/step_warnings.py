@@ -8,6 +8,7 @@ from dolfinx_nts.bodies.batch import BodyBatch
 from dolfinx_nts.bodies.motion import motion_of
 from dolfinx_nts.bodies.solid.inversion import describe, smallest_dets
 from dolfinx_nts.contact.hidden_facets import hidden_facets
+from dolfinx_nts.contact.overlap import OverlapWatch
 from dolfinx_nts.contact.pair import INITIAL_PENETRATION
 from dolfinx_nts.equations.problem import StepProblem
 from dolfinx_nts.interaction.evaluation import Evaluation
@@ -87,6 +88,16 @@ def tell_step(solution: Solution, problem: StepProblem, step: Evaluation, state:
     _tell_turns(solution, problem, state)
     tell_inversion(solution, problem, step, state)
     tell_couplings(solution, problem, step, state)
+
+
+def tell_overlap(solution: Solution, watch: OverlapWatch, state: State, *, last: bool) -> None:
+    """Warn of bodies inside each other; arguments as of `Stepper.look`. Collective."""
+    for found in watch.look(
+        state.u, state.time, contacts=state.contacts, edges=state.edges, last=last
+    ):
+        solution.warn(
+            found.kind, state.time, found.depth, found.text, grave=found.grave, about=found.about
+        )
 
 
 def tell_inversion(

@@ -338,14 +338,7 @@ class Stepper:
     def _look_inside(self, last: bool) -> None:
         """`look` at bodies inside each other."""
         if self._overlap is not None:
-            state = self.state
-            for found in self._overlap.look(
-                state.u, state.time, contacts=state.contacts, edges=state.edges, last=last
-            ):
-                self.solution.warn(
-                    found.kind, state.time, found.depth, found.text, grave=found.grave,
-                    about=found.about,
-                )  # fmt: skip
+            step_warnings.tell_overlap(self.solution, self._overlap, self.state, last=last)
 
     def _accept(self, state: State) -> None:
         batches = self.system.batches
