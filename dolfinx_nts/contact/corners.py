@@ -46,6 +46,7 @@ class Corners(FacetPair):
         )  # fmt: skip
         self.leave_to(np.empty(0, dtype=np.int64), np.empty((0, 4), dtype=np.int64))
         self._around = facets_around(self.slave)
+        self._rims = self._sharp_sides()
         self._level = 1.0 - TILTED[self.yields] ** 2
 
     @property
@@ -142,7 +143,34 @@ class Corners(FacetPair):
         off -= np.clip(part, 0.0, 1.0)[:, None] * way
         beside = np.linalg.norm(off, axis=1) < _AT_EDGE * facets.size(corners[facet[one]])
         held[one[beside]] = True
-        return held
+        return held if self.slave.body.rigid else held | self._at_rim(point, facet, x)
+
+    def _at_rim(self, point: IntArray, facet: IntArray, x: Sequence[FloatArray]) -> BoolArray:
+        """Which corners are over a sharp edge of their facets, shape (n,); arguments as of `_held`.
+
+        Where the rims of two bodies lie on each other the slave's nodes hold one that deforms.
+        """
+        corners, found = x[1][self.master.facets[facet]], np.zeros(len(facet), dtype=bool)
+        normal = _areas(corners)
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        for side in range(corners.shape[1]):
+            start, end = corners[:, side], corners[:, (side + 1) % corners.shape[1]]
+            off, way = x[0][point] - start, end - start
+            off -= _dot(off, normal)[:, None] * normal
+            off -= np.clip(_dot(off, way) / _dot(way, way), 0.0, 1.0)[:, None] * way
+            near = np.linalg.norm(off, axis=1) < _AT_EDGE * facets.size(corners)
+            found |= near & self._rims[facet, side]
+        return found
+
+    def _sharp_sides(self) -> BoolArray:
+        """Which sides of the master's facets are sharp edges of its body, shape (facets, nc)."""
+        edges, at = self.sharp_edges[1], self.master.points[self.master.facets]
+        sides = np.stack([at, np.roll(at, -1, axis=1)], axis=2)
+        count = 1 + max(int(edges.surface.points.max(initial=0)), int(at.max(initial=0)))
+        sharp, own = (
+            np.sort(a, axis=-1) @ [count, 1] for a in (edges.surface.points[edges.ends], sides)
+        )
+        return np.isin(own, sharp)
 
     def _lie_flat(
         self, node: IntArray, facet: IntArray, x: FloatArray, corners: FloatArray
@@ -193,7 +221,7 @@ def corners_of(pair: Any) -> list[Corners]:
     """
     if not (isinstance(pair, FacetPair) and pair.has_edges) or pair.slave.massless.any():
         return []
-    return [Corners(pair)] if len(pair.sharp_edges[1].ends) else []
+    return [Corners(pair)] if pair.holds_nodes and len(pair.sharp_edges[1].ends) else []
 
 
 def _with_corners(pair: FacetPair) -> Surface:
