@@ -25,7 +25,7 @@ from dolfinx_nts.integrators import Integrator
 from dolfinx_nts.interaction.evaluation import EvaluationPoint
 from dolfinx_nts.kernels.projected_volume import ProjectedVolume, shear_modulus
 from dolfinx_nts.kernels.strain_energy import Isotropic, green_strain, strain_energy
-from dolfinx_nts.parallel import anywhere, global_max, global_sum, raise_together
+from dolfinx_nts.parallel import anywhere, global_sum, raise_together
 from dolfinx_nts.types import ExtraForm, FloatArray, Settings, Values
 from dolfinx_nts.validation import (
     is_whole,
@@ -42,8 +42,9 @@ _STRESS_FREE = 1e-6
 _SMALL_STRAIN = 1e-4
 #: Bulk over shear modulus from which on cells of degree 1 lock in any motion (nu = 0.499).
 _INCOMPRESSIBLE = 500.0
-#: Longest side of the box around a body over the shortest from which on it may bend.
-_THIN = 4.0
+#: Largest spread of a body's nodes over the least from which on it may bend: a bar or plate of one
+#: cell over the thickness is some 4 times as long as thick.
+_THIN = 2.3
 
 
 @known_options
@@ -284,13 +285,10 @@ class Continuum(UflBody):
         x = self.reference.reshape(-1, 3)
         count = global_sum(self.comm, np.array([float(len(x))]))
         off = x - global_sum(self.comm, x.sum(axis=0)) / count
-        # Along the axes of the nodes, whatever way the body is turned.
+        # Spread along the axes of the nodes, which is the same whatever way the body is turned.
         moments: FloatArray = np.dot(off.T, off)
-        _, axes = np.linalg.eigh(global_sum(self.comm, moments))
-        along = off @ axes
-        ends = np.array([along.max(axis=0, initial=-np.inf), (-along).max(axis=0, initial=-np.inf)])
-        sides = global_max(self.comm, ends).sum(axis=0)
-        if sides.max() < _THIN * sides.min():
+        spread = np.linalg.eigvalsh(global_sum(self.comm, moments))
+        if spread[2] < _THIN**2 * spread[0]:
             return False
         outside = compat.exterior_facets(self.mesh)
         on_boundary = fem.locate_dofs_topological(self.space, 2, outside)
