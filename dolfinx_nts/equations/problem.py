@@ -133,8 +133,8 @@ class StepProblem:
         if again is not None:
             lengths.motion = np.maximum(lengths.motion, lengths.motion_of(again))
             way = [terms.du for terms in again.terms]
-        # Bodies at rest may fall.
-        length = lengths.displaced(dt**2 * float(np.linalg.norm(self.loads.gravity)))
+        fall = dt**2 if self.integrator.inertia else 0.0
+        length = lengths.displaced(fall * float(np.linalg.norm(self.loads.gravity)))
         self.rounding.begin(self.factor, length, lengths.moved, lengths.extent)
         step = Step(
             state, dt, self.factor, self.integrator, self.condense,
@@ -317,7 +317,7 @@ class StepProblem:
 
     def _closed(self, batch: ContactElements) -> float:
         """Gap of a batch that surely counts as closed [m], see `ContactElements.ratios`."""
-        motion, moved = (float(a.max()) for a in (self.lengths.motion, self.lengths.moved))
+        motion, moved = self.lengths.farthest, float(self.lengths.moved.max())
         gap = np.array([0.0, 1.0, 0.0, 0.0])
         limits = batch.ratios(None, gap, motion, motion + moved, self.rtol)
         return 1.0 / limits[f"{batch.name} constraints"]

@@ -30,12 +30,14 @@ class Lengths:
         motion: Largest motion of a point of each body that is predicted, shape (bodies,).
         extent: Largest coordinate, likewise.
         moved: Largest displacement at t_n, likewise.
+        fall: What a body at rest may fall in the step, at most.
     """
 
     def __init__(self, system: System) -> None:
         self._batches = system.batches
         self.centre, self.radius, self.director = box_of(system)
         self.motion, self.extent, self.moved = np.zeros((3, len(system.bodies)))
+        self.fall = 0.0
         links = (*system.contact_bodies, *system.joint_bodies)
         self._linked = [list(bodies) for bodies in links if len(bodies) > 1]
 
@@ -70,6 +72,7 @@ class Lengths:
         Args:
             fall: What a body at rest may fall [m].
         """
+        self.fall = fall
         length: FloatArray = self.moved + self.motion + fall
         # A body at rest beside a moving one gets the rounding of the linear solve for both.
         linked = length.tolist()  # numbers one by one are faster outside of NumPy
@@ -78,6 +81,11 @@ class Lengths:
             for k in bodies:
                 linked[k] = longest
         return np.array(linked)
+
+    @property
+    def farthest(self) -> float:
+        """Motion of a body in the step, as predicted, or as it would be without what holds it."""
+        return max(float(self.motion.max()), self.fall)
 
     @property
     def span(self) -> float:

@@ -109,7 +109,7 @@ def _of_elements(problem: StepProblem, e: Evaluation) -> dict[str, float]:
         if of is not None:
             np.maximum.at(extents, of, c.extents if np.ndim(of) else c.extent)
     top = global_max(comm, np.array([*local, *extents]))
-    motion = max(top[0], float(problem.lengths.motion.max()))
+    motion = max(top[0], problem.lengths.farthest)
     rounded = motion + float(problem.lengths.moved.max())
     extents = top[len(local) :]
     sizes, ratio = top[2 : len(local)].reshape(-1, 4), dict[str, float]()
